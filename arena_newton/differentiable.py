@@ -1,0 +1,201 @@
+"""Gradients of the kernels for torch: reference integration and success margins as `torch.autograd.Function`.
+
+Forward runs the very kernel that the benchmark runs, recorded on a `wp.Tape`; backward replays the tape. Gradients are
+those of a function that is smooth almost everywhere: at ties of a minimum they are one of the one-sided ones.
+"""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
+
+if TYPE_CHECKING:
+    import torch
+
+    from arena_newton.kernels.canonical import ReferencePose
+
+__all__ = ["ReferenceState", "reference_step", "success_margin"]
+
+_FLOAT_STATE = ("position", "quat", "joints", "prev_yaw", "prev_z")
+
+
+class ReferenceState(NamedTuple):
+    """What one step of the reference hands to the next, as torch tensors."""
+
+    position: "torch.Tensor"
+    """World position [m], shape [worlds, 3]."""
+    quat: "torch.Tensor"
+    """World orientation of the target, wxyz, shape [worlds, 4]."""
+    joints: "torch.Tensor"
+    """Joint targets [rad], canonical order, shape [worlds, 29]."""
+    prev_yaw: "torch.Tensor"
+    """Yaw of the last target [rad], shape [worlds]."""
+    prev_z: "torch.Tensor"
+    """Height of the last action [m], shape [worlds]."""
+    heading: "torch.Tensor"
+    """Heading of the robot at reset [rad], shape [worlds]; a constant."""
+    steps: "torch.Tensor"
+    """Steps since the reset, int32, shape [worlds]."""
+    joint_vel: "torch.Tensor"
+    """Backward difference of the joint targets [rad/s], shape [worlds, 29]; an output only."""
+
+    @classmethod
+    def of(cls, ref: "ReferencePose") -> "ReferenceState":
+        """Copies the state of a reference pose."""
+        import warp as wp
+
+        return cls(*(wp.to_torch(getattr(ref, name), requires_grad=False).clone() for name in cls._fields))
+
+
+def _backpropagate(
+    tape: Any, inputs: Sequence[Any], outputs: Sequence[Any], grads: Sequence["torch.Tensor | None"]
+) -> list["torch.Tensor | None"]:
+    """Runs a tape backward from gradients of its outputs; gives gradients of its inputs, None where none is kept."""
+    import warp as wp
+
+    seeds = {
+        array: wp.from_torch(grad.detach().contiguous(), dtype=array.dtype)
+        for array, grad in zip(outputs, grads, strict=True)
+        if grad is not None
+    }
+    tape.backward(grads=seeds)
+    result = [wp.to_torch(a.grad).clone() if a is not None and a.requires_grad else None for a in inputs]
+    tape.zero()
+    return result
+
+
+def _stream(tensor: "torch.Tensor") -> Any:
+    """Context in which Warp works on torch's current stream, so that the two need not wait for each other."""
+    import contextlib
+
+    import warp as wp
+
+    if not tensor.is_cuda:
+        return contextlib.nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(tensor.device))
+
+
+def _function() -> type:
+    """The autograd function, made once torch is there."""
+    import torch
+
+    class _Recorded(torch.autograd.Function):
+        """`record(*arrays) -> (tape, outputs)` as a torch function of the tensors behind the arrays."""
+
+        @staticmethod
+        def forward(ctx: Any, record: Callable, *tensors: "torch.Tensor") -> tuple["torch.Tensor", ...]:
+            import warp as wp
+
+            with _stream(tensors[0]):
+                arrays = [
+                    wp.from_torch(t.detach().contiguous(), requires_grad=need)
+                    for t, need in zip(tensors, ctx.needs_input_grad[1:], strict=True)
+                ]
+                tape, outputs = record(*arrays)
+                results = tuple(wp.to_torch(o, requires_grad=False).clone() for o in outputs)
+            ctx.tape, ctx.arrays, ctx.outputs = tape, arrays, outputs
+            return results
+
+        @staticmethod
+        @torch.autograd.function.once_differentiable
+        def backward(ctx: Any, *grads: "torch.Tensor | None") -> tuple:
+            with _stream(next(g for g in grads if g is not None)):
+                return None, *_backpropagate(ctx.tape, ctx.arrays, ctx.outputs, grads)
+
+    return _Recorded
+
+
+_RECORDED: list[type] = []
+
+
+def _apply(record: Callable, *tensors: "torch.Tensor") -> tuple["torch.Tensor", ...]:
+    if not _RECORDED:
+        _RECORDED.append(_function())
+    return _RECORDED[0].apply(record, *tensors)
+
+
+def reference_step(
+    action: "torch.Tensor", state: ReferenceState, *, max_root_delta_deg: float = 0.0
+) -> tuple["torch.Tensor", ReferenceState]:
+    """One step of the canonical reference, differentiable in the action and in the state before it.
+
+    Args:
+        action: Canonical actions, float32, shape [worlds, 40].
+        state: The state before; `ReferenceState.of` copies it from a running reference.
+        max_root_delta_deg: Largest rotation [deg] between consecutive targets; 0 = no limit.
+
+    Returns:
+        The mimic command, shape [worlds, 35], and the state after, whose position and quat are the target pose.
+    """
+    import dataclasses
+
+    import torch
+    import warp as wp
+
+    from arena_newton.kernels.canonical import ReferencePose, launch_integrate
+
+    worlds = action.shape[0]
+    steps = torch.empty_like(state.steps)
+
+    def record(action_array: wp.array, *floats: wp.array) -> tuple[wp.Tape, list[wp.array]]:
+        device = action_array.device
+        order = {"canonical_to_mujoco": CANONICAL_TO_MUJOCO, "tick": TICK}
+        after = ReferencePose.allocate(worlds, device, **order, requires_grad=True)
+        before = dataclasses.replace(
+            after,
+            heading=wp.from_torch(state.heading.detach().contiguous()),
+            steps=wp.from_torch(state.steps.contiguous()),
+            **dict(zip(_FLOAT_STATE, floats, strict=True)),
+        )
+        mask = wp.full(worlds, 1, dtype=wp.int32, device=device)
+        tape = wp.Tape()
+        with tape:
+            launch_integrate(before, action_array, mask, max_root_delta_deg, out=after)
+        steps.copy_(wp.to_torch(after.steps))
+        return tape, [after.mimic, *(getattr(after, name) for name in _FLOAT_STATE), after.joint_vel]
+
+    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = _apply(
+        record, action, *(getattr(state, name) for name in _FLOAT_STATE)
+    )
+    return mimic, ReferenceState(position, quat, joints, prev_yaw, prev_z, state.heading, steps, joint_vel)
+
+
+def success_margin(launch: Callable[..., None], **arguments: Any) -> "torch.Tensor":
+    """The margin of a success predicate, differentiable in every floating-point tensor among the arguments.
+
+    Args:
+        launch: A wrapper of `kernels.success`, such as `launch_football`.
+        **arguments: Its arguments by name. Tensors (float32 or int32) stand for Warp arrays; boxes, numbers and Warp
+            arrays pass through. Leave out the outputs and the counter: they are made here, the counter as zero.
+
+    Returns:
+        The margin [m], shape [worlds].
+    """
+    import torch
+    import warp as wp
+
+    floats = {k: v for k, v in arguments.items() if isinstance(v, torch.Tensor) and v.is_floating_point()}
+    if not floats:
+        raise TypeError(f"{launch.__name__} needs at least one floating-point tensor to differentiate")
+    fixed = {
+        k: wp.from_torch(v.contiguous()) if isinstance(v, torch.Tensor) else v
+        for k, v in arguments.items()
+        if k not in floats
+    }
+    worlds = next(iter(floats.values())).shape[0]
+
+    def record(*arrays: wp.array) -> tuple[wp.Tape, list[wp.array]]:
+        device = arrays[0].device
+        margin = wp.zeros(worlds, dtype=wp.float32, device=device, requires_grad=True)
+        made = {
+            name: wp.zeros(worlds, dtype=wp.int32, device=device)
+            for name in ("success", "counter", "event")
+            if name in inspect.signature(launch).parameters
+        }
+        tape = wp.Tape()
+        with tape:
+            launch(**dict(zip(floats, arrays, strict=True)), **fixed, **made, margin=margin)
+        return tape, [margin]
+
+    return _apply(record, *floats.values())[0]

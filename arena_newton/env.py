@@ -1,0 +1,456 @@
+"""ArenaEnv: a batch of worlds of one task, judged by one rule set, moved by one tracker.
+
+A world's episode has two phases: the start-up (`SETTLE_TICKS` with a standing command, objects come to rest, the
+tracker's history fills) and the episode proper, whose step 0 is the policy's first action.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton import robot as g1
+from arena_newton.errors import InputError
+from arena_newton.interfaces import EpisodeResult, Observation, RobotState, TrackerCommand
+
+if TYPE_CHECKING:
+    from arena_newton.rules import RuleSet
+
+__all__ = ["SETTLE_TICKS", "STAND_ACTION", "ArenaEnv"]
+
+SETTLE_TICKS = 50
+"""Start-up length [ticks]: dropped obstacles come to rest, the tracker takes its stance."""
+
+STAND_ACTION = np.array(
+    [0.0, 0.0, g1.SPAWN_HEIGHT, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+    + [g1.DEFAULT_POSE[i] for i in g1.CANONICAL_TO_MUJOCO]
+    + [0.0, 0.0],
+    dtype=np.float32,
+)
+"""Canonical action of standing still: TWIST2's command when there is no input (root z 0.8 m, default pose)."""
+
+
+class ArenaEnv:
+    """A batch of worlds; see `run_episodes` for the loop that keeps all of them busy."""
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        tracker: Any,
+        worlds: int = 20,
+        engine: str = "auto",
+        device: str | None = None,
+        rules: str | RuleSet = "paper",
+        mode: str = "base",
+        variant_file: str | None = None,
+        fast_physics: bool = False,
+        camera: Any = None,
+        threads: int | None = None,
+    ):
+        """Build the scene and bind tracker, judge and kernels.
+
+        Args:
+            task: Task name.
+            tracker: A bound-once tracker (`arena_newton.trackers`).
+            worlds: Worlds in the batch.
+            engine: `auto`, `mujoco` or `warp`.
+            device: Warp device, such as `cpu` or `cuda:0`.
+            rules: Rule set or its name.
+            mode: `base`, `execution`, `semantic` or `visual`.
+            variant_file: A user's USD layer instead of the task's own scene.
+            fast_physics: Use the tracker's fast physics rate.
+            camera: `CameraConfig` of the head camera for policies that see, or None.
+            threads: CPU threads of engine `mujoco`; all by default.
+
+        Raises:
+            InputError: Something named in the message is missing or does not fit.
+        """
+        import torch
+        import warp as wp
+
+        from arena_newton import rules as rule_sets
+        from arena_newton import tasks
+        from arena_newton.kernels import canonical
+        from arena_newton.physics import make_physics, resolve_engine
+        from arena_newton.scene import load_scene
+
+        if worlds < 1:
+            raise InputError(f"--worlds {worlds}: must be at least 1")
+        self.spec = tasks.get(task)
+        self.rules = rule_sets.get(rules) if isinstance(rules, str) else rules
+        self.mode = mode
+        self.tracker = tracker
+        self.worlds = worlds
+        self.engine, device = resolve_engine(engine, device)
+        self.scene = load_scene(
+            task,
+            worlds=worlds,
+            device=device,
+            variant=self.spec.variant(mode, self.rules) if variant_file is None else "base",
+            rules=self.rules,
+            drive=tracker.drive,
+            variant_file=variant_file,
+            native=self.engine == "mujoco",
+        )
+        self.rate = tracker.fast_physics_rate if fast_physics else tracker.physics_rate
+        self.physics = make_physics(self.scene, self.rate, self.engine, threads)
+        self.device = self.physics.device
+        self.torch_device = wp.device_to_torch(self.device)
+        self.judge = self.spec.judge(self.scene, self.rules)
+        self.judge.bind(self.physics) if hasattr(self.judge, "bind") else None
+        self.physics.want_forces = bool(getattr(self.judge, "needs_forces", False))
+
+        h = self.scene.robot
+        canonical_order = np.array(g1.CANONICAL_TO_MUJOCO)
+
+        def ints(values: Iterable[int]) -> Any:
+            return wp.array(np.asarray(list(values), dtype=np.int32), dtype=wp.int32, device=self.device)
+
+        def zeros(*shape: int, dtype: Any = wp.float32) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=self.device)
+
+        self._canonical_qpos = ints(h.joint_qpos[canonical_order])
+        self._canonical_qvel = ints(h.joint_qvel[canonical_order])
+        self._joint_ctrl, self._hand_ctrl = ints(h.joint_ctrl), ints(h.hand_ctrl)
+        hands = len(h.hand_ctrl)
+        close = (g1.HAND_CLOSE_LEFT + g1.HAND_CLOSE_RIGHT)[:hands]
+        self._hand_close = wp.array(np.array(close, np.float32), dtype=wp.float32, device=self.device)
+        self._hand_open = wp.array(np.array((g1.HAND_OPEN * 2)[:hands], np.float32), dtype=wp.float32, device=self.device)
+        self._critical = ints(h.critical_bodies)
+        self.reference = canonical.ReferencePose.allocate(worlds, self.device)
+        self._state64, self._action = zeros(worlds, 64), zeros(worlds, 40)
+        self._heading0 = zeros(worlds)
+        self._stand = wp.array(STAND_ACTION, dtype=wp.float32, device=self.device)
+        self._streak, self._fallen = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
+        self._bad_state, self._bad_action = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
+        self._status, self._mask = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
+
+        t = wp.to_torch
+        self._t_qpos, self._t_qvel = t(self.physics.qpos), t(self.physics.qvel)
+        self._t_action, self._t_state = t(self._action), t(self._state64)
+        long = {"dtype": torch.long, "device": self.torch_device}
+        self._i_q, self._i_v = torch.tensor(h.joint_qpos, **long), torch.tensor(h.joint_qvel, **long)
+        self._to_mujoco = torch.tensor(g1.MUJOCO_TO_CANONICAL, **long)
+        self._t_stand = torch.tensor(STAND_ACTION, device=self.torch_device)
+        self._t_ref_joints, self._t_ref_vel = t(self.reference.joints), t(self.reference.joint_vel)
+        self._t_mimic, self._t_ref_quat = t(self.reference.mimic), t(self.reference.quat)
+        tracker.bind(worlds, self.torch_device)
+
+        self.tick = np.zeros(worlds, dtype=np.int64)
+        """Ticks since each world's step 0; negative while it settles."""
+        self.active = np.zeros(worlds, dtype=bool)
+        """Worlds that run an episode."""
+        self._fresh = np.zeros(worlds, dtype=bool)
+        self.draws: list[Any] = [None] * worlds
+        self.lights = None
+        self.camera = None
+        if camera is not None:
+            self.add_camera(camera)
+
+    def add_camera(self, config: Any) -> Any:
+        """Attach the head camera (done at construction when `camera` is given)."""
+        from arena_newton.camera import Camera
+
+        self.camera = Camera.from_scene(
+            self.scene, self.physics, prim=config.prim, width=config.width, height=config.height, lights=self._lights()
+        )
+        return self.camera
+
+    def _lights(self) -> Any:
+        from arena_newton.camera import WorldLights
+
+        if self.lights is None:
+            self.lights = WorldLights.allocate(self.worlds, self.device)
+            for w, draws in enumerate(self.draws):
+                self.lights.set(w, draws.light if draws is not None else None)
+        return self.lights
+
+    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | None = None) -> None:
+        """Start an episode in each of `worlds` (all by default) from its episode seed alone.
+
+        Args:
+            seeds: Episode seeds, one a world.
+            worlds: World indices; all worlds by default.
+        """
+        from arena_newton.kernels import canonical
+
+        rows = np.arange(self.worlds) if worlds is None else np.asarray(worlds, dtype=np.int64)
+        if len(seeds) != len(rows):
+            raise InputError(f"{len(seeds)} seeds for {len(rows)} worlds")
+        p, h = self.physics, self.scene.robot
+        qpos = p.qpos0[rows].copy()
+        mocap_pos = np.tile(p.mocap_pos0, (len(rows), 1, 1))
+        mocap_quat = np.tile(p.mocap_quat0, (len(rows), 1, 1))
+        qpos[:, h.root_qpos : h.root_qpos + 3] = self.spec.spawn_position
+        qpos[:, h.root_qpos + 3 : h.root_qpos + 7] = self.spec.spawn_quat
+        qpos[:, h.joint_qpos] = g1.DEFAULT_POSE
+        qpos[:, h.hand_qpos] = 0.0
+        for k, (seed, w) in enumerate(zip(seeds, rows, strict=True)):
+            draws = self.draws[w] = self.spec.draw(int(seed), self.mode, self.rules)
+            for prim, pose in draws.placed.items():
+                if self.scene.has_body(f"{prim}/Frame"):
+                    mocap = self.scene.mocap_id(prim)
+                    mocap_pos[k, mocap], mocap_quat[k, mocap] = pose.position, pose.quat
+                else:
+                    address = self.scene.joint_qpos(prim)
+                    qpos[k, address : address + 3] = pose.position
+                    qpos[k, address + 3 : address + 7] = pose.quat
+            if self.lights is not None:
+                self.lights.set(int(w), draws.light)
+        p.reset_worlds(rows, qpos, mocap_pos, mocap_quat)
+        mask = self._upload(rows)
+        canonical.launch_reset_reference(self.reference, p.qpos, h.root_qpos, mask)
+        self.judge.reset(mask)
+        host = self._streak.numpy()
+        host[rows] = 0
+        self._streak.assign(host)
+        self.tracker.reset(self._torch_mask(rows))
+        self.tick[rows] = -SETTLE_TICKS
+        self.active[rows] = True
+        self._fresh[rows] = True
+
+    def _upload(self, rows: np.ndarray) -> Any:
+        host = np.zeros(self.worlds, dtype=np.int32)
+        host[rows] = 1
+        self._mask.assign(host)
+        return self._mask
+
+    def _torch_mask(self, rows: np.ndarray) -> Any:
+        import torch
+
+        host = np.zeros(self.worlds, dtype=bool)
+        host[rows] = True
+        return torch.from_numpy(host).to(self.torch_device)
+
+    def observe(self, mask: np.ndarray | None = None, *, image: bool = False) -> Observation:
+        """State 64 of every world and, if asked, the head camera's picture of the worlds in `mask`."""
+        from arena_newton.kernels import canonical
+
+        p, h = self.physics, self.scene.robot
+        canonical.launch_state64(
+            p.qpos, p.qvel, h.root_qpos, h.root_qvel, self._canonical_qpos, self._canonical_qvel, self._heading0, self._state64
+        )
+        picture = None
+        if image:
+            if self.camera is None:
+                raise InputError("the policy needs images, but the environment was built without a camera")
+            picture = self.render(self.camera, mask)
+        asked = self.active & (self.tick >= 0) if mask is None else mask
+        return Observation(
+            state=self._t_state,
+            image=picture,
+            mask=asked,
+            task=self.spec.name,
+            gym_id=self.spec.gym_id,
+            instruction=self.spec.instruction,
+        )
+
+    def render(self, camera: Any, mask: np.ndarray | None = None) -> Any:
+        """Render one camera; uint8 torch tensor [worlds, H, W, 3]."""
+        if not hasattr(self, "_newton_state"):
+            self._newton_state = self.scene.model.state()
+        self.physics.write_newton_state(self._newton_state)
+        return camera.render(self._newton_state, mask)
+
+    def _begin(self, rows: np.ndarray) -> None:
+        """Step 0 of an episode: heading and reference are taken from the robot as it stands now."""
+        from arena_newton.kernels import canonical, rotations
+
+        mask = self._upload(rows)
+        p, h = self.physics, self.scene.robot
+        canonical.launch_reset_reference(self.reference, p.qpos, h.root_qpos, mask)
+        rotations.launch_heading(p.qpos, h.root_qpos, mask, self._heading0)
+        self.judge.reset(mask)
+
+    def step(self, action: Any) -> np.ndarray:
+        """Advance every active world one tick.
+
+        Args:
+            action: Canonical actions, float32 torch tensor [worlds, 40]; rows of settling worlds are replaced by the
+                standing command.
+
+        Returns:
+            Status codes of `arena_newton.kernels.tick`, int32 [worlds].
+        """
+        import torch
+        import warp as wp
+
+        from arena_newton.kernels import canonical, fall, reset, tick
+
+        p, h = self.physics, self.scene.robot
+        starting = np.flatnonzero(self.active & (self.tick == 0))
+        if len(starting):
+            self._begin(starting)
+        self._t_action.copy_(action)
+        settling = self.active & (self.tick < 0)
+        if settling.any():
+            self._t_action[torch.from_numpy(settling).to(self.torch_device)] = self._t_stand
+        canonical.launch_validate_action(self._action, self._bad_action)
+        tick.launch_sanitize(self._bad_action, self._stand, self._action)
+        mask = self._upload(np.flatnonzero(self.active))
+        canonical.launch_integrate(self.reference, self._action, mask, self.tracker.max_root_delta_deg)
+        command = TrackerCommand(
+            mimic=self._t_mimic,
+            joints=self._t_ref_joints.index_select(1, self._to_mujoco),
+            joint_vel=self._t_ref_vel.index_select(1, self._to_mujoco),
+            quat=self._t_ref_quat,
+        )
+        root, vel = h.root_qpos, h.root_qvel
+        state = RobotState(
+            quat=self._t_qpos[:, root + 3 : root + 7],
+            ang_vel_body=self._t_qvel[:, vel + 3 : vel + 6],
+            joint_pos=self._t_qpos.index_select(1, self._i_q),
+            joint_vel=self._t_qvel.index_select(1, self._i_v),
+        )
+        if self._fresh.any():
+            self.tracker.prefill(command, state, self._torch_mask(np.flatnonzero(self._fresh)))
+            self._fresh[:] = False
+        targets = wp.from_torch(self.tracker.step(command, state).contiguous(), dtype=wp.float32)
+        tick.launch_write_ctrl(
+            targets, self._joint_ctrl, self.reference.hands, self._hand_ctrl, self._hand_open, self._hand_close, p.ctrl
+        )
+        p.set_active(self.active)
+        p.step()
+        self.judge.evaluate(p)
+        fall.launch_fall_rules(
+            p.qpos, h.root_qpos, p.contact_force, self._critical, self.rules, self._streak, self._fallen
+        )
+        reset.launch_nonfinite(p.qpos, p.qvel, self._bad_state)
+        tick.launch_status(
+            self.judge.success, self._fallen, self.judge.event, self._bad_state, self._bad_action, self._status
+        )
+        self.tick[self.active] += 1
+        return self._status.numpy()
+
+    def run_episodes(
+        self,
+        policy: Any,
+        episodes: Sequence[Any],
+        on_finish: Callable[[EpisodeResult], None] | None = None,
+        on_tick: Callable[[int], None] | None = None,
+        recorder: Any = None,
+        max_steps: int | None = None,
+    ) -> list[EpisodeResult]:
+        """Run planned episodes, giving each world the next one as soon as it is free.
+
+        Args:
+            policy: A policy (`arena_newton.policies`).
+            episodes: Objects with `episode_seed` (and whatever the caller needs back).
+            on_finish: Called with each result, in the order of ending.
+            on_tick: Called each tick with the number of active worlds.
+            recorder: Takes pictures: `.start(env, world, episode)`, `.tick(env)`, `.finish(env, world, result)`.
+            max_steps: Step budget instead of the rule set's.
+
+        Returns:
+            Results in the order of `episodes`.
+        """
+        import torch
+
+        from arena_newton.kernels import tick as codes
+
+        budget = max_steps or self.spec.max_steps(self.rules)
+        waiting = deque(enumerate(episodes))
+        running: list[tuple[int, Any] | None] = [None] * self.worlds
+        started = np.zeros(self.worlds)
+        results: list[EpisodeResult | None] = [None] * len(episodes)
+        chunk = torch.zeros((self.worlds, 1, 40), device=self.torch_device)
+        cursor, length = np.zeros(self.worlds, np.int64), np.zeros(self.worlds, np.int64)
+        rows = torch.arange(self.worlds, device=self.torch_device)
+        policy_errors: dict[int, str] = {}
+
+        def assign(free: list[int]) -> None:
+            taken = [(w, *waiting.popleft()) for w in free if waiting]
+            for w in free:
+                running[w] = None
+                self.active[w] = False
+            if not taken:
+                return
+            worlds = [w for w, _, _ in taken]
+            self.reset([e.episode_seed for _, _, e in taken], worlds)
+            mask = np.zeros(self.worlds, dtype=bool)
+            mask[worlds] = True
+            seeds = [0] * self.worlds
+            for w, i, e in taken:
+                running[w], started[w] = (i, e), time.perf_counter()
+                seeds[w] = e.episode_seed
+                length[w] = cursor[w] = 0
+                if recorder is not None:
+                    recorder.start(self, w, e)
+            policy.reset(seeds, [self.spec.gym_id] * self.worlds, mask)
+
+        def finish(w: int, outcome: str, reason: str, error: str | None = None) -> None:
+            index, episode = running[w]
+            startup = outcome == "fall" and self.tick[w] <= 0
+            result = EpisodeResult(
+                episode=episode,
+                outcome=outcome,
+                reason="startup_fall" if startup else reason,
+                steps=max(int(self.tick[w]), 0),
+                margin=float(self.judge.margin.numpy()[w]),
+                startup_fall=startup,
+                overflow=bool(self.physics.overflow.numpy()[w]),
+                sim_s=float((self.tick[w] + SETTLE_TICKS) * g1.TICK),
+                wall_s=time.perf_counter() - started[w],
+                error=error,
+            )
+            results[index] = result
+            if recorder is not None:
+                recorder.finish(self, w, result)
+            if on_finish is not None:
+                on_finish(result)
+
+        assign(list(range(self.worlds)))
+        while self.active.any():
+            asks = self.active & (self.tick >= 0) & (cursor >= length)
+            if asks.any():
+                starting = np.flatnonzero(asks & (self.tick == 0))
+                if len(starting):
+                    self._begin(starting)
+                answer = policy.act(self.observe(asks, image=policy.needs_image))
+                actions = torch.as_tensor(answer.actions, dtype=torch.float32, device=self.torch_device)
+                if actions.shape[1] > chunk.shape[1]:
+                    chunk = torch.nn.functional.pad(chunk, (0, 0, 0, actions.shape[1] - chunk.shape[1]))
+                ask = torch.from_numpy(asks).to(self.torch_device)
+                chunk[ask, : actions.shape[1]] = actions[ask]
+                cursor[asks], length[asks] = 0, actions.shape[1]
+                policy_errors = dict(answer.errors)
+                for w, message in policy_errors.items():
+                    finish(w, "error", "policy", message)
+                if policy_errors:
+                    assign(list(policy_errors))
+                    if not self.active.any():
+                        break
+            acting = self.active & (self.tick >= 0)
+            index = torch.from_numpy(np.where(acting, np.minimum(cursor, chunk.shape[1] - 1), 0)).to(self.torch_device)
+            status = self.step(chunk[rows, index])
+            cursor[acting] += 1
+            if recorder is not None:
+                recorder.tick(self)
+            ended = []
+            for w in np.flatnonzero(self.active):
+                code, t = int(status[w]), int(self.tick[w])
+                if code == codes.ERROR_STATE:
+                    finish(w, "error", "nonfinite_state", "the simulation state of this world became non-finite")
+                elif code == codes.ERROR_ACTION and t > 0:
+                    finish(w, "error", "bad_action", "the policy's action is non-finite or its rot6d is degenerate")
+                elif code == codes.SUCCESS and t > 0:
+                    finish(w, "success", "success")
+                elif code == codes.FALL:
+                    finish(w, "fall", "fall")
+                elif code > codes.EVENT and t > 0:
+                    finish(w, "timeout", self.judge.events[code - codes.EVENT])
+                elif t >= budget:
+                    finish(w, "timeout", "timeout")
+                else:
+                    continue
+                ended.append(int(w))
+            if ended:
+                assign(ended)
+            if on_tick is not None:
+                on_tick(int(self.active.sum()))
+        return [r for r in results if r is not None]

@@ -1,0 +1,402 @@
+"""One interface, two engines: native MuJoCo on the CPU and mujoco_warp on CUDA or the Warp CPU backend.
+
+Both step the model that Newton compiled from the USD stage. State arrays are Warp arrays, float32, MuJoCo layout,
+shape [worlds, n]; the free joint's quaternion is wxyz, its angular velocity is in the body frame.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.robot import PhysicsRate
+    from arena_newton.scene import Scene
+
+__all__ = ["MujocoPhysics", "Physics", "WarpPhysics", "make_physics", "resolve_engine"]
+
+
+def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
+    """Engine and device for `auto`, checked against what this machine has.
+
+    Raises:
+        InputError: Unknown engine, or a device that is not here.
+    """
+    import warp as wp
+
+    cuda = wp.is_cuda_available()
+    if engine not in {"auto", "mujoco", "warp"}:
+        raise InputError(f"--engine {engine}: unknown, choose auto, mujoco or warp")
+    if device is not None and device != "cpu":
+        if not device.startswith("cuda"):
+            raise InputError(f"--device {device}: unknown, choose cpu, cuda or cuda:N")
+        if not cuda:
+            raise InputError(f"--device {device}: no CUDA device on this machine, use --device cpu")
+        if device != "cuda" and device not in {d.alias for d in wp.get_cuda_devices()}:
+            raise InputError(f"--device {device}: no such device, this machine has {wp.get_cuda_device_count()}")
+    if engine == "auto":
+        engine = "warp" if cuda and device != "cpu" else "mujoco"
+    if engine == "mujoco":
+        if device not in (None, "cpu"):
+            raise InputError(f"--device {device}: engine mujoco runs on the CPU, use --engine warp for CUDA")
+        return "mujoco", "cpu"
+    return "warp", device or ("cuda:0" if cuda else "cpu")
+
+
+class Physics:
+    """State views, reset and one 50 Hz tick; see the engines below."""
+
+    engine: str
+
+    def __init__(self, scene: Scene, rate: PhysicsRate):
+        """Bind a scene; `rate` is the tracker's physics rate."""
+        import warp as wp
+
+        self.scene = scene
+        self.rate = rate
+        self.worlds = scene.worlds
+        self.device = wp.get_device(scene.device)
+        self.want_forces = False
+        """Fill `contact_force` every tick (otherwise only for worlds tilted beyond 60°, engine `mujoco`)."""
+        m = scene.mj_model
+        self.nq, self.nv, self.nu, self.nbody, self.nmocap = m.nq, m.nv, m.nu, m.nbody, m.nmocap
+        self.qpos0 = np.tile(m.qpos0.astype(np.float32), (self.worlds, 1))
+        self.mocap_pos0 = np.array([m.body_pos[b] for b in range(m.nbody) if m.body_mocapid[b] >= 0], dtype=np.float32)
+        self.mocap_quat0 = np.array([m.body_quat[b] for b in range(m.nbody) if m.body_mocapid[b] >= 0], np.float32)
+        with wp.ScopedDevice(self.device):
+            self.contact_force = wp.zeros((self.worlds, m.nbody), dtype=wp.float32)
+            self.pair_force = wp.zeros(self.worlds, dtype=wp.float32)
+            self.overflow = wp.zeros(self.worlds, dtype=wp.int32)
+            self.latch_locked = wp.full(self.worlds, 1, dtype=wp.int32)
+        self._pair: tuple[np.ndarray, np.ndarray] | None = None
+
+    def watch_pair(self, geoms_a: list[int], geoms_b: list[int]) -> None:
+        """Report the normal force between two groups of geoms in `pair_force` [N], shape [worlds]."""
+        a, b = np.zeros(self.scene.mj_model.ngeom, np.int32), np.zeros(self.scene.mj_model.ngeom, np.int32)
+        a[geoms_a], b[geoms_b] = 1, 1
+        self._pair = (a, b)
+
+    def set_latch(self, locked: Any) -> None:
+        """Lock (1) or release (0) the door latch of each world; int32 Warp array [worlds]."""
+        import warp as wp
+
+        wp.copy(self.latch_locked, locked)
+
+    def step(self) -> None:
+        """Advance one 50 Hz tick under the current `ctrl`."""
+        self.bare_step()
+        self.read_contacts()
+
+    def bare_step(self) -> None:
+        """Only the physics of one tick."""
+        raise TypeError("use make_physics() for an engine")
+
+    def read_contacts(self) -> None:
+        """Contact forces and overflow flags of the last physics step."""
+
+    def reset_worlds(self, worlds: np.ndarray, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray) -> None:
+        """Put worlds at rest in a state, clearing every trace of their past.
+
+        Args:
+            worlds: World indices [k].
+            qpos: Positions [k, nq].
+            mocap_pos: Fixture positions [m], shape [k, nmocap, 3].
+            mocap_quat: Fixture orientations wxyz, shape [k, nmocap, 4].
+        """
+        raise TypeError("use make_physics() for an engine")
+
+    def write_newton_state(self, state: Any) -> None:
+        """Write body poses into a Newton state (for rendering)."""
+        import warp as wp
+
+        from arena_newton.kernels import newton_state
+
+        if not hasattr(self, "_newton_map"):
+            self._newton_map = wp.array(self.scene.body_to_newton, dtype=wp.int32, device=self.device)
+        newton_state.launch_body_q(self.xpos, self.xquat, self._newton_map, state.body_q)
+
+
+class MujocoPhysics(Physics):
+    """Native MuJoCo: one MjData a world, several threads, bit-identical for any number of worlds."""
+
+    engine = "mujoco"
+
+    def __init__(self, scene: Scene, rate: PhysicsRate, threads: int | None = None):
+        """Allocate one MjData a world."""
+        import mujoco
+        import warp as wp
+
+        super().__init__(scene, rate)
+        self._mj = mujoco
+        m = self._m = scene.mj_model
+        m.opt.timestep = rate.dt
+        m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._data = [mujoco.MjData(m) for _ in range(self.worlds)]
+        self._np: dict[str, np.ndarray] = {}
+
+        def shared(name: str, *shape: int) -> None:
+            buffer = np.zeros((self.worlds, *shape), dtype=np.float32)
+            self._np[name] = buffer
+            setattr(self, name, wp.array(buffer, dtype=wp.float32, device="cpu", copy=False))
+
+        shared("qpos", m.nq)
+        shared("qvel", m.nv)
+        shared("ctrl", m.nu)
+        shared("xpos", m.nbody, 3)
+        shared("xquat", m.nbody, 4)
+        shared("xipos", m.nbody, 3)
+        self._np["contact_force"] = self.contact_force.numpy()
+        self._np["pair_force"] = self.pair_force.numpy()
+        self._np["overflow"] = self.overflow.numpy()
+        self._np["latch"] = self.latch_locked.numpy()
+        self.threads = max(1, min(threads or len(os.sched_getaffinity(0)), self.worlds))
+        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._shares = np.array_split(np.arange(self.worlds), self.threads)
+        self._active = np.ones(self.worlds, dtype=bool)
+        every = np.arange(self.worlds)
+        mocap = (np.tile(self.mocap_pos0, (self.worlds, 1, 1)), np.tile(self.mocap_quat0, (self.worlds, 1, 1)))
+        self.reset_worlds(every, self.qpos0, *mocap)
+
+    def _each(self, work: Any) -> None:
+        if self._pool is None:
+            work(self._shares[0])
+        else:
+            list(self._pool.map(work, self._shares))
+
+    def set_active(self, mask: np.ndarray) -> None:
+        """Step only the worlds of a bool mask [worlds]; the others keep their state."""
+        self._active[:] = mask
+
+    def _step_share(self, share: np.ndarray) -> None:
+        m, n, step = self._m, self.rate.substeps, self._mj.mj_step
+        ctrl, latch, equality = self._np["ctrl"], self._np["latch"], self.scene.latch_equality
+        for w in share:
+            if not self._active[w]:
+                continue
+            d = self._data[w]
+            d.ctrl[:] = ctrl[w]
+            if equality >= 0:
+                d.eq_active[equality] = latch[w]
+            step(m, d, n)
+            self._publish(w, d)
+
+    def _publish(self, w: int, d: Any) -> None:
+        self._mj.mj_kinematics(self._m, d)
+        self._mj.mj_comPos(self._m, d)
+        out = self._np
+        out["qpos"][w] = d.qpos
+        out["qvel"][w] = d.qvel
+        out["xpos"][w] = d.xpos
+        out["xquat"][w] = d.xquat
+        out["xipos"][w] = d.xipos
+
+    def _bare_share(self, share: np.ndarray) -> None:
+        m, n, step, data = self._m, self.rate.substeps, self._mj.mj_step, self._data
+        for w in share:
+            step(m, data[w], n)
+
+    def mj_step_only(self) -> None:
+        """Nothing but `mj_step` on the same threads: what `bench` divides by."""
+        self._each(self._bare_share)
+
+    def bare_step(self) -> None:
+        """Only the physics of one tick."""
+        self._each(self._step_share)
+
+    def read_contacts(self) -> None:
+        """Contact forces and overflow flags of the last physics step."""
+        warn = (self._mj.mjtWarning.mjWARN_CONTACTFULL, self._mj.mjtWarning.mjWARN_CNSTRFULL)
+        root = self.scene.robot.root_qpos
+        q = self._np["qpos"][:, root + 3 : root + 7]
+        tilted = 1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2) < 0.5
+        self._np["pair_force"][:] = 0.0
+        for w in np.flatnonzero(self._active):
+            d = self._data[w]
+            if d.warning[warn[0]].number or d.warning[warn[1]].number:
+                self._np["overflow"][w] = 1
+            if self.want_forces or tilted[w]:
+                self._np["contact_force"][w] = self._body_forces(d)
+            if self._pair is not None and d.ncon:
+                self._np["pair_force"][w] = self._pair_normal(d)
+
+    def _body_forces(self, d: Any) -> np.ndarray:
+        total = np.zeros((self.nbody, 3))
+        wrench = np.zeros(6)
+        for c in range(d.ncon):
+            contact = d.contact[c]
+            self._mj.mj_contactForce(self._m, d, c, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]
+            total[self._m.geom_bodyid[contact.geom[1]]] += force
+            total[self._m.geom_bodyid[contact.geom[0]]] -= force
+        return np.linalg.norm(total, axis=1)
+
+    def _pair_normal(self, d: Any) -> float:
+        a, b = self._pair
+        geom = d.contact.geom
+        hit = np.flatnonzero((a[geom[:, 0]] & b[geom[:, 1]]) | (b[geom[:, 0]] & a[geom[:, 1]]))
+        wrench, total = np.zeros(6), 0.0
+        for c in hit:
+            self._mj.mj_contactForce(self._m, d, int(c), wrench)
+            total += wrench[0]
+        return total
+
+    def reset_worlds(self, worlds, qpos, mocap_pos, mocap_quat) -> None:
+        """See `Physics.reset_worlds`."""
+        for k, w in enumerate(worlds):
+            d = self._data[w]
+            self._mj.mj_resetData(self._m, d)
+            d.qpos[:] = qpos[k]
+            d.mocap_pos[:] = mocap_pos[k]
+            d.mocap_quat[:] = mocap_quat[k]
+            self._np["latch"][w] = 1
+            if self.scene.latch_equality >= 0:
+                d.eq_active[self.scene.latch_equality] = 1
+            d.ctrl[:] = 0
+            self._np["ctrl"][w] = 0
+            self._np["contact_force"][w] = 0
+            self._np["pair_force"][w] = 0
+            self._np["overflow"][w] = 0
+            self._publish(w, d)
+
+
+class WarpPhysics(Physics):
+    """mujoco_warp: all worlds in one launch; on CUDA the substeps of a tick are one captured graph."""
+
+    engine = "warp"
+
+    def __init__(self, scene: Scene, rate: PhysicsRate):
+        """Bind the solver's batch and, on CUDA, capture the tick."""
+        import mujoco_warp
+        import warp as wp
+
+        super().__init__(scene, rate)
+        self._mjw = mujoco_warp
+        self._m, self._d = scene.solver.mjw_model, scene.solver.mjw_data
+        self._m.opt.timestep.fill_(rate.dt)
+        scene.mj_model.opt.timestep = rate.dt
+        self._m.opt.warn_overflow = 0
+        d = self._d
+
+        def view(array: Any, *shape: int) -> Any:
+            return wp.array(
+                ptr=array.ptr, dtype=wp.float32, shape=(self.worlds, *shape), device=self.device, copy=False
+            )
+
+        self.qpos, self.qvel, self.ctrl = d.qpos, d.qvel, d.ctrl
+        self.xpos = view(d.xpos, self.nbody, 3)
+        self.xquat = view(d.xquat, self.nbody, 4)
+        self.xipos = view(d.xipos, self.nbody, 3)
+        m = scene.mj_model
+        with wp.ScopedDevice(self.device):
+            self._geom_body = wp.array(m.geom_bodyid, dtype=wp.int32)
+            self._force_vector = wp.zeros((self.worlds, m.nbody), dtype=wp.vec3)
+        self._groups: tuple[Any, Any] | None = None
+        self._graph: Any = None
+        self._full_graph: Any = None
+        every = np.arange(self.worlds)
+        mocap = (np.tile(self.mocap_pos0, (self.worlds, 1, 1)), np.tile(self.mocap_quat0, (self.worlds, 1, 1)))
+        self.reset_worlds(every, self.qpos0, *mocap)
+
+    def _launch_tick(self) -> None:
+        from arena_newton.kernels import newton_state
+
+        if self.scene.latch_equality >= 0:
+            newton_state.launch_latch(self.latch_locked, self.scene.latch_equality, self._d.eq_active)
+        for _ in range(self.rate.substeps):
+            self._mjw.step(self._m, self._d)
+        newton_state.launch_overflow(self._d.overflow, self.overflow)
+        self._mjw.kinematics(self._m, self._d)
+        self._mjw.com_pos(self._m, self._d)
+
+    def _solver_tick(self) -> None:
+        for _ in range(self.rate.substeps):
+            self._mjw.step(self._m, self._d)
+
+    def _capture(self, work: Any) -> Any:
+        import warp as wp
+
+        work()
+        with wp.ScopedCapture(self.device) as capture:
+            work()
+        return capture.graph
+
+    def bare_step(self) -> None:
+        """Only the physics of one tick."""
+        import warp as wp
+
+        with wp.ScopedDevice(self.device):
+            if not self.device.is_cuda:
+                self._launch_tick()
+                return
+            if self._full_graph is None:
+                saved = [wp.clone(a) for a in (self._d.qpos, self._d.qvel, self._d.qacc_warmstart, self._d.time)]
+                self._full_graph = self._capture(self._launch_tick)
+                for array, copy in zip(
+                    (self._d.qpos, self._d.qvel, self._d.qacc_warmstart, self._d.time), saved, strict=True
+                ):
+                    wp.copy(array, copy)
+            wp.capture_launch(self._full_graph)
+
+    def mj_step_only(self) -> None:
+        """Nothing but the solver's captured graph: what `bench` divides by."""
+        import warp as wp
+
+        with wp.ScopedDevice(self.device):
+            if not self.device.is_cuda:
+                self._solver_tick()
+                return
+            if self._graph is None:
+                self._graph = self._capture(self._solver_tick)
+            wp.capture_launch(self._graph)
+
+    def set_active(self, mask: np.ndarray) -> None:
+        """All worlds of a batch step together; idle ones are stepped and ignored."""
+
+    def watch_pair(self, geoms_a: list[int], geoms_b: list[int]) -> None:
+        """See `Physics.watch_pair`."""
+        import warp as wp
+
+        super().watch_pair(geoms_a, geoms_b)
+        self._groups = tuple(wp.array(g, dtype=wp.int32, device=self.device) for g in self._pair)
+
+    def read_contacts(self) -> None:
+        """Contact forces of the last physics step (float atomics: not bit-deterministic on CUDA)."""
+        from arena_newton.kernels import contact
+
+        contact.launch_contact_forces(self._m, self._d, self._geom_body, self._force_vector, self.contact_force)
+        if self._groups is not None:
+            contact.launch_pair_force(self._m, self._d, *self._groups, self.pair_force)
+
+    def reset_worlds(self, worlds, qpos, mocap_pos, mocap_quat) -> None:
+        """See `Physics.reset_worlds`."""
+        import warp as wp
+
+        mask = np.zeros(self.worlds, dtype=bool)
+        mask[worlds] = True
+        with wp.ScopedDevice(self.device):
+            self._mjw.reset_data(self._m, self._d, wp.array(mask, dtype=wp.bool))
+            for array, rows in ((self._d.qpos, qpos), (self._d.mocap_pos, mocap_pos), (self._d.mocap_quat, mocap_quat)):
+                if array.size == 0:
+                    continue
+                host = array.numpy()
+                host[worlds] = np.asarray(rows, dtype=np.float32).reshape(host[worlds].shape)
+                array.assign(host)
+            for array in (self.contact_force, self.pair_force, self.overflow, self._d.overflow):
+                host = array.numpy()
+                host[worlds] = 0
+                array.assign(host)
+            latch = self.latch_locked.numpy()
+            latch[worlds] = 1
+            self.latch_locked.assign(latch)
+            self._mjw.kinematics(self._m, self._d)
+            self._mjw.com_pos(self._m, self._d)
+
+
+def make_physics(scene: Scene, rate: PhysicsRate, engine: str, threads: int | None = None) -> Physics:
+    """Engine `mujoco` or `warp` over a scene."""
+    return MujocoPhysics(scene, rate, threads) if engine == "mujoco" else WarpPhysics(scene, rate)

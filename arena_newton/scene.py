@@ -1,0 +1,446 @@
+"""A USD stage becomes one Newton model with N worlds and the one MuJoCo model that both engines step.
+
+Handles (bodies, joints, geoms, markers, frames) are found by prim path; nothing here knows a task.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton import robot as g1
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.rules import RuleSet
+
+__all__ = ["Frame", "Marker", "RobotHandles", "Scene", "ball_solref", "load_scene", "scene_path"]
+
+SCENES = Path(__file__).resolve().parent / "usd_scenes"
+ROBOT = "/World/Robot"
+BALL_STIFFNESS = 10000.0
+"""Contact stiffness of the ball [1/s²·kg-normalised, MuJoCo direct solref], measured to give the stated bounce at 5 ms."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pose fixed to a MuJoCo body (body 0 is the world)."""
+
+    body_id: int
+    """MuJoCo body index."""
+    pos: tuple[float, float, float]
+    """Position in the body's frame [m]."""
+    quat: tuple[float, float, float, float]
+    """Orientation in the body's frame, wxyz."""
+
+
+@dataclass(frozen=True)
+class Marker(Frame):
+    """An oriented box that a rule reads."""
+
+    half: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Half extents [m]."""
+
+
+@dataclass(frozen=True)
+class RobotHandles:
+    """Addresses of the robot in the MuJoCo model."""
+
+    root_body: int
+    root_qpos: int
+    """First of the 7 root coordinates in qpos."""
+    root_qvel: int
+    """First of the 6 root velocities in qvel."""
+    joint_qpos: np.ndarray
+    """int32 [29], MuJoCo (TWIST2) order."""
+    joint_qvel: np.ndarray
+    """int32 [29], MuJoCo (TWIST2) order."""
+    joint_ctrl: np.ndarray
+    """int32 [29], MuJoCo (TWIST2) order."""
+    hand_qpos: np.ndarray
+    """int32 [14] left then right, or empty with fixed hands."""
+    hand_ctrl: np.ndarray
+    """int32 [14] left then right, or empty with fixed hands."""
+    bodies: tuple[int, ...] = ()
+    """MuJoCo body ids of every link."""
+    critical_bodies: tuple[int, ...] = ()
+    """Links that count for the fall rule's contact test."""
+
+
+def scene_path(task_or_path: str | Path) -> Path:
+    """Path of the stage for a task name or a file.
+
+    Raises:
+        InputError: Neither a task's scene nor a readable file.
+    """
+    built_in = SCENES / str(task_or_path) / "scene.usda"
+    if built_in.is_file():
+        return built_in
+    path = Path(task_or_path)
+    if path.suffix in {".usda", ".usd", ".usdc", ".usdz"} and path.is_file():
+        return path
+    raise InputError(f"{task_or_path}: no such scene file (expected a task name or an existing .usda file)")
+
+
+def ball_solref(restitution: float) -> tuple[float, float]:
+    """MuJoCo direct-form solref (−stiffness, −damping) of a contact with the given coefficient of restitution.
+
+    A unit-mass spring–damper with damping ratio ζ = −ln e / sqrt(π² + ln² e) leaves with e times its speed.
+    """
+    e = max(float(restitution), 1e-3)
+    zeta = -np.log(e) / np.sqrt(np.pi**2 + np.log(e) ** 2)
+    return -BALL_STIFFNESS, float(-2.0 * zeta * np.sqrt(BALL_STIFFNESS))
+
+
+@dataclass
+class Scene:
+    """A built scene: Newton model, MuJoCo model, and handles by prim path."""
+
+    path: Path
+    variant: str
+    hands: str
+    worlds: int
+    device: Any
+    stage: Any
+    model: Any
+    solver: Any
+    mj_model: Any
+    body_ids: dict[str, int]
+    """Prim path → MuJoCo body."""
+    joint_ids: dict[str, int]
+    """Prim path → MuJoCo joint."""
+    body_to_newton: np.ndarray
+    """int32 [worlds, nbody]: Newton body of each MuJoCo body (−1 for the world)."""
+    geom_labels: list[str]
+    """Prim path of each MuJoCo geom."""
+    drive: g1.DriveGains
+    latch_equality: int = -1
+    """MuJoCo equality that locks the door leaf, −1 without a latch."""
+    _robot: RobotHandles | None = field(default=None, repr=False)
+
+    def body_id(self, prim_path: str) -> int:
+        """MuJoCo body of a rigid prim.
+
+        Raises:
+            InputError: The stage has no such rigid body.
+        """
+        if prim_path not in self.body_ids:
+            raise InputError(f"{self.path}: prim {prim_path} is missing or is not a rigid body")
+        return self.body_ids[prim_path]
+
+    def has_body(self, prim_path: str) -> bool:
+        """Whether the stage has that rigid body."""
+        return prim_path in self.body_ids
+
+    def link(self, name: str) -> int:
+        """MuJoCo body of a robot link by its name."""
+        for path, body in self.body_ids.items():
+            if path.startswith(f"{ROBOT}/") and path.rsplit("/", 1)[1] == name:
+                return body
+        raise InputError(f"{self.path}: robot link {name} is missing under {ROBOT}")
+
+    def joint(self, prim_path: str) -> int:
+        """MuJoCo joint of a joint prim."""
+        if prim_path not in self.joint_ids:
+            raise InputError(f"{self.path}: joint prim {prim_path} is missing")
+        return self.joint_ids[prim_path]
+
+    def joint_qpos(self, prim_path: str) -> int:
+        """Address in qpos of a joint prim, or of the free joint of a rigid prim."""
+        return int(self.mj_model.jnt_qposadr[self._joint_of(prim_path)])
+
+    def joint_qvel(self, prim_path: str) -> int:
+        """Address in qvel of a joint prim, or of the free joint of a rigid prim."""
+        return int(self.mj_model.jnt_dofadr[self._joint_of(prim_path)])
+
+    def _joint_of(self, prim_path: str) -> int:
+        if prim_path in self.joint_ids:
+            return self.joint_ids[prim_path]
+        body = self.body_id(prim_path)
+        if self.mj_model.body_jntnum[body] != 1:
+            raise InputError(f"{self.path}: prim {prim_path} has no free joint")
+        return int(self.mj_model.body_jntadr[body])
+
+    def mocap_id(self, prim_path: str) -> int:
+        """MuJoCo mocap index of a fixture (its root or its `Frame`)."""
+        frame = prim_path if prim_path in self.body_ids else f"{prim_path}/Frame"
+        mocap = int(self.mj_model.body_mocapid[self.body_id(frame)])
+        if mocap < 0:
+            raise InputError(f"{self.path}: prim {prim_path} is not a fixture (Frame anchored by a fixed joint)")
+        return mocap
+
+    def geom_ids(self, prim_path: str) -> list[int]:
+        """MuJoCo geoms at or under a prim."""
+        found = [i for i, p in enumerate(self.geom_labels) if p == prim_path or p.startswith(prim_path + "/")]
+        if not found:
+            raise InputError(f"{self.path}: prim {prim_path} holds no collision geometry")
+        return found
+
+    def frame(self, name_or_path: str) -> Frame:
+        """A frame prim by path, or by its name under the robot, as a pose in the body that carries it."""
+        return Frame(*self._local_pose(self._find(name_or_path)))
+
+    def marker(self, prim_path: str) -> Marker:
+        """A marker prim as an oriented box in the body that carries it.
+
+        Raises:
+            InputError: The prim or its `arena:size` is missing.
+        """
+        prim = self._find(prim_path)
+        size = prim.GetAttribute("arena:size").Get()
+        if size is None:
+            raise InputError(f"{self.path}: marker {prim_path} has no attribute arena:size")
+        body, pos, quat = self._local_pose(prim)
+        return Marker(body, pos, quat, tuple(0.5 * float(v) for v in size))
+
+    def _find(self, name_or_path: str) -> Any:
+        prim = self.stage.GetPrimAtPath(name_or_path) if name_or_path.startswith("/") else None
+        if prim is None or not prim:
+            from pxr import Usd
+
+            base = self.stage.GetPrimAtPath(ROBOT)
+            prim = None
+            if not name_or_path.startswith("/") and base:
+                prim = next((p for p in Usd.PrimRange(base) if p.GetName() == name_or_path), None)
+        if prim is None or not prim:
+            raise InputError(f"{self.path}: prim {name_or_path} is missing")
+        return prim
+
+    def _local_pose(self, prim: Any) -> tuple[int, tuple, tuple]:
+        from pxr import Gf, UsdGeom
+
+        cache = UsdGeom.XformCache()
+        carrier = prim
+        while carrier and str(carrier.GetPath()) not in self.body_ids:
+            carrier = carrier.GetParent()
+        body = self.body_ids[str(carrier.GetPath())] if carrier else 0
+        world = cache.GetLocalToWorldTransform(prim)
+        local = world * cache.GetLocalToWorldTransform(carrier).GetInverse() if body else world
+        transform = Gf.Transform(local)
+        p, q = transform.GetTranslation(), transform.GetRotation().GetQuat()
+        im = q.GetImaginary()
+        return body, (p[0], p[1], p[2]), (q.GetReal(), im[0], im[1], im[2])
+
+    @property
+    def robot(self) -> RobotHandles:
+        """Addresses of the robot."""
+        if self._robot is None:
+            self._robot = self._robot_handles()
+        return self._robot
+
+    def _robot_handles(self) -> RobotHandles:
+        m = self.mj_model
+        by_name = {p.rsplit("/", 1)[1]: j for p, j in self.joint_ids.items() if p.startswith(ROBOT + "/")}
+        actuator_of_joint = {int(m.actuator_trnid[a, 0]): a for a in range(m.nu)}
+        missing = [n for n in g1.MUJOCO_JOINTS if n not in by_name]
+        if missing:
+            raise InputError(f"{self.path}: robot joint {missing[0]} is missing under {ROBOT}")
+        body = [by_name[n] for n in g1.MUJOCO_JOINTS]
+        hand = [by_name[n] for n in g1.HAND_JOINTS if n in by_name]
+        root = self.link("pelvis")
+        root_joint = int(m.body_jntadr[root])
+        links = {p.rsplit("/", 1)[1]: b for p, b in self.body_ids.items() if p.startswith(ROBOT + "/")}
+        critical = tuple(
+            sorted(
+                b
+                for n, b in links.items()
+                if any(w in n for w in g1.CRITICAL_BODY_WORDS) and "ankle" not in n and "foot" not in n
+            )
+        )
+        return RobotHandles(
+            root_body=root,
+            root_qpos=int(m.jnt_qposadr[root_joint]),
+            root_qvel=int(m.jnt_dofadr[root_joint]),
+            joint_qpos=np.array([m.jnt_qposadr[j] for j in body], dtype=np.int32),
+            joint_qvel=np.array([m.jnt_dofadr[j] for j in body], dtype=np.int32),
+            joint_ctrl=np.array([actuator_of_joint[j] for j in body], dtype=np.int32),
+            hand_qpos=np.array([m.jnt_qposadr[j] for j in hand], dtype=np.int32),
+            hand_ctrl=np.array([actuator_of_joint[j] for j in hand], dtype=np.int32),
+            bodies=tuple(sorted(links.values())),
+            critical_bodies=critical,
+        )
+
+
+def _open_stage(path: Path, variant: str, hands: str) -> Any:
+    from pxr import Tf, Usd
+
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise InputError(f"{path}: not a readable USD layer ({str(error).splitlines()[0]})") from None
+    stage.SetEditTarget(stage.GetSessionLayer())
+    robot_prim = stage.GetPrimAtPath(ROBOT)
+    if not robot_prim:
+        raise InputError(f"{path}: prim {ROBOT} is missing")
+    if not robot_prim.GetVariantSet("hands").SetVariantSelection(hands):
+        raise InputError(f"{path}: prim {ROBOT} has no variant set 'hands'")
+    world = stage.GetPrimAtPath("/World")
+    sets = world.GetVariantSets()
+    if variant != "base":
+        if not sets.HasVariantSet("semantics") or variant not in sets.GetVariantSet("semantics").GetVariantNames():
+            raise InputError(f"{path}: prim /World has no variant {variant!r} in variant set 'semantics'")
+    if sets.HasVariantSet("semantics") and variant in sets.GetVariantSet("semantics").GetVariantNames():
+        sets.GetVariantSet("semantics").SetVariantSelection(variant)
+    return stage
+
+
+def _set_drives(builder: Any, drive: g1.DriveGains) -> None:
+    from newton import JointTargetMode
+
+    gains = {n: (drive.kp[i], drive.kd[i], drive.effort[i], None) for i, n in enumerate(g1.MUJOCO_JOINTS)}
+    finger = (drive.finger_kp, drive.finger_kd, drive.finger_effort, drive.finger_armature)
+    gains |= dict.fromkeys(g1.HAND_JOINTS, finger)
+    for joint, label in enumerate(builder.joint_label):
+        name = label.rsplit("/", 1)[-1]
+        if not label.startswith(ROBOT + "/") or name not in gains:
+            continue
+        dof = builder.joint_qd_start[joint]
+        kp, kd, effort, armature = gains[name]
+        builder.joint_target_mode[dof] = int(JointTargetMode.POSITION)
+        builder.joint_target_ke[dof] = kp
+        builder.joint_target_kd[dof] = kd
+        builder.joint_effort_limit[dof] = effort
+        if armature is not None:
+            builder.joint_armature[dof] = armature
+
+
+def _free_fixtures(builder: Any) -> None:
+    """Flag bodies that hang on the world by a fixed joint as kinematic, so that each world can pose its own."""
+    from newton import BodyFlags, JointType
+
+    for joint, kind in enumerate(builder.joint_type):
+        if kind == JointType.FIXED and builder.joint_parent[joint] == -1:
+            builder.body_flags[builder.joint_child[joint]] = int(BodyFlags.KINEMATIC)
+
+
+def _add_latch(builder: Any, stage: Any) -> bool:
+    from newton.solvers import mujoco
+
+    for prim in stage.Traverse():
+        if prim.HasAttribute("arena:latch") and prim.GetAttribute("arena:latch").Get():
+            leaf = builder.joint_label.index(str(prim.GetPath()))
+            handle = next(
+                (j for j, label in enumerate(builder.joint_label) if label == str(prim.GetPath().GetParentPath()) + "/HandleHinge"),
+                None,
+            )
+            if handle is None:
+                raise InputError(f"{stage.GetRootLayer().identifier}: {prim.GetPath()} has a latch but no HandleHinge")
+            # leaf = 0 + 0·handle: the leaf is held at its closed angle while the equality is active.
+            mujoco.add_equality_joint(builder, leaf, handle, polycoef=(0.0, 0.0), label="latch", enabled=True)
+            return True
+    return False
+
+
+def load_scene(
+    task: str | Path,
+    *,
+    worlds: int = 1,
+    device: str | None = None,
+    variant: str = "base",
+    hands: str = "dex3",
+    rules: RuleSet | None = None,
+    drive: g1.DriveGains = g1.TWIST2_DRIVE,
+    variant_file: str | Path | None = None,
+    contacts_per_world: int = 96,
+    constraints_per_world: int = 320,
+    native: bool = False,
+) -> Scene:
+    """Build a scene.
+
+    Args:
+        task: Task name, or path of a stage.
+        worlds: Number of parallel worlds.
+        device: Warp device of the Newton model.
+        variant: Variant of the set `semantics` on `/World`.
+        hands: `dex3` or `fixed`.
+        rules: Rule set; decides the ball's restitution.
+        drive: Gains of the robot's position drives.
+        variant_file: A user's layer to open instead of the task's own scene.
+        contacts_per_world: Contact buffer of engine `warp`.
+        constraints_per_world: Constraint buffer of engine `warp`.
+        native: The model is stepped by native MuJoCo; the batch's Warp solver is not allocated.
+
+    Raises:
+        InputError: The stage cannot be read or misses a prim that the robot needs.
+    """
+    import newton
+    import warp as wp
+
+    path = scene_path(variant_file or task)
+    stage = _open_stage(path, variant, hands)
+    template = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(template)
+    template.rigid_gap = 0.0
+    template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False)
+    _set_drives(template, drive)
+    _free_fixtures(template)
+    latched = _add_latch(template, stage)
+
+    def finalize(count: int) -> Any:
+        builder = newton.ModelBuilder()
+        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+        builder.rigid_gap = 0.0
+        builder.replicate(template, count)
+        return builder.finalize(device=device)
+
+    with wp.ScopedDevice(device):
+        model = finalize(worlds)
+        solver = newton.solvers.SolverMuJoCo(
+            finalize(1) if native and worlds > 1 else model,
+            njmax=constraints_per_world,
+            nconmax=contacts_per_world,
+            iterations=10,
+            ls_iterations=20,
+            solver="newton",
+            integrator="implicitfast",
+            cone="pyramidal",
+            impratio=1.0,
+            kinematic_switchable_roots=False,
+            use_mujoco_cpu=native,
+        )
+    m = solver.mj_model
+    map_body = solver.mjc_body_to_newton.numpy()
+    if native and worlds > 1:
+        stride = model.body_count // worlds
+        map_body = np.where(map_body[0] < 0, -1, map_body[0] + stride * np.arange(worlds)[:, None]).astype(np.int32)
+    body_ids = {model.body_label[n]: b for b, n in enumerate(map_body[0]) if n >= 0}
+    map_joint = solver.mjc_jnt_to_newton_jnt.numpy()[0]
+    joint_ids = {model.joint_label[n]: j for j, n in enumerate(map_joint) if n >= 0}
+    map_geom = solver.mjc_geom_to_newton_shape.numpy()[0]
+    labels = solver.model.shape_label
+    geom_labels = [labels[s] if s >= 0 else "" for s in map_geom[: m.ngeom]]
+
+    scene = Scene(
+        path=path,
+        variant=variant,
+        hands=hands,
+        worlds=worlds,
+        device=model.device,
+        stage=stage,
+        model=model,
+        solver=solver,
+        mj_model=m,
+        body_ids=body_ids,
+        joint_ids=joint_ids,
+        body_to_newton=map_body,
+        geom_labels=geom_labels,
+        drive=drive,
+        latch_equality=0 if latched else -1,
+    )
+    if rules is not None and scene.has_body("/World/Ball"):
+        _set_restitution(scene, rules.ball_restitution)
+    return scene
+
+
+def _set_restitution(scene: Scene, restitution: float) -> None:
+    geoms = scene.geom_ids("/World/Ball")
+    solref = ball_solref(restitution)
+    scene.mj_model.geom_solref[geoms] = solref
+    warp_model = getattr(scene.solver, "mjw_model", None)
+    if warp_model is not None:
+        batch = warp_model.geom_solref.numpy()
+        batch[..., geoms, :] = solref
+        warp_model.geom_solref.assign(batch)

@@ -1,0 +1,55 @@
+"""Seeds of an episode: who, where and under which light depends on three names and numbers only.
+
+The formulas are those of the original benchmark, and its recorded files are reproduced exactly (tests hold the vectors).
+"""
+
+import hashlib
+import random
+import zlib
+
+import numpy as np
+
+__all__ = ["episode_seed", "light_rng", "object_rng", "object_seed"]
+
+_U64 = (1 << 64) - 1
+_EPISODE_STEP = 0x9E3779B185EBCA87
+"""Step of the object seed between the episodes of one process; every evaluation episode is the first of its process."""
+_ENV_STEP = 0x85EBCA77
+"""Step of the object generator between the worlds of the original simulator."""
+_LIGHT_KEY = 0x1A2B3C4D
+"""Separates the light's generator from all others."""
+
+
+def episode_seed(gym_id: str, group_seed: int, repeat: int) -> int:
+    """Seed of one episode: the last four bytes of sha256("gym_id|group_seed|repeat"), as a positive int32.
+
+    Args:
+        gym_id: The task's id as the original spells it.
+        group_seed: 0, 1 or 2 in the published protocol.
+        repeat: 0 to 19 in the published protocol.
+    """
+    digest = hashlib.sha256(f"{gym_id}|{group_seed}|{repeat}".encode()).digest()
+    return int.from_bytes(digest[-4:], "big") & 0x7FFFFFFF
+
+
+def object_seed(episode_seed: int) -> int:
+    """Master seed of an episode's objects, 64 bits."""
+    return (int(episode_seed) ^ _EPISODE_STEP) & _U64
+
+
+def object_rng(object_seed: int, record_name: str, env_index: int = 0) -> np.random.Generator:
+    """Generator of one object.
+
+    Args:
+        object_seed: Master seed of the episode's objects.
+        record_name: The object's name in the original's records, e.g. `football`.
+        env_index: World index in the original's simulator. The original evaluates one world a process, so an
+            episode here always uses 0, whichever world of the batch runs it.
+    """
+    key = int(object_seed) ^ zlib.crc32(record_name.encode()) ^ ((env_index + 1) * _ENV_STEP)
+    return np.random.default_rng(key & _U64)
+
+
+def light_rng(episode_seed: int) -> random.Random:
+    """Generator of the light in visual mode."""
+    return random.Random(int(episode_seed) ^ _LIGHT_KEY)

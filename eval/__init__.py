@@ -1,0 +1,1 @@
+"""The judge: plan, run, journal, statistics and report of a benchmark run (``python -m arena_newton.eval``)."""

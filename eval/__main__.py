@@ -1,0 +1,191 @@
+"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|list] ...``."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from arena_newton.errors import ArenaError, InputError
+
+if TYPE_CHECKING:
+    from arena_newton.eval.run import Factories
+
+__all__ = ["main"]
+
+PROG = "python -m arena_newton.eval"
+COMMANDS = ("run", "resume", "report", "bench", "list")
+OVERVIEW = f"""commands:
+  {PROG} [run] [flags]           evaluate (flags below)
+  {PROG} resume <out> [flags]    continue a run; finished episodes are kept
+  {PROG} report <out>            write tables and report again from the journal
+  {PROG} list [flags] [--json]   show the plan, run nothing
+  {PROG} bench [--what ...]      measure this machine against the figures to reach
+"""
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Write tables and reports of a results folder again from its journal."""
+
+    json: bool = False
+    """Print results.json instead of the table."""
+
+
+def main(argv: Sequence[str] | None = None, factories: Factories | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments; those of the process by default.
+        factories: builders of the parts of a run; the real ones by default.
+
+    Returns:
+        Exit code: 0 done, 1 episodes with errors or missing, 2 bad input or no room, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    command = arguments.pop(0) if arguments and arguments[0] in COMMANDS else "run"
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return _COMMANDS[command](arguments, factories)
+    except InputError as error:
+        print(f"error: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except ArenaError as error:
+        from arena_newton.eval.journal import StorageError
+
+        print(f"error: {_one_line(error)}", file=sys.stderr)
+        return 2 if isinstance(error, StorageError) else 1
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _parse(kind: type[_T], arguments: list[str], command: str, default: _T | None = None) -> _T:
+    """Parse flags with tyro; its multi-line complaint becomes one line."""
+    import tyro
+
+    complaint = io.StringIO()
+    given: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, args=arguments, prog=f"{PROG} {command}".rstrip(), **given)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        text = re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue())
+        lines = [line.strip(" │╭╮╰╯─┃") for line in text.splitlines()]
+        message = " ".join(line for line in lines if line)
+        raise InputError(re.sub(r"\s*For full helptext,? .*$", "", message)) from None
+
+
+def _folder(arguments: list[str], command: str) -> Path:
+    if not arguments or arguments[0].startswith("-"):
+        raise InputError(f"{command}: name the results folder: {PROG} {command} <out>")
+    return Path(arguments.pop(0)).expanduser()
+
+
+def _wants_help(arguments: Sequence[str]) -> bool:
+    return any(argument in ("-h", "--help") for argument in arguments)
+
+
+def _run(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.config import RunOptions
+
+    if _wants_help(arguments):
+        print(OVERVIEW)
+    options = _parse(RunOptions, arguments, "run")
+    from arena_newton.eval.run import execute
+
+    return execute(options, factories)
+
+
+def _resume(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.config import RunOptions
+
+    if _wants_help(arguments):
+        print(f"usage: {PROG} resume <out> [flags]; flags that change the results are refused\n")
+        _parse(RunOptions, ["--help"], "resume <out>")
+    folder = _folder(arguments, "resume")
+    from arena_newton.eval.run import execute, stored_options
+
+    options = _parse(RunOptions, arguments, "resume", default=stored_options(folder))
+    return execute(options, factories)
+
+
+def _report(arguments: list[str], factories: Factories | None) -> int:
+    if _wants_help(arguments):
+        _parse(ReportOptions, ["--help"], "report <out>")
+    folder = _folder(arguments, "report")
+    options = _parse(ReportOptions, arguments, "report")
+    import json
+
+    from arena_newton.eval import report
+
+    results = report.write_reports(report.load_run(folder))
+    if options.json:
+        print(json.dumps(results, indent=2))
+        return 0
+    print(report.table(results))
+    for note in report.notes(results):
+        print(note)
+    print(f"report: {folder / 'report.html'}")
+    return 0
+
+
+def _list(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.config import RunOptions
+
+    as_json = "--json" in arguments
+    if _wants_help(arguments):
+        print(f"usage: {PROG} list [flags of run] [--json]; --json prints one object per episode\n")
+    options = _parse(RunOptions, [a for a in arguments if a != "--json"], "list")
+    from arena_newton.eval.config import resolve
+    from arena_newton.eval.run import make_plan
+
+    config = resolve(options)
+    episodes = make_plan(config)
+    if as_json:
+        import json
+
+        from arena_newton.eval import plan
+
+        for episode in episodes:
+            print(json.dumps(plan.describe(episode), allow_nan=False))
+        return 0
+    print(f"configuration {config.hash}: {len(episodes)} episodes")
+    for episode in episodes:
+        print(
+            f"{episode.index:>5} {episode.task:<12} {episode.mode:<10} seed {episode.group_seed} "
+            f"repeat {episode.repeat:>2} episode_seed {episode.episode_seed:>10} max_steps {episode.max_steps}"
+        )
+    return 0
+
+
+def _bench(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval import bench
+
+    return bench.run(_parse(bench.BenchOptions, arguments, "bench"))
+
+
+_COMMANDS = {"run": _run, "resume": _resume, "report": _report, "list": _list, "bench": _bench}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

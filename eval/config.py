@@ -1,0 +1,280 @@
+"""Flags of a run, what they resolve to, and the hash that a results folder is known by."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from arena_newton import __version__
+from arena_newton.errors import InputError
+
+__all__ = [
+    "ENGINES",
+    "MODES",
+    "QUICK_MAX_STEPS",
+    "QUICK_REPEATS",
+    "RULES",
+    "RunConfig",
+    "RunOptions",
+    "config_hash",
+    "differing_key",
+    "explicit",
+    "hash_path",
+    "policy_label",
+    "resolve",
+]
+
+MODES = ("base", "execution", "semantic", "visual")
+RULES = ("paper", "released")
+ENGINES = ("auto", "mujoco", "warp")
+POLICY_PATH_SCHEMES = ("replay", "lerobot")
+
+PROTOCOL_SEEDS = (0, 1, 2)
+"""Group seeds of the benchmark's protocol (original benchmark: 3 seeds)."""
+PROTOCOL_REPEATS = 20
+"""Repeats per group seed of the benchmark's protocol."""
+QUICK_SEEDS = (0,)
+QUICK_REPEATS = 2
+"""Repeats of the default look at all seven tasks, sized to end within two minutes on a bare CPU."""
+QUICK_MAX_STEPS = 250
+"""Step cap of that look [ticks of 0.02 s]."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
+
+    Without --task, --mode, --seeds, --repeats and --max-steps a quick look at all seven tasks runs (about two minutes
+    on a CPU). As soon as one of them is given, the rest follows the benchmark's protocol: 3 seeds x 20 repeats.
+    """
+
+    task: tuple[str, ...] = ()
+    """Task names, or all: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
+    tracker: str = "pd"
+    """Tracker that executes the 40D action: pd, twist2, ..."""
+    checkpoint: str | None = None
+    """File with the tracker's weights."""
+    policy: str = "stand"
+    """Policy that decides it: stand, replay:<clip or episode>, remote:<url>."""
+    mode: tuple[str, ...] = ()
+    """Evaluation modes, one or several: base execution semantic visual. [base]"""
+    rules: str = "paper"
+    """Rule set: paper or released."""
+    seeds: tuple[int, ...] = ()
+    """Group seeds. [0 1 2]"""
+    repeats: int | None = None
+    """Episodes per group seed. [20]"""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "auto"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1, ... [the best there is]"""
+    variant: str | None = None
+    """USD file that replaces or extends the scene of the one task named."""
+    fast_physics: bool = False
+    """Run a 1 ms tracker at 5 ms x 4 substeps."""
+    max_steps: int | None = None
+    """Cap on the step budget of the rule set [ticks of 0.02 s]."""
+    video: bool = False
+    """Write ego and world videos (H.264 MP4), one pair per episode."""
+    strip: bool = False
+    """Write the 10-frame picture strip of each episode."""
+    out: str | None = None
+    """Results folder. [results/<date>_<time>]"""
+    retry_errors: bool = False
+    """On resume, run episodes again that ended with an error."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """A validated, fully resolved run."""
+
+    tasks: tuple[str, ...]
+    modes: tuple[str, ...]
+    tracker: str
+    checkpoint: Path | None
+    checkpoint_hash: str | None
+    policy: str
+    policy_hash: str | None
+    rules: str
+    rules_hash: str
+    seeds: tuple[int, ...]
+    repeats: int
+    max_steps: int | None
+    engine: str
+    device: str
+    variant: Path | None
+    variant_hash: str | None
+    fast_physics: bool
+    worlds: int
+    video: bool
+    strip: bool
+
+    def identity(self) -> dict[str, Any]:
+        """What the results depend on, by flag name; two runs with equal identity may share a results folder.
+
+        The number of worlds, videos and the folder are absent: they do not change an episode. Files count by content.
+        """
+        return {
+            "version": __version__,
+            "task": list(self.tasks),
+            "mode": list(self.modes),
+            "tracker": self.tracker,
+            "checkpoint": self.checkpoint_hash,
+            "policy": policy_label(self.policy),
+            "policy_file": self.policy_hash,
+            "rules": self.rules,
+            "rules_hash": self.rules_hash,
+            "seeds": list(self.seeds),
+            "repeats": self.repeats,
+            "max_steps": self.max_steps,
+            "engine": self.engine,
+            "device": self.device.split(":")[0],
+            "variant": self.variant_hash,
+            "fast_physics": self.fast_physics,
+        }
+
+    @property
+    def hash(self) -> str:
+        """Hash of :meth:`identity`."""
+        return config_hash(self.identity())
+
+
+def config_hash(value: Any) -> str:
+    """First 12 hex digits of the SHA-256 of the canonical JSON of ``value``."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def hash_path(path: Path) -> str:
+    """First 12 hex digits of the SHA-256 of a file, or of names and contents of all files in a folder."""
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(file.relative_to(path).as_posix().encode() + b"\0")
+        try:
+            with file.open("rb") as handle:
+                while block := handle.read(1 << 20):
+                    digest.update(block)
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    return digest.hexdigest()[:12]
+
+
+def differing_key(stored: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """First key whose value differs between two identities, with both values; None when they are equal."""
+    for key in [*wanted, *(k for k in stored if k not in wanted)]:
+        if stored.get(key) != wanted.get(key):
+            return key, stored.get(key), wanted.get(key)
+    return None
+
+
+def resolve(options: RunOptions) -> RunConfig:
+    """Check every flag and file, and fill in what was left open.
+
+    Raises:
+        InputError: a flag names something unknown or absent; the message says what is known.
+    """
+    from arena_newton import rules as rule_sets
+    from arena_newton import tasks as task_specs
+    from arena_newton.physics import resolve_engine
+
+    quick = not (options.task or options.mode or options.seeds or options.repeats is not None or options.max_steps)
+    known = tuple(task_specs.names())
+    tasks = known if quick or not options.task or tuple(options.task) == ("all",) else tuple(options.task)
+    _each("--task", tasks, known, extra="all")
+    modes = tuple(options.mode) or ("base",)
+    _each("--mode", modes, MODES)
+    _each("--rules", (options.rules,), RULES)
+    _each("--engine", (options.engine,), ENGINES)
+    seeds = tuple(options.seeds) or (QUICK_SEEDS if quick else PROTOCOL_SEEDS)
+    if len(set(seeds)) != len(seeds) or min(seeds) < 0:
+        raise InputError(f"--seeds {' '.join(map(str, seeds))}: expected different numbers, none below 0")
+    repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else PROTOCOL_REPEATS)
+    max_steps = QUICK_MAX_STEPS if quick else options.max_steps
+    for flag, number in (("--repeats", repeats), ("--worlds", options.worlds), ("--max-steps", max_steps)):
+        if number is not None and number < 1:
+            raise InputError(f"{flag} {number}: expected a number of at least 1")
+
+    checkpoint = _existing("--checkpoint", options.checkpoint)
+    scheme, _, target = options.policy.partition(":")
+    policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES else None
+    if scheme == "remote" and not target.startswith(("http://", "https://")):
+        raise InputError(f"--policy {options.policy}: expected remote:http://host:port or remote:https://...")
+    variant = _existing("--variant", options.variant)
+    if variant is not None and len(tasks) != 1:
+        raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
+    engine, device = resolve_engine(options.engine, options.device)
+    return RunConfig(
+        tasks=tasks,
+        modes=modes,
+        tracker=options.tracker,
+        checkpoint=checkpoint,
+        checkpoint_hash=hash_path(checkpoint) if checkpoint else None,
+        policy=options.policy,
+        policy_hash=hash_path(policy_path) if policy_path else None,
+        rules=options.rules,
+        rules_hash=rule_sets.get(options.rules).hash,
+        seeds=seeds,
+        repeats=repeats,
+        max_steps=max_steps,
+        engine=engine,
+        device=device,
+        variant=variant,
+        variant_hash=hash_path(variant) if variant else None,
+        fast_physics=options.fast_physics,
+        worlds=options.worlds,
+        video=options.video,
+        strip=options.strip,
+    )
+
+
+def explicit(options: RunOptions, config: RunConfig) -> RunOptions:
+    """The flags with every default filled in and every path absolute: what ``resume`` starts from."""
+    scheme, _, target = options.policy.partition(":")
+    local = scheme in POLICY_PATH_SCHEMES and target
+    return dataclasses.replace(
+        options,
+        task=config.tasks,
+        mode=config.modes,
+        seeds=config.seeds,
+        repeats=config.repeats,
+        max_steps=config.max_steps,
+        engine=config.engine,
+        device=config.device,
+        checkpoint=str(config.checkpoint) if config.checkpoint else None,
+        variant=str(config.variant) if config.variant else None,
+        policy=f"{scheme}:{Path(target).expanduser().resolve()}" if local else options.policy,
+        retry_errors=False,
+    )
+
+
+def policy_label(policy: str) -> str:
+    """Name of a policy in tables: the spec, with a local path shortened to its file name."""
+    scheme, _, target = policy.partition(":")
+    return f"{scheme}:{Path(target).name}" if scheme in POLICY_PATH_SCHEMES and target else policy
+
+
+def _each(flag: str, given: tuple[str, ...], known: tuple[str, ...], extra: str = "") -> None:
+    for name in given:
+        if name not in known:
+            choices = " ".join((*known, extra) if extra else known)
+            hint = f"{extra!r} stands alone" if extra and name == extra else f"known are: {choices}"
+            raise InputError(f"{flag} {name}: {hint}")
+    if len(set(given)) != len(given):
+        raise InputError(f"{flag} {' '.join(given)}: a name stands there twice")
+
+
+def _existing(flag: str, given: str | None) -> Path | None:
+    if given is None:
+        return None
+    path = Path(given).expanduser()
+    if not given or not path.exists():
+        raise InputError(f"{flag} {given}: no such file")
+    return path.resolve()

@@ -1,0 +1,381 @@
+"""Run a plan: validate everything, build one environment per task and mode, journal every episode, write the report."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import gc
+import json
+import math
+import shlex
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from arena_newton.errors import InputError
+from arena_newton.eval import report
+from arena_newton.eval.config import RunConfig, RunOptions, differing_key, explicit, policy_label, resolve
+from arena_newton.eval.journal import Journal, StorageError, write_atomic
+
+__all__ = ["Factories", "execute", "make_plan", "stored_options"]
+
+
+def _make_env(task: str, **options: Any) -> Any:
+    from arena_newton.env import ArenaEnv
+
+    return ArenaEnv(task, **options)
+
+
+def _make_tracker(spec: str, checkpoint: Path | None) -> Any:
+    from arena_newton import trackers
+
+    return trackers.get(spec, checkpoint=str(checkpoint) if checkpoint else None)
+
+
+def _make_policy(spec: str) -> Any:
+    from arena_newton import policies
+
+    return policies.get(spec)
+
+
+def _check_variant(path: Path, task: str) -> list[str]:
+    from arena_newton.usd_scenes import validate
+
+    return [str(finding) for finding in validate.check(path, task)]
+
+
+@dataclass(frozen=True)
+class Factories:
+    """What a run builds its parts with; tests put their own in."""
+
+    env: Callable[..., Any] = _make_env
+    tracker: Callable[[str, Path | None], Any] = _make_tracker
+    policy: Callable[[str], Any] = _make_policy
+    check_variant: Callable[[Path, str], list[str]] = _check_variant
+
+
+def make_plan(config: RunConfig) -> list[Any]:
+    """The episodes of a run in plan order."""
+    from arena_newton.eval import plan
+
+    return list(
+        plan.make_plan(
+            tasks=config.tasks,
+            trackers=(config.tracker,),
+            policies=(policy_label(config.policy),),
+            modes=config.modes,
+            rules=config.rules,
+            engine=config.engine,
+            seeds=config.seeds,
+            repeats=config.repeats,
+            max_steps=config.max_steps,
+        )
+    )
+
+
+def stored_options(folder: Path) -> RunOptions:
+    """The flags that a results folder was made with, to be resumed."""
+    stored = report.read_config(folder)["options"]
+    known = {field.name for field in dataclasses.fields(RunOptions)}
+    values = {key: tuple(v) if isinstance(v, list) else v for key, v in stored.items() if key in known}
+    return dataclasses.replace(RunOptions(**values), out=str(folder))
+
+
+def execute(options: RunOptions, factories: Factories | None = None) -> int:
+    """Run or continue the run that ``options`` describe.
+
+    Returns:
+        Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise.
+
+    Raises:
+        InputError: a flag, file or folder is wrong; raised before the first episode.
+        StorageError: the results folder cannot be written; finished episodes are kept.
+    """
+    factories = factories or Factories()
+    config = resolve(options)
+    folder = Path(options.out).expanduser() if options.out else _new_folder()
+    document = _document(options, config)
+    _check_folder(folder, document)
+    policy = _check_parts(config, factories)
+    episodes = make_plan(config)
+    document["planned"] = len(episodes)
+    _open_folder(folder, document)
+    print(f"configuration {config.hash}")
+    for key, value in config.identity().items():
+        print(f"  {key:<13} {_shown(value)}")
+    print(f"  {len(episodes)} episodes -> {folder}", flush=True)
+
+    began = time.perf_counter()
+    resume = f"python -m arena_newton.eval resume {shlex.quote(str(folder))}"
+    with Journal(folder / report.JOURNAL_FILE) as journal:
+        if journal.torn_bytes:
+            print(f"  cut a torn last line of {journal.torn_bytes} bytes off the journal", file=sys.stderr)
+        done = {r["index"]: r for r in journal.records}
+        if options.retry_errors:
+            done = {index: record for index, record in done.items() if record["outcome"] != "error"}
+        waiting = [episode for episode in episodes if episode.index not in done]
+        if done:
+            print(f"  {len(done)} episodes are finished, {len(waiting)} remain", flush=True)
+        try:
+            if waiting:
+                _run_groups(config, folder, waiting, journal, factories, policy, len(done), len(episodes))
+        except KeyboardInterrupt:
+            kept = len({record["index"] for record in journal.records})
+            print(f"\ninterrupted: {kept} of {len(episodes)} episodes are kept; continue with: {resume}")
+            return 130
+        except StorageError as error:
+            raise StorageError(f"{error}; free space, then: {resume}") from None
+    results = report.write_reports(report.load_run(folder))
+    print(f"\n{report.table(results)}")
+    for note in report.notes(results):
+        print(note)
+    print(f"{results['finished']} episodes, this run took {time.perf_counter() - began:.0f} s")
+    print(f"report: {folder / 'report.html'}")
+    errors = sum(cell["errors"] for cell in results["cells"])
+    return 0 if results["complete"] and not errors else 1
+
+
+def _new_folder() -> Path:
+    return Path("results") / datetime.datetime.now().strftime("%Y%m%d_%H%M%S")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    return "-" if value is None else str(value)
+
+
+def _document(options: RunOptions, config: RunConfig) -> dict[str, Any]:
+    """Content of config.json."""
+    from arena_newton import rules, tasks
+    from arena_newton.doctor import versions
+
+    return {
+        "config_hash": config.hash,
+        "config": config.identity(),
+        "rule_set": json.loads(json.dumps(rules.get(config.rules).to_dict())),
+        "gym_ids": {name: tasks.get(name).gym_id for name in config.tasks},
+        "options": json.loads(json.dumps(dataclasses.asdict(explicit(options, config)))),
+        "versions": versions(),
+        "planned": 0,
+    }
+
+
+def _check_folder(folder: Path, document: dict[str, Any]) -> None:
+    """Refuse a folder of another configuration, or one that holds something else."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file")
+    if (folder / report.CONFIG_FILE).exists():
+        stored = report.read_config(folder)
+        difference = differing_key(stored["config"], document["config"])
+        if difference is not None:
+            key, was, now = difference
+            raise InputError(
+                f"{folder}: holds results of another configuration: {key} was {_shown(was)}, now {_shown(now)}; "
+                "choose another --out"
+            )
+    elif folder.exists() and any(folder.iterdir()):
+        raise InputError(f"--out {folder}: is not empty and holds no results; choose another folder")
+
+
+def _open_folder(folder: Path, document: dict[str, Any]) -> None:
+    path = folder / report.CONFIG_FILE
+    if path.exists():
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps(document, indent=2) + "\n")
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be created ({error.strerror})") from None
+
+
+def _check_parts(config: RunConfig, factories: Factories) -> Any:
+    """Build tracker and policy and look into the variant, so that wrong input shows before the first episode."""
+    factories.tracker(config.tracker, config.checkpoint)
+    policy = factories.policy(config.policy)
+    if config.variant is not None:
+        findings = factories.check_variant(config.variant, config.tasks[0])
+        if findings:
+            more = f" (and {len(findings) - 1} more findings)" if len(findings) > 1 else ""
+            raise InputError(f"--variant {config.variant}: {findings[0]}{more}")
+    return policy
+
+
+def _run_groups(
+    config: RunConfig,
+    folder: Path,
+    waiting: Sequence[Any],
+    journal: Journal,
+    factories: Factories,
+    policy: Any,
+    finished: int,
+    planned: int,
+) -> None:
+    from tqdm import tqdm
+
+    groups: dict[tuple[str, str], list[Any]] = {}
+    for episode in waiting:
+        groups.setdefault((episode.task, episode.mode), []).append(episode)
+    with tqdm(total=planned, initial=finished, unit="episode", dynamic_ncols=True, smoothing=0.05) as bar:
+        for (task, mode), episodes in groups.items():
+            bar.set_description(f"{task} {mode}")
+            _run_group(config, folder, task, mode, episodes, journal, factories, policy, bar)
+
+
+def _run_group(
+    config: RunConfig,
+    folder: Path,
+    task: str,
+    mode: str,
+    episodes: list[Any],
+    journal: Journal,
+    factories: Factories,
+    policy: Any,
+    bar: Any,
+) -> None:
+    """Run the episodes of one task and mode in one environment.
+
+    Something that breaks the environment itself, other than wrong input or a full disk, ends this group's remaining
+    episodes as errors; the other groups still run.
+    """
+    left = {episode.index: episode for episode in episodes}
+    rate = _TickRate(bar)
+    env = recorder = None
+    worlds = min(config.worlds, len(episodes))
+    try:
+        env = factories.env(
+            task,
+            tracker=factories.tracker(config.tracker, config.checkpoint),
+            worlds=worlds,
+            engine=config.engine,
+            device=config.device,
+            rules=config.rules,
+            mode=mode,
+            variant_file=str(config.variant) if config.variant else None,
+            fast_physics=config.fast_physics,
+            camera=_policy_camera(policy),
+        )
+        if config.video or config.strip:
+            from arena_newton.eval.recorder import Recorder
+
+            recorder = Recorder(folder, video=config.video, strip=config.strip)
+
+        def on_finish(result: Any) -> None:
+            media = recorder.media(result.episode) if recorder is not None else {}
+            journal.append(_record(config, result, media))
+            left.pop(result.episode.index, None)
+            bar.update()
+
+        env.run_episodes(
+            policy, episodes, on_finish=on_finish, on_tick=rate.tick, recorder=recorder, max_steps=episodes[0].max_steps
+        )
+    except (InputError, StorageError):
+        raise
+    except Exception as error:
+        bar.clear()
+        traceback.print_exc()
+        message = f"{type(error).__name__}: {error}"
+        for episode in list(left.values()):
+            journal.append(_error_record(config, episode, message))
+            bar.update()
+    finally:
+        if recorder is not None:
+            recorder.close()
+        del env
+        gc.collect()
+
+
+def _policy_camera(policy: Any) -> Any:
+    """Camera that a policy asks for; None for one that does not see."""
+    if not policy.needs_image:
+        return None
+    own = getattr(policy, "camera", None)
+    if own is not None:
+        return own
+    from arena_newton.camera import CameraConfig
+
+    return CameraConfig()
+
+
+class _TickRate:
+    """Shows simulated world-ticks per second on the progress bar."""
+
+    def __init__(self, bar: Any):
+        self._bar, self._world_ticks, self._since = bar, 0, time.perf_counter()
+
+    def tick(self, active: int) -> None:
+        self._world_ticks += active
+        now = time.perf_counter()
+        if now - self._since >= 1.0:
+            self._bar.set_postfix_str(f"{self._world_ticks / (now - self._since):.0f} world-ticks/s, {active} worlds")
+            self._world_ticks, self._since = 0, now
+
+
+def _record(config: RunConfig, result: Any, media: dict[str, str]) -> dict[str, Any]:
+    """Journal line of a finished episode."""
+    finished = time.time()
+    return _base_record(config, result.episode) | {
+        "outcome": result.outcome,
+        "reason": result.reason,
+        "steps": int(result.steps),
+        "margin": float(result.margin) if math.isfinite(result.margin) else None,
+        "startup_fall": bool(result.startup_fall),
+        "overflow": bool(result.overflow),
+        "error": result.error,
+        "durations": {"wall_s": round(float(result.wall_s), 6), "sim_s": round(float(result.sim_s), 6)},
+        "started_at": _iso(finished - float(result.wall_s)),
+        "finished_at": _iso(finished),
+        "media": media,
+        "video": media.get("ego", ""),
+    }
+
+
+def _error_record(config: RunConfig, episode: Any, message: str) -> dict[str, Any]:
+    """Journal line of an episode whose environment broke."""
+    now = _iso(time.time())
+    return _base_record(config, episode) | {
+        "outcome": "error",
+        "reason": "environment",
+        "steps": 0,
+        "margin": None,
+        "startup_fall": False,
+        "overflow": False,
+        "error": message,
+        "durations": {"wall_s": 0.0, "sim_s": 0.0},
+        "started_at": now,
+        "finished_at": now,
+        "media": {},
+        "video": "",
+    }
+
+
+def _base_record(config: RunConfig, episode: Any) -> dict[str, Any]:
+    return {
+        "index": episode.index,
+        "task": episode.task,
+        "tracker": episode.tracker,
+        "policy": episode.policy,
+        "mode": episode.mode,
+        "rules": episode.rules,
+        "engine": episode.engine,
+        "group_seed": episode.group_seed,
+        "repeat": episode.repeat,
+        "episode_seed": episode.episode_seed,
+        "object_seed": episode.object_seed,
+        "max_steps": episode.max_steps,
+        "hashes": {
+            "config": config.hash,
+            "rules": config.rules_hash,
+            "checkpoint": config.checkpoint_hash,
+            "policy": config.policy_hash,
+            "variant": config.variant_hash,
+        },
+    }
+
+
+def _iso(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,52 @@
+"""Between the solver's batch and the rest: body poses for rendering, latch flags, overflow flags."""
+
+import warp as wp
+
+__all__ = ["launch_body_q", "launch_latch", "launch_overflow"]
+
+
+@wp.kernel
+def _body_q(
+    xpos: wp.array3d[wp.float32],
+    xquat: wp.array3d[wp.float32],
+    newton_body: wp.array2d[wp.int32],
+    body_q: wp.array[wp.transform],
+):
+    world, body = wp.tid()
+    target = newton_body[world, body]
+    if target >= 0:
+        position = wp.vec3(xpos[world, body, 0], xpos[world, body, 1], xpos[world, body, 2])
+        rotation = wp.quat(xquat[world, body, 1], xquat[world, body, 2], xquat[world, body, 3], xquat[world, body, 0])
+        body_q[target] = wp.transform(position, rotation)
+
+
+def launch_body_q(xpos: wp.array, xquat: wp.array, newton_body: wp.array, body_q: wp.array) -> None:
+    """Write body poses [worlds, nbody] (position [m], quaternion wxyz) into Newton's `State.body_q`."""
+    wp.launch(_body_q, dim=newton_body.shape, inputs=[xpos, xquat, newton_body], outputs=[body_q], device=xpos.device)
+
+
+@wp.kernel
+def _latch(locked: wp.array[wp.int32], equality: wp.int32, eq_active: wp.array2d[wp.bool]):
+    world = wp.tid()
+    eq_active[world, equality] = locked[world] != 0
+
+
+def launch_latch(locked: wp.array, equality: int, eq_active: wp.array) -> None:
+    """Set an equality constraint active where `locked` [worlds] is 1."""
+    wp.launch(_latch, dim=locked.shape[0], inputs=[locked, equality], outputs=[eq_active], device=locked.device)
+
+
+@wp.kernel
+def _overflow(mask: wp.array[wp.int32], lost: wp.int32, seen: wp.array[wp.int32]):
+    world = wp.tid()
+    if (mask[world] & lost) != 0:
+        seen[world] = 1
+
+
+LOST_CONTACTS = 0b10111111
+"""Bits of mujoco_warp's overflow mask that mean lost contacts or constraint rows (not iteration limits)."""
+
+
+def launch_overflow(mask: wp.array, seen: wp.array) -> None:
+    """Remember in `seen` [worlds] that a contact or constraint buffer overflowed since the last reset."""
+    wp.launch(_overflow, dim=seen.shape[0], inputs=[mask, LOST_CONTACTS], outputs=[seen], device=seen.device)

@@ -1,0 +1,39 @@
+"""Success predicates of the seven tasks in both rule sets, each with a signed continuous margin.
+
+A margin is the smallest slack [m] of the conditions of one instant: at least 0 exactly when all hold. Conditions that
+are no lengths enter by a length that the docstring of their launch names. Margins are differentiable almost everywhere.
+Success is the margin's sign, or, where a rule asks for several ticks in a row, a counter of ticks with margin >= 0.
+A minimum may drop a NaN: `reset.launch_nonfinite` tells broken worlds, whose verdict means nothing.
+"""
+
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.kernels.success_hoi import (
+    launch_double_desk_paper,
+    launch_double_desk_released,
+    launch_football,
+    launch_pp_box_paper,
+    launch_pp_box_released,
+)
+from arena_newton.kernels.success_hsi import (
+    launch_boxing,
+    launch_open_door_paper,
+    launch_open_door_released,
+    launch_sit_sofa_paper,
+    launch_sit_sofa_released,
+    launch_vis_navi,
+)
+
+__all__ = [
+    "Boxes",
+    "launch_boxing",
+    "launch_double_desk_paper",
+    "launch_double_desk_released",
+    "launch_football",
+    "launch_open_door_paper",
+    "launch_open_door_released",
+    "launch_pp_box_paper",
+    "launch_pp_box_released",
+    "launch_sit_sofa_paper",
+    "launch_sit_sofa_released",
+    "launch_vis_navi",
+]

@@ -1,0 +1,375 @@
+"""Success predicates of the tasks that move an object: Football, DoubleDesk, P&PBox. Read `success` first."""
+
+# ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
+
+import warp as wp
+
+from arena_newton.kernels.boxes import (
+    FAR,
+    Boxes,
+    box_centre,
+    box_rotation,
+    count_up,
+    holds,
+    slack_box,
+    slack_xy,
+    world_half,
+)
+from arena_newton.kernels.rotations import load_quat3, load_vec3
+
+__all__ = [
+    "launch_double_desk_paper",
+    "launch_double_desk_released",
+    "launch_football",
+    "launch_pp_box_paper",
+    "launch_pp_box_released",
+]
+
+
+@wp.kernel
+def football_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    ball: int,
+    goal_body: wp.array[int],
+    goal_pos: wp.array[wp.vec3],
+    goal_quat: wp.array[wp.vec4],
+    goal_half: wp.array[wp.vec3],
+    pitch_body: wp.array[int],
+    pitch_pos: wp.array[wp.vec3],
+    pitch_quat: wp.array[wp.vec4],
+    pitch_half: wp.array[wp.vec3],
+    rear_bound: int,
+    judge_out: int,
+    min_z: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+    event: wp.array[int],
+):
+    """One thread a world."""
+    w = wp.tid()
+    p = load_vec3(xpos, w, ball)
+    q = box_rotation(xquat, goal_body, goal_quat, w, 0)
+    c = box_centre(xpos, xquat, goal_body, goal_pos, w, 0)
+    v = wp.quat_rotate_inv(q, p - c)
+    h = goal_half[0]
+    m = wp.min(wp.min(h[0] - wp.abs(v[0]), h[2] - wp.abs(v[2])), h[1] + v[1])
+    if rear_bound != 0:
+        m = wp.min(m, h[1] - v[1])
+    margin[w] = m
+    success[w] = holds(m)
+    out = int(0)
+    if judge_out != 0:
+        pq = box_rotation(xquat, pitch_body, pitch_quat, w, 0)
+        pc = box_centre(xpos, xquat, pitch_body, pitch_pos, w, 0)
+        pv = wp.quat_rotate_inv(pq, p - pc)
+        if slack_xy(pv, pitch_half[0]) < 0.0 or p[2] < min_z:
+            out = 1
+    event[w] = wp.where(m >= 0.0, 0, out)
+
+
+def launch_football(
+    xpos: wp.array,
+    xquat: wp.array,
+    *,
+    ball_body: int,
+    goal: Boxes,
+    pitch: Boxes,
+    rear_bound: bool,
+    judge_out: bool,
+    min_z: float,
+    success: wp.array,
+    margin: wp.array,
+    event: wp.array,
+) -> None:
+    """Football: the ball's centre inside the goal's volume, with (`paper`) or without (`released`) its rear face.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        ball_body: The ball.
+        goal: One box whose +y face is the rear of the net.
+        pitch: One box; xy beyond its upright faces is out.
+        rear_bound: Whether the +y face bounds the goal.
+        judge_out: Whether leaving the field is an event.
+        min_z: A ball below this height [m] has left the field.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+        event: Output, 1 = the ball left the field without a goal, int32, shape [worlds].
+    """
+    wp.launch(
+        football_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, ball_body, *goal.arrays, *pitch.arrays, int(rear_bound), int(judge_out), min_z],
+        outputs=[success, margin, event],
+        device=success.device,
+    )
+
+
+@wp.kernel
+def double_desk_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    xipos: wp.array3d[float],
+    hammer: int,
+    box_body: wp.array[int],
+    box_pos: wp.array[wp.vec3],
+    box_quat: wp.array[wp.vec4],
+    box_half: wp.array[wp.vec3],
+    world_aligned: int,
+    min_z: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    p = load_vec3(xipos, w, hammer)
+    q = box_rotation(xquat, box_body, box_quat, w, 0)
+    offset = p - box_centre(xpos, xquat, box_body, box_pos, w, 0)
+    m = float(0.0)
+    if world_aligned != 0:
+        m = wp.min(slack_box(offset, world_half(q, box_half[0])), p[2] - min_z)
+    else:
+        m = slack_box(wp.quat_rotate_inv(q, offset), box_half[0])
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_double_desk_paper(
+    xpos: wp.array,
+    xquat: wp.array,
+    xipos: wp.array,
+    *,
+    hammer_body: int,
+    inside: Boxes,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """DoubleDesk, `paper`: the hammer's centre of mass inside the crate's box in the crate's own frame.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        xipos: Centres of mass [m], shape [worlds, nbody, 3].
+        hammer_body: The hammer.
+        inside: One box, the crate's.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        double_desk_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, xipos, hammer_body, *inside.arrays, 0, 0.0],
+        outputs=[success, margin],
+        device=success.device,
+    )
+
+
+def launch_double_desk_released(
+    xpos: wp.array,
+    xquat: wp.array,
+    xipos: wp.array,
+    *,
+    hammer_body: int,
+    inside: Boxes,
+    min_z: float,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """DoubleDesk, `released`: the hammer's centre of mass inside the crate's world-axis box and not below `min_z` [m].
+
+    Other arguments as `launch_double_desk_paper`.
+    """
+    wp.launch(
+        double_desk_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, xipos, hammer_body, *inside.arrays, 1, min_z],
+        outputs=[success, margin],
+        device=success.device,
+    )
+
+
+@wp.func
+def slack_on_deck(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    centre: wp.vec3,
+    bottom: float,
+    deck_body: wp.array[int],
+    deck_pos: wp.array[wp.vec3],
+    deck_quat: wp.array[wp.vec4],
+    deck_half: wp.array[wp.vec3],
+    world: int,
+    deck: int,
+    height_tolerance: float,
+) -> float:
+    """Slack [m] of a box on one deck: its centre within the span, its bottom near the deck's top face."""
+    q = box_rotation(xquat, deck_body, deck_quat, world, deck)
+    c = box_centre(xpos, xquat, deck_body, deck_pos, world, deck)
+    top = c + wp.quat_rotate(q, wp.vec3(0.0, 0.0, deck_half[deck][2]))
+    span = slack_xy(wp.quat_rotate_inv(q, centre - c), deck_half[deck])
+    return wp.min(span, height_tolerance - wp.abs(bottom - top[2]))
+
+
+@wp.kernel
+def pp_box_paper_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    qvel: wp.array2d[float],
+    box: int,
+    box_qvel_adr: int,
+    box_half: wp.vec3,
+    deck_body: wp.array[int],
+    deck_pos: wp.array[wp.vec3],
+    deck_quat: wp.array[wp.vec4],
+    deck_half: wp.array[wp.vec3],
+    height_tolerance: float,
+    max_speed: float,
+    confirm_ticks: int,
+    window: float,
+    counter: wp.array[int],
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    p = load_vec3(xpos, w, box)
+    bottom = p[2] - world_half(load_quat3(xquat, w, box), box_half)[2]
+    best = int(0)
+    best_slack = float(-FAR)
+    for d in range(deck_body.shape[0]):
+        s = slack_on_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, d, height_tolerance)
+        if s > best_slack:
+            best_slack = s
+            best = d
+    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    m = slack_on_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, best, height_tolerance)
+    v = wp.vec3(qvel[w, box_qvel_adr], qvel[w, box_qvel_adr + 1], qvel[w, box_qvel_adr + 2])
+    speed = wp.sqrt(wp.dot(v, v) + 1.0e-12)
+    m = wp.min(m, (max_speed - speed) * window)
+    count = count_up(m, counter[w])
+    counter[w] = count
+    margin[w] = m
+    success[w] = wp.where(count >= confirm_ticks, 1, 0)
+
+
+def launch_pp_box_paper(
+    xpos: wp.array,
+    xquat: wp.array,
+    qvel: wp.array,
+    *,
+    box_body: int,
+    box_qvel_adr: int,
+    box_half: wp.vec3,
+    decks: Boxes,
+    height_tolerance: float,
+    max_speed: float,
+    confirm_ticks: int,
+    tick: float,
+    counter: wp.array,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """P&PBox, `paper`: box centre above any deck within its span, bottom near the deck, slow, several ticks in a row.
+
+    The bottom is the box's lowest corner. Speed enters the margin as the length (max_speed - speed) x confirmation
+    time.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        qvel: Velocities, MuJoCo layout, shape [worlds, nv].
+        box_body: The box, its origin at its centre.
+        box_qvel_adr: Address of its free joint in `qvel`.
+        box_half: Half extents of the box [m].
+        decks: Boxes whose top faces are the decks' surfaces, at least one.
+        height_tolerance: Largest distance of bottom and deck [m], 0.06.
+        max_speed: Largest speed [m/s], 0.05.
+        confirm_ticks: Ticks in a row, 10.
+        tick: Control period [s].
+        counter: Ticks in a row so far, updated, int32, shape [worlds]; clear it at reset.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        pp_box_paper_kernel,
+        dim=success.shape[0],
+        inputs=[
+            xpos,
+            xquat,
+            qvel,
+            box_body,
+            box_qvel_adr,
+            box_half,
+            *decks.arrays,
+            height_tolerance,
+            max_speed,
+            confirm_ticks,
+            confirm_ticks * tick,
+        ],
+        outputs=[counter, success, margin],
+        device=success.device,
+    )
+
+
+@wp.kernel
+def pp_box_released_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    box: int,
+    box_half: wp.vec3,
+    deck_body: wp.array[int],
+    deck_pos: wp.array[wp.vec3],
+    deck_quat: wp.array[wp.vec4],
+    deck_half: wp.array[wp.vec3],
+    deck: int,
+    plane_z: float,
+    height_tolerance: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    p = load_vec3(xpos, w, box)
+    h = world_half(box_rotation(xquat, deck_body, deck_quat, w, deck), deck_half[deck])
+    offset = p - box_centre(xpos, xquat, deck_body, deck_pos, w, deck)
+    m = slack_xy(offset, wp.vec3(h[0] - box_half[0], h[1] - box_half[1], h[2]))
+    m = wp.min(m, height_tolerance - wp.abs(p[2] - box_half[2] - plane_z))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_pp_box_released(
+    xpos: wp.array,
+    xquat: wp.array,
+    *,
+    box_body: int,
+    box_half: wp.vec3,
+    decks: Boxes,
+    deck: int,
+    plane_z: float,
+    height_tolerance: float,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """P&PBox, `released`: box centre in the target deck's world-axis span less the box's half, bottom near a plane.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        box_body: The box, its origin at its centre.
+        box_half: Half extents of the box [m]; its xy shrink the span, its z is taken off the centre's height.
+        decks: The shelf's decks.
+        deck: Which of them is the target.
+        plane_z: Height of the target plane [m], about 0.648.
+        height_tolerance: Largest distance to the plane [m], 0.06.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        pp_box_released_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, box_body, box_half, *decks.arrays, deck, plane_z, height_tolerance],
+        outputs=[success, margin],
+        device=success.device,
+    )

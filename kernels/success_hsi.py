@@ -1,0 +1,481 @@
+"""Success predicates of the tasks between robot and scene: OpenDoor, SitSofa, Boxing, VisNavi. Read `success` first."""
+
+# ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
+
+import warp as wp
+
+from arena_newton.kernels.boxes import (
+    FAR,
+    Boxes,
+    box_centre,
+    box_rotation,
+    count_up,
+    holds,
+    slack_standing,
+    slack_xy,
+    world_half,
+)
+from arena_newton.kernels.rotations import load_quat3, load_vec3
+
+__all__ = [
+    "launch_boxing",
+    "launch_open_door_paper",
+    "launch_open_door_released",
+    "launch_sit_sofa_paper",
+    "launch_sit_sofa_released",
+    "launch_vis_navi",
+]
+
+
+@wp.kernel
+def open_door_paper_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    qpos: wp.array2d[float],
+    root: int,
+    door_body: wp.array[int],
+    door_pos: wp.array[wp.vec3],
+    door_quat: wp.array[wp.vec4],
+    half_width: float,
+    min_y: float,
+    stand_height: float,
+    stand_up: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    p = wp.vec3(qpos[w, root], qpos[w, root + 1], qpos[w, root + 2])
+    q = box_rotation(xquat, door_body, door_quat, w, 0)
+    v = wp.quat_rotate_inv(q, p - box_centre(xpos, xquat, door_body, door_pos, w, 0))
+    m = wp.min(half_width - wp.abs(v[0]), v[1] - min_y)
+    m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_open_door_paper(
+    xpos: wp.array,
+    xquat: wp.array,
+    qpos: wp.array,
+    *,
+    root_qpos_adr: int,
+    doorway: Boxes,
+    half_width: float,
+    min_y: float,
+    stand_height: float,
+    stand_up: float,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """OpenDoor, `paper`: the root has passed the frame's plane y = 0 within the doorway, and the robot stands.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        qpos: Positions, MuJoCo layout, shape [worlds, nq].
+        root_qpos_adr: Address of the robot's free joint in `qpos`.
+        doorway: One box; its frame's y = 0 is the plane, x = 0 the middle of the leaf.
+        half_width: Largest |x| [m], 0.55.
+        min_y: Smallest y [m], 0.02.
+        stand_height: Smallest root height of a standing robot [m], 0.45.
+        stand_up: Smallest up-axis z of a standing robot, 0.60; its slack counts as metres at 1 m up the robot's axis.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        open_door_paper_kernel,
+        dim=success.shape[0],
+        inputs=[
+            xpos,
+            xquat,
+            qpos,
+            root_qpos_adr,
+            doorway.body,
+            doorway.pos,
+            doorway.quat,
+            half_width,
+            min_y,
+            stand_height,
+            stand_up,
+        ],
+        outputs=[success, margin],
+        device=success.device,
+    )
+
+
+@wp.kernel
+def open_door_released_kernel(
+    qpos: wp.array2d[float],
+    root: int,
+    leaf: int,
+    latched: wp.array[int],
+    min_angle: float,
+    stand_height: float,
+    stand_up: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    m = -min_angle
+    if latched[w] == 0:
+        m = wp.abs(qpos[w, leaf]) - min_angle
+    m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_open_door_released(
+    qpos: wp.array,
+    *,
+    root_qpos_adr: int,
+    leaf_qpos_adr: int,
+    latched: wp.array,
+    min_angle: float,
+    stand_height: float,
+    stand_up: float,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """OpenDoor, `released`: the latch is released, the leaf has opened far enough, and the robot stands.
+
+    Angles enter the margin as the arc [m] at 1 m from the hinge; a latched leaf counts as closed.
+
+    Args:
+        qpos: Positions, MuJoCo layout, shape [worlds, nq].
+        root_qpos_adr: Address of the robot's free joint in `qpos`.
+        leaf_qpos_adr: Address of the leaf's hinge in `qpos`, 0 rad = closed.
+        latched: 1 = the latch still holds the leaf, int32, shape [worlds].
+        min_angle: Smallest |angle| of the leaf [rad], 60 deg, positive.
+        stand_height: Smallest root height of a standing robot [m], 0.45.
+        stand_up: Smallest up-axis z of a standing robot, 0.60.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        open_door_released_kernel,
+        dim=success.shape[0],
+        inputs=[qpos, root_qpos_adr, leaf_qpos_adr, latched, min_angle, stand_height, stand_up],
+        outputs=[success, margin],
+        device=success.device,
+    )
+
+
+@wp.kernel
+def sit_sofa_paper_kernel(
+    qpos: wp.array2d[float],
+    root: int,
+    seat_force: wp.array[float],
+    min_force: float,
+    max_root_z: float,
+    stiffness: float,
+    confirm_ticks: int,
+    counter: wp.array[int],
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    m = wp.min(max_root_z - qpos[w, root + 2], (seat_force[w] - min_force) / stiffness)
+    count = count_up(m, counter[w])
+    counter[w] = count
+    margin[w] = m
+    success[w] = wp.where(count >= confirm_ticks, 1, 0)
+
+
+def launch_sit_sofa_paper(
+    qpos: wp.array,
+    seat_force: wp.array,
+    *,
+    root_qpos_adr: int,
+    min_force: float,
+    max_root_z: float,
+    confirm_ticks: int,
+    stiffness: float = 500.0,
+    counter: wp.array,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """SitSofa, `paper`: pelvis, hips and thighs press the seat hard enough and the root is low, several ticks in a row.
+
+    Args:
+        qpos: Positions, MuJoCo layout, shape [worlds, nq].
+        seat_force: Normal force of those links on the seat [N], shape [worlds].
+        root_qpos_adr: Address of the robot's free joint in `qpos`.
+        min_force: Smallest force [N], 50.
+        max_root_z: Root height below which the robot sits [m], 0.62.
+        confirm_ticks: Ticks in a row, 25.
+        stiffness: Turns force into length for the margin alone [N/m]; 500 puts no force 0.1 m away from 50 N.
+        counter: Ticks in a row so far, updated, int32, shape [worlds]; clear it at reset.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        sit_sofa_paper_kernel,
+        dim=success.shape[0],
+        inputs=[qpos, root_qpos_adr, seat_force, min_force, max_root_z, stiffness, confirm_ticks],
+        outputs=[counter, success, margin],
+        device=success.device,
+    )
+
+
+@wp.func
+def slack_in_seat(p: wp.vec3, centre: wp.vec3, half: wp.vec3, below: float, above: float) -> float:
+    """Slack [m] of a point in the seat volume: xy in the seat, z from `below` its bottom to `above` its top."""
+    v = p - centre
+    return wp.min(slack_xy(v, half), wp.min(v[2] + half[2] + below, half[2] + above - v[2]))
+
+
+@wp.kernel
+def sit_sofa_released_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    contact_force: wp.array2d[float],
+    bodies: wp.array[int],
+    seat_body: wp.array[int],
+    seat_pos: wp.array[wp.vec3],
+    seat_quat: wp.array[wp.vec4],
+    seat_half: wp.array[wp.vec3],
+    below: float,
+    above: float,
+    min_force: float,
+    stiffness: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    c = box_centre(xpos, xquat, seat_body, seat_pos, w, 0)
+    h = world_half(box_rotation(xquat, seat_body, seat_quat, w, 0), seat_half[0])
+    pressing = bodies[0]
+    first = bodies[0]
+    second = int(-1)
+    pressing_slack = float(-FAR)
+    first_slack = float(-FAR)
+    second_slack = float(-FAR)
+    for k in range(bodies.shape[0]):
+        b = bodies[k]
+        s = slack_in_seat(load_vec3(xpos, w, b), c, h, below, above)
+        f = wp.min(s, (contact_force[w, b] - min_force) / stiffness)
+        if f > pressing_slack:
+            pressing_slack = f
+            pressing = b
+        if s > first_slack:
+            second_slack = first_slack
+            if k > 0:
+                second = first
+            first_slack = s
+            first = b
+        elif s > second_slack:
+            second_slack = s
+            second = b
+    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    m = wp.min(
+        slack_in_seat(load_vec3(xpos, w, pressing), c, h, below, above),
+        (contact_force[w, pressing] - min_force) / stiffness,
+    )
+    if second >= 0:
+        m = wp.max(m, slack_in_seat(load_vec3(xpos, w, second), c, h, below, above))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_sit_sofa_released(
+    xpos: wp.array,
+    xquat: wp.array,
+    contact_force: wp.array,
+    *,
+    bodies: wp.array,
+    seat: Boxes,
+    below: float,
+    above: float,
+    min_force: float,
+    stiffness: float = 500.0,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """SitSofa, `released`: one listed body in the seat volume with contact, or two in it without; one tick.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        contact_force: Norm of the net contact force on each body [N], shape [worlds, nbody].
+        bodies: Pelvis, hips, waist and torso, at least one, int32, shape [k].
+        seat: One box; its world-axis box is the seat.
+        below: How far below the seat's bottom a body still counts [m], 0.10.
+        above: How far above the seat's top a body still counts [m], 0.35.
+        min_force: Smallest contact force [N], 5.
+        stiffness: Turns force into length for the margin alone [N/m].
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        sit_sofa_released_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, contact_force, bodies, *seat.arrays, below, above, min_force, stiffness],
+        outputs=[success, margin],
+        device=success.device,
+    )
+
+
+@wp.func
+def fist_distance(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    target: wp.vec3,
+    palm_body: wp.array[int],
+    palm_offset: wp.array[wp.vec3],
+    world: int,
+    palm: int,
+) -> float:
+    """Distance [m] of one palm's frame to a point."""
+    b = palm_body[palm]
+    p = load_vec3(xpos, world, b) + wp.quat_rotate(load_quat3(xquat, world, b), palm_offset[palm])
+    d = p - target
+    return wp.sqrt(wp.dot(d, d) + 1.0e-12)
+
+
+@wp.kernel
+def boxing_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    palm_body: wp.array[int],
+    palm_offset: wp.array[wp.vec3],
+    target_body: wp.array[int],
+    target_pos: wp.array[wp.vec3],
+    target_quat: wp.array[wp.vec4],
+    target_half: wp.array[wp.vec3],
+    min_radius: float,
+    pad: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    centre = box_centre(xpos, xquat, target_body, target_pos, w, 0)
+    h = target_half[0]
+    reach = wp.max(wp.max(wp.max(h[0], h[1]), h[2]), min_radius) + pad
+    best = int(0)
+    best_distance = float(FAR)
+    for k in range(palm_body.shape[0]):
+        d = fist_distance(xpos, xquat, centre, palm_body, palm_offset, w, k)
+        if d < best_distance:
+            best_distance = d
+            best = k
+    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    m = reach - fist_distance(xpos, xquat, centre, palm_body, palm_offset, w, best)
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_boxing(
+    xpos: wp.array,
+    xquat: wp.array,
+    *,
+    palm_body: wp.array,
+    palm_offset: wp.array,
+    target: Boxes,
+    min_radius: float,
+    pad: float,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """Boxing: a palm within max(bounding radius, min_radius) + pad of the target's centre.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        palm_body: Bodies that carry the palms, int32, shape [k].
+        palm_offset: Palms in those bodies' frames [m], vec3, shape [k].
+        target: One box; half of its largest extent is the bounding radius.
+        min_radius: 0 in `paper`, 0.10 in `released` [m].
+        pad: Reach beyond the radius [m], 0.08.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        boxing_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, palm_body, palm_offset, *target.arrays, min_radius, pad],
+        outputs=[success, margin],
+        device=success.device,
+    )
+
+
+@wp.func
+def foot_slack(
+    xpos: wp.array3d[float], feet: wp.array[int], centre: wp.vec3, q: wp.quat, half: wp.vec3, world: int, foot: int
+) -> float:
+    """Slack [m] of one foot link's origin in the zone, seen from above."""
+    return slack_xy(wp.quat_rotate_inv(q, load_vec3(xpos, world, feet[foot]) - centre), half)
+
+
+@wp.kernel
+def vis_navi_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    qpos: wp.array2d[float],
+    root: int,
+    feet: wp.array[int],
+    zone_body: wp.array[int],
+    zone_pos: wp.array[wp.vec3],
+    zone_quat: wp.array[wp.vec4],
+    zone_half: wp.array[wp.vec3],
+    stand_height: float,
+    stand_up: float,
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread a world."""
+    w = wp.tid()
+    q = box_rotation(xquat, zone_body, zone_quat, w, 0)
+    c = box_centre(xpos, xquat, zone_body, zone_pos, w, 0)
+    worst = int(0)
+    worst_slack = float(FAR)
+    for k in range(feet.shape[0]):
+        s = foot_slack(xpos, feet, c, q, zone_half[0], w, k)
+        if s < worst_slack:
+            worst_slack = s
+            worst = k
+    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    m = foot_slack(xpos, feet, c, q, zone_half[0], w, worst)
+    m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+def launch_vis_navi(
+    xpos: wp.array,
+    xquat: wp.array,
+    qpos: wp.array,
+    *,
+    root_qpos_adr: int,
+    feet: wp.array,
+    zone: Boxes,
+    stand_height: float,
+    stand_up: float,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """VisNavi: the origins of all foot links inside the zone, seen from above, and the robot stands.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        qpos: Positions, MuJoCo layout, shape [worlds, nq].
+        root_qpos_adr: Address of the robot's free joint in `qpos`.
+        feet: Ankle links, int32, shape [k].
+        zone: One box.
+        stand_height: Smallest root height of a standing robot [m], 0.45.
+        stand_up: Smallest up-axis z of a standing robot, 0.60.
+        success: Output, int32, shape [worlds].
+        margin: Output [m], shape [worlds].
+    """
+    wp.launch(
+        vis_navi_kernel,
+        dim=success.shape[0],
+        inputs=[xpos, xquat, qpos, root_qpos_adr, feet, *zone.arrays, stand_height, stand_up],
+        outputs=[success, margin],
+        device=success.device,
+    )

@@ -1,0 +1,85 @@
+"""Per-tick bookkeeping: joint targets into actuators, one status code a world."""
+
+import warp as wp
+
+__all__ = ["ERROR_ACTION", "ERROR_STATE", "FALL", "RUNNING", "SUCCESS", "launch_sanitize", "launch_status", "launch_write_ctrl"]
+
+RUNNING = 0
+SUCCESS = 1
+FALL = 2
+ERROR_STATE = 3
+ERROR_ACTION = 4
+EVENT = 8
+"""Codes from EVENT on carry a judge's event number."""
+
+
+@wp.kernel
+def _write_ctrl(
+    targets: wp.array2d[wp.float32],
+    joint_ctrl: wp.array[wp.int32],
+    hands: wp.array2d[wp.float32],
+    hand_ctrl: wp.array[wp.int32],
+    hand_open: wp.array[wp.float32],
+    hand_close: wp.array[wp.float32],
+    ctrl: wp.array2d[wp.float32],
+):
+    world, i = wp.tid()
+    joints = joint_ctrl.shape[0]
+    if i < joints:
+        ctrl[world, joint_ctrl[i]] = targets[world, i]
+    else:
+        finger = i - joints
+        side = (2 * finger) // hand_ctrl.shape[0]
+        if hands[world, side] >= 0.5:
+            ctrl[world, hand_ctrl[finger]] = hand_close[finger]
+        else:
+            ctrl[world, hand_ctrl[finger]] = hand_open[finger]
+
+
+def launch_write_ctrl(targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close, ctrl) -> None:
+    """Write joint targets [worlds, 29] and binary hands [worlds, 2] into actuator targets `ctrl` [worlds, nu]."""
+    dim = (ctrl.shape[0], joint_ctrl.shape[0] + hand_ctrl.shape[0])
+    inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close]
+    wp.launch(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
+
+
+@wp.kernel
+def _sanitize(bad: wp.array[wp.int32], neutral: wp.array[wp.float32], action: wp.array2d[wp.float32]):
+    world, i = wp.tid()
+    if bad[world] != 0:
+        action[world, i] = neutral[i]
+
+
+def launch_sanitize(bad: wp.array, neutral: wp.array, action: wp.array) -> None:
+    """Replace the actions of worlds flagged `bad` [worlds] by `neutral` [40]."""
+    wp.launch(_sanitize, dim=action.shape, inputs=[bad, neutral], outputs=[action], device=action.device)
+
+
+@wp.kernel
+def _status(
+    success: wp.array[wp.int32],
+    fallen: wp.array[wp.int32],
+    event: wp.array[wp.int32],
+    bad_state: wp.array[wp.int32],
+    bad_action: wp.array[wp.int32],
+    status: wp.array[wp.int32],
+):
+    world = wp.tid()
+    code = wp.int32(0)
+    if event[world] != 0:
+        code = wp.int32(8) + event[world]
+    if fallen[world] != 0:
+        code = wp.int32(2)
+    if success[world] != 0:
+        code = wp.int32(1)
+    if bad_state[world] != 0:
+        code = wp.int32(3)
+    if bad_action[world] != 0:
+        code = wp.int32(4)
+    status[world] = code
+
+
+def launch_status(success, fallen, event, bad_state, bad_action, status) -> None:
+    """One code a world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
+    inputs = [success, fallen, event, bad_state, bad_action]
+    wp.launch(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)

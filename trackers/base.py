@@ -1,0 +1,154 @@
+"""What a tracker is: it turns the reference of one 50 Hz tick into 29 joint targets for every world at once.
+
+Torch is imported only by the trackers themselves, so that listing their names stays quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arena_newton.errors import InputError
+from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE, DriveGains, PhysicsRate
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["ENTRY_POINT_GROUP", "RobotState", "Tracker", "TrackerCommand", "get", "names", "register"]
+
+ENTRY_POINT_GROUP = "arena_newton.trackers"
+"""Other packages offer trackers under this entry point group: a callable that takes `checkpoint: Path | None`."""
+
+_BUILT_IN = {
+    "pd": "arena_newton.trackers.pd:from_checkpoint",
+    "twist2": "arena_newton.trackers.twist2:from_checkpoint",
+}
+_registered: dict[str, Callable[[Path | None], Tracker]] = {}
+
+
+@dataclass
+class TrackerCommand:
+    """The reference of this tick, for all worlds (torch views of Warp arrays)."""
+
+    mimic: torch.Tensor
+    """TWIST2's 35-number command: v_x, v_y [m/s, reference root frame], z [m], roll, pitch [rad], yaw rate [rad/s],
+    29 joints in MuJoCo order [rad]; shape [worlds, 35]."""
+    joints: torch.Tensor
+    """Reference joint positions [rad], MuJoCo order, shape [worlds, 29]."""
+    quat: torch.Tensor | None = None
+    """Reference root orientation in the world, wxyz, shape [worlds, 4]."""
+    joint_vel: torch.Tensor | None = None
+    """Reference joint velocities [rad/s], MuJoCo order, shape [worlds, 29]."""
+
+
+@dataclass
+class RobotState:
+    """What the robot measures, for all worlds (torch views of Warp arrays)."""
+
+    quat: torch.Tensor
+    """Root orientation in the world, wxyz, shape [worlds, 4]."""
+    ang_vel_body: torch.Tensor
+    """Root angular velocity in the body frame [rad/s], shape [worlds, 3]."""
+    joint_pos: torch.Tensor
+    """Joint positions [rad], MuJoCo order, shape [worlds, 29]."""
+    joint_vel: torch.Tensor
+    """Joint velocities [rad/s], MuJoCo order, shape [worlds, 29]."""
+
+
+class Tracker:
+    """Base of all trackers; a subclass sets the attributes and writes `step`."""
+
+    name: str = "tracker"
+    """Name in reports and on the command line."""
+    checkpoint: str | None = None
+    """File the weights came from."""
+    checkpoint_hash: str = "none"
+    """First 12 hexadecimal digits of the checkpoint's SHA-256."""
+    joints: tuple[str, ...] = MUJOCO_JOINTS
+    """Order of the joint targets."""
+    drive: DriveGains = TWIST2_DRIVE
+    """PD drive that executes the targets."""
+    physics_rate: PhysicsRate = PhysicsRate(dt=0.005, substeps=4)
+    """Physics rate the tracker was made for."""
+    fast_physics_rate: PhysicsRate = PhysicsRate(dt=0.005, substeps=4)
+    """Physics rate under `--fast-physics`."""
+    ignores: tuple[str, ...] = ()
+    """Parts of the 40-number action that cannot reach the robot through this tracker."""
+    worlds: int = 0
+    """Worlds this tracker is bound to."""
+
+    def rate(self, *, fast: bool = False) -> PhysicsRate:
+        """Physics step and substeps a tick."""
+        return self.fast_physics_rate if fast else self.physics_rate
+
+    def bind(self, worlds: int, device: Any = "cpu", scene: Any = None) -> None:
+        """Allocate buffers for `worlds` worlds on a torch device; `scene` is for trackers that need the model."""
+        self.worlds = worlds
+        self.device = device
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Forget the past of the worlds in `mask` (all without one); shape [worlds], bool."""
+
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """Pretend that the worlds in `mask` have held this command and state for a while."""
+
+    def step(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; valid until the next call."""
+        raise TypeError(f"tracker {self.name!r} defines no step()")
+
+    def describe(self) -> dict[str, Any]:
+        """What a result must record to name this tracker exactly."""
+        return {
+            "name": self.name,
+            "checkpoint_hash": self.checkpoint_hash,
+            "drive": self.drive.name,
+            "physics_dt": self.physics_rate.dt,
+            "substeps": self.physics_rate.substeps,
+            "ignores": list(self.ignores),
+        }
+
+
+def register(name: str, factory: Callable[[Path | None], Tracker]) -> None:
+    """Offer a tracker under `name` in this process; `factory` takes the checkpoint's path or None."""
+    _registered[name] = factory
+
+
+def _entry_points() -> dict[str, importlib.metadata.EntryPoint]:
+    return {e.name: e for e in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)}
+
+
+def names() -> tuple[str, ...]:
+    """Names of all trackers that `get` knows, sorted."""
+    return tuple(sorted({*_BUILT_IN, *_registered, *_entry_points()}))
+
+
+def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
+    """Make a tracker by name.
+
+    Args:
+        spec: Name of a built-in, registered or entry-point tracker.
+        checkpoint: Weights file (`--checkpoint`), for trackers that need one.
+
+    Raises:
+        InputError: Unknown name, or a checkpoint that is absent or unfit.
+    """
+    path = None if checkpoint is None else Path(checkpoint)
+    if spec not in names():
+        raise InputError(f"--tracker {spec}: unknown tracker; known are {', '.join(names())}")
+    if path is not None and not path.is_file():
+        raise InputError(f"--checkpoint {path}: no such file")
+    if spec in _registered:
+        return _registered[spec](path)
+    if spec in _BUILT_IN:
+        module, _, attribute = _BUILT_IN[spec].partition(":")
+        return getattr(importlib.import_module(module), attribute)(path)
+    try:
+        factory = _entry_points()[spec].load()
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"--tracker {spec}: its package does not load ({type(error).__name__}: {reason})") from error
+    return factory(path)

@@ -1,0 +1,429 @@
+"""A small feed-forward ONNX network as a torch module: weights and structure are read from the file.
+
+The graph is evaluated once, node by node, on a probe batch. That fixes every shape, so the shape arithmetic that exporters
+leave in the graph disappears; what remains becomes a short list of torch modules in which common groups are one call
+(`x * sigmoid(x)`, layer normalisation, a convolution as one matrix product). A second batch of another size checks the
+short list against the node-by-node evaluation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.nn import functional
+
+from arena_newton.errors import InputError
+
+__all__ = ["OnnxNetwork", "load"]
+
+_PROBE_ROWS = 7
+"""Rows of the probe batch; a prime, so that a reshaped first dimension shows how it depends on the batch."""
+_CHECK_ROWS = 5
+_CHECK_TOLERANCE = 1e-4
+"""Largest allowed difference of the short list from the node-by-node evaluation, relative to the largest output."""
+_CONV_MATRIX_LIMIT = 1_000_000
+"""Largest matrix [numbers] that replaces a convolution."""
+_PACK_ROWS = 8
+"""Rows that the packed weight layout is chosen for."""
+
+_UNARY: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "Sigmoid": torch.sigmoid,
+    "Tanh": torch.tanh,
+    "Relu": torch.relu,
+    "Sqrt": torch.sqrt,
+    "Exp": torch.exp,
+    "Neg": torch.neg,
+    "Abs": torch.abs,
+    "Softplus": functional.softplus,
+    "Erf": torch.erf,
+}
+_BINARY: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
+    "Add": torch.add,
+    "Sub": torch.sub,
+    "Mul": torch.mul,
+    "Div": torch.div,
+    "Pow": torch.pow,
+    "MatMul": torch.matmul,
+}
+_SAME = frozenset({"Identity", "Dropout", "Cast", "Clip"})
+
+
+class _Unfit(Exception):
+    """The graph holds something that this reader does not know."""
+
+
+class _Linear(torch.nn.Module):
+    """A matrix product whose weights are packed for the processor (about twice as fast on a CPU for few rows)."""
+
+    def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None):
+        super().__init__()
+        self.register_buffer("weight", weight.contiguous())
+        self.register_buffer("bias", bias)
+        self._packed: torch.Tensor | None = None
+        self._product: Callable | None = None
+        if weight.device.type == "cpu" and torch.backends.mkldnn.is_available():
+            try:
+                self._packed = torch.ops.mkldnn._reorder_linear_weight(self.weight, _PACK_ROWS)
+                self._product = torch.ops.mkldnn._linear_pointwise
+                probe = torch.linspace(-1.0, 1.0, 2 * weight.shape[1]).reshape(2, -1)
+                torch.testing.assert_close(self(probe), functional.linear(probe, self.weight, bias), rtol=1e-3, atol=1e-3)
+            except (AttributeError, RuntimeError, NotImplementedError, AssertionError):
+                self._packed = None  # this build of torch packs differently: the plain product serves
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self._packed is not None and x.device.type == "cpu":
+            return self._product(x, self._packed, self.bias, "none", [], "")
+        return functional.linear(x, self.weight, self.bias)
+
+
+class _Convolution(torch.nn.Module):
+    """A convolution on a fixed length as one matrix product."""
+
+    def __init__(self, matrix: torch.Tensor, bias: torch.Tensor | None, shape: tuple[int, ...]):
+        super().__init__()
+        self.linear = _Linear(matrix.t(), bias)
+        self.shape = shape
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.linear(x.flatten(1)).reshape(-1, *self.shape)
+
+
+class _Call(torch.nn.Module):
+    """A function with its constant arguments in place."""
+
+    def __init__(self, function: Callable[..., torch.Tensor], constants: dict[int, torch.Tensor] | None = None):
+        super().__init__()
+        self.function = function
+        self.places = tuple(sorted(constants or {}))
+        for place in self.places:
+            self.register_buffer(f"constant_{place}", constants[place])
+
+    def forward(self, *dynamic: torch.Tensor) -> torch.Tensor:
+        if not self.places:
+            return self.function(*dynamic)
+        arguments = list(dynamic)
+        for place in self.places:
+            arguments.insert(place, getattr(self, f"constant_{place}"))
+        return self.function(*arguments)
+
+
+class OnnxNetwork(torch.nn.Module):
+    """The converted graph: maps [rows, in_width] to [rows, out_width], float32."""
+
+    def __init__(self, graph: _Graph):
+        """Compile a graph; see `load`."""
+        super().__init__()
+        self.in_width: int = graph.in_width
+        self.out_width: int = 0
+        self.sha256: str = ""
+        self.layers = torch.nn.ModuleList([module for module, _, _ in graph.steps])
+        self._route = [(inputs, output) for _, inputs, output in graph.steps]
+        self._input, self._output = graph.input, graph.output
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Outputs of all rows, shape [rows, out_width]."""
+        values = {self._input: x}
+        for layer, (inputs, output) in zip(self.layers, self._route, strict=True):
+            values[output] = layer(*[values[name] for name in inputs])
+        return values[self._output]
+
+
+class _Graph:
+    """One ONNX graph with its probe values, and the list of modules made from it."""
+
+    def __init__(self, model: Any):
+        import onnx
+
+        graph = model.graph
+        constants = {i.name: onnx.numpy_helper.to_array(i) for i in graph.initializer}
+        self.constants = {name: torch.from_numpy(value.copy()) for name, value in constants.items()}
+        inputs = [i for i in graph.input if i.name not in self.constants]
+        if len(inputs) != 1 or len(graph.output) != 1:
+            raise _Unfit(f"it has {len(inputs)} inputs and {len(graph.output)} outputs, expected one of each")
+        dims = inputs[0].type.tensor_type.shape.dim
+        if len(dims) != 2 or dims[1].dim_value < 1:
+            raise _Unfit("its input is not of shape [rows, width]")
+        self.input, self.output, self.in_width = inputs[0].name, graph.output[0].name, dims[1].dim_value
+        self.nodes = [(n.op_type, list(n.input), list(n.output), _attributes(n)) for n in graph.node]
+        self.producer = {out: node for node in self.nodes for out in node[2]}
+        self.probe: dict[str, torch.Tensor] = {}
+        self.dynamic: set[str] = set()
+        self.evaluate(_probe(_PROBE_ROWS, self.in_width), self.probe, self.dynamic)
+        self.steps = self._live(self._compile())
+
+    def evaluate(self, x: torch.Tensor, values: dict[str, torch.Tensor], dynamic: set[str] | None = None) -> torch.Tensor:
+        """The output node by node; `values` receives every intermediate, `dynamic` the names that depend on `x`."""
+        dynamic = set() if dynamic is None else dynamic
+        values.update(self.constants)
+        values[self.input] = x
+        dynamic.add(self.input)
+        for op, inputs, outputs, attributes in self.nodes:
+            arguments = [values[name] if name else None for name in inputs]
+            values[outputs[0]] = _evaluate(op, arguments, attributes)
+            if op != "Shape" and dynamic.intersection(inputs):
+                dynamic.add(outputs[0])
+        return values[self.output]
+
+    def _compile(self) -> list[tuple[torch.nn.Module, tuple[str, ...], str]]:
+        steps: list[tuple[torch.nn.Module, tuple[str, ...], str]] = []
+        same: dict[str, str] = {}
+        for op, inputs, outputs, attributes in self.nodes:
+            output = outputs[0]
+            if output not in self.dynamic:
+                continue
+            inputs = [same.get(name, name) for name in inputs]
+            if op in _SAME and torch.equal(self.probe[inputs[0]], self.probe[output]) and self._is_same(op, inputs, attributes):
+                same[output] = inputs[0]
+                continue
+            steps.append(self._module(op, inputs, output, attributes))
+        if self.output in same:
+            steps.append((_Call(torch.clone), (same[self.output],), self.output))
+        return steps
+
+    def _is_same(self, op: str, inputs: list[str], attributes: dict[str, Any]) -> bool:
+        if op != "Clip":
+            return True
+        bounds = [float(self.probe[name]) for name in inputs[1:] if name]
+        bounds += [float(attributes[k]) for k in ("min", "max") if k in attributes]
+        return all(math.isinf(b) for b in bounds)
+
+    def _module(self, op, inputs, output, attributes) -> tuple[torch.nn.Module, tuple[str, ...], str]:
+        fused = self._silu(op, inputs) or self._layer_norm(op, inputs)
+        if fused is not None:
+            return (*fused, output)
+        dynamic = tuple(name for name in inputs if name in self.dynamic)
+        static = {i: self.probe[name] for i, name in enumerate(inputs) if name and name not in self.dynamic}
+        shape = tuple(self.probe[output].shape)
+        module: torch.nn.Module
+        if op == "Gemm" and len(dynamic) == 1 and inputs[0] in self.dynamic and not attributes.get("transA", 0):
+            weight = static[1] if attributes.get("transB", 0) else static[1].t()
+            bias = static[2] * attributes.get("beta", 1.0) if 2 in static else None
+            module = _Linear(weight * attributes.get("alpha", 1.0), bias)
+        elif op == "MatMul" and 1 in static and static[1].dim() == 2:
+            module = _Linear(static[1].t(), None)
+        elif op == "Conv" and len(dynamic) == 1 and inputs[0] in self.dynamic:
+            module = self._convolution(inputs, static, attributes, shape)
+        elif op in ("Reshape", "Flatten") or (op in ("Squeeze", "Unsqueeze") and shape[0] == _PROBE_ROWS):
+            module, dynamic = _Call(lambda x, rest=shape[1:]: x.reshape(-1, *rest)), dynamic[:1]
+        elif op == "Slice":
+            slices = _slices(self.probe[inputs[0]].shape, static)
+            module, dynamic = _Call(lambda x, s=slices: x[s]), dynamic[:1]
+        elif op in _UNARY:
+            module = _Call(_UNARY[op])
+        elif op in _BINARY:
+            module = _Call(_BINARY[op], static)
+        elif op == "Concat" and not static:
+            module = _Call(lambda *x, axis=attributes["axis"]: torch.cat(x, axis))
+        elif op == "Transpose":
+            module = _Call(lambda x, perm=tuple(attributes["perm"]): x.permute(perm))
+        else:
+            module = _Call(lambda *x, o=op, a=attributes: _evaluate(o, list(x), a), static)
+        return module, dynamic, output
+
+    def _silu(self, op: str, inputs: list[str]) -> tuple[torch.nn.Module, tuple[str, ...]] | None:
+        if op != "Mul":
+            return None
+        for x, gate in (inputs, inputs[::-1]):
+            node = self.producer.get(gate)
+            if node and node[0] == "Sigmoid" and node[1][0] == x:
+                return torch.nn.SiLU(), (x,)
+        return None
+
+    def _layer_norm(self, op: str, inputs: list[str]) -> tuple[torch.nn.Module, tuple[str, ...]] | None:
+        """Match (x - mean) / sqrt(mean((x - mean)**2) + eps) * weight + bias backwards from its last addition."""
+
+        def made_by(name: str, kind: str) -> list[str] | None:
+            node = self.producer.get(name)
+            return node[1] if node and node[0] == kind else None
+
+        if op != "Add" or inputs[1] in self.dynamic or not (scaled := made_by(inputs[0], "Mul")):
+            return None
+        if scaled[1] in self.dynamic or not (normed := made_by(scaled[0], "Div")):
+            return None
+        centred, root = normed
+        if not (difference := made_by(centred, "Sub")) or not (summed := made_by(root, "Sqrt")):
+            return None
+        if not (variance := made_by(summed[0], "Add")) or variance[1] in self.dynamic:
+            return None
+        if not (square := made_by(variance[0], "ReduceMean")) or not (power := made_by(square[0], "Pow")):
+            return None
+        mean = made_by(difference[1], "ReduceMean")
+        if not mean or mean[0] != difference[0] or power[0] != centred or float(self.probe[power[1]]) != 2.0:
+            return None
+        axes = [_axes(self.producer[name], self.probe) for name in (variance[0], difference[1])]
+        x, weight, bias = difference[0], self.probe[scaled[1]], self.probe[inputs[1]]
+        rank, width = self.probe[x].dim(), self.probe[x].shape[-1]
+        if any(a not in ([-1], [rank - 1]) for a in axes) or weight.shape != (width,) or bias.shape != (width,):
+            return None
+        epsilon = float(self.probe[variance[1]])
+        return _Call(lambda v, w, b: functional.layer_norm(v, w.shape, w, b, epsilon), {1: weight, 2: bias}), (x,)
+
+    def _convolution(self, inputs, static, attributes, shape) -> torch.nn.Module:
+        in_shape = tuple(self.probe[inputs[0]].shape)[1:]
+        size = math.prod(in_shape)
+        if size * math.prod(shape[1:]) > _CONV_MATRIX_LIMIT:
+            return _Call(lambda *x: _evaluate("Conv", list(x), attributes), static)
+        basis = torch.eye(size).reshape(size, *in_shape)
+        matrix = _evaluate("Conv", [basis, static[1], None], attributes).flatten(1)
+        bias = static[2].repeat_interleave(math.prod(shape[2:])) if 2 in static else None
+        return _Convolution(matrix, bias, shape[1:])
+
+    def _live(self, steps):
+        needed, live = {self.output}, []
+        for step in reversed(steps):
+            if step[2] in needed:
+                needed.update(step[1])
+                live.append(step)
+        return live[::-1]
+
+
+def _probe(rows: int, width: int) -> torch.Tensor:
+    return torch.randn(rows, width, generator=torch.Generator().manual_seed(rows))
+
+
+def _attributes(node: Any) -> dict[str, Any]:
+    import onnx
+
+    values = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+    if "value" in values:
+        values["value"] = torch.from_numpy(onnx.numpy_helper.to_array(values["value"]).copy())
+    return values
+
+
+def _axes(node: tuple, values: dict[str, torch.Tensor]) -> list[int]:
+    _, inputs, _, attributes = node
+    if "axes" in attributes:
+        return list(attributes["axes"])
+    return values[inputs[1]].flatten().tolist() if len(inputs) > 1 and inputs[1] else []
+
+
+def _slices(shape: torch.Size, static: dict[int, torch.Tensor]) -> tuple[slice, ...]:
+    starts, ends = static[1].tolist(), static[2].tolist()
+    axes = static[3].tolist() if 3 in static else range(len(starts))
+    steps = static[4].tolist() if 4 in static else [1] * len(starts)
+    slices = [slice(None)] * len(shape)
+    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
+        if step < 1:
+            raise _Unfit("a Slice runs backwards")
+        slices[axis] = slice(start, min(end, 2**62), step)
+    return tuple(slices)
+
+
+def _evaluate(op: str, x: list[torch.Tensor | None], attributes: dict[str, Any]) -> torch.Tensor:
+    """One ONNX operator in torch (operator set 11 and later)."""
+    if op in _UNARY:
+        return _UNARY[op](x[0])
+    if op in _BINARY:
+        return _BINARY[op](x[0], x[1])
+    match op:
+        case "Constant" if "value" in attributes:
+            return attributes["value"]
+        case "Identity" | "Dropout":
+            return x[0]
+        case "Cast" if attributes["to"] in (1, 7):
+            return x[0].to(torch.float32 if attributes["to"] == 1 else torch.int64)
+        case "Gemm":
+            a = x[0].t() if attributes.get("transA", 0) else x[0]
+            b = x[1].t() if attributes.get("transB", 0) else x[1]
+            product = attributes.get("alpha", 1.0) * (a @ b)
+            return product + attributes.get("beta", 1.0) * x[2] if len(x) > 2 and x[2] is not None else product
+        case "Elu":
+            return functional.elu(x[0], attributes.get("alpha", 1.0))
+        case "LeakyRelu":
+            return functional.leaky_relu(x[0], attributes.get("alpha", 0.01))
+        case "Softmax":
+            return torch.softmax(x[0], attributes.get("axis", -1))
+        case "Clip":
+            low, high = (x[i] if len(x) > i else attributes.get(k) for i, k in ((1, "min"), (2, "max")))
+            return x[0] if low is None and high is None else torch.clamp(x[0], low, high)
+        case "Concat":
+            return torch.cat(x, attributes["axis"])
+        case "Transpose":
+            return x[0].permute(tuple(attributes["perm"]))
+        case "Flatten" if attributes.get("axis", 1) == 1:
+            return x[0].flatten(1)
+        case "Shape":
+            return torch.tensor(x[0].shape)
+        case "Gather":
+            axis = attributes.get("axis", 0)
+            index = x[1].flatten().long()
+            shape = (*x[0].shape[:axis], *x[1].shape, *x[0].shape[axis + 1 :])
+            return x[0].index_select(axis, torch.where(index < 0, index + x[0].shape[axis], index)).reshape(shape)
+        case "Unsqueeze" | "Squeeze":
+            axes = attributes["axes"] if "axes" in attributes else x[1].tolist()
+            value = x[0]
+            for axis in sorted(axes, reverse=op == "Squeeze"):
+                value = value.unsqueeze(axis) if op == "Unsqueeze" else value.squeeze(axis)
+            return value
+        case "Reshape":
+            target = [x[0].shape[i] if n == 0 else n for i, n in enumerate(x[1].tolist())]
+            return x[0].reshape(target)
+        case "Slice" if len(x) >= 3:
+            return x[0][_slices(x[0].shape, {i: v for i, v in enumerate(x) if i and v is not None})]
+        case "ReduceMean":
+            axes = attributes["axes"] if "axes" in attributes else x[1].tolist()
+            return x[0].mean(dim=tuple(axes), keepdim=bool(attributes.get("keepdims", 1)))
+        case "LayerNormalization" if attributes.get("axis", -1) in (-1, x[0].dim() - 1):
+            bias = x[2] if len(x) > 2 else None
+            return functional.layer_norm(x[0], x[1].shape, x[1], bias, attributes.get("epsilon", 1e-5))
+        case "Conv" if x[0].dim() == 3:
+            before, after = attributes.get("pads", [0, 0])
+            stride, dilation = attributes.get("strides", [1]), attributes.get("dilations", [1])
+            bias = x[2] if len(x) > 2 else None
+            padded = functional.pad(x[0], (before, after))
+            return functional.conv1d(padded, x[1], bias, stride, 0, dilation, attributes.get("group", 1))
+    raise _Unfit(f"operator {op} with these arguments is not supported")
+
+
+@torch.inference_mode()
+def load(path: str | Path, *, in_width: int, out_width: int, flag: str = "--checkpoint") -> OnnxNetwork:
+    """Read a feed-forward network from an ONNX file.
+
+    Args:
+        path: The file.
+        in_width: Observation width that the caller needs.
+        out_width: Output width that the caller needs.
+        flag: Command-line flag that errors name.
+
+    Raises:
+        InputError: The file is absent, is no ONNX network, holds an unknown operator, or has other widths.
+    """
+    import onnx
+
+    where = f"{flag} {path}"
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+    try:
+        model = onnx.load_model_from_string(data)
+        if not model.graph.output:
+            raise _Unfit("it holds no graph")
+        if any(i.data_location == onnx.TensorProto.EXTERNAL for i in model.graph.initializer):
+            raise _Unfit("its weights lie in another file")
+        width = [d.dim_value for i in model.graph.input for d in i.type.tensor_type.shape.dim][-1:]
+        if width and width[0] not in (0, in_width):
+            raise InputError(f"{where}: the network takes {width[0]} numbers, expected {in_width}")
+        graph = _Graph(model)
+        network = OnnxNetwork(graph).eval()
+        x = _probe(_CHECK_ROWS, graph.in_width)
+        got, expected = network(x), graph.evaluate(x, {})
+        network.out_width = expected.shape[-1]
+        if expected.shape != (_CHECK_ROWS, out_width):
+            raise InputError(f"{where}: the network gives {expected.shape[-1]} numbers, expected {out_width}")
+        if not (got - expected).abs().max() <= _CHECK_TOLERANCE * (1.0 + expected.abs().max()):
+            raise _Unfit("its result depends on the batch size or is not finite")
+    except InputError:
+        raise
+    except _Unfit as error:
+        raise InputError(f"{where}: not a network that this reader can use: {error}") from error
+    except Exception as error:  # a damaged file fails anywhere inside protobuf, numpy or torch
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(f"{where}: not a usable ONNX file ({type(error).__name__}: {reason})") from error
+    network.sha256 = hashlib.sha256(data).hexdigest()
+    return network

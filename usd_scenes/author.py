@@ -1,0 +1,292 @@
+"""Small authoring vocabulary for the scene builders: bodies, geoms, materials, markers and cameras in USD.
+
+Lengths [m], masses [kg], quaternions wxyz. Every function returns the prim it wrote.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
+
+__all__ = [
+    "anchor",
+    "attribute",
+    "bind",
+    "bind_physics",
+    "box",
+    "camera",
+    "capsule",
+    "cylinder",
+    "distant_light",
+    "dome_light",
+    "fixture",
+    "marker",
+    "material",
+    "mesh",
+    "new_stage",
+    "physics_material",
+    "quad",
+    "rigid_body",
+    "sphere",
+    "xform",
+]
+
+Vec = Sequence[float]
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def new_stage(path: Path, default_prim: str = "/World", *, gravity: float = 9.81, scene: bool = True) -> Usd.Stage:
+    """Start a layer at `path` with metres, kilograms and z up, and a physics scene under the default prim."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    layer = Sdf.Layer.FindOrOpen(str(path)) if path.exists() else None
+    if layer is not None:
+        layer.Clear()
+    stage = Usd.Stage.Open(layer) if layer is not None else Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, default_prim)
+    stage.SetDefaultPrim(root.GetPrim())
+    if scene:
+        physics = UsdPhysics.Scene.Define(stage, f"{default_prim}/physicsScene")
+        physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
+        physics.CreateGravityMagnitudeAttr(gravity)
+    return stage
+
+
+def attribute(prim: Usd.Prim, name: str, value, kind: Sdf.ValueTypeName) -> Usd.Attribute:
+    """Author a custom attribute such as `mjc:solref`."""
+    attr = prim.CreateAttribute(name, kind)
+    attr.Set(value)
+    return attr
+
+
+def _pose(prim: Usd.Prim, position: Vec, quat: Vec, scale: Vec | None = None) -> Usd.Prim:
+    x = UsdGeom.Xformable(prim)
+    x.ClearXformOpOrder()
+    x.AddTranslateOp().Set(Gf.Vec3d(*map(float, position)))
+    if tuple(quat) != IDENTITY:
+        x.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*map(float, quat)))
+    if scale is not None:
+        x.AddScaleOp().Set(Gf.Vec3f(*map(float, scale)))
+    return prim
+
+
+def xform(stage: Usd.Stage, path: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+    """A plain frame."""
+    return _pose(UsdGeom.Xform.Define(stage, path).GetPrim(), position, quat)
+
+
+def rigid_body(
+    stage: Usd.Stage,
+    path: str,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    *,
+    mass: float,
+    inertia: Vec,
+    com: Vec = (0, 0, 0),
+    principal: Vec = IDENTITY,
+) -> Usd.Prim:
+    """A body with its mass [kg], diagonal inertia [kg·m²], centre of mass [m] and principal axes all authored."""
+    prim = xform(stage, path, position, quat)
+    UsdPhysics.RigidBodyAPI.Apply(prim)
+    api = UsdPhysics.MassAPI.Apply(prim)
+    api.CreateMassAttr(float(mass))
+    api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, com)))
+    api.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, inertia)))
+    api.CreatePrincipalAxesAttr(Gf.Quatf(*map(float, principal)))
+    return prim
+
+
+def anchor(stage: Usd.Stage, path: str, body: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+    """A fixed joint from the world to `body`."""
+    joint = UsdPhysics.FixedJoint.Define(stage, path)
+    joint.CreateBody1Rel().SetTargets([body])
+    joint.CreateLocalPos0Attr(Gf.Vec3f(*map(float, position)))
+    joint.CreateLocalRot0Attr(Gf.Quatf(*map(float, quat)))
+    joint.CreateLocalPos1Attr(Gf.Vec3f(0, 0, 0))
+    joint.CreateLocalRot1Attr(Gf.Quatf(1, 0, 0, 0))
+    return joint.GetPrim()
+
+
+def fixture(stage: Usd.Stage, path: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+    """An immovable body that is posed once an episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
+    root = xform(stage, path)
+    UsdPhysics.ArticulationRootAPI.Apply(root)
+    frame = rigid_body(stage, f"{path}/Frame", position, quat, mass=1.0, inertia=(0.1, 0.1, 0.1))
+    anchor(stage, f"{path}/anchor", f"{path}/Frame", position, quat)
+    return frame
+
+
+def _finish(prim: Usd.Prim, collide: bool, visual: bool, look: Usd.Prim | None, surface: Usd.Prim | None) -> Usd.Prim:
+    if collide:
+        UsdPhysics.CollisionAPI.Apply(prim)
+    if not visual:
+        UsdGeom.Imageable(prim).CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+    if look is not None:
+        bind(prim, look)
+    if surface is not None:
+        bind_physics(prim, surface)
+    return prim
+
+
+def box(
+    stage: Usd.Stage,
+    path: str,
+    half: Vec,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    *,
+    collide: bool = True,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
+    """A box with half sizes `half` [m]."""
+    geom = UsdGeom.Cube.Define(stage, path)
+    geom.CreateSizeAttr(2.0)
+    _pose(geom.GetPrim(), position, quat, half)
+    return _finish(geom.GetPrim(), collide, visual, look, surface)
+
+
+def sphere(stage, path, radius: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, *, collide=True, visual=True, look=None, surface=None):
+    """A sphere of `radius` [m]."""
+    geom = UsdGeom.Sphere.Define(stage, path)
+    geom.CreateRadiusAttr(float(radius))
+    _pose(geom.GetPrim(), position, quat)
+    return _finish(geom.GetPrim(), collide, visual, look, surface)
+
+
+def capsule(stage, path, radius: float, length: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, axis="Z", *, collide=True, visual=True, look=None, surface=None):
+    """A capsule of `radius` [m] and cylinder `length` [m] (caps come on top) along local `axis`."""
+    geom = UsdGeom.Capsule.Define(stage, path)
+    geom.CreateRadiusAttr(float(radius))
+    geom.CreateHeightAttr(float(length))
+    geom.CreateAxisAttr(axis)
+    _pose(geom.GetPrim(), position, quat)
+    return _finish(geom.GetPrim(), collide, visual, look, surface)
+
+
+def cylinder(stage, path, radius: float, length: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, axis="Z", *, collide=True, visual=True, look=None, surface=None):
+    """A cylinder of `radius` [m] and `length` [m] along local `axis`."""
+    geom = UsdGeom.Cylinder.Define(stage, path)
+    geom.CreateRadiusAttr(float(radius))
+    geom.CreateHeightAttr(float(length))
+    geom.CreateAxisAttr(axis)
+    _pose(geom.GetPrim(), position, quat)
+    return _finish(geom.GetPrim(), collide, visual, look, surface)
+
+
+def mesh(stage, path, points, faces, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, *, uv=None, collide=False, visual=True, look=None, surface=None):
+    """A triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
+    geom = UsdGeom.Mesh.Define(stage, path)
+    faces = np.asarray(faces, dtype=np.int32)
+    geom.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(points, dtype=np.float32)))
+    geom.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, dtype=np.int32)))
+    geom.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
+    geom.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    if uv is not None:
+        primvar = UsdGeom.PrimvarsAPI(geom).CreatePrimvar(
+            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+        )
+        primvar.Set(Vt.Vec2fArray.FromNumpy(np.asarray(uv, dtype=np.float32)))
+    _pose(geom.GetPrim(), position, quat)
+    if collide:
+        UsdPhysics.MeshCollisionAPI.Apply(geom.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
+    return _finish(geom.GetPrim(), collide, visual, look, surface)
+
+
+def quad(stage, path, half_x: float, half_y: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, *, repeat: Vec = (1, 1), look=None):
+    """A visual rectangle in the local xy plane facing +z, its texture repeated `repeat` times."""
+    points = [(-half_x, -half_y, 0), (half_x, -half_y, 0), (half_x, half_y, 0), (-half_x, half_y, 0)]
+    uv = [(0, 0), (repeat[0], 0), (repeat[0], repeat[1]), (0, repeat[1])]
+    return mesh(stage, path, points, [(0, 1, 2), (0, 2, 3)], position, quat, uv=uv, look=look)
+
+
+def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+    """A named oriented box (full extents `size` [m]) that rules read; never drawn, never touched."""
+    prim = xform(stage, path, position, quat)
+    attribute(prim, "arena:size", Gf.Vec3f(*map(float, size)), Sdf.ValueTypeNames.Float3)
+    return prim
+
+
+def material(stage, path, color: Vec = (0.8, 0.8, 0.8), *, roughness=0.8, metallic=0.0, texture: str | None = None) -> Usd.Prim:
+    """A UsdPreviewSurface look; `texture` is an asset path relative to the layer and replaces the colour."""
+    look = UsdShade.Material.Define(stage, path)
+    shader = UsdShade.Shader.Define(stage, f"{path}/Surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(float(roughness))
+    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(float(metallic))
+    diffuse = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    diffuse.Set(Gf.Vec3f(*map(float, color)))
+    if texture is not None:
+        image = UsdShade.Shader.Define(stage, f"{path}/Texture")
+        image.CreateIdAttr("UsdUVTexture")
+        image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(texture))
+        image.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("repeat")
+        image.CreateInput("wrapT", Sdf.ValueTypeNames.Token).Set("repeat")
+        reader = UsdShade.Shader.Define(stage, f"{path}/St")
+        reader.CreateIdAttr("UsdPrimvarReader_float2")
+        reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+        reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+        image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+        image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        diffuse.ConnectToSource(image.ConnectableAPI(), "rgb")
+    shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+    look.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    return look.GetPrim()
+
+
+def bind(prim: Usd.Prim, look: Usd.Prim) -> Usd.Prim:
+    """Bind a look to a prim."""
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(UsdShade.Material(look))
+    return prim
+
+
+def physics_material(stage, path, *, static: float = 1.0, dynamic: float = 1.0, restitution: float = 0.0) -> Usd.Prim:
+    """A physics material (friction coefficients, restitution)."""
+    prim = UsdShade.Material.Define(stage, path).GetPrim()
+    api = UsdPhysics.MaterialAPI.Apply(prim)
+    api.CreateStaticFrictionAttr(float(static))
+    api.CreateDynamicFrictionAttr(float(dynamic))
+    api.CreateRestitutionAttr(float(restitution))
+    return prim
+
+
+def bind_physics(prim: Usd.Prim, surface: Usd.Prim) -> Usd.Prim:
+    """Bind a physics material to a collision geom."""
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(
+        UsdShade.Material(surface), UsdShade.Tokens.weakerThanDescendants, "physics"
+    )
+    return prim
+
+
+def camera(stage, path, position: Vec, quat: Vec, *, focal: float, aperture: float, size: Vec = (640, 480)) -> Usd.Prim:
+    """A pinhole camera looking along local −z with +y up; `focal` and horizontal `aperture` share a unit."""
+    cam = UsdGeom.Camera.Define(stage, path)
+    cam.CreateFocalLengthAttr(float(focal))
+    cam.CreateHorizontalApertureAttr(float(aperture))
+    cam.CreateVerticalApertureAttr(float(aperture) * size[1] / size[0])
+    cam.CreateClippingRangeAttr(Gf.Vec2f(0.1, 1.0e5))
+    prim = _pose(cam.GetPrim(), position, quat)
+    attribute(prim, "arena:resolution", Gf.Vec2i(int(size[0]), int(size[1])), Sdf.ValueTypeNames.Int2)
+    return prim
+
+
+def dome_light(stage, path="/World/Light", *, intensity: float = 3000.0, color: Vec = (0.75, 0.75, 0.75)) -> Usd.Prim:
+    """A uniform dome."""
+    light = UsdLux.DomeLight.Define(stage, path)
+    light.CreateIntensityAttr(float(intensity))
+    light.CreateColorAttr(Gf.Vec3f(*map(float, color)))
+    return light.GetPrim()
+
+
+def distant_light(stage, path="/World/Light", *, intensity=5000.0, color: Vec = (0.75, 0.75, 0.75), quat: Vec = IDENTITY) -> Usd.Prim:
+    """A distant light shining along its local −z."""
+    light = UsdLux.DistantLight.Define(stage, path)
+    light.CreateIntensityAttr(float(intensity))
+    light.CreateAngleAttr(15.0)
+    light.CreateColorAttr(Gf.Vec3f(*map(float, color)))
+    return _pose(light.GetPrim(), (-4, -1, 18), quat)

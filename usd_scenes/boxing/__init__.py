@@ -1,0 +1,1 @@
+"""Boxing: reach the green target at one of two bags."""

@@ -1,0 +1,1 @@
+"""The two-desk scene and its author."""

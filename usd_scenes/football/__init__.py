@@ -1,0 +1,1 @@
+"""The football scene and its author."""

@@ -1,0 +1,1 @@
+"""OpenDoor: press the lever, push the leaf, walk through."""

@@ -1,0 +1,1 @@
+"""The box-to-shelf scene and its author."""

@@ -1,0 +1,1 @@
+"""SitSofa: walk round the cartons and sit down."""

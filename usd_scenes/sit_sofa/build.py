@@ -1,0 +1,146 @@
+"""Author SitSofa: a living room with carpet, sofa, coffee table and two light cartons in the way.
+
+Sofa, table and carton sizes: spec of the original (measured on its clips). The seat is stiff (solref 0.02 s, friction 1):
+experts sit on it as well as on a soft one, and it is cheaper to simulate.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.usd_scenes import author, rooms, warehouse
+
+SOFA_X = (-4.34, -2.28)
+SOFA_Y = (-1.65, -0.83)
+SEAT_X = (-4.17, -2.38)
+SEAT_Y = (-1.30, -0.83)
+SEAT_Z = (0.30, 0.42)
+ARM_Z = 0.59
+BACK_Z = 0.85
+TABLE_X = (-3.87, -2.54)
+TABLE_Y = (-0.24, 0.48)
+TABLE_Z = 0.30
+CARTON_EDGE = 0.42
+CARTON_MASS = 0.05
+CARTONS = {"Carton_1": (-1.45, -0.68, 0.10), "Carton_2": (-1.35, 0.06, 0.10)}
+"""Poses before the first draw; a carton's origin is the centre of its underside, so z 0.1 m is a drop of 0.1 m."""
+
+
+def _span(x, y, z):
+    """Half sizes and centre of the box between the bounds."""
+    low, high = np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
+    return tuple((high - low) / 2), tuple((high + low) / 2)
+
+
+def _sofa(stage, rough) -> None:
+    path = "/World/Sofa"
+    author.xform(stage, path)
+    look = stage.GetPrimAtPath("/World/Looks/Sofa")
+    seat = author.box(stage, f"{path}/SeatCushion", *_span(SEAT_X, SEAT_Y, SEAT_Z), visual=False, surface=rough)
+    rooms.contact(seat, solref=(0.02, 1.0))
+    half, centre = _span(SEAT_X, SEAT_Y, SEAT_Z)
+    author.marker(stage, f"{path}/Seat", tuple(2 * h for h in half), centre)
+    solids = {
+        "Base": _span(SEAT_X, (SOFA_Y[0], SOFA_Y[1] - 0.03), (0.06, SEAT_Z[0])),
+        "Back": _span(SEAT_X, (SOFA_Y[0], SEAT_Y[0]), (SEAT_Z[0], BACK_Z)),
+        "ArmLeft": _span((SOFA_X[0], SEAT_X[0]), SOFA_Y, (0.06, ARM_Z)),
+        "ArmRight": _span((SEAT_X[1], SOFA_X[1]), SOFA_Y, (0.06, ARM_Z)),
+    }
+    for name, (h, c) in solids.items():
+        author.box(stage, f"{path}/{name}", h, c, visual=False, surface=rough)
+        if name.startswith("Arm"):
+            warehouse.rounded_box(stage, f"{path}/{name}Cover", h, c, radius=0.05, look=look)
+    warehouse.rounded_box(stage, f"{path}/BaseCover", *solids["Base"], radius=0.02, look=look)
+    warehouse.rounded_box(
+        stage,
+        f"{path}/BackCover",
+        *_span(SEAT_X, (SOFA_Y[0], SOFA_Y[0] + 0.16), (SEAT_Z[0], 0.80)),
+        radius=0.05,
+        look=look,
+    )
+    edges = np.linspace(*SEAT_X, 4)
+    for i in range(3):
+        x = (edges[i] + 0.004, edges[i + 1] - 0.004)
+        warehouse.rounded_box(stage, f"{path}/SeatCover_{i}", *_span(x, SEAT_Y, SEAT_Z), radius=0.04, look=look)
+        warehouse.rounded_box(
+            stage,
+            f"{path}/BackCover_{i}",
+            *_span(x, (SOFA_Y[0] + 0.15, SEAT_Y[0]), (SEAT_Z[1] - 0.04, BACK_Z)),
+            radius=0.07,
+            look=look,
+        )
+    feet = author.material(stage, "/World/Looks/Feet", (0.08, 0.07, 0.06))
+    parts = [((0.03, 0.03, 0.03), (x, y, 0.03)) for x in (-4.26, -2.36) for y in (-1.57, -0.91)]
+    warehouse.boxes(stage, f"{path}/Feet", parts, look=feet)
+
+
+def _table(stage, rough) -> None:
+    path = "/World/CoffeeTable"
+    author.xform(stage, path)
+    look = stage.GetPrimAtPath("/World/Looks/Table")
+    author.box(stage, f"{path}/Solid", *_span(TABLE_X, TABLE_Y, (0.0, TABLE_Z)), visual=False, surface=rough)
+    inner = ((TABLE_X[0] + 0.05, TABLE_X[1] - 0.05), (TABLE_Y[0] + 0.05, TABLE_Y[1] - 0.05))
+    parts = [
+        _span(TABLE_X, TABLE_Y, (TABLE_Z - 0.07, TABLE_Z)),
+        _span(*inner, (0.08, TABLE_Z - 0.07)),
+        _span(TABLE_X, TABLE_Y, (0.0, 0.08)),
+    ]
+    warehouse.boxes(stage, f"{path}/Body", parts, look=look)
+
+
+def _carton(stage, name: str, position, looks, rough) -> None:
+    path, half = f"/World/{name}", CARTON_EDGE / 2
+    # A thin-walled cube: 5/18 m a².
+    inertia = (5.0 / 18.0 * CARTON_MASS * CARTON_EDGE**2,) * 3
+    author.rigid_body(stage, path, position, mass=CARTON_MASS, inertia=inertia, com=(0, 0, half))
+    author.box(stage, f"{path}/Solid", (half,) * 3, (0, 0, half), visual=False, surface=rough)
+    warehouse.boxes(stage, f"{path}/Board", [((half,) * 3, (0, 0, half))], look=looks[0], tile=CARTON_EDGE)
+    tape = [((0.03, half + 0.001, half + 0.001), (0, 0, half))]
+    warehouse.boxes(stage, f"{path}/Tape", tape, look=looks[1])
+
+
+def build(folder: Path) -> None:
+    """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
+    r = float(np.sqrt(0.5))
+    stage = rooms.task_stage(
+        folder / "scene.usda",
+        spawn=(-1.6, 2.0, SPAWN_HEIGHT),
+        facing=(r, 0.0, 0.0, -r),
+        eye=(-5.00612, 1.22158, 2.27319),
+        gaze=(-0.43051, -0.25339, 0.43941, 0.74657),
+        variants=warehouse.VARIANTS,
+    )
+    rough = warehouse.surface(stage)
+    for variant in warehouse.semantics(stage):
+        base = variant == "base"
+        warehouse.room_looks(
+            stage,
+            floor="concrete" if base else "wood",
+            wall="wall" if base else "brick",
+            skirting=(0.9, 0.9, 0.88) if base else (0.25, 0.16, 0.10),
+        )
+        author.material(
+            stage, "/World/Looks/Carpet", (0.55, 0.55, 0.55) if base else (0.45, 0.12, 0.12),
+            texture="../textures/carpet.png" if base else None,
+        )  # fmt: skip
+        author.material(
+            stage, "/World/Looks/Sofa", (0.80, 0.79, 0.77) if base else (0.13, 0.22, 0.36),
+            texture="../textures/fabric.png" if base else None,
+        )  # fmt: skip
+        author.material(
+            stage, "/World/Looks/Table", (0.88, 0.88, 0.88) if base else (0.42, 0.27, 0.15),
+            texture=None if base else "../textures/wood.png",
+        )  # fmt: skip
+    warehouse.room(stage, rough)
+    author.quad(
+        stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(3.2, 2.5),
+        look=stage.GetPrimAtPath("/World/Looks/Carpet"),
+    )  # fmt: skip
+    _sofa(stage, rough)
+    _table(stage, rough)
+    board = author.material(stage, "/World/Looks/Cardboard", (0.62, 0.45, 0.28), texture="../textures/cardboard.png")
+    tape = author.material(stage, "/World/Looks/Tape", (0.50, 0.36, 0.20))
+    for name, position in CARTONS.items():
+        _carton(stage, name, position, (board, tape), rough)
+    warehouse.save(stage, folder)

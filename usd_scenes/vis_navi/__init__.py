@@ -1,0 +1,1 @@
+"""VisNavi: walk round the obstacles into the marked square."""

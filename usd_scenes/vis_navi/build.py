@@ -1,0 +1,134 @@
+"""Author VisNavi: walk between dropped beams and blocks into the yellow outline by the wet-floor sign.
+
+Sizes of beams, blocks, outline and the poses before the first draw: spec of the original (measured on its clips).
+Masses are our choice, the original's are not published: light crates that a robot can shove, not lift.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.usd_scenes import author, rooms, warehouse
+from arena_newton.usd_scenes.solids import Solids
+
+BEAM_SIZE = (1.95, 0.38, 0.28)
+BEAM_MASS = 12.0
+BLOCK_SIZE = (0.5, 0.5, 0.8)
+BLOCK_MASS = 10.0
+PINK = (0.86, 0.44, 0.45)
+YELLOW = (0.93, 0.78, 0.03)
+SIGN_POSITION = (-2.0, -0.25, 0.0)
+OUTLINE = 0.97
+"""Outer edge of the painted square [m]: the original's region is the bounding box of that square."""
+OUTLINE_CENTRE = (-0.05, -0.06)
+OUTLINE_STRIPE = 0.05
+ZONE_HEIGHT = 2.0
+
+OBSTACLES = {
+    "Beam_a": (-1.25, -4.05, 0.16),
+    "Beam_b": (-2.45, -2.75, 0.56),
+    "Beam_c": (-1.65, -2.15, 1.06),
+    "Block_a": (-0.95, -3.15, 1.56),
+    "Block_b": (-2.85, -1.85, 1.3),
+    "Block_c": (-3.25, -3.45, 1.8),
+}
+
+
+def _obstacle(stage, name: str, position, size, mass: float, look, rough) -> None:
+    half = 0.5 * np.asarray(size)
+    inertia = (
+        mass / 3.0 * np.array([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2])
+    )
+    author.rigid_body(stage, f"/World/{name}", position, mass=mass, inertia=inertia)
+    author.box(stage, f"/World/{name}/Geom", half, look=look, surface=rough)
+
+
+def _folding_sign(stage, parent: str) -> None:
+    """Two leaning panels with a pictogram, standing on the far side of the outline."""
+    yellow = author.material(stage, "/World/Looks/SignYellow", YELLOW)
+    black = author.material(stage, "/World/Looks/SignBlack", (0.04, 0.04, 0.04))
+    y, lean = OUTLINE_CENTRE[1] + OUTLINE / 2 - 0.02, np.deg2rad(9.0)
+    for name, side in (("PanelFront", -1), ("PanelBack", 1)):
+        quat = (float(np.cos(lean / 2)), side * float(np.sin(lean / 2)), 0.0, 0.0)
+        author.box(
+            stage,
+            f"{parent}/{name}",
+            (0.15, 0.008, 0.31),
+            (-0.05, y + side * 0.05, 0.306),
+            quat,
+            collide=False,
+            look=yellow,
+        )
+    # Triangle and bar on the front panel, lifted 1 mm off it.
+    q = (float(np.cos(lean / 2)), -float(np.sin(lean / 2)), 0.0, 0.0)
+    author.mesh(
+        stage,
+        f"{parent}/Pictogram",
+        [(-0.09, -0.0095, 0.02), (0.09, -0.0095, 0.02), (0, -0.0095, 0.18),
+         (-0.10, -0.0095, -0.20), (0.10, -0.0095, -0.20), (0.10, -0.0095, -0.13), (-0.10, -0.0095, -0.13)],
+        [(0, 1, 2), (3, 4, 5), (3, 5, 6)],
+        (-0.05, y - 0.05, 0.306),
+        q,
+        look=black,
+    )  # fmt: skip
+
+
+def _outline(stage, parent: str) -> None:
+    yellow = author.material(stage, "/World/Looks/OutlineYellow", YELLOW)
+    (cx, cy), half, s = OUTLINE_CENTRE, OUTLINE / 2, OUTLINE_STRIPE / 2
+    parts = [((half, s, 0.001), (cx, cy + k * (half - s), 0.002)) for k in (-1, 1)]
+    parts += [((s, half, 0.001), (cx + k * (half - s), cy, 0.002)) for k in (-1, 1)]
+    warehouse.boxes(stage, f"{parent}/Outline", parts, look=yellow)
+
+
+def _ring_sign(stage, parent: str) -> None:
+    """The semantic stand-in: a painted ring of the same diameter and a round plate on a post."""
+    orange = author.material(stage, "/World/Looks/SignOrange", (0.95, 0.36, 0.03))
+    white = author.material(stage, "/World/Looks/SignWhite", (0.92, 0.92, 0.92))
+    cx, cy = OUTLINE_CENTRE
+    Solids().ring(OUTLINE / 2 - 1.4 * OUTLINE_STRIPE, OUTLINE / 2, (cx, cy, 0.003)).write(
+        stage, f"{parent}/Ring", look=orange
+    )
+    y, r = cy + OUTLINE / 2 - 0.02, float(np.sqrt(0.5))
+    author.box(stage, f"{parent}/Post", (0.02, 0.02, 0.25), (-0.05, y + 0.02, 0.25), collide=False, look=white)
+    author.cylinder(
+        stage, f"{parent}/Plate", 0.16, 0.02, (-0.05, y, 0.46), (r, r, 0.0, 0.0), collide=False, look=orange
+    )
+    author.cylinder(
+        stage, f"{parent}/PlateFace", 0.09, 0.024, (-0.05, y, 0.46), (r, r, 0.0, 0.0), collide=False, look=white
+    )
+
+
+def build(folder: Path) -> None:
+    """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
+    r = float(np.sqrt(0.5))
+    stage = rooms.task_stage(
+        folder / "scene.usda",
+        spawn=(-1.90, -5.20, SPAWN_HEIGHT),
+        facing=(r, 0.0, 0.0, r),
+        eye=(0.45796, -1.01443, 2.42268),
+        gaze=(0.50211, 0.27898, 0.39756, 0.71555),
+        variants=warehouse.VARIANTS,
+    )
+    rough = warehouse.surface(stage)
+    warehouse.room_looks(stage)
+    warehouse.room(stage, rough)
+    pink = author.material(stage, "/World/Looks/Pink", PINK)
+    for name, position in OBSTACLES.items():
+        beam = name.startswith("Beam")
+        size, mass = (BEAM_SIZE, BEAM_MASS) if beam else (BLOCK_SIZE, BLOCK_MASS)
+        _obstacle(stage, name, position, size, mass, pink, rough)
+
+    author.fixture(stage, "/World/TargetSign", SIGN_POSITION)
+    frame = "/World/TargetSign/Frame"
+    (cx, cy), half = OUTLINE_CENTRE, OUTLINE / 2
+    author.box(stage, f"{frame}/Body", (0.15, 0.05, 0.3), (-0.05, cy + half - 0.02, 0.305), visual=False, surface=rough)
+    author.marker(stage, f"{frame}/Zone", (OUTLINE, OUTLINE, ZONE_HEIGHT), (cx, cy, ZONE_HEIGHT / 2))
+    for variant in warehouse.semantics(stage):
+        if variant == "base":
+            _folding_sign(stage, frame)
+            _outline(stage, frame)
+        else:
+            _ring_sign(stage, frame)
+    warehouse.save(stage, folder)

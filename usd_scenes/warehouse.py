@@ -1,0 +1,184 @@
+"""The grey warehouse room shared by several scenes, and the mesh shapes its furniture is made of.
+
+Lengths [m]. Room size: walls of the original near x = +0.55 and y = −6.5 (measured on its clips), the far walls
+near x = −7.2 and behind the camera.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Usd, UsdGeom, UsdPhysics
+
+from arena_newton.usd_scenes import author, rooms
+from arena_newton.usd_scenes.solids import Solids
+
+__all__ = [
+    "FLOOR_X",
+    "FLOOR_Y",
+    "VARIANTS",
+    "boxes",
+    "room",
+    "room_looks",
+    "rounded_box",
+    "save",
+    "semantics",
+    "surface",
+]
+
+FLOOR_X = (-7.2, 0.6)
+"""Extent of the room along x [m]."""
+FLOOR_Y = (-6.5, 5.2)
+"""Extent of the room along y [m]."""
+VARIANTS = ("base", "semantic")
+"""Variants of these scenes; the first is selected."""
+_HEIGHT = 4.4
+_SKIRTING = 0.09
+
+_FACES = (
+    # (normal axis, sign, u axis, v axis)
+    (0, 1, 1, 2),
+    (0, -1, 1, 2),
+    (1, 1, 0, 2),
+    (1, -1, 0, 2),
+    (2, 1, 0, 1),
+    (2, -1, 0, 1),
+)
+
+
+def boxes(
+    stage: Usd.Stage,
+    path: str,
+    parts: Iterable[tuple[Sequence[float], Sequence[float]]],
+    *,
+    look=None,
+    tile: float = 1.0,
+) -> Usd.Prim:
+    """One visual mesh made of several axis-aligned boxes `(half sizes, centre)`; its texture repeats every `tile` m."""
+    shell = Solids()
+    for half, centre in parts:
+        shell.box(half, centre, tile=tile)
+    return shell.write(stage, path, look=look)
+
+
+def rounded_box(
+    stage: Usd.Stage,
+    path: str,
+    half: Sequence[float],
+    position=(0, 0, 0),
+    *,
+    radius: float = 0.05,
+    steps: int = 3,
+    look=None,
+) -> Usd.Prim:
+    """A visual box with rounded edges, for cushions; `half` sizes include the rounding."""
+    half = np.asarray(half, dtype=float)
+    radius = min(radius, *half)
+    inner = half - radius
+    points, faces, uv = [], [], []
+    # Each face: corner fan, flat middle, corner fan.
+    angles = np.linspace(0.0, np.pi / 4, steps + 1)
+    ramp = np.concatenate([-np.tan(angles[::-1]), np.tan(angles)])
+    side = np.concatenate([-np.ones(steps + 1), np.ones(steps + 1)])
+    n = len(ramp)
+    for axis, sign, u, v in _FACES:
+        first = len(points)
+        for j in range(n):
+            for i in range(n):
+                direction = np.zeros(3)
+                direction[axis], direction[u], direction[v] = sign, ramp[i], ramp[j]
+                corner = np.zeros(3)
+                corner[axis], corner[u], corner[v] = sign * inner[axis], side[i] * inner[u], side[j] * inner[v]
+                p = corner + radius * direction / np.linalg.norm(direction)
+                points.append(p)
+                uv.append((p[u] + half[u], p[v] + half[v]))
+        outward = sign > 0 if axis != 1 else sign < 0
+        for j in range(n - 1):
+            for i in range(n - 1):
+                a, b, c, d = (
+                    first + j * n + i,
+                    first + j * n + i + 1,
+                    first + (j + 1) * n + i + 1,
+                    first + (j + 1) * n + i,
+                )
+                faces.extend([[a, b, c], [a, c, d]] if outward else [[a, c, b], [a, d, c]])
+    return author.mesh(stage, path, points, faces, position, uv=uv, look=look)
+
+
+def _plane(stage: Usd.Stage, path: str, position, quat, surface: Usd.Prim) -> Usd.Prim:
+    """An invisible collision plane whose normal is local +z."""
+    plane = UsdGeom.Plane.Define(stage, path)
+    plane.AddTranslateOp().Set(Gf.Vec3d(*map(float, position)))
+    plane.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*map(float, quat)))
+    plane.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+    UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
+    return author.bind_physics(plane.GetPrim(), surface)
+
+
+def surface(stage: Usd.Stage, name: str = "Rough", *, friction: float = 1.0) -> Usd.Prim:
+    """The scene's physics material; friction 1 is the original's scene-wide value."""
+    return author.physics_material(stage, f"/World/Looks/{name}", static=friction, dynamic=friction)
+
+
+def room_looks(
+    stage: Usd.Stage, *, floor: str = "concrete", wall: str = "wall", skirting: Sequence[float] = (0.9, 0.9, 0.88)
+) -> None:
+    """The looks that `room` binds: floor and wall textures by name, skirting colour."""
+    author.material(stage, "/World/Looks/Floor", (0.5, 0.5, 0.49), roughness=0.5, texture=f"../textures/{floor}.png")
+    author.material(stage, "/World/Looks/Wall", (0.5, 0.52, 0.51), texture=f"../textures/{wall}.png")
+    author.material(stage, "/World/Looks/Skirting", skirting)
+
+
+def room(stage: Usd.Stage, rough: Usd.Prim, *, tile: float = 2.0) -> None:
+    """Floor, walls, skirting line and wall sockets; floor and walls also stop bodies (planes)."""
+    looks = {n: stage.GetPrimAtPath(f"/World/Looks/{n}") for n in ("Floor", "Wall", "Skirting")}
+    (x0, x1), (y0, y1), h = FLOOR_X, FLOOR_Y, _HEIGHT
+    cx, cy, lx, ly = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
+    author.xform(stage, "/World/Room")
+    author.quad(
+        stage, "/World/Room/Floor", lx / 2, ly / 2, (cx, cy, 0), repeat=(lx / tile, ly / tile), look=looks["Floor"]
+    )
+    corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    points, faces, uv = [], [], []
+    for i, start in enumerate(corners):
+        end = corners[(i + 1) % 4]
+        length, first = float(np.hypot(end[0] - start[0], end[1] - start[1])), len(points)
+        points += [(*start, 0), (*end, 0), (*end, h), (*start, h)]
+        uv += [(0, 0), (length / tile, 0), (length / tile, h / tile), (0, h / tile)]
+        faces += [(first, first + 2, first + 1), (first, first + 3, first + 2)]  # wound to face inwards
+    author.mesh(stage, "/World/Room/Walls", points, faces, uv=uv, look=looks["Wall"])
+    s, t = _SKIRTING / 2, 0.01
+    sockets = [((t, 0.04, 0.06), (x0 + t, y, 0.45)) for y in (-4.5, -2.0, 0.5, 3.0)]
+    sockets += [((0.04, t, 0.06), (x, y, 0.45)) for x in (-5.5, -3.2, -1.0) for y in (y0 + t, y1 - t)]
+    line = [((lx / 2, t, s), (cx, y, s)) for y in (y0 + t, y1 - t)]
+    line += [((t, ly / 2, s), (x, cy, s)) for x in (x0 + t, x1 - t)]
+    boxes(stage, "/World/Room/Skirting", [*line, *sockets], look=looks["Skirting"])
+    r = float(np.sqrt(0.5))
+    for name, position, quat in (
+        ("Ground", (cx, cy, 0), (1, 0, 0, 0)),
+        ("StopWest", (x0, cy, 0), (r, 0, r, 0)),
+        ("StopEast", (x1, cy, 0), (r, 0, -r, 0)),
+        ("StopSouth", (cx, y0, 0), (r, -r, 0, 0)),
+        ("StopNorth", (cx, y1, 0), (r, r, 0, 0)),
+    ):
+        _plane(stage, f"/World/Room/{name}", position, quat, rough)
+
+
+def semantics(stage: Usd.Stage) -> Iterator[str]:
+    """Author the variants of /World: yields each name with edits going into that variant, and selects the first again.
+
+    Whatever differs between variants is written inside all of them, because opinions outside a variant set are stronger.
+    """
+    choice = stage.GetDefaultPrim().GetVariantSets().GetVariantSet(rooms.SEMANTICS)
+    first = choice.GetVariantSelection()
+    for name in choice.GetVariantNames():
+        choice.SetVariantSelection(name)
+        with choice.GetVariantEditContext():
+            yield name
+    choice.SetVariantSelection(first)
+
+
+def save(stage: Usd.Stage, folder: Path) -> None:
+    """Write the scene and, beside it, `variants/semantic.usda`, the same scene with that variant selected."""
+    stage.GetRootLayer().Save()
+    rooms.variant_layer(folder / "variants" / "semantic.usda", "semantic")
