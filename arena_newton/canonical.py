@@ -49,7 +49,7 @@ MIMIC: dict[str, slice] = {
     "yaw_rate": slice(5, 6),
     "joint_pos": slice(6, 35),
 }
-"""Mimic command: velocity [m/s, reference root frame], height [m], roll and pitch [rad], yaw rate [rad/s], joints [rad]."""
+"""Mimic command: velocity [m/s, reference root frame], height [m], roll, pitch, yaw rate [rad, rad/s], joints [rad]."""
 MIMIC_WIDTH = 35
 
 IDENTITY_ROT6D: tuple[float, ...] = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
@@ -87,7 +87,8 @@ def validate_action(action: Any, where: str) -> np.ndarray:
         InputError: Wrong width, no numbers, NaN or infinity, or a root_rot6d that names no rotation.
     """
     try:
-        array = np.asarray(action, dtype=np.float32)
+        with np.errstate(over="ignore"):
+            array = np.asarray(action, dtype=np.float32)
     except (TypeError, ValueError):
         raise InputError(f"{where}: action is not an array of numbers, expected shape [..., {ACTION_WIDTH}]") from None
     if array.ndim == 0 or array.shape[-1] != ACTION_WIDTH:
@@ -108,8 +109,8 @@ def validate_action(action: Any, where: str) -> np.ndarray:
     if len(flat):
         row = [int(i) for i in flat[0]] if array.ndim > 1 else []
         raise InputError(
-            f"{where}{_row(row)}: action root_rot6d (indices {part.start}:{part.stop}) names no rotation, its two columns"
-            f" are zero or parallel; expected e.g. {list(IDENTITY_ROT6D)}"
+            f"{where}{_row(row)}: action root_rot6d (indices {part.start}:{part.stop}) names no rotation: its two "
+            f"columns are zero or parallel, expected e.g. {list(IDENTITY_ROT6D)}"
         )
     return array
 

@@ -6,6 +6,7 @@ tracker's history fills) and the episode proper, whose step 0 is the policy's fi
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -32,6 +33,10 @@ STAND_ACTION = np.array(
     dtype=np.float32,
 )
 """Canonical action of standing still: TWIST2's command when there is no input (root z 0.8 m, default pose)."""
+
+
+EVENTS = {1: "ball_out"}
+"""A judge's event number → reason of the timeout."""
 
 
 class ArenaEnv:
@@ -102,8 +107,7 @@ class ArenaEnv:
         self.device = self.physics.device
         self.torch_device = wp.device_to_torch(self.device)
         self.judge = self.spec.judge(self.scene, self.rules)
-        self.judge.bind(self.physics) if hasattr(self.judge, "bind") else None
-        self.physics.want_forces = bool(getattr(self.judge, "needs_forces", False))
+        self.judge.bind(self.physics)
 
         h = self.scene.robot
         canonical_order = np.array(g1.CANONICAL_TO_MUJOCO)
@@ -122,9 +126,10 @@ class ArenaEnv:
         self._hand_close = wp.array(np.array(close, np.float32), dtype=wp.float32, device=self.device)
         self._hand_open = wp.array(np.array((g1.HAND_OPEN * 2)[:hands], np.float32), dtype=wp.float32, device=self.device)
         self._critical = ints(h.critical_bodies)
-        self.reference = canonical.ReferencePose.allocate(worlds, self.device)
+        self.reference = canonical.ReferencePose.allocate(
+            worlds, self.device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK
+        )
         self._state64, self._action = zeros(worlds, 64), zeros(worlds, 40)
-        self._heading0 = zeros(worlds)
         self._stand = wp.array(STAND_ACTION, dtype=wp.float32, device=self.device)
         self._streak, self._fallen = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
         self._bad_state, self._bad_action = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
@@ -177,7 +182,7 @@ class ArenaEnv:
             seeds: Episode seeds, one a world.
             worlds: World indices; all worlds by default.
         """
-        from arena_newton.kernels import canonical
+        from arena_newton.kernels import canonical, reset
 
         rows = np.arange(self.worlds) if worlds is None else np.asarray(worlds, dtype=np.int64)
         if len(seeds) != len(rows):
@@ -195,10 +200,10 @@ class ArenaEnv:
             for prim, pose in draws.placed.items():
                 if self.scene.has_body(f"{prim}/Frame"):
                     mocap = self.scene.mocap_id(prim)
-                    mocap_pos[k, mocap], mocap_quat[k, mocap] = pose.position, pose.quat
+                    mocap_pos[k, mocap], mocap_quat[k, mocap] = pose.pos, pose.quat
                 else:
                     address = self.scene.joint_qpos(prim)
-                    qpos[k, address : address + 3] = pose.position
+                    qpos[k, address : address + 3] = pose.pos
                     qpos[k, address + 3 : address + 7] = pose.quat
             if self.lights is not None:
                 self.lights.set(int(w), draws.light)
@@ -206,9 +211,7 @@ class ArenaEnv:
         mask = self._upload(rows)
         canonical.launch_reset_reference(self.reference, p.qpos, h.root_qpos, mask)
         self.judge.reset(mask)
-        host = self._streak.numpy()
-        host[rows] = 0
-        self._streak.assign(host)
+        reset.launch_clear(mask, self._streak)
         self.tracker.reset(self._torch_mask(rows))
         self.tick[rows] = -SETTLE_TICKS
         self.active[rows] = True
@@ -233,7 +236,7 @@ class ArenaEnv:
 
         p, h = self.physics, self.scene.robot
         canonical.launch_state64(
-            p.qpos, p.qvel, h.root_qpos, h.root_qvel, self._canonical_qpos, self._canonical_qvel, self._heading0, self._state64
+            p.qpos, p.qvel, h.root_qpos, h.root_qvel, self._canonical_qpos, self._canonical_qvel, self.reference.heading, self._state64
         )
         picture = None
         if image:
@@ -259,12 +262,11 @@ class ArenaEnv:
 
     def _begin(self, rows: np.ndarray) -> None:
         """Step 0 of an episode: heading and reference are taken from the robot as it stands now."""
-        from arena_newton.kernels import canonical, rotations
+        from arena_newton.kernels import canonical
 
         mask = self._upload(rows)
         p, h = self.physics, self.scene.robot
         canonical.launch_reset_reference(self.reference, p.qpos, h.root_qpos, mask)
-        rotations.launch_heading(p.qpos, h.root_qpos, mask, self._heading0)
         self.judge.reset(mask)
 
     def step(self, action: Any) -> np.ndarray:
@@ -293,7 +295,7 @@ class ArenaEnv:
         canonical.launch_validate_action(self._action, self._bad_action)
         tick.launch_sanitize(self._bad_action, self._stand, self._action)
         mask = self._upload(np.flatnonzero(self.active))
-        canonical.launch_integrate(self.reference, self._action, mask, self.tracker.max_root_delta_deg)
+        canonical.launch_integrate(self.reference, self._action, mask, getattr(self.tracker, 'max_root_delta_deg', 0.0))
         command = TrackerCommand(
             mimic=self._t_mimic,
             joints=self._t_ref_joints.index_select(1, self._to_mujoco),
@@ -317,8 +319,14 @@ class ArenaEnv:
         p.set_active(self.active)
         p.step()
         self.judge.evaluate(p)
-        fall.launch_fall_rules(
-            p.qpos, h.root_qpos, p.contact_force, self._critical, self.rules, self._streak, self._fallen
+        fall.launch_fall(
+            p.qpos,
+            h.root_qpos,
+            p.contact_force,
+            self._critical,
+            self._streak,
+            self._fallen,
+            **dataclasses.asdict(self.rules.fall),
         )
         reset.launch_nonfinite(p.qpos, p.qvel, self._bad_state)
         tick.launch_status(
@@ -443,7 +451,7 @@ class ArenaEnv:
                 elif code == codes.FALL:
                     finish(w, "fall", "fall")
                 elif code > codes.EVENT and t > 0:
-                    finish(w, "timeout", self.judge.events[code - codes.EVENT])
+                    finish(w, "timeout", EVENTS[code - codes.EVENT])
                 elif t >= budget:
                     finish(w, "timeout", "timeout")
                 else:

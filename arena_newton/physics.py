@@ -66,8 +66,9 @@ class Physics:
         m = scene.mj_model
         self.nq, self.nv, self.nu, self.nbody, self.nmocap = m.nq, m.nv, m.nu, m.nbody, m.nmocap
         self.qpos0 = np.tile(m.qpos0.astype(np.float32), (self.worlds, 1))
-        self.mocap_pos0 = np.array([m.body_pos[b] for b in range(m.nbody) if m.body_mocapid[b] >= 0], dtype=np.float32)
-        self.mocap_quat0 = np.array([m.body_quat[b] for b in range(m.nbody) if m.body_mocapid[b] >= 0], np.float32)
+        fixtures = [b for b in range(m.nbody) if m.body_mocapid[b] >= 0]
+        self.mocap_pos0 = m.body_pos[fixtures].astype(np.float32)
+        self.mocap_quat0 = m.body_quat[fixtures].astype(np.float32)
         with wp.ScopedDevice(self.device):
             self.contact_force = wp.zeros((self.worlds, m.nbody), dtype=wp.float32)
             self.pair_force = wp.zeros(self.worlds, dtype=wp.float32)
@@ -294,8 +295,8 @@ class WarpPhysics(Physics):
         m = scene.mj_model
         with wp.ScopedDevice(self.device):
             self._geom_body = wp.array(m.geom_bodyid, dtype=wp.int32)
+            self._geom_group = wp.zeros(m.ngeom, dtype=wp.int32)
             self._force_vector = wp.zeros((self.worlds, m.nbody), dtype=wp.vec3)
-        self._groups: tuple[Any, Any] | None = None
         self._graph: Any = None
         self._full_graph: Any = None
         every = np.arange(self.worlds)
@@ -312,6 +313,8 @@ class WarpPhysics(Physics):
         newton_state.launch_overflow(self._d.overflow, self.overflow)
         self._mjw.kinematics(self._m, self._d)
         self._mjw.com_pos(self._m, self._d)
+        if self.device.is_cuda:
+            self._launch_contacts()
 
     def _solver_tick(self) -> None:
         for _ in range(self.rate.substeps):
@@ -359,18 +362,37 @@ class WarpPhysics(Physics):
 
     def watch_pair(self, geoms_a: list[int], geoms_b: list[int]) -> None:
         """See `Physics.watch_pair`."""
-        import warp as wp
+        from arena_newton.kernels import contact
 
         super().watch_pair(geoms_a, geoms_b)
-        self._groups = tuple(wp.array(g, dtype=wp.int32, device=self.device) for g in self._pair)
+        a, b = self._pair
+        self._geom_group.assign(a * contact.GROUP_A + b * contact.GROUP_B)
+
+    def _launch_contacts(self) -> None:
+        from arena_newton.kernels import contact
+
+        c = self._d.contact
+        contact.launch_contact_force(
+            self._d.nacon,
+            c.geom,
+            c.worldid,
+            c.frame,
+            c.friction,
+            c.dim,
+            c.efc_address,
+            self._d.efc.force,
+            pyramidal=True,
+            geom_body=self._geom_body,
+            geom_group=self._geom_group,
+            net_force=self._force_vector,
+            force_norm=self.contact_force,
+            pair_force=self.pair_force,
+        )
 
     def read_contacts(self) -> None:
         """Contact forces of the last physics step (float atomics: not bit-deterministic on CUDA)."""
-        from arena_newton.kernels import contact
-
-        contact.launch_contact_forces(self._m, self._d, self._geom_body, self._force_vector, self.contact_force)
-        if self._groups is not None:
-            contact.launch_pair_force(self._m, self._d, *self._groups, self.pair_force)
+        if not self.device.is_cuda:  # on CUDA they are part of the tick's graph
+            self._launch_contacts()
 
     def reset_worlds(self, worlds, qpos, mocap_pos, mocap_quat) -> None:
         """See `Physics.reset_worlds`."""

@@ -1,8 +1,8 @@
 """Rule sets: what counts as success and as a fall, how long an episode lasts, where objects are put.
 
 `paper` is what the benchmark's paper says, made precise where it is silent; `released` is what its released code does.
-A rule set is frozen, printable and hashed; its hash is stored with every result. The numbers that belong to one task stand
-in that task's file, the common ones here.
+A rule set is frozen, printable and hashed; its hash is stored with every result. The numbers that belong to one task
+stand in that task's file, the common ones here.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from arena_newton.errors import InputError
 from arena_newton.robot import PhysicsRate
 
 __all__ = [
+    "ByRules",
     "CylinderRange",
     "FallRule",
     "FixedLight",
@@ -26,6 +27,7 @@ __all__ = [
     "StandingRule",
     "TaskRules",
     "get",
+    "markdown",
     "names",
 ]
 
@@ -74,6 +76,23 @@ class ObjectRule:
     spawn scale × sample."""
     base: PoseRange | CylinderRange
     execution: PoseRange | CylinderRange
+
+
+@dataclass(frozen=True)
+class ByRules[T]:
+    """One value for each rule set."""
+
+    paper: T
+    released: T
+
+    @classmethod
+    def same(cls, value: T) -> "ByRules[T]":
+        """The same value in both."""
+        return cls(value, value)
+
+    def of(self, rules_name: str) -> T:
+        """The value of one rule set."""
+        return self.paper if rules_name == "paper" else self.released
 
 
 @dataclass(frozen=True)
@@ -147,8 +166,8 @@ class RuleSet:
     fall: FallRule
     tasks: tuple[TaskRules, ...]
     navi_visual_room_swap: bool
-    """The original's released VisNavi visual configuration also exchanges the room's asset. No room of ours stands in for
-    that asset, so this records the difference and changes nothing in the scene."""
+    """The original's released VisNavi visual configuration also exchanges the room's asset. No room of ours stands in
+    for that asset, so this records the difference and changes nothing in the scene."""
     standing: StandingRule = StandingRule()
     visual_light: LightRange = LightRange()
     twist2_rate: PhysicsRate = PhysicsRate(dt=0.001, substeps=20)
@@ -183,9 +202,7 @@ class RuleSet:
 
     def table(self) -> list[tuple[str, str]]:
         """Rows (item, what this set says) in the order of the documentation."""
-        from arena_newton import rules_table
-
-        return rules_table.rows(self)
+        return _rows(self)
 
     def __str__(self) -> str:
         """One line a row."""
@@ -215,3 +232,201 @@ def get(name: str) -> RuleSet:
         tasks=tuple(tasks.get(task).rules.of(name) for task in tasks.names()),
         navi_visual_room_swap=not paper,
     )
+
+
+def _num(value: float) -> str:
+    """A number as the tables print it."""
+    return f"{round(value, 4):g}".replace("-", "−")
+
+
+def _span(bounds: Range | None) -> str:
+    if bounds is None:
+        return "–"
+    return _num(bounds[0]) if bounds[0] == bounds[1] else f"{_num(bounds[0])} … {_num(bounds[1])}"
+
+
+def _fall_text(rule: FallRule) -> str:
+    soft, hard, force = _num(rule.soft_tilt_deg), _num(rule.hard_tilt_deg), _num(rule.force_threshold)
+    if rule.at_once:
+        return (
+            f"tilt > {soft}° for {rule.confirm_ticks} consecutive ticks, or tilt > {hard}° at once, "
+            f"or ≥ {force} N on a critical body with tilt > {soft}° at once"
+        )
+    return (
+        f"(tilt > {hard}°, or tilt > {soft}° with ≥ {force} N on a critical body) "
+        f"for {rule.confirm_ticks} consecutive ticks"
+    )
+
+
+def _football_text(s: Any) -> str:
+    (x0, x1), (y0, y1), (z0, z1) = s.goal_x, s.goal_y, s.goal_z
+    text = f"ball centre in {_num(x0)} < x < {_num(x1)}, y > {_num(y0)}, {_num(z0)} < z < {_num(z1)}"
+    return f"{text} and y < {_num(y1)}" if s.rear_bound else f"{text}, no rear bound"
+
+
+def _pp_box_text(s: Any) -> str:
+    if hasattr(s, "plane_z"):
+        return (
+            f"box centre over the layer at {_num(s.plane_z)} m, bottom within {_num(s.height_tolerance)} m of it, "
+            "no speed test"
+        )
+    return (
+        f"box centre above any shelf deck within its span, bottom within {_num(s.height_tolerance)} m of the deck, "
+        f"slower than {_num(s.max_speed)} m/s for {s.confirm_ticks} ticks"
+    )
+
+
+def _door_text(s: Any) -> str:
+    latch = f"the latch releases at {_num(s.release_deg)}° of the handle"
+    if hasattr(s, "min_leaf_deg"):
+        return f"latch released, leaf ≥ {_num(s.min_leaf_deg)}°, standing; {latch}"
+    return (
+        f"root through the frame plane: |x_local| ≤ {_num(s.half_width)} m, y_local > {_num(s.min_y)} m in the "
+        f"door's frame, standing; {latch}"
+    )
+
+
+def _sofa_text(s: Any) -> str:
+    if hasattr(s, "confirm_ticks"):
+        return (
+            f"pelvis, hip and thigh links together press the seat with ≥ {_num(s.min_force)} N for {s.confirm_ticks} "
+            f"consecutive ticks, root z < {_num(s.max_root_z)} m"
+        )
+    return (
+        f"one tick of ≥ {_num(s.min_force)} N on a pelvis, hip, waist or torso link in the seat volume "
+        f"(from {_num(s.below)} m below to {_num(s.above)} m above the seat), or two of them in it without contact"
+    )
+
+
+def _boxing_text(s: Any) -> str:
+    radius = f"max(bounding radius, {_num(s.min_radius)} m)" if s.min_radius > 0.0 else "target's bounding radius"
+    return f"a palm within ({radius} + {_num(s.hand_radius)} m) of the target's centre"
+
+
+def _desk_text(s: Any) -> str:
+    if s.crate_frame:
+        return "hammer's centre of mass inside the crate's box in the crate's own frame"
+    return f"hammer's centre of mass inside the crate's world-axis box, and z ≥ {_num(s.min_z)} m"
+
+
+def _placement_text(rules: RuleSet, placement: str) -> str:
+    found = [o.record for t in rules.tasks for o in t.objects if o.placement == placement]
+    return ", ".join(found) or "none"
+
+
+def _light_text(rules: RuleSet) -> str:
+    fixed = [t.task for t in rules.tasks if t.light is not None]
+    text = "dome in base, execution and semantic"
+    if fixed:
+        text += f" (distant always in {', '.join(fixed)})"
+    v = rules.visual_light
+    return (
+        f"{text}; visual: distant, pitch {_span(v.pitch_deg)}°, roll {_span(v.roll_deg)}°, yaw {_span(v.yaw_deg)}°, "
+        f"intensity {_span(v.intensity)}, each colour {_span(v.color[0])}"
+    )
+
+
+def _rows(rules: RuleSet) -> list[tuple[str, str]]:
+    """What a rule set says, row by row."""
+    success = {t.task: t.success for t in rules.tasks}
+    ball = success["football"]
+    paper = rules.name == "paper"
+    return [
+        ("step budget (50 Hz ticks)", ", ".join(f"{t.task} {t.max_steps}" for t in rules.tasks)),
+        ("fall", _fall_text(rules.fall)),
+        ("football", _football_text(ball)),
+        (
+            "football, ball leaves the field",
+            f"beyond the backdrop walls or z < {_num(ball.out_z)} m: ends, outcome `timeout` with reason `ball_out`"
+            if ball.ball_out
+            else "never ends",
+        ),
+        ("ball restitution", _num(ball.ball_restitution)),
+        ("double_desk", _desk_text(success["double_desk"])),
+        ("pp_box", _pp_box_text(success["pp_box"])),
+        ("open_door", _door_text(success["open_door"])),
+        ("sit_sofa", _sofa_text(success["sit_sofa"])),
+        ("boxing", _boxing_text(success["boxing"])),
+        ("vis_navi", "both feet (ankle links) inside the target box, standing"),
+        (
+            "standing",
+            f"root z ≥ {_num(rules.standing.min_root_z)} m and up-axis ≥ {_num(rules.standing.min_up)}",
+        ),
+        ("placed absolutely", _placement_text(rules, "absolute")),
+        ("placed as offset from the initial pose", _placement_text(rules, "offset")),
+        ("placed as initial pose + spawn scale × sample", _placement_text(rules, "scaled")),
+        (
+            "execution mode",
+            "ranges widened about the base range, never shifted, never void (see the ranges below)"
+            if paper
+            else "ranges as the released configuration has them",
+        ),
+        (
+            "semantic football",
+            "texture-modified goal"
+            if rules.task("football").semantic_variant == "semantic"
+            else "texture-modified goal and a dynamic ball dropped beside the way (scene variant `semantic_released`)",
+        ),
+        ("lights", _light_text(rules)),
+        (
+            "vis_navi in visual mode",
+            "the original also swaps the room's asset; recorded here, the scene stays"
+            if rules.navi_visual_room_swap
+            else "light only",
+        ),
+        ("TWIST2 physics rate", f"{_num(1e3 * rules.twist2_rate.dt)} ms × {rules.twist2_rate.substeps}"),
+        ("success is judged", rules.success_judged),
+    ]
+
+
+def _range_text(ranges: PoseRange | CylinderRange) -> str:
+    if isinstance(ranges, CylinderRange):
+        axes = ", ".join(f"({_num(x)}, {_num(y)})" for x, y in ranges.centers)
+        return f"{_num(ranges.radius)} m around {axes}; z {_span(ranges.z)}"
+    parts = [f"{k} {_span(getattr(ranges, k))}" for k in ("x", "y", "z", "yaw") if getattr(ranges, k) is not None]
+    return ", ".join(parts)
+
+
+def markdown() -> str:
+    """The documentation page `docs/rules.md`."""
+    sets = [get(name) for name in names()]
+    lines = [
+        "# Rule sets",
+        "",
+        "`--rules paper` (default) follows the paper of the benchmark, made precise where it is silent; `--rules",
+        "released` follows its released code. A run prints the set it uses and stores the set's hash with every result.",
+        "This page is generated: `python -m arena_newton.rules > docs/rules.md`.",
+        "",
+        "| item | " + " | ".join(f"`{s.name}`" for s in sets) + " |",
+        "|---|" + "---|" * len(sets),
+    ]
+    for (item, first), (_, second) in zip(*(s.table() for s in sets), strict=True):
+        cells = [item, first, "the same" if first == second else second]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    lines += [
+        "",
+        "## Where objects are put",
+        "",
+        "Ranges of the sampled pose, in m and rad. A sample is drawn once from the episode's seed; the placement above",
+        "turns it into a world pose. Base ranges, and with them the draws of base, semantic and visual mode, are the",
+        "same in both sets.",
+        "",
+        "| task | object | base | execution, `paper` | execution, `released` |",
+        "|---|---|---|---|---|",
+    ]
+    for ours, theirs in zip(*(s.tasks for s in sets), strict=True):
+        for a, b in zip(ours.objects, theirs.objects, strict=True):
+            wide, original = _range_text(a.execution), _range_text(b.execution)
+            lines.append(
+                f"| {ours.task} | {a.record} | {_range_text(a.base)} | {wide} | "
+                f"{'the same' if wide == original else original} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    import sys
+
+    from arena_newton import rules as this
+
+    sys.stdout.write(this.markdown())

@@ -1,6 +1,6 @@
 """Seeds of an episode: who, where and under which light depends on three names and numbers only.
 
-The formulas are those of the original benchmark, and its recorded files are reproduced exactly (tests hold the vectors).
+The formulas are those of the original benchmark; its recorded seeds and samples are reproduced exactly (see the tests).
 """
 
 import hashlib

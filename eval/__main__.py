@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from arena_newton.errors import ArenaError, InputError
 
@@ -29,8 +29,6 @@ OVERVIEW = f"""commands:
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} bench [--what ...]      measure this machine against the figures to reach
 """
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def _parse(kind: type[_T], arguments: list[str], command: str, default: _T | None = None) -> _T:
+def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | None = None) -> T:
     """Parse flags with tyro; its multi-line complaint becomes one line."""
     import tyro
 
@@ -154,20 +152,19 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
     as_json = "--json" in arguments
     if _wants_help(arguments):
-        print(f"usage: {PROG} list [flags of run] [--json]; --json prints one object per episode\n")
+        print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
     options = _parse(RunOptions, [a for a in arguments if a != "--json"], "list")
-    from arena_newton.eval.config import resolve
-    from arena_newton.eval.run import make_plan
+    from arena_newton.eval import config as configs
 
-    config = resolve(options)
-    episodes = make_plan(config)
+    config = configs.resolve(options)
+    episodes = configs.episodes(config)
     if as_json:
         import json
 
         from arena_newton.eval import plan
 
-        for episode in episodes:
-            print(json.dumps(plan.describe(episode), allow_nan=False))
+        rows = [json.dumps(row, allow_nan=False) for row in plan.to_list_json(episodes)]
+        print("[\n" + ",\n".join(rows) + "\n]")
         return 0
     print(f"configuration {config.hash}: {len(episodes)} episodes")
     for episode in episodes:

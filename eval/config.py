@@ -7,30 +7,28 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from arena_newton import __version__
 from arena_newton.errors import InputError
 
+if TYPE_CHECKING:
+    from arena_newton.eval.plan import Episode
+
 __all__ = [
-    "ENGINES",
-    "MODES",
     "QUICK_MAX_STEPS",
     "QUICK_REPEATS",
-    "RULES",
     "RunConfig",
     "RunOptions",
     "config_hash",
     "differing_key",
+    "episodes",
     "explicit",
     "hash_path",
     "policy_label",
     "resolve",
 ]
 
-MODES = ("base", "execution", "semantic", "visual")
-RULES = ("paper", "released")
-ENGINES = ("auto", "mujoco", "warp")
 POLICY_PATH_SCHEMES = ("replay", "lerobot")
 
 PROTOCOL_SEEDS = (0, 1, 2)
@@ -53,7 +51,7 @@ class RunOptions:
     """
 
     task: tuple[str, ...] = ()
-    """Task names, or all: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
+    """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
     tracker: str = "pd"
     """Tracker that executes the 40D action: pd, twist2, ..."""
     checkpoint: str | None = None
@@ -61,19 +59,19 @@ class RunOptions:
     policy: str = "stand"
     """Policy that decides it: stand, replay:<clip or episode>, remote:<url>."""
     mode: tuple[str, ...] = ()
-    """Evaluation modes, one or several: base execution semantic visual. [base]"""
+    """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
     """Rule set: paper or released."""
     seeds: tuple[int, ...] = ()
-    """Group seeds. [0 1 2]"""
+    """Group seeds; the protocol's are 0 1 2."""
     repeats: int | None = None
-    """Episodes per group seed. [20]"""
+    """Episodes per group seed; the protocol's are 20."""
     worlds: int = 20
     """Episodes simulated at once."""
     engine: str = "auto"
     """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
     device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1, ... [the best there is]"""
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1; the best there is when none is named."""
     variant: str | None = None
     """USD file that replaces or extends the scene of the one task named."""
     fast_physics: bool = False
@@ -85,7 +83,7 @@ class RunOptions:
     strip: bool = False
     """Write the 10-frame picture strip of each episode."""
     out: str | None = None
-    """Results folder. [results/<date>_<time>]"""
+    """Results folder; results/<date>_<time> when none is named."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
 
@@ -185,23 +183,14 @@ def resolve(options: RunOptions) -> RunConfig:
     from arena_newton import tasks as task_specs
     from arena_newton.physics import resolve_engine
 
-    quick = not (options.task or options.mode or options.seeds or options.repeats is not None or options.max_steps)
-    known = tuple(task_specs.names())
-    tasks = known if quick or not options.task or tuple(options.task) == ("all",) else tuple(options.task)
-    _each("--task", tasks, known, extra="all")
-    modes = tuple(options.mode) or ("base",)
-    _each("--mode", modes, MODES)
-    _each("--rules", (options.rules,), RULES)
-    _each("--engine", (options.engine,), ENGINES)
+    quick = not (options.task or options.mode or options.seeds) and (options.repeats, options.max_steps) == (None, None)
+    tasks = task_specs.names() if tuple(options.task) in ((), ("all",)) else tuple(options.task)
     seeds = tuple(options.seeds) or (QUICK_SEEDS if quick else PROTOCOL_SEEDS)
-    if len(set(seeds)) != len(seeds) or min(seeds) < 0:
-        raise InputError(f"--seeds {' '.join(map(str, seeds))}: expected different numbers, none below 0")
+    if min(seeds) < 0:
+        raise InputError(f"--seeds {min(seeds)}: expected numbers of at least 0")
+    if options.worlds < 1:
+        raise InputError(f"--worlds {options.worlds}: expected at least 1")
     repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else PROTOCOL_REPEATS)
-    max_steps = QUICK_MAX_STEPS if quick else options.max_steps
-    for flag, number in (("--repeats", repeats), ("--worlds", options.worlds), ("--max-steps", max_steps)):
-        if number is not None and number < 1:
-            raise InputError(f"{flag} {number}: expected a number of at least 1")
-
     checkpoint = _existing("--checkpoint", options.checkpoint)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES else None
@@ -211,9 +200,9 @@ def resolve(options: RunOptions) -> RunConfig:
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
     engine, device = resolve_engine(options.engine, options.device)
-    return RunConfig(
+    config = RunConfig(
         tasks=tasks,
-        modes=modes,
+        modes=tuple(options.mode) or ("base",),
         tracker=options.tracker,
         checkpoint=checkpoint,
         checkpoint_hash=hash_path(checkpoint) if checkpoint else None,
@@ -223,15 +212,38 @@ def resolve(options: RunOptions) -> RunConfig:
         rules_hash=rule_sets.get(options.rules).hash,
         seeds=seeds,
         repeats=repeats,
-        max_steps=max_steps,
+        max_steps=QUICK_MAX_STEPS if quick else options.max_steps,
         engine=engine,
         device=device,
         variant=variant,
-        variant_hash=hash_path(variant) if variant else None,
+        variant_hash=_hash_scene(variant) if variant else None,
         fast_physics=options.fast_physics,
         worlds=options.worlds,
         video=options.video,
         strip=options.strip,
+    )
+    episodes(config)
+    return config
+
+
+def episodes(config: RunConfig) -> list[Episode]:
+    """The run's episodes in plan order.
+
+    Raises:
+        InputError: an unknown task or mode, something named twice, or a number out of range.
+    """
+    from arena_newton.eval import plan
+
+    return plan.expand(
+        config.tasks,
+        tracker=config.tracker,
+        policy=policy_label(config.policy),
+        modes=config.modes,
+        rules=config.rules,
+        engine=config.engine,
+        seeds=config.seeds,
+        repeats=config.repeats,
+        max_steps=config.max_steps,
     )
 
 
@@ -261,14 +273,15 @@ def policy_label(policy: str) -> str:
     return f"{scheme}:{Path(target).name}" if scheme in POLICY_PATH_SCHEMES and target else policy
 
 
-def _each(flag: str, given: tuple[str, ...], known: tuple[str, ...], extra: str = "") -> None:
-    for name in given:
-        if name not in known:
-            choices = " ".join((*known, extra) if extra else known)
-            hint = f"{extra!r} stands alone" if extra and name == extra else f"known are: {choices}"
-            raise InputError(f"{flag} {name}: {hint}")
-    if len(set(given)) != len(given):
-        raise InputError(f"{flag} {' '.join(given)}: a name stands there twice")
+def _hash_scene(path: Path) -> str:
+    """Hash of a USD file with every layer and asset that it loads."""
+    from pxr import UsdUtils
+
+    silence = UsdUtils.CoalescingDiagnosticDelegate()
+    layers, assets, _ = UsdUtils.ComputeAllDependencies(str(path))
+    del silence
+    files = {layer.realPath for layer in layers} | {str(asset) for asset in assets} | {str(path)}
+    return config_hash(sorted(hash_path(Path(file)) for file in files if file and Path(file).is_file()))
 
 
 def _existing(flag: str, given: str | None) -> Path | None:

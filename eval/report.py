@@ -203,7 +203,7 @@ def notes(results: dict[str, Any]) -> list[str]:
         found.append(f"In {overflows} episodes a contact or constraint buffer overflowed.")
     cap = results["config"]["max_steps"]
     if cap is not None:
-        found.append(f"Episodes were capped at {cap} ticks ({cap * 0.02:g} s); the benchmark's step budgets are longer.")
+        found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * 0.02:g} s): no benchmark result.")
     return found
 
 
@@ -219,14 +219,18 @@ def _markdown(run: RunRecord, results: dict[str, Any]) -> str:
         "## Configuration",
         "",
     ]
-    lines += [f"- {key}: `{json.dumps(value)}`" for key, value in run.config.items()]
+    lines += [f"- {key}: `{_plain(value)}`" for key, value in run.config.items()]
     lines += ["", f"## Rule set `{run.config['rules']}`", ""]
-    lines += [f"- {key}: `{json.dumps(value)}`" for key, value in run.document["rule_set"].items()]
+    lines += [f"- {key}: `{_plain(value)}`" for key, value in run.document["rule_set"].items()]
     media = _media(run)
     if media:
         lines += ["", "## Recordings", ""]
         lines += [f"- {title}: " + ", ".join(f"[{name}]({path})" for name, path in links) for title, links in media]
     return "\n".join(lines) + "\n"
+
+
+def _plain(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def _media(run: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -269,10 +273,11 @@ def _html(run: RunRecord, results: dict[str, Any]) -> str:
         "and seed rates pooled). CI: Wilson. AFR: falls per episode. Falls at start happened while the tracker settled."
         "</p>"
     )
-    for title, content in (("Configuration", run.config), (f"Rule set {run.config['rules']}", run.document["rule_set"])):
+    sections = {"Configuration": run.config, f"Rule set {run.config['rules']}": run.document["rule_set"]}
+    for title, content in sections.items():
         parts.append(f"<h2>{escape(title)}</h2><div class='scroll'><table><tbody>")
         parts += [
-            f"<tr><td>{escape(key)}</td><td class='text'><code>{escape(json.dumps(value))}</code></td></tr>"
+            f"<tr><td>{escape(key)}</td><td class='text'><code>{escape(_plain(value))}</code></td></tr>"
             for key, value in content.items()
         ]
         parts.append("</tbody></table></div>")

@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from arena_newton.errors import InputError
+from arena_newton.eval import config as configs
 from arena_newton.eval import report
-from arena_newton.eval.config import RunConfig, RunOptions, differing_key, explicit, policy_label, resolve
+from arena_newton.eval.config import RunConfig, RunOptions
 from arena_newton.eval.journal import Journal, StorageError, write_atomic
 
-__all__ = ["Factories", "execute", "make_plan", "stored_options"]
+__all__ = ["Factories", "execute", "stored_options"]
 
 
 def _make_env(task: str, **options: Any) -> Any:
@@ -42,10 +43,10 @@ def _make_policy(spec: str) -> Any:
     return policies.get(spec)
 
 
-def _check_variant(path: Path, task: str) -> list[str]:
+def _check_variant(path: Path, task: str) -> None:
     from arena_newton.usd_scenes import validate
 
-    return [str(finding) for finding in validate.check(path, task)]
+    validate.check(path, task)
 
 
 @dataclass(frozen=True)
@@ -55,26 +56,8 @@ class Factories:
     env: Callable[..., Any] = _make_env
     tracker: Callable[[str, Path | None], Any] = _make_tracker
     policy: Callable[[str], Any] = _make_policy
-    check_variant: Callable[[Path, str], list[str]] = _check_variant
-
-
-def make_plan(config: RunConfig) -> list[Any]:
-    """The episodes of a run in plan order."""
-    from arena_newton.eval import plan
-
-    return list(
-        plan.make_plan(
-            tasks=config.tasks,
-            trackers=(config.tracker,),
-            policies=(policy_label(config.policy),),
-            modes=config.modes,
-            rules=config.rules,
-            engine=config.engine,
-            seeds=config.seeds,
-            repeats=config.repeats,
-            max_steps=config.max_steps,
-        )
-    )
+    check_variant: Callable[[Path, str], None] = _check_variant
+    """Raises InputError for a file that is no scene of the task."""
 
 
 def stored_options(folder: Path) -> RunOptions:
@@ -96,12 +79,12 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
         StorageError: the results folder cannot be written; finished episodes are kept.
     """
     factories = factories or Factories()
-    config = resolve(options)
+    config = configs.resolve(options)
     folder = Path(options.out).expanduser() if options.out else _new_folder()
     document = _document(options, config)
     _check_folder(folder, document)
     policy = _check_parts(config, factories)
-    episodes = make_plan(config)
+    episodes = configs.episodes(config)
     document["planned"] = len(episodes)
     _open_folder(folder, document)
     print(f"configuration {config.hash}")
@@ -157,9 +140,9 @@ def _document(options: RunOptions, config: RunConfig) -> dict[str, Any]:
     return {
         "config_hash": config.hash,
         "config": config.identity(),
-        "rule_set": json.loads(json.dumps(rules.get(config.rules).to_dict())),
+        "rule_set": dict(rules.get(config.rules).table()),
         "gym_ids": {name: tasks.get(name).gym_id for name in config.tasks},
-        "options": json.loads(json.dumps(dataclasses.asdict(explicit(options, config)))),
+        "options": json.loads(json.dumps(dataclasses.asdict(configs.explicit(options, config)))),
         "versions": versions(),
         "planned": 0,
     }
@@ -171,7 +154,7 @@ def _check_folder(folder: Path, document: dict[str, Any]) -> None:
         raise InputError(f"--out {folder}: is a file")
     if (folder / report.CONFIG_FILE).exists():
         stored = report.read_config(folder)
-        difference = differing_key(stored["config"], document["config"])
+        difference = configs.differing_key(stored["config"], document["config"])
         if difference is not None:
             key, was, now = difference
             raise InputError(
@@ -198,10 +181,7 @@ def _check_parts(config: RunConfig, factories: Factories) -> Any:
     factories.tracker(config.tracker, config.checkpoint)
     policy = factories.policy(config.policy)
     if config.variant is not None:
-        findings = factories.check_variant(config.variant, config.tasks[0])
-        if findings:
-            more = f" (and {len(findings) - 1} more findings)" if len(findings) > 1 else ""
-            raise InputError(f"--variant {config.variant}: {findings[0]}{more}")
+        factories.check_variant(config.variant, config.tasks[0])
     return policy
 
 
@@ -260,12 +240,12 @@ def _run_group(
             camera=_policy_camera(policy),
         )
         if config.video or config.strip:
-            from arena_newton.eval.recorder import Recorder
+            from arena_newton.recorder import EpisodeRecorder
 
-            recorder = Recorder(folder, video=config.video, strip=config.strip)
+            recorder = EpisodeRecorder(folder, video=config.video, strip=config.strip)
 
         def on_finish(result: Any) -> None:
-            media = recorder.media(result.episode) if recorder is not None else {}
+            media = _media(folder, recorder.label(result.episode)) if recorder is not None else {}
             journal.append(_record(config, result, media))
             left.pop(result.episode.index, None)
             bar.update()
@@ -283,9 +263,7 @@ def _run_group(
             journal.append(_error_record(config, episode, message))
             bar.update()
     finally:
-        if recorder is not None:
-            recorder.close()
-        del env
+        env = recorder = None
         gc.collect()
 
 
@@ -299,6 +277,17 @@ def _policy_camera(policy: Any) -> Any:
     from arena_newton.camera import CameraConfig
 
     return CameraConfig()
+
+
+def _media(folder: Path, label: str) -> dict[str, str]:
+    """Recordings of an episode that lie in the results folder, by name."""
+    found = {}
+    for kind, suffix in (("videos", "mp4"), ("strips", "png")):
+        for camera in ("ego", "world"):
+            path = Path(kind) / f"{label}__{camera}.{suffix}"
+            if (folder / path).is_file():
+                found[camera if kind == "videos" else f"{camera} strip"] = path.as_posix()
+    return found
 
 
 class _TickRate:

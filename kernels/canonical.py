@@ -1,7 +1,8 @@
 """The canonical 64D state, the integration of 40D actions into a reference pose, and the 35D mimic command.
 
 Schema v3.1 of the original benchmark: xy displacement per control step in the reference's own full frame, absolute
-root height, orientation as rot6d with the initial heading removed, 29 absolute joint positions in canonical order, hands.
+root height, orientation as rot6d with the initial heading removed, 29 absolute joint positions in canonical order, two
+hands.
 """
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change

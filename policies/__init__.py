@@ -1,1 +1,5 @@
-"""policies of arena_newton."""
+"""Policies: they look and decide a 40-number whole-body action."""
+
+from arena_newton.policies.base import Chunk, Observation, Policy, PolicyError, get, names, register, world_mask
+
+__all__ = ["Chunk", "Observation", "Policy", "PolicyError", "get", "names", "register", "world_mask"]

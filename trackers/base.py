@@ -8,11 +8,11 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arena_newton.errors import InputError
+from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE, DriveGains, PhysicsRate
 
 if TYPE_CHECKING:
@@ -28,35 +28,6 @@ _BUILT_IN = {
     "twist2": "arena_newton.trackers.twist2:from_checkpoint",
 }
 _registered: dict[str, Callable[[Path | None], Tracker]] = {}
-
-
-@dataclass
-class TrackerCommand:
-    """The reference of this tick, for all worlds (torch views of Warp arrays)."""
-
-    mimic: torch.Tensor
-    """TWIST2's 35-number command: v_x, v_y [m/s, reference root frame], z [m], roll, pitch [rad], yaw rate [rad/s],
-    29 joints in MuJoCo order [rad]; shape [worlds, 35]."""
-    joints: torch.Tensor
-    """Reference joint positions [rad], MuJoCo order, shape [worlds, 29]."""
-    quat: torch.Tensor | None = None
-    """Reference root orientation in the world, wxyz, shape [worlds, 4]."""
-    joint_vel: torch.Tensor | None = None
-    """Reference joint velocities [rad/s], MuJoCo order, shape [worlds, 29]."""
-
-
-@dataclass
-class RobotState:
-    """What the robot measures, for all worlds (torch views of Warp arrays)."""
-
-    quat: torch.Tensor
-    """Root orientation in the world, wxyz, shape [worlds, 4]."""
-    ang_vel_body: torch.Tensor
-    """Root angular velocity in the body frame [rad/s], shape [worlds, 3]."""
-    joint_pos: torch.Tensor
-    """Joint positions [rad], MuJoCo order, shape [worlds, 29]."""
-    joint_vel: torch.Tensor
-    """Joint velocities [rad/s], MuJoCo order, shape [worlds, 29]."""
 
 
 class Tracker:

@@ -1,10 +1,10 @@
 """Network inference whose result for one world does not depend on the other worlds.
 
-Matrix products and vectorised activations on a CPU give a row other last bits in a batch of 3 than in a batch of 20, and
-a walking robot amplifies that to another trajectory. Rows are therefore padded to a multiple of a fixed block size. Which
-size leaves a row's bits alone wherever it stands in a block depends on the network, the library and the processor, so it
-is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it replaces the separate
-ones. On other devices the batch runs whole, without that promise.
+Matrix products and vectorised activations on a CPU give a row other last bits in a batch of 3 than in a batch of 20,
+and a walking robot amplifies that to another trajectory. Rows are therefore padded to a multiple of a fixed block size.
+Which size leaves a row's bits alone wherever it stands in a block depends on the network, the library and the
+processor, so it is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it
+replaces the separate ones. On other devices the batch runs whole, without that promise.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class BlockRunner:
         rows = -(-self.worlds // block) * block
         if merged or rows == block:
             return self.network(self._buffer[:rows])[: self.worlds]
-        return torch.cat([self.network(self._buffer[i : i + block].clone()) for i in range(0, rows, block)])[: self.worlds]
+        blocks = [self.network(self._buffer[i : i + block].clone()) for i in range(0, rows, block)]
+        return torch.cat(blocks)[: self.worlds]
 
     def plan(self) -> tuple[int, bool]:
         """Block size, and whether all blocks may run as one product, for the present number of threads."""

@@ -121,11 +121,12 @@ def surface(stage: Usd.Stage, name: str = "Rough", *, friction: float = 1.0) -> 
 
 
 def room_looks(
-    stage: Usd.Stage, *, floor: str = "concrete", wall: str = "wall", skirting: Sequence[float] = (0.9, 0.9, 0.88)
+    stage: Usd.Stage, *, floor: str = "concrete", wall: str | None = None, skirting: Sequence[float] = (0.9, 0.9, 0.88)
 ) -> None:
-    """The looks that `room` binds: floor and wall textures by name, skirting colour."""
+    """The looks that `room` binds: floor and wall textures by name (no wall texture: the original's grey), skirting."""
+    wall_texture = None if wall is None else f"../textures/{wall}.png"
     author.material(stage, "/World/Looks/Floor", (0.5, 0.5, 0.49), roughness=0.5, texture=f"../textures/{floor}.png")
-    author.material(stage, "/World/Looks/Wall", (0.5, 0.52, 0.51), texture=f"../textures/{wall}.png")
+    author.material(stage, "/World/Looks/Wall", (0.235, 0.245, 0.24), texture=wall_texture)
     author.material(stage, "/World/Looks/Skirting", skirting)
 
 
@@ -165,9 +166,9 @@ def room(stage: Usd.Stage, rough: Usd.Prim, *, tile: float = 2.0) -> None:
 
 
 def semantics(stage: Usd.Stage) -> Iterator[str]:
-    """Author the variants of /World: yields each name with edits going into that variant, and selects the first again.
+    """Author the variants of /World: yields each name while edits go into that variant, then selects the first.
 
-    Whatever differs between variants is written inside all of them, because opinions outside a variant set are stronger.
+    Whatever differs between variants is written inside each of them: opinions outside a variant set are stronger.
     """
     choice = stage.GetDefaultPrim().GetVariantSets().GetVariantSet(rooms.SEMANTICS)
     first = choice.GetVariantSelection()

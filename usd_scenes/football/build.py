@@ -20,7 +20,7 @@ BACK, BACK_HEIGHT = 5.03, 0.70
 """Rear posts' y and height [m]."""
 POST = 0.05
 """Radius of posts and crossbar [m]; our choice."""
-NET_SPACING, CORD = 0.12, 0.014
+NET_SPACING, CORD = 0.13, 0.02
 """Mesh and cord width of the net [m]; our choice, wide enough for a 224-pixel image."""
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.g1.links import LINKS, Link
@@ -116,7 +116,7 @@ def build(path: Path = PATH) -> None:
     robot = stage.GetDefaultPrim()
     UsdPhysics.ArticulationRootAPI.Apply(robot)
     robot.AddAppliedSchema("NewtonArticulationRootAPI")
-    author.attribute(robot, "newton:selfCollisionEnabled", False, Sdf.ValueTypeNames.Bool)
+    _attribute(robot, "newton:selfCollisionEnabled", False, Sdf.ValueTypeNames.Bool)
     UsdGeom.Scope.Define(stage, f"{ROOT}/Looks")
     looks = {
         name: author.material(stage, f"{ROOT}/Looks/{name}", color, roughness=roughness)
@@ -180,13 +180,12 @@ def _fixed(stage, fingers, poses, looks, grip) -> None:
             if not np.allclose(base, quat):
                 raise ValueError(f"{link.name}: the open hand's links are expected to be parallel to the wrist")
             offset = _matrix(base).T @ (position - origin)
-            parts += [(points + offset, faces) for points, faces in map(grid, HAND_SHAPES[link.name])]
+            parts += [(points + offset, normals, faces) for points, normals, faces in map(grid, HAND_SHAPES[link.name])]
             finger = link.name.removesuffix("_link").split("_", 2)[2]
             if finger in HAND_BOXES:
                 name = f"{ROOT}/{wrist.name}/{finger}_collision"
                 _hand_box(stage, name, HAND_BOXES[finger], side, grip, offset)
-        points, faces = merge(parts)
-        author.mesh(stage, f"{ROOT}/{wrist.name}/fingers", _round(points), faces, look=looks["hand"])
+        _mesh(stage, f"{ROOT}/{wrist.name}/fingers", *merge(parts), looks["hand"])
 
 
 def _link(stage: Usd.Stage, link: Link, poses: dict) -> None:
@@ -223,22 +222,30 @@ def _joint(stage: Usd.Stage, link: Link) -> None:
     prim = joint.GetPrim()
     prim.AddAppliedSchema("NewtonJointAPI")
     prim.AddAppliedSchema("MjcJointAPI")
-    author.attribute(prim, "newton:armature", hinge.armature, Sdf.ValueTypeNames.Float)
-    author.attribute(prim, "mjc:solreflimit", [0.02, 1.0], Sdf.ValueTypeNames.DoubleArray)
-    author.attribute(prim, "arena:effort", hinge.effort, Sdf.ValueTypeNames.Float)
+    _attribute(prim, "newton:armature", hinge.armature, Sdf.ValueTypeNames.Float)
+    _attribute(prim, "mjc:solreflimit", [0.02, 1.0], Sdf.ValueTypeNames.DoubleArray)
+    _attribute(prim, "arena:effort", hinge.effort, Sdf.ValueTypeNames.Float)
+
+
+def _attribute(prim: Usd.Prim, name: str, value, kind: Sdf.ValueTypeName) -> None:
+    """Author a vendor attribute; not `custom`, so that the text is the same with and without that vendor's schemas."""
+    prim.CreateAttribute(name, kind, False).Set(value)
 
 
 def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Bar | Rod], looks: dict[str, Usd.Prim]) -> None:
     for k, shape in enumerate(shapes):
         path = f"{parent}/visual_{k}"
         if isinstance(shape, Rod):
-            author.cylinder(
-                stage, path, shape.radius, shape.length, shape.center, shape.quat, shape.axis,
-                collide=False, look=looks[shape.look],
-            )  # fmt: skip
+            size = {"radius": shape.radius, "length": shape.length, "position": shape.center, "axis": shape.axis}
+            author.cylinder(stage, path, **size, collide=False, look=looks[shape.look])
         else:
-            points, faces = grid(shape)
-            author.mesh(stage, path, _round(points), faces, quat=shape.quat, look=looks[shape.look])
+            _mesh(stage, path, *grid(shape), looks[shape.look])
+
+
+def _mesh(stage: Usd.Stage, path: str, points, normals, faces, look: Usd.Prim) -> None:
+    geom = UsdGeom.Mesh(author.mesh(stage, path, _round(points), faces, look=look))
+    geom.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.round(normals, 3).astype(np.float32)))
+    geom.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 
 
 def _body_collisions(stage: Usd.Stage, skin: Usd.Prim) -> None:
@@ -264,8 +271,8 @@ def _hand_box(stage, path: str, size, side: str, grip: Usd.Prim, offset=(0.0, 0.
     center = np.array([x, y if side == "left" else -y, z]) + offset
     prim = author.box(stage, path, half, _round(center), visual=False, surface=grip)
     prim.AddAppliedSchema("MjcCollisionAPI")
-    author.attribute(prim, "mjc:solref", list(HAND_SOLREF), Sdf.ValueTypeNames.DoubleArray)
-    author.attribute(prim, "mjc:condim", 3, Sdf.ValueTypeNames.Int)
+    _attribute(prim, "mjc:solref", list(HAND_SOLREF), Sdf.ValueTypeNames.DoubleArray)
+    _attribute(prim, "mjc:condim", 3, Sdf.ValueTypeNames.Int)
 
 
 def _frames(stage: Usd.Stage) -> None:
@@ -318,7 +325,7 @@ def _z_to(direction: np.ndarray) -> np.ndarray:
 
 
 def _round(values: np.ndarray) -> np.ndarray:
-    """Tenths of a millimetre... kept short so that the layer stays readable [m]."""
+    """To a hundredth of a millimetre, so that the text of the layer stays short [m]."""
     return np.round(np.asarray(values, dtype=float), 5) + 0.0
 
 

@@ -20,10 +20,14 @@ from arena_newton.usd_scenes import author, rooms, warehouse
 POSITION = (-1.614, 2.314, 0.002)
 LEAF_SIZE = (1.0, 0.04, 2.14)
 LEAF_MASS = 20.0
+"""[kg]"""
 LEAF_CLEARANCE = 0.01
 LEAF_LIMITS = (-2.0, 110.0)
+"""[deg]"""
 LEAF_DAMPING = 1.5
+"""[N·m·s/rad]"""
 LEAF_FRICTION = 0.5
+"""[N·m]"""
 PARTITION_HEIGHT = 2.55
 PARTITION_THICKNESS = 0.10
 PARTITION_X = (-6.6, 4.6)
@@ -34,8 +38,11 @@ LEVER_LENGTH = 0.12
 LEVER_RADIUS = 0.011
 HANDLE_MASS = 0.3
 HANDLE_SPRING = 2.5
+"""[N·m/rad]"""
 HANDLE_DAMPING = 0.1
+"""[N·m·s/rad]"""
 HANDLE_LIMITS = (-50.0, 2.0)
+"""[deg]"""
 DOORWAY = (1.10, 0.04, 2.15)
 """The passage a rule tests [m]: |x| ≤ 0.55 and |y| ≤ 0.02 in the frame."""
 
@@ -51,6 +58,8 @@ def _hinge(stage: Usd.Stage, path: str, parent: str, child: str, axis: str, at_p
     joint.CreateLocalRot1Attr(Gf.Quatf(1, 0, 0, 0))
     joint.CreateLowerLimitAttr(float(limits[0]))
     joint.CreateUpperLimitAttr(float(limits[1]))
+    # MuJoCo's own default stop; the importer's would let the leaf bounce between its limits.
+    author.attribute(joint.GetPrim(), "mjc:solreflimit", Gf.Vec2d(0.02, 1.0), Sdf.ValueTypeNames.Double2)
     return joint.GetPrim()
 
 
@@ -150,12 +159,13 @@ def _chain(stage, rough) -> None:
         stage, "/World/Door/LeafHinge", "/World/Door/Frame", "/World/Door/Leaf", "Z", hinge_in_frame, LEAF_LIMITS
     )
     author.attribute(leaf, "arena:latch", True, Sdf.ValueTypeNames.Bool)
-    author.attribute(leaf, "newton:damping", LEAF_DAMPING, Sdf.ValueTypeNames.Float)
+    # USD angles are degrees: damping and stiffness of a hinge are per degree, friction is a torque.
+    author.attribute(leaf, "newton:damping", float(np.deg2rad(LEAF_DAMPING)), Sdf.ValueTypeNames.Float)
     author.attribute(leaf, "newton:friction", LEAF_FRICTION, Sdf.ValueTypeNames.Float)
     handle = _hinge(
         stage, "/World/Door/HandleHinge", "/World/Door/Leaf", "/World/Door/Handle", "Y", pivot_in_leaf, HANDLE_LIMITS
     )
-    author.attribute(handle, "newton:damping", HANDLE_DAMPING, Sdf.ValueTypeNames.Float)
+    author.attribute(handle, "newton:damping", float(np.deg2rad(HANDLE_DAMPING)), Sdf.ValueTypeNames.Float)
     author.attribute(handle, "newton:armature", 0.001, Sdf.ValueTypeNames.Float)
     drive = UsdPhysics.DriveAPI.Apply(handle, "angular")
     drive.CreateTypeAttr("force")

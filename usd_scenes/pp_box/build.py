@@ -126,7 +126,7 @@ def build(folder: Path) -> None:
         variants=("base", "semantic"),
     )
     looks = rooms.workshop(
-        stage, low=(-5.6, -8.0), high=(2.0, 2.4), windows=[("-x", -4.6, 2.0, 1.1), ("-x", -1.9, 2.0, 1.1)]
+        stage, low=(-5.6, -8.0), high=(2.0, 2.4), windows=[("-x", -4.2, 2.0, 1.1), ("+y", -3.6, 2.0, 0.3)]
     )
     cardboard = author.material(stage, "/World/Looks/cardboard", texture="../textures/cardboard.png")
     rooms.bench(stage, "/World/Table", TABLE_LOW, TABLE_HIGH)

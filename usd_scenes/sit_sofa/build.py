@@ -1,7 +1,7 @@
 """Author SitSofa: a living room with carpet, sofa, coffee table and two light cartons in the way.
 
-Sofa, table and carton sizes: spec of the original (measured on its clips). The seat is stiff (solref 0.02 s, friction 1):
-experts sit on it as well as on a soft one, and it is cheaper to simulate.
+Sofa, table and carton sizes: spec of the original (measured on its clips). The seat is stiff (solref 0.02 s,
+friction 1): experts sit on it as well as on a soft one, and it is cheaper to simulate.
 """
 
 from pathlib import Path
@@ -23,8 +23,8 @@ TABLE_Y = (-0.24, 0.48)
 TABLE_Z = 0.30
 CARTON_EDGE = 0.42
 CARTON_MASS = 0.05
-CARTONS = {"Carton_1": (-1.45, -0.68, 0.10), "Carton_2": (-1.35, 0.06, 0.10)}
-"""Poses before the first draw; a carton's origin is the centre of its underside, so z 0.1 m is a drop of 0.1 m."""
+CARTONS = {"Carton_1": (-1.45, -0.68, 0.31), "Carton_2": (-1.35, 0.06, 0.31)}
+"""Centres before the first draw: the original puts undersides at z 0.10 m, and the cartons drop."""
 
 
 def _span(x, y, z):
@@ -93,10 +93,10 @@ def _carton(stage, name: str, position, looks, rough) -> None:
     path, half = f"/World/{name}", CARTON_EDGE / 2
     # A thin-walled cube: 5/18 m a².
     inertia = (5.0 / 18.0 * CARTON_MASS * CARTON_EDGE**2,) * 3
-    author.rigid_body(stage, path, position, mass=CARTON_MASS, inertia=inertia, com=(0, 0, half))
-    author.box(stage, f"{path}/Solid", (half,) * 3, (0, 0, half), visual=False, surface=rough)
-    warehouse.boxes(stage, f"{path}/Board", [((half,) * 3, (0, 0, half))], look=looks[0], tile=CARTON_EDGE)
-    tape = [((0.03, half + 0.001, half + 0.001), (0, 0, half))]
+    author.rigid_body(stage, path, position, mass=CARTON_MASS, inertia=inertia)
+    author.box(stage, f"{path}/Solid", (half,) * 3, visual=False, surface=rough)
+    warehouse.boxes(stage, f"{path}/Board", [((half,) * 3, (0, 0, 0))], look=looks[0], tile=CARTON_EDGE)
+    tape = [((0.03, half + 0.001, half + 0.001), (0, 0, 0))]
     warehouse.boxes(stage, f"{path}/Tape", tape, look=looks[1])
 
 
@@ -117,21 +117,17 @@ def build(folder: Path) -> None:
         warehouse.room_looks(
             stage,
             floor="concrete" if base else "wood",
-            wall="wall" if base else "brick",
+            wall=None if base else "brick",
             skirting=(0.9, 0.9, 0.88) if base else (0.25, 0.16, 0.10),
         )
-        author.material(
-            stage, "/World/Looks/Carpet", (0.55, 0.55, 0.55) if base else (0.45, 0.12, 0.12),
-            texture="../textures/carpet.png" if base else None,
-        )  # fmt: skip
-        author.material(
-            stage, "/World/Looks/Sofa", (0.80, 0.79, 0.77) if base else (0.13, 0.22, 0.36),
-            texture="../textures/fabric.png" if base else None,
-        )  # fmt: skip
-        author.material(
-            stage, "/World/Looks/Table", (0.88, 0.88, 0.88) if base else (0.42, 0.27, 0.15),
-            texture=None if base else "../textures/wood.png",
-        )  # fmt: skip
+        looks = {
+            "Carpet": ((0.30, 0.30, 0.31), None) if base else ((0.5, 0.3, 0.3), "carpet"),
+            "Sofa": ((0.80, 0.79, 0.77), "fabric") if base else ((0.10, 0.19, 0.33), None),
+            "Table": ((0.88, 0.88, 0.88), None) if base else ((0.22, 0.12, 0.06), None),
+        }
+        for name, (color, texture) in looks.items():
+            path = None if texture is None else f"../textures/{texture}.png"
+            author.material(stage, f"/World/Looks/{name}", color, texture=path)
     warehouse.room(stage, rough)
     author.quad(
         stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(3.2, 2.5),

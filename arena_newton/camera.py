@@ -1,0 +1,407 @@
+"""Ego, wrist and world cameras: one batched ray tracer, one light per world.
+
+Newton's `SensorCamera` traces albedo, normal and depth; its lights are global to the sensor, so `kernels.lighting`
+shades those three per world and casts the shadow rays. Formula and exposure are documented there.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+    from arena_newton.tasks import LightDraw
+
+__all__ = ["CAMERA_PRIMS", "Camera", "CameraConfig", "WorldLights"]
+
+CAMERA_PRIMS = {
+    "ego": "front_cam",
+    "left_wrist": "left_wrist_cam",
+    "right_wrist": "right_wrist_cam",
+    "world": "/World/WorldCamera",
+}
+"""Camera name → prim (a path, or a name under the robot)."""
+LIGHT_PRIM = "/World/Light"
+DOME_INTENSITY = 3000.0
+"""Intensity of the original's dome light."""
+DOME_COLOR = (0.75, 0.75, 0.75)
+"""Colour of the original's dome light, linear RGB."""
+Fit = Literal["native", "pad"]
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A camera for policies or videos."""
+
+    width: int = 224
+    """Image width [px]."""
+    height: int = 224
+    """Image height [px]."""
+    prim: str = "ego"
+    """`ego`, `left_wrist`, `right_wrist`, `world`, or the path of a camera prim."""
+    fit: Fit = "pad"
+    """`native`: the lens fills width × height with square pixels, horizontal view kept; `pad`: the sensor's own aspect
+    (4:3 for the robot's cameras) fitted into width × height, black around it, as the original prepares policy images."""
+    samples: int = 1
+    """Rays per pixel along each axis (2 is 4 rays a pixel: smooth edges for videos)."""
+
+
+class WorldLights:
+    """One light per world: a uniform dome, or a distant light with shadows."""
+
+    def __init__(self, worlds: int, device: Any, stage: Any = None):
+        """See `allocate`."""
+        import warp as wp
+
+        self.worlds = worlds
+        self.device = wp.get_device(device)
+        with wp.ScopedDevice(self.device):
+            self.distant = wp.zeros(worlds, dtype=wp.int32)
+            """1 for a distant light, 0 for a dome, shape [worlds]."""
+            self.direction = wp.zeros(worlds, dtype=wp.vec3)
+            """Unit vector from the light to the scene, shape [worlds]."""
+            self.radiance = wp.zeros(worlds, dtype=wp.vec3)
+            """Intensity times colour, linear RGB, shape [worlds]."""
+        self._host = {
+            "distant": np.zeros(worlds, dtype=np.int32),
+            "direction": np.tile(np.float32([0, 0, -1]), (worlds, 1)),
+            "radiance": np.zeros((worlds, 3), dtype=np.float32),
+        }
+        self._base = _stage_light(stage)
+        for world in range(worlds):
+            self.set(world, None)
+
+    @classmethod
+    def allocate(cls, worlds: int, device: Any, stage: Any = None) -> WorldLights:
+        """Lights of a batch, all set to the base light.
+
+        Args:
+            worlds: Number of worlds.
+            device: Warp device, the one of the model.
+            stage: USD stage whose `/World/Light` is the base light; without one, the original's dome.
+        """
+        return cls(worlds, device, stage)
+
+    def set(
+        self,
+        world: int,
+        light: LightDraw | None,
+        dome_intensity: float | None = None,
+        dome_color: Sequence[float] | None = None,
+    ) -> None:
+        """Set the light of one world; it holds from the next render on.
+
+        Args:
+            world: World index.
+            light: A distant light (`direction` from the light to the scene, `intensity`, `color`), or None for the base
+                light.
+            dome_intensity: With `light` None: a dome of this intensity instead of the base light.
+            dome_color: With `light` None: a dome of this colour, linear RGB.
+        """
+        if light is not None:
+            direction, intensity, color = light.direction, light.intensity, light.color
+        elif dome_intensity is None and dome_color is None:
+            direction, intensity, color = self._base
+        else:
+            direction = None
+            intensity = DOME_INTENSITY if dome_intensity is None else dome_intensity
+            color = DOME_COLOR if dome_color is None else dome_color
+        host = self._host
+        host["distant"][world] = direction is not None
+        if direction is not None:
+            vector = np.asarray(direction, dtype=np.float64)
+            length = np.linalg.norm(vector)
+            if vector.shape != (3,) or not np.isfinite(length) or length == 0.0:
+                raise InputError(f"light of world {world}: direction must be three finite numbers, got {direction}")
+            host["direction"][world] = vector / length
+        host["radiance"][world] = float(intensity) * np.asarray(color, dtype=np.float64)
+        self._dirty = True
+
+    def upload(self) -> None:
+        """Bring changes to the device (a render does it)."""
+        if self._dirty:
+            for name, values in self._host.items():
+                getattr(self, name).assign(values)
+            self._dirty = False
+
+
+def _stage_light(stage: Any) -> tuple[tuple[float, ...] | None, float, tuple[float, ...]]:
+    """Direction (None for a dome), intensity and colour of the stage's `/World/Light`."""
+    if stage is None or not stage.GetPrimAtPath(LIGHT_PRIM):
+        return None, DOME_INTENSITY, DOME_COLOR
+    from pxr import Gf, UsdGeom, UsdLux
+
+    prim = stage.GetPrimAtPath(LIGHT_PRIM)
+    light = UsdLux.LightAPI(prim)
+    intensity = float(light.GetIntensityAttr().Get()) * 2.0 ** float(light.GetExposureAttr().Get())
+    color = tuple(float(c) for c in light.GetColorAttr().Get())
+    if not prim.IsA(UsdLux.DistantLight):
+        return None, intensity, color
+    # A distant light shines along its local −z (UsdLux).
+    pose = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
+    return tuple(pose.TransformDir(Gf.Vec3d(0, 0, -1)).GetNormalized()), intensity, color
+
+
+class _Tracer:
+    """What the cameras of one model share: Newton's sensor with its textures, and the shadow casters."""
+
+    _of_model: weakref.WeakKeyDictionary[Any, _Tracer] = weakref.WeakKeyDictionary()
+
+    def __init__(self, model: Any):
+        import newton
+        import warp as wp
+        from newton._src.geometry.raycast import ray_intersect_shape_no_normal
+        from newton.sensors import SensorCamera
+
+        from arena_newton.kernels.lighting import Occluders
+
+        on_cuda = model.device.is_cuda
+        self.sensor = SensorCamera(
+            model,
+            default_render_config=SensorCamera.RenderConfig(
+                enable_textures=True,
+                enable_particles=False,
+                # Both sides of a mesh are drawn, as in USD; shading turns the normal to the viewer.
+                enable_backface_culling=False,
+                enable_ambient_lighting=False,
+                # Neighbouring threads should meet the same shapes; the CPU walks one view after the other.
+                render_order=SensorCamera.RenderOrder.TILED if on_cuda else SensorCamera.RenderOrder.VIEW_PRIORITY,
+            ),
+        )
+        self.preserve = int(SensorCamera.WorldRenderFlag.DISABLE_PRESERVE)
+        self.ray_primitive = ray_intersect_shape_no_normal
+        self.mesh_type = int(newton.GeoType.MESH)
+        mesh_like = (int(newton.GeoType.HFIELD), int(newton.GeoType.CONVEX_MESH))
+        types = model.shape_type.numpy()
+        self.occluders = Occluders()
+        self.occluders.bvh = model.bvh_shapes.id
+        self.occluders.group_roots = model.bvh_shapes_group_roots
+        self.occluders.leaves = model.bvh_shape_enabled
+        self.occluders.types = wp.array(
+            np.where(np.isin(types, mesh_like), self.mesh_type, types), dtype=wp.int32, device=model.device
+        )
+        self.occluders.sizes = model.shape_scale
+        self.occluders.transforms = model.bvh_shape_world_transforms
+        self.occluders.meshes = model.shape_source_ptr
+        byte = np.arange(256) / 255.0
+        linear = np.where(byte <= 0.04045, byte / 12.92, ((byte + 0.055) / 1.055) ** 2.4)
+        self.decode = wp.array(linear, dtype=wp.float32, device=model.device)
+
+    @classmethod
+    def of(cls, model: Any) -> _Tracer:
+        """The tracer of a model, made on first use."""
+        if model.bvh_shapes is None:
+            raise InputError("the scene has no visible shape to render")
+        if model not in cls._of_model:
+            cls._of_model[model] = cls(model)
+        return cls._of_model[model]
+
+
+class Camera:
+    """A camera in every world of a model; looks along its −z, +y up."""
+
+    def __init__(
+        self,
+        model: Any,
+        body: np.ndarray,
+        position: Sequence[float],
+        quat: Sequence[float],
+        *,
+        width: int,
+        height: int,
+        focal_length: float,
+        horizontal_aperture: float,
+        lights: WorldLights,
+        fit: Fit = "native",
+        aspect: float = 4.0 / 3.0,
+        samples: int = 1,
+    ):
+        """Allocate the pictures.
+
+        Args:
+            model: Newton model with N worlds.
+            body: int [worlds], Newton body that carries the camera, −1 for a camera fixed in the world.
+            position: Camera in the body's frame [m].
+            quat: Camera in the body's frame, wxyz.
+            width: Image width [px].
+            height: Image height [px].
+            focal_length: Focal length, in the unit of the aperture.
+            horizontal_aperture: Width of the sensor; pixels are square.
+            lights: The worlds' lights.
+            fit: See `CameraConfig.fit`.
+            aspect: Width over height of the sensor, for `fit="pad"`.
+            samples: Rays per pixel along each axis.
+
+        Raises:
+            InputError: A size that is not positive, or an unknown `fit`.
+        """
+        import torch
+        import warp as wp
+        from newton.sensors import SensorCamera
+
+        if min(width, height, samples) < 1:
+            raise InputError(f"camera: width, height and samples must be positive, got {width}×{height}, {samples}")
+        if fit not in ("native", "pad"):
+            raise InputError(f"camera: fit {fit!r} unknown, choose native or pad")
+        if min(focal_length, horizontal_aperture, aspect) <= 0.0:
+            raise InputError("camera: focal length, aperture and aspect must be positive")
+        if lights.worlds != model.world_count:
+            raise InputError(f"camera: lights of {lights.worlds} worlds for a model of {model.world_count}")
+        self.model, self.lights = model, lights
+        self.width, self.height, self.samples = width, height, samples
+        self.worlds, self.device = model.world_count, model.device
+        inner_w, inner_h = width, height
+        if fit == "pad":
+            inner_w = min(width, max(1, round(height * aspect)))
+            inner_h = min(height, max(1, round(width / aspect)))
+        self._size = (inner_h, inner_w)
+        self._origin = ((height - inner_h) // 2, (width - inner_w) // 2)
+        self._tracer = _Tracer.of(model)
+        w, h, sensor = inner_w * samples, inner_h * samples, self._tracer.sensor
+        self._rays = SensorCamera.compute_camera_rays_pinhole(
+            w,
+            h,
+            focal_length=focal_length,
+            horizontal_aperture=horizontal_aperture,
+            vertical_aperture=horizontal_aperture * h / w,
+            device=self.device,
+        )
+        qw, qx, qy, qz = (float(v) for v in quat)
+        self._local = wp.transform(wp.vec3(*(float(v) for v in position)), wp.normalize(wp.quat(qx, qy, qz, qw)))
+        with wp.ScopedDevice(self.device):
+            self._body = wp.array(np.broadcast_to(body, self.worlds), dtype=wp.int32)
+            self.poses = wp.zeros(self.worlds, dtype=wp.transform)
+            """World pose of each camera at the last render [m]."""
+            self._view_world = wp.array(np.arange(self.worlds), dtype=wp.int32)
+            self._albedo = sensor.allocate_image_albedo(self.worlds, w, h)
+            self._normals = sensor.allocate_image_normal(self.worlds, w, h)
+            self._depth = sensor.allocate_image_depth(self.worlds, w, h)
+            self.image = wp.zeros((self.worlds, height, width, 3), dtype=wp.uint8)
+            """The pictures of the last render, uint8 [worlds, height, width, 3]."""
+        self._torch_image = wp.to_torch(self.image)
+        self._torch_view_world = wp.to_torch(self._view_world)
+        self._every = torch.arange(self.worlds, dtype=torch.int32, device=self._torch_image.device)
+
+    @classmethod
+    def from_scene(
+        cls,
+        scene: Scene,
+        physics: Physics | None = None,
+        prim: str = "ego",
+        width: int = 224,
+        height: int = 224,
+        lights: WorldLights | None = None,
+        *,
+        fit: Fit = "native",
+        samples: int = 1,
+    ) -> Camera:
+        """A camera authored in the scene's stage: its lens, its pose and the body that carries it.
+
+        Args:
+            scene: The built scene.
+            physics: Not needed to build a camera; kept so that a caller may hand both.
+            prim: `ego`, `left_wrist`, `right_wrist`, `world`, or the path of a camera prim.
+            width: Image width [px].
+            height: Image height [px].
+            lights: The worlds' lights; by default the stage's light in every world.
+            fit: See `CameraConfig.fit`.
+            samples: Rays per pixel along each axis.
+
+        Raises:
+            InputError: The prim is missing or is not a camera.
+        """
+        from pxr import UsdGeom
+
+        name = CAMERA_PRIMS.get(prim, prim)
+        frame = scene.frame(name)
+        path = name if name.startswith("/") else _path_under_robot(scene.stage, name)
+        lens = UsdGeom.Camera(scene.stage.GetPrimAtPath(path))
+        if not lens:
+            raise InputError(f"{scene.path}: prim {path} is not a Camera")
+        focal, aperture = float(lens.GetFocalLengthAttr().Get()), float(lens.GetHorizontalApertureAttr().Get())
+        vertical = float(lens.GetVerticalApertureAttr().Get())
+        body = scene.body_to_newton[:, frame.body_id] if frame.body_id else np.full(scene.worlds, -1)
+        return cls(
+            scene.model,
+            body,
+            frame.pos,
+            frame.quat,
+            width=width,
+            height=height,
+            focal_length=focal,
+            horizontal_aperture=aperture,
+            lights=lights or WorldLights.allocate(scene.worlds, scene.device, scene.stage),
+            fit=fit,
+            aspect=aperture / vertical,
+            samples=samples,
+        )
+
+    def render(self, state: Any, mask: Any = None) -> Any:
+        """Render the worlds of a mask; the pictures of the others stay as they were.
+
+        Args:
+            state: Newton state whose `body_q` holds the bodies' poses.
+            mask: bool [worlds] (array or tensor); None renders all.
+
+        Returns:
+            torch tensor uint8 [worlds, height, width, 3], on the model's device, that shares memory with `image` and is
+            overwritten by the next render.
+        """
+        import torch
+
+        from arena_newton.kernels import lighting
+
+        tracer, lights = self._tracer, self.lights
+        if mask is None:
+            self._torch_view_world.copy_(self._every)
+        else:
+            if not torch.is_tensor(mask) and hasattr(mask, "numpy"):
+                mask = mask.numpy()
+            asked = torch.as_tensor(mask, device=self._every.device).bool()
+            self._torch_view_world.copy_(torch.where(asked, self._every, tracer.preserve))
+        lights.upload()
+        self.model.bvh_refit_shapes(state)
+        lighting.launch_camera_poses(state.body_q, self._body, self._local, self.poses)
+        tracer.sensor.update(
+            state,
+            self.poses,
+            self._rays,
+            albedo_image=self._albedo,
+            normal_image=self._normals,
+            depth_image=self._depth,
+            world_indices=self._view_world,
+        )
+        lighting.launch_shade(
+            tracer.ray_primitive,
+            tracer.mesh_type,
+            view_world=self._view_world,
+            poses=self.poses,
+            rays=self._rays,
+            albedo=self._albedo,
+            normals=self._normals,
+            depth=self._depth,
+            decode=tracer.decode,
+            scene=tracer.occluders,
+            distant=lights.distant,
+            direction=lights.direction,
+            light=lights.radiance,
+            samples=self.samples,
+            size=self._size,
+            origin=self._origin,
+            image=self.image,
+        )
+        return self._torch_image
+
+
+def _path_under_robot(stage: Any, name: str) -> str:
+    from pxr import Usd
+
+    return next(str(p.GetPath()) for p in Usd.PrimRange(stage.GetPrimAtPath("/World/Robot")) if p.GetName() == name)

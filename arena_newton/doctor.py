@@ -1,0 +1,206 @@
+"""``python -m arena_newton doctor``: what is installed, what it runs on, and what to do about what is missing."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Finding", "examine", "main", "versions"]
+
+_REQUIRED = {
+    "newton": "physics, scenes and cameras",
+    "warp-lang": "kernels",
+    "mujoco": "engine mujoco",
+    "mujoco-warp": "engine warp",
+    "torch": "trackers and policies",
+    "usd-core": "scene files",
+    "newton-usd-schemas": "scene files",
+    "trimesh": "meshes",
+    "numpy": "arithmetic",
+    "onnx": "official tracker checkpoints",
+    "tyro": "command line",
+    "tqdm": "progress bar",
+    "pillow": "textures and picture strips",
+}
+_OPTIONAL = {
+    "lerobot": "LeRobot policies and datasets",
+    "rsl-rl-lib": "tracker training",
+    "opencv-python-headless": "image resizing of policies",
+    "onnxruntime": "check of converted checkpoints",
+    "av": "videos (--video)",
+}
+_INSTALL = "run `uv sync` in the checkout, or `pip install --upgrade arena-newton`"
+_MIN_FREE_GIB = 2.0
+"""Below this free space a run with videos or a cold kernel cache may end on a full disk [GiB]."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination."""
+
+    subject: str
+    value: str
+    status: str = "ok"
+    """``ok``, ``note`` (works, but something is absent) or ``bad`` (a run fails)."""
+    advice: str = ""
+    """What to do about it."""
+
+
+def versions() -> dict[str, str | None]:
+    """Installed versions by distribution name, without importing anything heavy; None for what is absent."""
+    from arena_newton import __version__
+
+    found: dict[str, str | None] = {"python": platform.python_version(), "arena-newton": __version__}
+    for name in (*_REQUIRED, *_OPTIONAL):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def _packages() -> list[Finding]:
+    found = versions()
+    minor = sys.version_info[:2]
+    advice = "" if minor == (3, 12) else "use Python 3.12, for instance `uv python install 3.12`"
+    findings = [
+        Finding("python", f"{found['python']} ({sys.executable})", "ok" if minor == (3, 12) else "bad", advice),
+        Finding("arena-newton", str(found["arena-newton"])),
+    ]
+    for name, purpose in _REQUIRED.items():
+        version = found[name]
+        missing = Finding(name, "missing", "bad", f"needed for {purpose}: {_INSTALL}")
+        findings.append(missing if version is None else Finding(name, version))
+    for name, purpose in _OPTIONAL.items():
+        version = found[name]
+        missing = Finding(name, "missing", "note", f"needed for {purpose}: {_INSTALL}")
+        findings.append(missing if version is None else Finding(name, version))
+    return findings
+
+
+def _devices() -> list[Finding]:
+    findings = [Finding("cpu", f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}")]
+    try:
+        import warp as wp
+
+        wp.config.quiet = True
+        wp.init()
+        devices = wp.get_cuda_devices()
+    except Exception as error:
+        return [*findings, Finding("warp", f"does not start ({_short(error)})", "bad", _INSTALL)]
+    for device in devices:
+        gib = device.total_memory / 2**30
+        findings.append(Finding(device.alias, f"{device.name}, {gib:.0f} GiB, sm_{device.arch}"))
+    if not devices:
+        advice = "fine for engine mujoco; for thousands of worlds use a machine with an NVIDIA driver (`nvidia-smi`)"
+        findings.append(Finding("cuda", "none", "note", advice))
+    try:
+        import torch
+
+        cuda = torch.cuda.is_available()
+    except Exception as error:
+        return [*findings, Finding("torch", f"does not start ({_short(error)})", "bad", _INSTALL)]
+    if devices and not cuda:
+        advice = "torch was built without CUDA; trackers would run on the CPU: install the CUDA build of torch"
+        findings.append(Finding("torch cuda", "none", "bad", advice))
+    elif cuda:
+        findings.append(Finding("torch cuda", f"{torch.version.cuda}, {torch.cuda.device_count()} devices"))
+    return findings
+
+
+def _engines() -> list[Finding]:
+    findings = []
+    try:
+        import mujoco
+
+        model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>")
+        mujoco.mj_step(model, mujoco.MjData(model))
+        findings.append(Finding("engine mujoco", "steps"))
+    except Exception as error:
+        findings.append(Finding("engine mujoco", f"does not step ({_short(error)})", "bad", _INSTALL))
+    try:
+        import mujoco_warp
+        import warp as wp
+
+        where = "CUDA" if wp.is_cuda_available() else "the Warp CPU backend (slow: use --engine mujoco)"
+        findings.append(Finding("engine warp", f"{mujoco_warp.__name__} imports, runs on {where}"))
+    except Exception as error:
+        findings.append(Finding("engine warp", f"does not import ({_short(error)})", "bad", _INSTALL))
+    return findings
+
+
+def _storage() -> list[Finding]:
+    findings = []
+    try:
+        import warp as wp
+
+        cache = Path(wp.config.kernel_cache_dir or "")
+        files = [p for p in cache.rglob("*") if p.is_file()] if cache.is_dir() else []
+        size = sum(p.stat().st_size for p in files) / 2**20
+        if files:
+            findings.append(Finding("kernel cache", f"{cache}, {size:.0f} MiB in {len(files)} files"))
+        else:
+            advice = "nothing to do: the first run compiles for about a minute; WARP_CACHE_PATH moves it"
+            findings.append(Finding("kernel cache", f"{cache}, empty", "note", advice))
+        place = next(p for p in (cache, *cache.parents) if p.exists())
+        if not os.access(place, os.W_OK):
+            findings.append(Finding("kernel cache", "not writable", "bad", "set WARP_CACHE_PATH to a writable folder"))
+    except Exception as error:
+        findings.append(Finding("kernel cache", f"unknown ({_short(error)})", "bad", _INSTALL))
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    advice = "" if free >= _MIN_FREE_GIB else "free some space or write results elsewhere with --out"
+    findings.append(Finding("free disk here", f"{free:.1f} GiB", "ok" if free >= _MIN_FREE_GIB else "note", advice))
+    return findings
+
+
+def _scenes() -> list[Finding]:
+    import arena_newton
+
+    root = Path(arena_newton.__file__).parent / "usd_scenes"
+    findings = []
+    for name in ("g1/g1.usda", *(f"{task}/scene.usda" for task in _task_names())):
+        if not (root / name).is_file():
+            advice = "run `python -m arena_newton.usd_scenes build`"
+            findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
+    return findings or [Finding("scenes", f"robot and all tasks in {root}")]
+
+
+def _task_names() -> tuple[str, ...]:
+    from arena_newton import tasks
+
+    return tuple(tasks.names())
+
+
+def _short(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+
+
+def examine() -> list[Finding]:
+    """Everything worth knowing before a run."""
+    findings = _packages()
+    if any(finding.status == "bad" for finding in findings):
+        return findings
+    return [*findings, *_devices(), *_engines(), *_storage(), *_scenes()]
+
+
+def main() -> int:
+    """Print the findings.
+
+    Returns:
+        Exit code: 0 when a run can start, 1 when something in the way must be mended first.
+    """
+    findings = examine()
+    width = max(len(finding.subject) for finding in findings)
+    for finding in findings:
+        mark = {"ok": "  ", "note": "- ", "bad": "! "}[finding.status]
+        print(f"{mark}{finding.subject:<{width}}  {finding.value}")
+        if finding.advice:
+            print(f"  {'':<{width}}  -> {finding.advice}")
+    bad = sum(finding.status == "bad" for finding in findings)
+    print(f"{bad} problems to mend" if bad else "ready: python -m arena_newton.eval")
+    return 1 if bad else 0

@@ -1,0 +1,348 @@
+"""What a task is: names, spawn, randomised objects, budgets and the judge that binds a built scene to a predicate.
+
+Drawing is pure: an episode's draws depend on its seed, its mode and the rule set, and on nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from arena_newton import seeding
+from arena_newton.errors import InputError
+from arena_newton.rules import (
+    MODES,
+    ByRules,
+    CylinderRange,
+    FixedLight,
+    LightRange,
+    ObjectRule,
+    PoseRange,
+    RuleSet,
+    TaskRules,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["DISTANT_LIGHT", "Draws", "Judge", "LightDraw", "ObjectSpec", "Pose", "TaskSpec", "widened"]
+
+Vec3 = tuple[float, float, float]
+Quat = tuple[float, float, float, float]
+Sample = dict[str, float]
+
+IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
+FACE_PLUS_Y: Quat = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+FACE_MINUS_Y: Quat = (math.sqrt(0.5), 0.0, 0.0, -math.sqrt(0.5))
+
+EXECUTION_SHARE = 1.45 / 1.2
+"""Football's execution range over its base range (±1.45 m over ±1.2 m): a range grows by 21 %."""
+
+DISTANT_LIGHT = FixedLight()
+"""The distant light that two of the original's scenes carry in every mode."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A world pose."""
+
+    pos: Vec3
+    """[m]."""
+    quat: Quat
+    """wxyz."""
+
+
+@dataclass(frozen=True)
+class LightDraw:
+    """One distant light."""
+
+    direction: Vec3
+    """Unit vector from the light to the scene."""
+    intensity: float
+    color: Vec3
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    yaw_deg: float = 0.0
+    angle_deg: float = 15.0
+    """Angular size [deg]: how soft shadows are (original benchmark)."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Everything random about one episode."""
+
+    sampled: dict[str, Sample]
+    """Record name → the sample as configured: x, y, z [m], yaw [rad] (and what else the task draws)."""
+    placed: dict[str, Pose]
+    """Prim path → world pose of the prim's origin."""
+    light: LightDraw | None
+    """Distant light of the episode; None: the scene's dome."""
+
+
+@dataclass(frozen=True)
+class ObjectSpec:
+    """One randomised object."""
+
+    record: str
+    """Name in the original's records."""
+    prim: str
+    """Prim path in the scene."""
+    base: PoseRange | CylinderRange
+    execution: PoseRange | CylinderRange
+    """Execution range as the original configures it."""
+    init: Vec3 = (0.0, 0.0, 0.0)
+    """Initial position [m], to which `offset` and `scaled` placement add."""
+    init_quat: Quat = IDENTITY
+    spawn_scale: float = 1.0
+    """Scale at which the original spawns the asset, which its `scaled` placement applies to the sample."""
+    placement: ByRules[str] = field(default_factory=lambda: ByRules.same("absolute"))
+    execution_void: bool = False
+    """The original's execution range has no effect there (its placement scales it away)."""
+    lift: float = 0.0
+    """Height of our prim's origin above the original's [m]."""
+
+    def rule(self, rules_name: str) -> ObjectRule:
+        """What a rule set says about this object."""
+        execution = self.execution
+        if rules_name == "paper" and isinstance(self.base, PoseRange) and isinstance(self.execution, PoseRange):
+            execution = paper_execution(self.base, self.execution, self.execution_void)
+        return ObjectRule(self.record, self.placement.of(rules_name), self.base, execution)
+
+
+def widened(bounds: tuple[float, float]) -> tuple[float, float]:
+    """A range about the same centre, wider by `EXECUTION_SHARE`."""
+    centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    return centre - half * EXECUTION_SHARE, centre + half * EXECUTION_SHARE
+
+
+def paper_execution(base: PoseRange, original: PoseRange, void: bool) -> PoseRange:
+    """Execution range under `paper`: the original's where that widens the base range, else the base range widened.
+
+    An axis that the original leaves alone stays as it is. One that it shifts, or changes without effect, grows about
+    the base range by Football's share.
+    """
+
+    def axis(wanted: Any, given: Any) -> Any:
+        if given == wanted:
+            return wanted
+        contains = given[0] <= wanted[0] and given[1] >= wanted[1]
+        return given if contains and not void else widened(wanted)
+
+    return PoseRange(*(axis(getattr(base, k), getattr(original, k)) for k in ("x", "y", "z", "yaw")))
+
+
+def draw_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """One number; reversed bounds are harmless, equal bounds consume nothing."""
+    low, high = min(bounds), max(bounds)
+    return float(rng.uniform(low, high)) if high > low else low
+
+
+def sample_pose(rng: np.random.Generator, ranges: PoseRange, order: tuple[str, ...]) -> Sample:
+    """One sample; axes are drawn in the given order."""
+    return {k: draw_uniform(rng, getattr(ranges, k)) for k in order if getattr(ranges, k) is not None}
+
+
+def object_range(rule: ObjectRule, mode: str) -> Any:
+    """The range in force."""
+    return rule.execution if mode == "execution" else rule.base
+
+
+def sample_objects(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:
+    """Samples of every object, each from its own generator in the order yaw, x, y, z (original benchmark)."""
+    master = seeding.object_seed(episode_seed)
+    return {
+        o.record: sample_pose(seeding.object_rng(master, o.record), object_range(o, mode), ("yaw", "x", "y", "z"))
+        for o in rules.objects
+    }
+
+
+def yaw_quat(yaw: float) -> Quat:
+    """Rotation about z."""
+    return math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
+
+
+def multiply(a: Quat, b: Quat) -> Quat:
+    """Quaternion product, wxyz."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def place(spec: ObjectSpec, rule: ObjectRule, sample: Sample) -> Pose:
+    """World pose of an object's prim for a sample."""
+    p = [sample["x"], sample["y"], sample["z"]]
+    if rule.placement != "absolute":
+        scale = spec.spawn_scale if rule.placement == "scaled" else 1.0
+        p = [o + scale * v for o, v in zip(spec.init, p, strict=True)]
+    norm = math.sqrt(sum(v * v for v in spec.init_quat))
+    init = tuple(v / norm for v in spec.init_quat)
+    return Pose((p[0], p[1], p[2] + spec.lift), multiply(yaw_quat(sample.get("yaw", 0.0)), init))  # type: ignore[arg-type]
+
+
+def light_direction(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Vec3:
+    """Direction of a light that shines along −z after rotateXYZ = (roll, pitch, yaw): first about x, then y, then z."""
+    roll, pitch, yaw = (math.radians(v) for v in (roll_deg, pitch_deg, yaw_deg))
+    x, y, z = -math.sin(pitch) * math.cos(roll), math.sin(roll), -math.cos(pitch) * math.cos(roll)
+    return math.cos(yaw) * x - math.sin(yaw) * y, math.sin(yaw) * x + math.cos(yaw) * y, z
+
+
+def draw_light(episode_seed: int, ranges: LightRange) -> LightDraw:
+    """Visual mode's light; equal bounds consume no draw."""
+    rng = seeding.light_rng(episode_seed)
+
+    def draw(bounds: tuple[float, float]) -> float:
+        low, high = min(bounds), max(bounds)
+        return rng.uniform(low, high) if high > low else low
+
+    yaw, pitch, roll = draw(ranges.yaw_deg), draw(ranges.pitch_deg), draw(ranges.roll_deg)
+    intensity = draw(ranges.intensity)
+    red, green, blue = (draw(c) for c in ranges.color)
+    return LightDraw(light_direction(yaw, pitch, roll), intensity, (red, green, blue), pitch, roll, yaw)
+
+
+class Judge:
+    """Success of every world, judged on the device once a tick.
+
+    A subclass binds prim handles of a built scene to a kernel of `kernels.success`.
+    """
+
+    def __init__(self, scene: Scene):
+        """Allocate the outputs."""
+        import warp as wp
+
+        self.worlds = scene.worlds
+        self.device = wp.get_device(scene.device)
+        with wp.ScopedDevice(self.device):
+            self.success = wp.zeros(self.worlds, dtype=wp.int32)
+            """1 = success, shape [worlds]."""
+            self.margin = wp.zeros(self.worlds, dtype=wp.float32)
+            """Signed distance to success [m], at least 0 where the predicate holds at this instant, shape [worlds]."""
+            self.event = wp.zeros(self.worlds, dtype=wp.int32)
+            """0 nothing, 1 the ball left the field, shape [worlds]."""
+        self.counters: list[Any] = []
+        """int32 arrays [worlds] that a reset clears."""
+
+    def counter(self) -> Any:
+        """A new counter of ticks, cleared at reset, shape [worlds]."""
+        import warp as wp
+
+        self.counters.append(wp.zeros(self.worlds, dtype=wp.int32, device=self.device))
+        return self.counters[-1]
+
+    def outputs(self) -> dict[str, Any]:
+        """Keyword arguments that every kernel of `kernels.success` takes."""
+        return {"success": self.success, "margin": self.margin}
+
+    def bind(self, physics: Physics) -> None:
+        """Tell the physics what it must measure; called once before the first tick."""
+
+    def evaluate(self, physics: Physics) -> None:
+        """Fill `success`, `margin` and `event` for the state after this tick."""
+        raise TypeError("use TaskSpec.judge() for a task's judge")
+
+    def reset(self, mask: Any) -> None:
+        """Forget the past of some worlds.
+
+        Args:
+            mask: 1 = reset, int32 Warp array, shape [worlds].
+        """
+        from arena_newton.kernels import reset
+
+        for array in (*self.counters, self.success, self.event):
+            reset.launch_clear(mask, array)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSpec:
+    """One task."""
+
+    name: str
+    gym_id: str
+    """The original's id; it seeds episodes and is sent to remote policies, so its spelling matters."""
+    instruction: str
+    spawn_position: Vec3
+    """Robot root at spawn [m]."""
+    spawn_quat: Quat
+    """Robot root at spawn, wxyz."""
+    objects: tuple[ObjectSpec, ...]
+    steps: ByRules[int]
+    """Step budget [50 Hz ticks]."""
+    success: ByRules[Any]
+    """Numbers of the predicate, a frozen dataclass per rule set."""
+    make_judge: Callable[[Scene, RuleSet], Judge]
+    sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
+    """Draws the samples: (episode seed, mode, rules) → record name → sample."""
+    semantic_variant: ByRules[str] = field(default_factory=lambda: ByRules.same("semantic"))
+    light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
+    """Distant light of the modes other than visual; None: the scene's dome."""
+    needs_forces: bool = False
+    """The predicate reads contact forces."""
+
+    @property
+    def rules(self) -> ByRules[TaskRules]:
+        """What each rule set says about this task."""
+        return ByRules(*(self._rules(name) for name in ("paper", "released")))
+
+    def _rules(self, rules_name: str) -> TaskRules:
+        return TaskRules(
+            task=self.name,
+            max_steps=self.steps.of(rules_name),
+            success=self.success.of(rules_name),
+            objects=tuple(o.rule(rules_name) for o in self.objects),
+            semantic_variant=self.semantic_variant.of(rules_name),
+            light=self.light.of(rules_name),
+        )
+
+    def max_steps(self, rules: RuleSet) -> int:
+        """Step budget [50 Hz ticks]."""
+        return rules.task(self.name).max_steps
+
+    def variant(self, mode: str, rules: RuleSet) -> str:
+        """Variant of the scene's set `semantics`."""
+        _check_mode(mode)
+        return rules.task(self.name).semantic_variant if mode == "semantic" else "base"
+
+    def draw(self, seed: int, mode: str, rules: RuleSet) -> Draws:
+        """Everything random about the episode with this seed.
+
+        Args:
+            seed: Episode seed.
+            mode: base, execution, semantic or visual.
+            rules: Rule set; it decides where a sample is put.
+
+        Raises:
+            InputError: Unknown mode.
+        """
+        _check_mode(mode)
+        own = rules.task(self.name)
+        sampled = self.sample(seed, mode, own)
+        placed = {o.prim: place(o, own.object(o.record), sampled[o.record]) for o in self.objects}
+        light = None
+        if mode == "visual":
+            light = draw_light(seed, rules.visual_light)
+        elif own.light is not None:
+            light = LightDraw(light_direction(0.0, 0.0, 0.0), own.light.intensity, own.light.color)
+        return Draws(sampled, placed, light)
+
+    def judge(self, scene: Scene, rules: RuleSet) -> Judge:
+        """The task's judge over a built scene.
+
+        Raises:
+            InputError: The scene misses a prim or marker that the predicate reads; the message names it.
+        """
+        return self.make_judge(scene, rules)
+
+
+def _check_mode(mode: str) -> None:
+    if mode not in MODES:
+        raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)}")

@@ -1,0 +1,87 @@
+"""DoubleDesk: carry the hammer from the right desk into the crate on the left desk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, Judge, ObjectSpec, TaskSpec
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["TASK", "DoubleDeskJudge", "DoubleDeskRule"]
+
+HAMMER = "/World/Hammer"
+BASKET = "/World/Basket"
+
+
+@dataclass(frozen=True)
+class DoubleDeskRule:
+    """Numbers of the predicate; the crate's box is the marker `Basket/Frame/Inside` of the stage."""
+
+    crate_frame: bool
+    """True: the box turns with the crate. False: the world-axis box around the turned crate."""
+    min_z: float | None
+    """Lowest height of the hammer's centre of mass that still counts [m]; None: no such test."""
+
+
+class DoubleDeskJudge(Judge):
+    """The hammer's centre of mass in the crate."""
+
+    def __init__(self, scene: Scene, rules: RuleSet):
+        """Bind hammer and crate."""
+        from arena_newton.kernels.success import Boxes
+
+        super().__init__(scene)
+        self.rule: DoubleDeskRule = rules.task("double_desk").success
+        self.hammer = scene.body_id(HAMMER)
+        self.inside = Boxes.upload([scene.marker(f"{BASKET}/Frame/Inside")], self.device)
+
+    def evaluate(self, physics: Physics) -> None:
+        """See `Judge.evaluate`."""
+        from arena_newton.kernels import success
+
+        state = (physics.xpos, physics.xquat, physics.xipos)
+        common = {"hammer_body": self.hammer, "inside": self.inside, **self.outputs()}
+        if self.rule.crate_frame:
+            success.launch_double_desk_paper(*state, **common)
+        else:
+            success.launch_double_desk_released(*state, min_z=self.rule.min_z, **common)
+
+
+TASK = TaskSpec(
+    name="double_desk",
+    gym_id="Isaac-Move-PickPlace-DoubleDesk-G129-Dex3-Wholebody",
+    instruction="Put the hammer from the right table into the basket on the left table.",
+    spawn_position=(-3.7, -2.2, 0.8),
+    spawn_quat=IDENTITY,
+    objects=(
+        ObjectSpec(
+            record="hammer",
+            prim=HAMMER,
+            base=PoseRange(x=(-3.2, -2.4), y=(-3.15, -3.0), z=(0.8, 0.8), yaw=(-0.35, 0.35)),
+            execution=PoseRange(x=(-3.36, -2.52), y=(-3.15, -3.0), z=(0.8, 0.8), yaw=(-0.35, 0.35)),
+            init_quat=(0.7139051, 0.0, 0.0, -0.7002425),
+        ),
+        ObjectSpec(
+            record="basket",
+            prim=BASKET,
+            base=PoseRange(x=(-3.6, -2.0), y=(-0.3, -0.005), z=(0.745, 0.745), yaw=(-0.785398, 0.785398)),
+            execution=PoseRange(x=(-5.0, -2.0), y=(-0.3, -0.005), z=(0.745, 0.745), yaw=(-0.785398, 0.785398)),
+            init=(-2.8, -0.1, 0.745),
+            spawn_scale=0.01,
+            placement=ByRules(paper="absolute", released="scaled"),
+            execution_void=True,
+        ),
+    ),
+    steps=ByRules.same(2000),
+    success=ByRules(
+        paper=DoubleDeskRule(crate_frame=True, min_z=None),
+        released=DoubleDeskRule(crate_frame=False, min_z=0.445),
+    ),
+    make_judge=DoubleDeskJudge,
+    light=ByRules(paper=None, released=DISTANT_LIGHT),
+)

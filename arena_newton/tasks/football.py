@@ -1,0 +1,91 @@
+"""Football: kick the ball into the goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["TASK", "FootballJudge", "FootballRule"]
+
+BALL = "/World/Ball"
+GOAL = "/World/Goal/Volume"
+PITCH = "/World/Pitch"
+
+
+@dataclass(frozen=True)
+class FootballRule:
+    """Numbers of the predicate; the goal's box itself is the marker `Goal/Volume` of the stage."""
+
+    rear_bound: bool
+    """Whether a ball behind the net no longer counts."""
+    ball_out: bool
+    """Whether leaving the field ends the episode."""
+    ball_restitution: float
+    goal_x: tuple[float, float] = (-2.5, 2.6)
+    """Goal's box as the original states it, which the stage's marker must equal (a test compares) [m]."""
+    goal_y: tuple[float, float] = (3.03, 5.03)
+    goal_z: tuple[float, float] = (0.0, 1.85)
+    out_z: float = -0.5
+    """A ball below this height has left the field [m]."""
+
+
+class FootballJudge(Judge):
+    """The ball's centre in the goal's box."""
+
+    def __init__(self, scene: Scene, rules: RuleSet):
+        """Bind ball, goal and pitch."""
+        from arena_newton.kernels.success import Boxes
+
+        super().__init__(scene)
+        self.rule: FootballRule = rules.task("football").success
+        self.ball = scene.body_id(BALL)
+        self.goal = Boxes.upload([scene.marker(GOAL)], self.device)
+        self.pitch = Boxes.upload([scene.marker(PITCH)], self.device)
+
+    def evaluate(self, physics: Physics) -> None:
+        """See `Judge.evaluate`."""
+        from arena_newton.kernels import success
+
+        success.launch_football(
+            physics.xpos,
+            physics.xquat,
+            ball_body=self.ball,
+            goal=self.goal,
+            pitch=self.pitch,
+            rear_bound=self.rule.rear_bound,
+            judge_out=self.rule.ball_out,
+            min_z=self.rule.out_z,
+            event=self.event,
+            **self.outputs(),
+        )
+
+
+TASK = TaskSpec(
+    name="football",
+    gym_id="Isaac-Move-Football-Single-G129-Dex3-Wholebody",
+    instruction="Kick the soccer ball into the goal.",
+    spawn_position=(0.0, -2.0, 0.8),
+    spawn_quat=FACE_PLUS_Y,
+    objects=(
+        ObjectSpec(
+            record="football",
+            prim=BALL,
+            base=PoseRange(x=(-1.2, 1.2), y=(-1.2, 1.2), z=(0.11, 0.11)),
+            execution=PoseRange(x=(-1.45, 1.45), y=(-1.45, 1.45), z=(0.11, 0.11)),
+        ),
+    ),
+    steps=ByRules(paper=1300, released=2000),
+    success=ByRules(
+        paper=FootballRule(rear_bound=True, ball_out=True, ball_restitution=0.1),
+        released=FootballRule(rear_bound=False, ball_out=False, ball_restitution=0.75),
+    ),
+    make_judge=FootballJudge,
+    semantic_variant=ByRules(paper="semantic", released="semantic_released"),
+)

@@ -1,0 +1,122 @@
+"""OpenDoor: press the handle, push the door open and walk through."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["TASK", "DoorOpenRule", "DoorPassedRule", "OpenDoorJudge"]
+
+DOOR = "/World/Door"
+
+
+@dataclass(frozen=True)
+class DoorPassedRule:
+    """The root is through the frame's plane and the robot stands."""
+
+    half_width: float = 0.55
+    """Largest |x| of the root in the door's frame [m]."""
+    min_y: float = 0.02
+    """Smallest y of the root in the door's frame [m]."""
+    release_deg: float = 20.0
+    """Angle from its rest at which the pressed handle releases the latch [deg]."""
+
+
+@dataclass(frozen=True)
+class DoorOpenRule:
+    """The latch is released, the leaf is open and the robot stands."""
+
+    min_leaf_deg: float = 60.0
+    """[deg]."""
+    release_deg: float = 20.0
+    """Angle from its rest at which the pressed handle releases the latch [deg]."""
+
+
+class OpenDoorJudge(Judge):
+    """The door's predicate, and its latch: released once the handle has turned enough, locked again at reset only."""
+
+    def __init__(self, scene: Scene, rules: RuleSet):
+        """Bind doorway, leaf, handle and root."""
+        import warp as wp
+
+        from arena_newton.kernels.success import Boxes
+
+        super().__init__(scene)
+        self.rule: DoorPassedRule | DoorOpenRule = rules.task("open_door").success
+        self.standing = rules.standing
+        self.root = scene.robot.root_qpos
+        self.leaf = scene.joint_qpos(f"{DOOR}/LeafHinge")
+        self.handle = scene.joint_qpos(f"{DOOR}/HandleHinge")
+        self.handle_rest = float(scene.mj_model.qpos0[self.handle])
+        self.doorway = Boxes.upload([scene.marker(f"{DOOR}/Frame/Doorway")], self.device)
+        self.locked = wp.full(self.worlds, 1, dtype=wp.int32, device=self.device)
+        """1 = the latch holds the leaf, shape [worlds]."""
+
+    def evaluate(self, physics: Physics) -> None:
+        """See `Judge.evaluate`; also releases latches for the next tick."""
+        from arena_newton.kernels import latch, success
+
+        release = math.radians(self.rule.release_deg)
+        latch.launch_release(physics.qpos, self.handle, self.handle_rest - release, self.locked)
+        physics.set_latch(self.locked)
+        common = {
+            "root_qpos_adr": self.root,
+            "stand_height": self.standing.min_root_z,
+            "stand_up": self.standing.min_up,
+            **self.outputs(),
+        }
+        if isinstance(self.rule, DoorPassedRule):
+            success.launch_open_door_paper(
+                physics.xpos,
+                physics.xquat,
+                physics.qpos,
+                doorway=self.doorway,
+                half_width=self.rule.half_width,
+                min_y=self.rule.min_y,
+                **common,
+            )
+        else:
+            success.launch_open_door_released(
+                physics.qpos,
+                leaf_qpos_adr=self.leaf,
+                latched=self.locked,
+                min_angle=math.radians(self.rule.min_leaf_deg),
+                **common,
+            )
+
+    def reset(self, mask: Any) -> None:
+        """See `Judge.reset`; the latch locks again."""
+        from arena_newton.kernels import latch
+
+        super().reset(mask)
+        latch.launch_lock(mask, self.locked)
+
+
+TASK = TaskSpec(
+    name="open_door",
+    gym_id="Isaac-Move-Open-Door-G129-Dex3-Wholebody",
+    instruction="Open the door.",
+    spawn_position=(-1.6, 0.2, 0.8),
+    spawn_quat=FACE_PLUS_Y,
+    objects=(
+        ObjectSpec(
+            record="door",
+            prim=DOOR,
+            base=PoseRange(x=(-0.754, 0.55), y=(-0.8, 0.1), z=(0.0, 0.0)),
+            execution=PoseRange(x=(-0.9, 0.66), y=(-0.96, 0.12), z=(0.0, 0.0)),
+            init=(-1.614, 2.314, 0.002),
+            placement=ByRules.same("offset"),
+        ),
+    ),
+    steps=ByRules.same(1800),
+    success=ByRules(paper=DoorPassedRule(), released=DoorOpenRule()),
+    make_judge=OpenDoorJudge,
+)

@@ -1,0 +1,138 @@
+"""SitSofa: walk around the cartons and sit down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, TaskSpec
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["TASK", "SeatPressedRule", "SeatTouchedRule", "SitSofaJudge"]
+
+SEAT = "/World/Sofa/Seat"
+CUSHION = "/World/Sofa/SeatCushion"
+
+_HIPS = tuple(f"{side}_hip_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll", "yaw"))
+PRESSING_LINKS = ("pelvis", *_HIPS)
+"""Pelvis, hip and thigh (hip_yaw) links."""
+TOUCHING_LINKS = (*PRESSING_LINKS, "waist_yaw_link", "waist_roll_link", "torso_link")
+"""Links that the original's code accepts on the seat."""
+
+
+@dataclass(frozen=True)
+class SeatPressedRule:
+    """Pelvis, hips and thighs together press the seat for a while, and the root is low."""
+
+    min_force: float = 50.0
+    """[N]."""
+    confirm_ticks: int = 25
+    max_root_z: float = 0.62
+    """[m]."""
+
+
+@dataclass(frozen=True)
+class SeatTouchedRule:
+    """One link in the seat volume with contact, or two without, in a single tick."""
+
+    min_force: float = 5.0
+    """[N]."""
+    below: float = 0.10
+    """The volume begins this far below the seat's box [m]."""
+    above: float = 0.35
+    """The volume ends this far above the seat's box [m]."""
+
+
+class SitSofaJudge(Judge):
+    """The robot on the seat."""
+
+    def __init__(self, scene: Scene, rules: RuleSet):
+        """Bind seat, cushion and links."""
+        import warp as wp
+
+        from arena_newton.kernels.success import Boxes
+
+        super().__init__(scene)
+        self.rule: SeatPressedRule | SeatTouchedRule = rules.task("sit_sofa").success
+        self.root = scene.robot.root_qpos
+        self.seat = Boxes.upload([scene.marker(SEAT)], self.device)
+        self.cushion_geoms = scene.geom_ids(CUSHION)
+        pressing = {scene.link(name) for name in PRESSING_LINKS}
+        self.pressing_geoms = [g for g, b in enumerate(scene.mj_model.geom_bodyid) if int(b) in pressing]
+        touching = [scene.link(name) for name in TOUCHING_LINKS]
+        self.touching = wp.array(touching, dtype=wp.int32, device=self.device)
+        self.seated = self.counter()
+        self._bound: Physics | None = None
+
+    def bind(self, physics: Physics) -> None:
+        """See `Judge.bind`."""
+        if self._bound is physics:
+            return
+        if isinstance(self.rule, SeatPressedRule):
+            physics.watch_pair(self.pressing_geoms, self.cushion_geoms)
+        else:
+            physics.want_forces = True
+        self._bound = physics
+
+    def evaluate(self, physics: Physics) -> None:
+        """See `Judge.evaluate`."""
+        from arena_newton.kernels import success
+
+        self.bind(physics)
+        if isinstance(self.rule, SeatPressedRule):
+            success.launch_sit_sofa_paper(
+                physics.qpos,
+                physics.pair_force,
+                root_qpos_adr=self.root,
+                min_force=self.rule.min_force,
+                max_root_z=self.rule.max_root_z,
+                confirm_ticks=self.rule.confirm_ticks,
+                counter=self.seated,
+                **self.outputs(),
+            )
+        else:
+            success.launch_sit_sofa_released(
+                physics.xpos,
+                physics.xquat,
+                physics.contact_force,
+                bodies=self.touching,
+                seat=self.seat,
+                below=self.rule.below,
+                above=self.rule.above,
+                min_force=self.rule.min_force,
+                **self.outputs(),
+            )
+
+
+TASK = TaskSpec(
+    name="sit_sofa",
+    gym_id="Isaac-Move-Sit-Sofa-G129-Dex3-Wholebody",
+    instruction="Sit on the sofa.",
+    spawn_position=(-1.6, 2.0, 0.8),
+    spawn_quat=FACE_MINUS_Y,
+    objects=(
+        ObjectSpec(
+            record="carton_obstacle_01",
+            prim="/World/Carton_1",
+            base=PoseRange(x=(-2.1, -1.7), y=(0.6, 0.8), z=(0.1, 0.1)),
+            execution=PoseRange(x=(-2.6, -1.7), y=(0.75, 0.95), z=(0.1, 0.1)),
+            # The original's cube has its origin at its base and drops 0.1 m; ours has it at its centre.
+            lift=0.21,
+        ),
+        ObjectSpec(
+            record="carton_obstacle_02",
+            prim="/World/Carton_2",
+            base=PoseRange(x=(-2.3, -1.7), y=(-0.1, 0.4), z=(0.1, 0.1)),
+            execution=PoseRange(x=(-2.4, -1.7), y=(-0.4, 0.2), z=(0.1, 0.1)),
+            lift=0.21,
+        ),
+    ),
+    steps=ByRules(paper=1050, released=2000),
+    success=ByRules(paper=SeatPressedRule(), released=SeatTouchedRule()),
+    make_judge=SitSofaJudge,
+    needs_forces=True,
+)

@@ -1,0 +1,119 @@
+"""VisNavi: walk around dropped obstacles into the yellow area at the wet-floor sign."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from arena_newton import seeding
+from arena_newton.rules import ByRules, PoseRange, RuleSet, TaskRules
+from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, Sample, TaskSpec, object_range, sample_pose
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["TASK", "VisNaviJudge", "VisNaviRule"]
+
+SIGN = "/World/TargetSign"
+FEET = tuple(f"{side}_ankle_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll"))
+
+
+@dataclass(frozen=True)
+class VisNaviRule:
+    """The area is the marker `TargetSign/Frame/Zone` of the stage."""
+
+    feet: tuple[str, ...] = FEET
+    """Links whose origins must be inside."""
+
+
+class VisNaviJudge(Judge):
+    """Both feet in the marked area."""
+
+    def __init__(self, scene: Scene, rules: RuleSet):
+        """Bind area, feet and root."""
+        import warp as wp
+
+        from arena_newton.kernels.success import Boxes
+
+        super().__init__(scene)
+        rule: VisNaviRule = rules.task("vis_navi").success
+        self.standing = rules.standing
+        self.root = scene.robot.root_qpos
+        self.feet = wp.array([scene.link(name) for name in rule.feet], dtype=wp.int32, device=self.device)
+        self.zone = Boxes.upload([scene.marker(f"{SIGN}/Frame/Zone")], self.device)
+
+    def evaluate(self, physics: Physics) -> None:
+        """See `Judge.evaluate`."""
+        from arena_newton.kernels import success
+
+        success.launch_vis_navi(
+            physics.xpos,
+            physics.xquat,
+            physics.qpos,
+            root_qpos_adr=self.root,
+            feet=self.feet,
+            zone=self.zone,
+            stand_height=self.standing.min_root_z,
+            stand_up=self.standing.min_up,
+            **self.outputs(),
+        )
+
+
+def sample_layout(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:
+    """One generator draws all obstacles, each x, y, z, yaw; the sign has its own and draws yaw first."""
+    master = seeding.object_seed(episode_seed)
+    layout = np.random.default_rng(master)
+    sampled = {}
+    for rule in rules.objects:
+        ranges = object_range(rule, mode)
+        if rule.record.startswith("obstacle_"):
+            sampled[rule.record] = sample_pose(layout, ranges, ("x", "y", "z", "yaw"))
+        else:
+            rng = seeding.object_rng(master, rule.record)
+            sampled[rule.record] = sample_pose(rng, ranges, ("yaw", "x", "y", "z"))
+    return sampled
+
+
+def _obstacle(record: str, prim: str, x: tuple[float, float], z: float) -> ObjectSpec:
+    """An obstacle dropped from height z [m]; it falls and comes to rest while the robot settles."""
+    yaw = (-0.785398, 0.785398)
+    return ObjectSpec(
+        record=record,
+        prim=prim,
+        base=PoseRange(x=x, y=(-2.5, -1.2), z=(z, z), yaw=yaw),
+        execution=PoseRange(x=x, y=(-2.76, -1.2), z=(z, z), yaw=yaw),
+    )
+
+
+TASK = TaskSpec(
+    name="vis_navi",
+    gym_id="Isaac-Move-SmallWarehouse-VisionNavigation-G129-Dex3-Wholebody",
+    instruction="Avoid obstacles and move to the yellow marked area.",
+    spawn_position=(-1.90, -5.20, 0.80),
+    spawn_quat=FACE_PLUS_Y,
+    objects=(
+        _obstacle("obstacle_01_a", "/World/Beam_a", (-0.5, -0.4), 0.16),
+        _obstacle("obstacle_01_b", "/World/Beam_b", (-2.2, -1.7), 0.56),
+        _obstacle("obstacle_01_c", "/World/Beam_c", (-4.6, -4.5), 1.06),
+        _obstacle("obstacle_02_a", "/World/Block_a", (-1.8, -0.7), 1.56),
+        _obstacle("obstacle_02_b", "/World/Block_b", (-5.2, -4.0), 1.3),
+        _obstacle("obstacle_02_c", "/World/Block_c", (-3.1, -2.0), 1.8),
+        ObjectSpec(
+            record="target_sign",
+            prim=SIGN,
+            base=PoseRange(x=(-3.0, -1.5), y=(-0.12, 0.8), z=(0.0, 0.0), yaw=(-0.3, 0.3)),
+            execution=PoseRange(x=(-5.0, 0.0), y=(-0.12, 5.0), z=(0.0, 0.0), yaw=(-0.3, 0.3)),
+            init=(-2.0, -0.25, 0.0),
+            spawn_scale=0.01,
+            placement=ByRules(paper="absolute", released="scaled"),
+            execution_void=True,
+        ),
+    ),
+    steps=ByRules.same(1800),
+    success=ByRules.same(VisNaviRule()),
+    make_judge=VisNaviJudge,
+    sample=sample_layout,
+)

@@ -1,0 +1,145 @@
+"""The plan of an evaluation: which episodes, in which order, with which draws. Pure: nothing is built, nothing runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from arena_newton import rules as rule_sets
+from arena_newton import seeding, tasks
+from arena_newton.errors import InputError
+
+__all__ = ["Episode", "expand", "to_list_json"]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One planned episode."""
+
+    index: int
+    """Place in the plan, from 0."""
+    task: str
+    mode: str
+    rules: str
+    tracker: str
+    policy: str
+    engine: str
+    group_seed: int
+    repeat: int
+    episode_seed: int
+    """Seed of everything random in the episode; the same for every mode, tracker, policy and rule set."""
+    object_seed: int
+    max_steps: int
+    """Step budget [50 Hz ticks]."""
+
+    @property
+    def key(self) -> str:
+        """Name that is unique in a plan, e.g. `football/base/s0/r3`."""
+        return f"{self.task}/{self.mode}/s{self.group_seed}/r{self.repeat}"
+
+
+def expand(
+    task_names: Sequence[str],
+    *,
+    tracker: str,
+    policy: str,
+    modes: Sequence[str] = ("base",),
+    rules: str = "paper",
+    engine: str = "mujoco",
+    seeds: Sequence[int] = (0, 1, 2),
+    repeats: int = 20,
+    max_steps: int | None = None,
+) -> list[Episode]:
+    """Episodes of a run: tasks × modes × group seeds × repeats, in this order.
+
+    Args:
+        task_names: Names of tasks, or `all` alone.
+        tracker: Name that results carry.
+        policy: Name that results carry.
+        modes: Test modes.
+        rules: Name of the rule set.
+        engine: Name of the physics engine.
+        seeds: Group seeds.
+        repeats: Episodes a group seed.
+        max_steps: Cap on the rule set's step budgets, or None.
+
+    Raises:
+        InputError: Unknown task, mode or rule set, something named twice, or nothing to run.
+    """
+    rule_set = rule_sets.get(rules)
+    names = tasks.names() if list(task_names) == ["all"] else tuple(task_names)
+    for flag, values in (("--task", names), ("--mode", modes), ("--seeds", seeds)):
+        if not values:
+            raise InputError(f"{flag}: nothing given, at least one value is needed")
+        twice = next((v for v in values if list(values).count(v) > 1), None)
+        if twice is not None:
+            raise InputError(f"{flag} {twice}: given twice")
+    for mode in modes:
+        if mode not in rule_sets.MODES:
+            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(rule_sets.MODES)}")
+    if repeats < 1:
+        raise InputError(f"--repeats {repeats}: expected at least 1")
+    if max_steps is not None and max_steps < 1:
+        raise InputError(f"--max-steps {max_steps}: expected at least 1")
+    episodes: list[Episode] = []
+    for name in names:
+        spec = tasks.get(name)
+        budget = spec.max_steps(rule_set)
+        for mode in modes:
+            for group_seed in seeds:
+                for repeat in range(repeats):
+                    seed = seeding.episode_seed(spec.gym_id, group_seed, repeat)
+                    episodes.append(
+                        Episode(
+                            index=len(episodes),
+                            task=name,
+                            mode=mode,
+                            rules=rules,
+                            tracker=tracker,
+                            policy=policy,
+                            engine=engine,
+                            group_seed=group_seed,
+                            repeat=repeat,
+                            episode_seed=seed,
+                            object_seed=seeding.object_seed(seed),
+                            max_steps=budget if max_steps is None else min(budget, max_steps),
+                        )
+                    )
+    return episodes
+
+
+def to_list_json(episodes: Iterable[Episode]) -> list[dict[str, Any]]:
+    """What `list --json` prints: one object per episode.
+
+    `sampled` and `placed` are keyed by the object's name in the original's records. A placed object names its prim, its
+    `position` [m] and its `orientation` (wxyz). `light` is the episode's distant light, or null under the scene's dome.
+    """
+    return [_listed(episode) for episode in episodes]
+
+
+def _listed(episode: Episode) -> dict[str, Any]:
+    spec = tasks.get(episode.task)
+    draws = spec.draw(episode.episode_seed, episode.mode, rule_sets.get(episode.rules))
+    placed = {}
+    for o in spec.objects:
+        pose = draws.placed[o.prim]
+        placed[o.record] = {"prim": o.prim, "position": list(pose.pos), "orientation": list(pose.quat)}
+    light = None
+    if draws.light is not None:
+        light = dataclasses.asdict(draws.light)
+        light |= {"direction": list(draws.light.direction), "color": list(draws.light.color)}
+    return {
+        "task": episode.task,
+        "mode": episode.mode,
+        "rules": episode.rules,
+        "group_seed": episode.group_seed,
+        "repeat": episode.repeat,
+        "episode_seed": episode.episode_seed,
+        "object_seed": episode.object_seed,
+        "sampled": draws.sampled,
+        "placed": placed,
+        "light": light,
+        "max_steps": episode.max_steps,
+    }

@@ -1,0 +1,181 @@
+"""The command line: defaults, one-line answers to bad input, exit codes, quick help."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from eval_fakes import factories
+
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+
+TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
+SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "1", "--seeds", "0"]
+
+
+def test_default_run(tmp_path, capsys, monkeypatch):
+    """Without flags all seven tasks run, a table is printed and the report lies where the last line says."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["--device", "cpu"], factories()) == 0
+    output = capsys.readouterr().out
+    assert all(re.search(rf"^\| {task} ", output, re.M) for task in TASKS)
+    report = re.search(r"^report: (.*)$", output, re.M)[1]
+    assert Path(report).is_file() and Path(report).parts[0] == "results"
+    results = json.loads((Path(report).parent / "results.json").read_text())
+    assert [cell["task"] for cell in results["cells"]] == TASKS
+    assert [suite["suite"] for suite in results["suites"]] == ["HOI_AVG", "HSI_AVG", "ALL_AVG"]
+
+
+def test_protocol_is_the_default_of_a_named_task(tmp_path):
+    """With a task named, 3 seeds x 20 repeats run under the paper's step budget."""
+    out = tmp_path / "o"
+    assert main(["run", "--task", "football", "--engine", "mujoco", "--out", str(out)], factories()) == 0
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert len(records) == 60
+    assert {r["max_steps"] for r in records} == {1300}
+    first = next(r for r in records if (r["group_seed"], r["repeat"]) == (0, 0))
+    assert first["episode_seed"] == 1132158683
+    keys = """task tracker policy mode rules engine group_seed repeat episode_seed outcome steps margin durations hashes
+    reason startup_fall overflow error"""
+    assert set(keys.split()) <= set(first)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--task", "footbal"], "--task footbal: .*football"),
+        (["--task", "all", "football"], "--task all"),
+        (["--task", "football", "football"], "given twice"),
+        (["--task", "football", "--mode", "bases"], "--mode bases: .*execution"),
+        (["--rules", "mine"], "--rules mine: .*released"),
+        (["--engine", "bullet"], "--engine bullet"),
+        (["--device", "tpu"], "--device tpu"),
+        (["--engine", "mujoco", "--device", "cuda:0"], "--device cuda:0"),
+        (["--tracker", "nobody"], "--tracker nobody"),
+        (["--checkpoint", "absent.onnx"], "--checkpoint absent.onnx: no such file"),
+        (["--policy", "replay:absent.npz"], "--policy absent.npz: no such file"),
+        (["--policy", "remote:host"], "--policy remote:host"),
+        (["--variant", "absent.usda"], "--variant absent.usda: no such file"),
+        (["--repeats", "0"], "--repeats 0"),
+        (["--worlds", "0"], "--worlds 0"),
+        (["--max-steps", "0"], "--max-steps 0"),
+        (["--seeds", "1", "1"], "--seeds 1: given twice"),
+        (["--seeds", "-1"], "seeds"),
+        (["--repeats", "two"], "repeats"),
+        (["--tasks", "football"], "--tasks"),
+        (["resume"], "name the results folder"),
+        (["resume", "absent"], "no results folder"),
+        (["report", "absent"], "no results folder"),
+    ],
+)
+def test_bad_input_gets_one_line(tmp_path, monkeypatch, capsys, flags, message):
+    """Wrong input ends with code 2 and one line on stderr before anything is written."""
+    monkeypatch.chdir(tmp_path)
+    assert main(flags, factories()) == 2
+    captured = capsys.readouterr()
+    assert re.fullmatch(rf"error: .*{message}.*\n", captured.err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_variant_is_looked_into(tmp_path, capsys):
+    """A variant file with a fault, or without its one task, is refused before the first episode."""
+    variant = tmp_path / "room.usda"
+    variant.write_text("#usda 1.0\n")
+    out = ["--out", str(tmp_path / "o")]
+
+    def refuse(path, task):
+        raise InputError(f"{path}: /World/Ball: missing in a scene of {task}")
+
+    assert main([*SHORT, "--variant", str(variant), *out], factories(check_variant=refuse)) == 2
+    assert "/World/Ball: missing in a scene of football" in capsys.readouterr().err
+    assert main(["--task", "all", "--engine", "mujoco", "--variant", str(variant), *out], factories()) == 2
+    assert "--task" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_out_folder_is_checked(tmp_path, capsys):
+    """A file or a folder with foreign content is no results folder."""
+    (tmp_path / "file").write_text("")
+    assert main([*SHORT, "--out", str(tmp_path / "file")], factories()) == 2
+    assert "is a file" in capsys.readouterr().err
+    assert main([*SHORT, "--out", str(tmp_path)], factories()) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root writes everywhere")
+def test_unwritable_out_folder(tmp_path, capsys):
+    """A folder without write permission is named."""
+    tmp_path.chmod(0o500)
+    assert main([*SHORT, "--out", str(tmp_path / "o")], factories()) == 2
+    assert "cannot be" in capsys.readouterr().err
+
+
+def test_out_below_a_file(tmp_path, capsys):
+    """A folder that cannot be created ends with code 2 and one line."""
+    (tmp_path / "file").write_text("")
+    assert main([*SHORT, "--out", str(tmp_path / "file" / "o")], factories()) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_list_runs_nothing(tmp_path, monkeypatch, capsys):
+    """`list --json` prints one object per episode with seeds, draws, poses and step budget."""
+    monkeypatch.chdir(tmp_path)
+    flags = ["list", "--json", "--engine", "mujoco", "--task", "football", "--mode", "base", "visual", "--repeats", "2"]
+    assert main(flags, factories()) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 12
+    keys = "task mode rules group_seed repeat episode_seed object_seed sampled placed".split()
+    assert all(set(keys) <= set(row) for row in rows)
+    assert rows[0]["episode_seed"] == 1132158683 and rows[0]["object_seed"] == 11400714786159236188
+    assert main([flag for flag in flags if flag != "--json"], factories()) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 13
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_report_from_journal(tmp_path, capsys):
+    """`report` writes deleted reports again, byte for byte."""
+    out = tmp_path / "o"
+    assert main([*SHORT, "--out", str(out)], factories()) == 0
+    before = (out / "report.html").read_bytes()
+    (out / "report.html").unlink()
+    assert main(["report", str(out)], factories()) == 0
+    assert (out / "report.html").read_bytes() == before
+    capsys.readouterr()
+    assert main(["report", str(out), "--json"], factories()) == 0
+    assert json.loads(capsys.readouterr().out)["complete"]
+
+
+@pytest.mark.parametrize("command", [[], ["resume"], ["report"], ["list"], ["bench"]])
+def test_help_is_quick_and_imports_nothing_heavy(command):
+    """--help answers in about a second: Warp, torch, USD and MuJoCo stay unloaded."""
+    code = (
+        "import sys; from arena_newton.eval.__main__ import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit as stop: assert not stop.code\n"
+        "heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'numpy', 'cv2'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    began = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", code, *command, "--help"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "usage" in done.stdout
+    assert time.perf_counter() - began < 5.0, "one second is the bar; five allow for a busy machine"
+
+
+def test_doctor_names_what_is_missing(monkeypatch, capsys):
+    """A missing required package is a problem with advice and code 1; a missing extra is a note."""
+    from arena_newton import doctor
+
+    installed = doctor.versions()
+    monkeypatch.setattr(doctor, "versions", lambda: installed | {"usd-core": None, "av": None})
+    assert doctor.main() == 1
+    output = capsys.readouterr().out
+    assert re.search(r"^! usd-core +missing\n +-> needed for scene files", output, re.M)
+    assert re.search(r"^- av +missing\n +-> needed for videos", output, re.M)

@@ -1,0 +1,116 @@
+"""Statistics against closed forms and against the paper's tables."""
+
+import csv
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+
+from arena_newton.eval.stats import SUITES, aggregate, cell, pooled, population_std, wilson
+
+PAPER = Path(__file__).resolve().parents[2] / ".." / "shared" / "paper" / "in_gmt.csv"
+
+
+def episodes(task, per_seed, repeats=20, falls=0, index=0):
+    """Records of one cell with the given successes per group seed."""
+    rows = []
+    for seed, won in enumerate(per_seed):
+        for repeat in range(repeats):
+            outcome = "success" if repeat < won else "fall" if falls > 0 else "timeout"
+            falls -= outcome == "fall"
+            row = {"task": task, "tracker": "t", "policy": "p", "mode": "base", "group_seed": seed, "repeat": repeat}
+            rows.append(row | {"outcome": outcome, "steps": 100 + repeat, "index": index + len(rows)})
+    return rows
+
+
+def test_cell_counts_and_rates():
+    """A cell counts outcomes, and its rates, interval and mean follow from the counts."""
+    rows = episodes("football", (4, 5, 7), falls=3)
+    rows[0]["outcome"] = "error"
+    rows[0]["steps"] = 0
+    rows[19]["startup_fall"] = True
+    result = cell(rows)
+    assert (result["episodes"], result["successes"], result["falls"], result["errors"]) == (60, 15, 3, 1)
+    assert result["startup_falls"] == (rows[19]["outcome"] == "fall")
+    assert result["sr"] == 0.25
+    assert result["afr"] == 0.05
+    assert result["sr_seed_std"] == pytest.approx(math.sqrt(((0.15 - 0.25) ** 2 + 0 + (0.35 - 0.25) ** 2) / 3))
+    assert result["mean_steps"] == pytest.approx((60 * 100 + 3 * 190 - 100) / 59)
+
+
+def test_wilson_interval():
+    """Known values of the Wilson interval (Newcombe 1998, table I, 81/263: 0.2553 to 0.3662), closed at the ends."""
+    assert wilson(81, 263) == pytest.approx([0.2553, 0.3662], abs=5e-5)
+    assert wilson(0, 20)[0] == 0.0
+    assert wilson(20, 20)[1] == 1.0
+    assert wilson(0, 0) is None
+
+
+def test_empty_input_gives_no_rate():
+    """Without episodes there is no rate, and no division by zero."""
+    assert cell([])["sr"] is None
+    assert population_std([]) is None
+    assert aggregate([]) == {"cells": [], "suites": []}
+
+
+def test_order_of_journal_is_irrelevant():
+    """Cells come in plan order, whatever order the episodes ended in."""
+    rows = episodes("football", (1, 2, 3)) + episodes("boxing", (3, 2, 1), index=60)
+    assert aggregate(rows) == aggregate(rows[::-1])
+    assert [c["task"] for c in aggregate(rows[::-1])["cells"]] == ["football", "boxing"]
+
+
+def test_suite_needs_all_its_tasks():
+    """A suite average is given only when each of its tasks was run."""
+    rows = episodes("football", (1, 2, 3))
+    assert aggregate(rows)["suites"] == []
+    assert pooled({"football": rows}, SUITES["HOI_AVG"]) is None
+
+
+def _seed_counts(mean, std):
+    """Successes of three seeds x 20 repeats that print as the paper's ``mean ± std`` [%]; all that fit."""
+    fits = []
+    for counts in itertools.combinations_with_replacement(range(21), 3):
+        rates = [100 * c / 20 for c in counts]
+        if round(sum(rates) / 3, 1) == mean and round(population_std(rates), 1) == std:
+            fits.append(counts)
+    return fits
+
+
+@pytest.mark.skipif(not PAPER.is_file(), reason="the paper's tables lie next to the checkout only in development")
+def test_suite_averages_match_the_paper():
+    """The paper's suite averages and fall rates come out of its own per-task rows (ACT: 28.33 ± 13.94, 27/420)."""
+    table = {}
+    for row in csv.DictReader(PAPER.open()):
+        table.setdefault((row["tracker"], row["mode"], row["policy"]), {})[row["task"]] = row
+    checked = 0
+    for key, rows in table.items():
+        choices = {
+            task: _seed_counts(float(rows[task]["sr_mean_pct"]), float(rows[task]["sr_std_pct"]))
+            for task in SUITES["ALL_AVG"]
+            if task in rows
+        }
+        for suite in ("HOI_AVG", "HSI_AVG"):
+            tasks = SUITES[suite]
+            if suite not in rows or any(len(choices.get(task, ())) != 1 for task in tasks):
+                continue
+            records = {task: episodes(task, choices[task][0]) for task in tasks}
+            result = pooled(records, tasks)
+            assert 100 * result["sr"] == pytest.approx(float(rows[suite]["sr_mean_pct"]), abs=0.006), (key, suite)
+            assert 100 * result["sr_std"] == pytest.approx(float(rows[suite]["sr_std_pct"]), abs=0.006), (key, suite)
+            checked += 1
+    assert checked > 20
+    act = table["twist2", "base", "act"]
+    tasks = SUITES["ALL_AVG"]
+    per_task = [_seed_counts(float(act[t]["sr_mean_pct"]), float(act[t]["sr_std_pct"]))[0] for t in tasks]
+    records = [
+        record
+        for i, (task, counts) in enumerate(zip(tasks, per_task, strict=True))
+        for record in episodes(task, counts, falls=27 if i == 0 else 0, index=60 * i)
+    ]
+    suites = {suite["suite"]: suite for suite in aggregate(records)["suites"]}
+    assert 100 * suites["HOI_AVG"]["sr"] == pytest.approx(28.33, abs=0.005)
+    assert 100 * suites["HOI_AVG"]["sr_std"] == pytest.approx(13.94, abs=0.005)
+    assert (suites["ALL_AVG"]["falls"], suites["ALL_AVG"]["episodes"]) == (27, 420)
+    assert 100 * suites["ALL_AVG"]["afr"] == pytest.approx(float(act["football"]["afr_pct"]), abs=0.005)

@@ -1,0 +1,190 @@
+"""Readers of motion clips (TWIST2/GMR pickles) and of action files (NPZ).
+
+Pickles run code when they are read. Only NumPy arrays, numbers, strings and plain containers are admitted here; a file
+that names anything else is refused before it is called.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arena_newton.canonical import ACTION_WIDTH, validate_action
+from arena_newton.errors import InputError
+
+__all__ = ["Clip", "load_actions", "load_clip", "load_plain_pickle"]
+
+JOINTS = 29
+START_FRAMES = 15
+"""A motion capture jump is looked for in this many first frames."""
+START_HEIGHT = 1.3
+"""Root height [m] that no clip starts with; captures that begin with a jump show 1.8 m."""
+START_SPEED = 2.5
+"""Root speed [m/s] that no clip starts with (the jumps show 40 m/s and more)."""
+START_JOINT_SPEED = 15.0
+"""Joint speed [rad/s] that no clip starts with."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A whole-body motion."""
+
+    fps: float
+    """Frames a second."""
+    root_pos: np.ndarray
+    """Root position [m], world, shape [frames, 3]."""
+    root_quat: np.ndarray
+    """Root orientation, wxyz, shape [frames, 4]."""
+    joint_pos: np.ndarray
+    """Joint positions [rad], MuJoCo order, shape [frames, 29]."""
+    trimmed: int = 0
+    """Frames of a motion capture jump that were cut off at the start."""
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return (len(self.root_pos) - 1) / self.fps
+
+
+class _RefusedError(Exception):
+    """The pickle names something that is no plain data."""
+
+
+def _latin1(text: str, encoding: str = "latin1") -> bytes:
+    if encoding not in ("latin1", "latin-1"):
+        raise _RefusedError(f"encoding {encoding}")
+    return text.encode("latin1")
+
+
+def _admitted() -> dict[tuple[str, str], Any]:
+    from numpy._core import multiarray, numeric
+
+    admitted: dict[tuple[str, str], Any] = {
+        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "dtype"): np.dtype,
+        ("_codecs", "encode"): _latin1,
+    }
+    for package in ("numpy._core", "numpy.core"):
+        admitted[f"{package}.multiarray", "_reconstruct"] = multiarray._reconstruct
+        admitted[f"{package}.multiarray", "scalar"] = multiarray.scalar
+        admitted[f"{package}.numeric", "_frombuffer"] = numeric._frombuffer
+    return admitted
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Admits NumPy arrays and plain containers only."""
+
+    def find_class(self, module: str, name: str) -> Callable[..., Any]:
+        admitted = _admitted().get((module, name))
+        if admitted is None:
+            raise _RefusedError(f"{module}.{name}")
+        return admitted
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise _RefusedError("a persistent id")
+
+
+def load_plain_pickle(path: str | Path, *, flag: str = "--policy replay:") -> Any:
+    """Read a pickle that holds nothing but NumPy arrays, numbers, strings and plain containers.
+
+    Raises:
+        InputError: The file is absent, damaged, or holds anything else; nothing of it was executed.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{flag}{path}: cannot be read ({error.strerror})") from error
+    try:
+        return _PlainUnpickler(io.BytesIO(data)).load()
+    except _RefusedError as error:
+        raise InputError(
+            f"{flag}{path}: the pickle holds {error}, which is refused: only NumPy arrays and plain containers are read"
+        ) from error
+    except Exception as error:  # a damaged pickle raises nearly anything
+        raise InputError(f"{flag}{path}: not a readable pickle ({type(error).__name__})") from error
+
+
+def load_clip(path: str | Path, *, flag: str = "--policy replay:", trim: bool = True) -> Clip:
+    """Read a TWIST2/GMR clip: fields `fps`, `root_pos`, `root_rot` (xyzw) and `dof_pos` (29 joints, MuJoCo order).
+
+    Args:
+        path: The `.pkl` file.
+        flag: What errors name before the path.
+        trim: Cut a motion capture jump off the start.
+
+    Raises:
+        InputError: A field is missing, of the wrong shape, or not finite.
+    """
+    where = f"{flag}{path}"
+    content = load_plain_pickle(path, flag=flag)
+    if not isinstance(content, dict):
+        raise InputError(f"{where}: holds {type(content).__name__}, expected a clip with named fields")
+    arrays = {}
+    for field in ("fps", "root_pos", "root_rot", "dof_pos"):
+        if field not in content:
+            raise InputError(f"{where}: field {field} is missing")
+        try:
+            arrays[field] = np.asarray(content[field], dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{where}: field {field} holds no numbers") from error
+        if not np.isfinite(arrays[field]).all():
+            raise InputError(f"{where}: field {field} holds NaN or infinity")
+    fps, frames = arrays["fps"], arrays["root_pos"].shape[0] if arrays["root_pos"].ndim == 2 else 0
+    if fps.size != 1 or not 1.0 <= float(fps.reshape(())) <= 1000.0:
+        raise InputError(f"{where}: field fps must be one number from 1 to 1000")
+    if arrays["dof_pos"].ndim == 2 and arrays["dof_pos"].shape[1] != JOINTS:
+        raise InputError(f"{where}: dof_pos has {arrays['dof_pos'].shape[1]} joints, expected {JOINTS}")
+    for field, width in (("root_pos", 3), ("root_rot", 4), ("dof_pos", JOINTS)):
+        if arrays[field].shape != (frames, width) or frames < 2:
+            shape = list(arrays[field].shape)
+            raise InputError(f"{where}: {field} has shape {shape}, expected [frames, {width}] with 2 or more frames")
+    norm = np.linalg.norm(arrays["root_rot"], axis=1, keepdims=True)
+    if (np.abs(norm - 1.0) > 0.1).any():
+        raise InputError(f"{where}: root_rot holds a quaternion that is not of length 1")
+    quat = (arrays["root_rot"] / norm)[:, [3, 0, 1, 2]]
+    rate = float(fps.reshape(()))
+    start = _start(arrays["root_pos"], arrays["dof_pos"], rate) if trim else 0
+    if frames - start < 2:
+        raise InputError(f"{where}: nothing is left after the jump at its start")
+    return Clip(rate, arrays["root_pos"][start:], quat[start:], arrays["dof_pos"][start:], start)
+
+
+def _start(root_pos: np.ndarray, joint_pos: np.ndarray, fps: float) -> int:
+    """First frame after the last jump within the first frames."""
+    speed = np.linalg.norm(np.diff(root_pos, axis=0), axis=1) * fps
+    joint_speed = np.abs(np.diff(joint_pos, axis=0)).max(axis=1) * fps
+    # A jump between frames i and i + 1 condemns frame i.
+    bad = (speed > START_SPEED) | (joint_speed > START_JOINT_SPEED) | (root_pos[:-1, 2] > START_HEIGHT)
+    hits = np.flatnonzero(bad[:START_FRAMES])
+    return int(hits[-1]) + 1 if hits.size else 0
+
+
+def load_actions(path: str | Path, *, flag: str = "--policy replay:") -> np.ndarray:
+    """Read canonical actions from an NPZ file with an array `action` of shape [ticks, 40].
+
+    Returns:
+        float32, shape [ticks, 40].
+
+    Raises:
+        InputError: The array is missing, of another width, or not finite.
+    """
+    where = f"{flag}{path}"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if "action" not in file.files:
+                raise InputError(f"{where}: array action is missing")
+            actions = np.asarray(file["action"], dtype=np.float32)
+    except FileNotFoundError as error:
+        raise InputError(f"{where}: no such file") from error
+    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(f"{where}: not a readable NPZ file ({type(error).__name__})") from error
+    if actions.ndim != 2 or len(actions) == 0:
+        raise InputError(f"{where}: action has shape {list(actions.shape)}, expected [ticks, {ACTION_WIDTH}]")
+    return validate_action(actions, where)

@@ -1,0 +1,96 @@
+"""`python -m arena_newton.usd_scenes {build,validate,list,preview}`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from arena_newton.errors import InputError
+
+MODES = ("base", "semantic", "visual")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m arena_newton.usd_scenes", description="Author, check and look at the USD scenes."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    build = commands.add_parser("build", help="write textures, robot and scenes from their authors")
+    build.add_argument("names", nargs="*", metavar="NAME", help="textures, g1 or a task; all by default")
+    build.add_argument("--out", type=Path, default=None, help="folder to build into (default: the project's own)")
+
+    validate = commands.add_parser("validate", help="name everything wrong with scene or variant files")
+    validate.add_argument("files", nargs="*", metavar="FILE", help="USD layers or task names; all scenes by default")
+    validate.add_argument("--task", default=None, help="judge the files as this task's (default: from their folders)")
+
+    commands.add_parser("list", help="tasks, their scene files and variants")
+
+    preview = commands.add_parser("preview", help="render a contact sheet (world and ego camera)")
+    preview.add_argument("targets", nargs="*", metavar="TARGET", help="task names or USD layers; all tasks by default")
+    preview.add_argument("--out", type=Path, default=Path("preview.png"), help="PNG to write")
+    preview.add_argument("--size", type=int, default=320, help="width of one picture [px]")
+    preview.add_argument("--mode", choices=MODES, default="base", help="which look")
+    return parser
+
+
+def _build(args: argparse.Namespace) -> int:
+    from arena_newton.usd_scenes.build import FOLDER, build_all
+
+    for path in build_all(args.out or FOLDER, args.names):
+        print(path)
+    return 0
+
+
+def _validate(args: argparse.Namespace) -> int:
+    from arena_newton.usd_scenes.build import FOLDER
+    from arena_newton.usd_scenes.validate import REQUIRED, validate
+
+    files = args.files or [name for name in REQUIRED if (FOLDER / name / "scene.usda").is_file()]
+    wrong = 0
+    for name in files:
+        path = FOLDER / name / "scene.usda" if name in REQUIRED else Path(name)
+        problems = validate(path, args.task)
+        wrong += len(problems)
+        for problem in problems:
+            print(problem)
+        if not problems:
+            print(f"{path}: ok")
+    return 2 if wrong else 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    from arena_newton.usd_scenes.build import FOLDER
+    from arena_newton.usd_scenes.validate import REQUIRED
+
+    for name in REQUIRED:
+        path = FOLDER / name / "scene.usda"
+        variants = sorted(p.stem for p in (FOLDER / name / "variants").glob("*.usda"))
+        state = path if path.is_file() else "not built"
+        print(f"{name:12} {', '.join(['base', *variants]):36} {state}")
+    return 0
+
+
+def _preview(args: argparse.Namespace) -> int:
+    if args.size < 16:
+        raise InputError(f"--size {args.size}: expected at least 16 pixels")
+    from arena_newton.usd_scenes.preview import preview
+    from arena_newton.usd_scenes.validate import REQUIRED
+
+    print(preview(args.targets or list(REQUIRED), args.out, args.size, args.mode))
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; 0 when all is well, 2 for bad input."""
+    args = _parser().parse_args(argv)
+    commands = {"build": _build, "validate": _validate, "list": _list, "preview": _preview}
+    try:
+        return commands[args.command](args)
+    except (InputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""Build every layer of the project: textures, robot, and one scene a task."""
+
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.usd_scenes.validate import REQUIRED
+
+__all__ = ["FOLDER", "PARTS", "build_all"]
+
+FOLDER = Path(__file__).resolve().parent
+"""Where the layers live in the project."""
+PARTS = ("textures", "g1", *REQUIRED)
+"""What can be built, in order."""
+
+
+def build_all(folder: Path = FOLDER, names: Sequence[str] = ()) -> list[Path]:
+    """Write the named parts (all by default) under `folder` and return what was written.
+
+    Layers refer to each other by relative paths, so a build elsewhere must hold the robot and the textures too.
+
+    Raises:
+        InputError: A name is no part.
+    """
+    for name in names:
+        if name not in PARTS:
+            raise InputError(f"unknown part {name!r}; parts are {', '.join(PARTS)}")
+    written = []
+    for name in names or PARTS:
+        target = folder / name
+        target.mkdir(parents=True, exist_ok=True)
+        if name == "textures":
+            from arena_newton.usd_scenes.textures import write_all
+
+            write_all(target)
+            written.append(target)
+        elif name == "g1":
+            path = target / "g1.usda"
+            import_module("arena_newton.usd_scenes.g1.build").build(path)
+            written.append(path)
+        else:
+            import_module(f"arena_newton.usd_scenes.{name}.build").build(target)
+            written.append(target / "scene.usda")
+    return written

@@ -1,0 +1,160 @@
+"""Contact sheets: a scene seen from the robot's head camera and from the world camera, as a PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton import robot as g1
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.scene import Scene
+
+__all__ = ["MODES", "preview"]
+
+MODES = ("base", "semantic", "visual")
+"""What a scene can be shown in; visual is the base variant under a drawn distant light."""
+_LIGHT_SEED = 0
+"""Episode seed of the light drawn for visual mode."""
+_SETTLE = 1.5
+"""Time for dropped objects to come to rest [s]."""
+_STEP = 0.005
+_VIEWS = (("ego", 4 / 3), ("world", 16 / 9))
+_LABEL = 18
+_GAP = 4
+
+
+def preview(targets: list[str], out: Path, size: int = 240, mode: str = "base") -> Path:
+    """Render a contact sheet: one row per target and mode, ego view left, world view right.
+
+    Objects are where the file puts them, dropped until they rest; the robot is held in its spawn pose.
+
+    Args:
+        targets: Task names or scene files.
+        out: PNG to write.
+        size: Height of a picture [px].
+        mode: base, semantic, visual, or all for the three of them.
+
+    Returns:
+        The path of the PNG.
+
+    Raises:
+        InputError: Unknown mode, size, or a target that is no scene.
+    """
+    from PIL import Image, ImageDraw
+
+    if mode != "all" and mode not in MODES:
+        raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
+    if size < 16:
+        raise InputError(f"--size {size}: must be at least 16 px")
+    if not targets:
+        raise InputError("preview: name at least one task or scene file")
+    rows = []
+    for target in targets:
+        for name in MODES if mode == "all" else (mode,):
+            rows.append((f"{target} | {name}", _views(target, size, name)))
+    widths = [round(size * aspect) for _, aspect in _VIEWS]
+    sheet = Image.new("RGB", (sum(widths) + _GAP * (len(widths) + 1), (size + _LABEL + _GAP) * len(rows)), (24, 24, 24))
+    text = ImageDraw.Draw(sheet)
+    for row, (label, pictures) in enumerate(rows):
+        y, x = row * (size + _LABEL + _GAP), _GAP
+        for (view, _), width, picture in zip(_VIEWS, widths, pictures, strict=True):
+            text.text((x, y + 3), f"{label} | {view}", fill=(235, 235, 235))
+            sheet.paste(Image.fromarray(picture), (x, y + _LABEL))
+            x += width + _GAP
+    out = Path(out)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        sheet.save(out, format="PNG")
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from None
+    return out
+
+
+def _views(target: str, size: int, mode: str) -> list[np.ndarray]:
+    """Pictures of one scene in one mode, uint8 [size, width, 3] each."""
+    from arena_newton.camera import Camera, WorldLights
+    from arena_newton.scene import load_scene
+
+    scene = load_scene(target, worlds=1, device="cpu", native=True, variant=_variant(target, mode))
+    lights = WorldLights.allocate(1, scene.device, scene.stage)
+    if mode == "visual":
+        lights.set(0, _light())
+    state = _settled(scene)
+    pictures = []
+    for view, aspect in _VIEWS:
+        camera = Camera.from_scene(scene, None, view, round(size * aspect), size, lights, samples=2)
+        pictures.append(camera.render(state)[0].cpu().numpy().copy())
+    return pictures
+
+
+def _variant(target: str, mode: str) -> str | None:
+    """The variant of `semantics` to load: a task's own, or for a file the one that it selects unless asked for semantic."""
+    if mode == "semantic":
+        return "semantic"
+    return _selected(target) or "base"
+
+
+def _selected(target: str) -> str | None:
+    """The variant that a scene selects by itself, None if it has none."""
+    from pxr import Tf, Usd
+
+    from arena_newton.scene import scene_path
+
+    path = scene_path(target)
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise InputError(f"{path}: not a readable USD layer ({str(error).splitlines()[0]})") from None
+    world = stage.GetPrimAtPath("/World")
+    return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None
+
+
+def _light() -> Any:
+    """Visual mode's light of one fixed seed; its ranges are the same for every task."""
+    from arena_newton import rules, tasks
+
+    return tasks.get("football").draw(_LIGHT_SEED, "visual", rules.get("paper")).light
+
+
+def _settled(scene: Scene) -> Any:
+    """Newton state with the robot in its spawn pose and every object at rest where it fell."""
+    import mujoco
+
+    m = scene.mj_model
+    data = mujoco.MjData(m)
+    handles = scene.robot
+    data.qpos[handles.joint_qpos] = g1.DEFAULT_POSE
+    data.ctrl[handles.joint_ctrl] = g1.DEFAULT_POSE
+    links = set(handles.bodies)
+    own_q, own_v = _robot_coordinates(m, links)
+    spawn = data.qpos[own_q].copy()
+    saved_step, m.opt.timestep = m.opt.timestep, _STEP
+    for _ in range(round(_SETTLE / _STEP)):
+        mujoco.mj_step(m, data)
+        data.qpos[own_q] = spawn
+        data.qvel[own_v] = 0.0
+    m.opt.timestep = saved_step
+    mujoco.mj_forward(m, data)
+    state = scene.model.state()
+    poses = state.body_q.numpy()
+    for body, newton_body in enumerate(scene.body_to_newton[0]):
+        if newton_body >= 0:
+            poses[newton_body, :3] = data.xpos[body]
+            poses[newton_body, 3:] = data.xquat[body][[1, 2, 3, 0]]
+    state.body_q.assign(poses)
+    return state
+
+
+def _robot_coordinates(m: Any, links: set[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the robot's own coordinates in qpos and qvel."""
+    q, v = [], []
+    for joint in range(m.njnt):
+        if int(m.jnt_bodyid[joint]) in links:
+            free = m.jnt_type[joint] == 0
+            q += range(m.jnt_qposadr[joint], m.jnt_qposadr[joint] + (7 if free else 1))
+            v += range(m.jnt_dofadr[joint], m.jnt_dofadr[joint] + (6 if free else 1))
+    return np.array(q), np.array(v)
