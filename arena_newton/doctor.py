@@ -88,7 +88,7 @@ def _devices() -> list[Finding]:
     try:
         import warp as wp
 
-        wp.config.quiet = True
+        wp.config.log_level = wp.LOG_WARNING
         wp.init()
         devices = wp.get_cuda_devices()
     except Exception as error:

@@ -393,8 +393,8 @@ def markdown() -> str:
     lines = [
         "# Rule sets",
         "",
-        "`--rules paper` (default) follows the paper of the benchmark, made precise where it is silent; `--rules",
-        "released` follows its released code. A run prints the set it uses and stores the set's hash with every result.",
+        "`--rules paper` (default) follows the benchmark's paper, made precise where it is silent; `--rules released`",
+        "follows its released code. A run prints the set it uses and stores the set's hash with every result.",
         "This page is generated: `python -m arena_newton.rules > docs/rules.md`.",
         "",
         "| item | " + " | ".join(f"`{s.name}`" for s in sets) + " |",

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from arena_newton.errors import InputError
+from arena_newton.eval.config import quiet_warp
 
 __all__ = ["BenchOptions", "Figure", "run"]
 
@@ -77,6 +78,7 @@ def run(options: BenchOptions) -> int:
     for name in wanted:
         if name not in known:
             raise InputError(f"--what {name}: known are {' '.join(known)} all")
+    quiet_warp()
     figures: list[Figure] = []
     for name in wanted:
         for figure in known[name](options):
@@ -98,7 +100,6 @@ def _line(figure: Figure) -> str:
 def _cuda() -> bool:
     import warp as wp
 
-    wp.config.quiet = True
     return wp.is_cuda_available()
 
 

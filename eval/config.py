@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +28,7 @@ __all__ = [
     "explicit",
     "hash_path",
     "policy_label",
+    "quiet_warp",
     "resolve",
 ]
 
@@ -199,6 +202,7 @@ def resolve(options: RunOptions) -> RunConfig:
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
+    quiet_warp()
     engine, device = resolve_engine(options.engine, options.device)
     config = RunConfig(
         tasks=tasks,
@@ -245,6 +249,26 @@ def episodes(config: RunConfig) -> list[Episode]:
         repeats=config.repeats,
         max_steps=config.max_steps,
     )
+
+
+def quiet_warp() -> None:
+    """Start Warp without its banner, and without its driver's complaint on a machine that has no GPU.
+
+    The complaint is written by native code to the error stream, where the answer to bad input shall be one line.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    sys.stderr.flush()
+    kept = os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
 
 
 def explicit(options: RunOptions, config: RunConfig) -> RunOptions:

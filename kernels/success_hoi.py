@@ -211,6 +211,32 @@ def slack_on_deck(
     return wp.min(span, height_tolerance - wp.abs(bottom - top[2]))
 
 
+@wp.func
+def best_deck(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    centre: wp.vec3,
+    bottom: float,
+    deck_body: wp.array[int],
+    deck_pos: wp.array[wp.vec3],
+    deck_quat: wp.array[wp.vec4],
+    deck_half: wp.array[wp.vec3],
+    world: int,
+    height_tolerance: float,
+) -> int:
+    """The deck with the largest slack. A function of its own: backward, a kernel does not run its loops anew."""
+    best = int(0)
+    best_slack = float(-FAR)
+    for d in range(deck_body.shape[0]):
+        s = slack_on_deck(
+            xpos, xquat, centre, bottom, deck_body, deck_pos, deck_quat, deck_half, world, d, height_tolerance
+        )
+        if s > best_slack:
+            best_slack = s
+            best = d
+    return best
+
+
 @wp.kernel
 def pp_box_paper_kernel(
     xpos: wp.array3d[float],
@@ -235,14 +261,7 @@ def pp_box_paper_kernel(
     w = wp.tid()
     p = load_vec3(xpos, w, box)
     bottom = p[2] - world_half(load_quat3(xquat, w, box), box_half)[2]
-    best = int(0)
-    best_slack = float(-FAR)
-    for d in range(deck_body.shape[0]):
-        s = slack_on_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, d, height_tolerance)
-        if s > best_slack:
-            best_slack = s
-            best = d
-    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    best = best_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, height_tolerance)
     m = slack_on_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, best, height_tolerance)
     v = wp.vec3(qvel[w, box_qvel_adr], qvel[w, box_qvel_adr + 1], qvel[w, box_qvel_adr + 2])
     speed = wp.sqrt(wp.dot(v, v) + 1.0e-12)

@@ -227,6 +227,79 @@ def slack_in_seat(p: wp.vec3, centre: wp.vec3, half: wp.vec3, below: float, abov
     return wp.min(slack_xy(v, half), wp.min(v[2] + half[2] + below, half[2] + above - v[2]))
 
 
+@wp.func
+def slack_pressing(
+    xpos: wp.array3d[float],
+    contact_force: wp.array2d[float],
+    centre: wp.vec3,
+    half: wp.vec3,
+    world: int,
+    body: int,
+    below: float,
+    above: float,
+    min_force: float,
+    stiffness: float,
+) -> float:
+    """Slack [m] of one body in the seat volume with contact."""
+    s = slack_in_seat(load_vec3(xpos, world, body), centre, half, below, above)
+    return wp.min(s, (contact_force[world, body] - min_force) / stiffness)
+
+
+@wp.func
+def most_pressing(
+    xpos: wp.array3d[float],
+    contact_force: wp.array2d[float],
+    bodies: wp.array[int],
+    centre: wp.vec3,
+    half: wp.vec3,
+    world: int,
+    below: float,
+    above: float,
+    min_force: float,
+    stiffness: float,
+) -> int:
+    """The body with the largest pressing slack. A function: backward, a kernel does not run its loops anew."""
+    best = bodies[0]
+    best_slack = float(-FAR)
+    for k in range(bodies.shape[0]):
+        b = bodies[k]
+        s = slack_pressing(xpos, contact_force, centre, half, world, b, below, above, min_force, stiffness)
+        if s > best_slack:
+            best_slack = s
+            best = b
+    return best
+
+
+@wp.func
+def second_deepest(
+    xpos: wp.array3d[float],
+    bodies: wp.array[int],
+    centre: wp.vec3,
+    half: wp.vec3,
+    world: int,
+    below: float,
+    above: float,
+) -> int:
+    """The body with the second largest slack in the seat volume, -1 where only one is listed."""
+    first = bodies[0]
+    second = int(-1)
+    first_slack = float(-FAR)
+    second_slack = float(-FAR)
+    for k in range(bodies.shape[0]):
+        b = bodies[k]
+        s = slack_in_seat(load_vec3(xpos, world, b), centre, half, below, above)
+        if s > first_slack:
+            second_slack = first_slack
+            if k > 0:
+                second = first
+            first_slack = s
+            first = b
+        elif s > second_slack:
+            second_slack = s
+            second = b
+    return second
+
+
 @wp.kernel
 def sit_sofa_released_kernel(
     xpos: wp.array3d[float],
@@ -248,33 +321,9 @@ def sit_sofa_released_kernel(
     w = wp.tid()
     c = box_centre(xpos, xquat, seat_body, seat_pos, w, 0)
     h = world_half(box_rotation(xquat, seat_body, seat_quat, w, 0), seat_half[0])
-    pressing = bodies[0]
-    first = bodies[0]
-    second = int(-1)
-    pressing_slack = float(-FAR)
-    first_slack = float(-FAR)
-    second_slack = float(-FAR)
-    for k in range(bodies.shape[0]):
-        b = bodies[k]
-        s = slack_in_seat(load_vec3(xpos, w, b), c, h, below, above)
-        f = wp.min(s, (contact_force[w, b] - min_force) / stiffness)
-        if f > pressing_slack:
-            pressing_slack = f
-            pressing = b
-        if s > first_slack:
-            second_slack = first_slack
-            if k > 0:
-                second = first
-            first_slack = s
-            first = b
-        elif s > second_slack:
-            second_slack = s
-            second = b
-    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
-    m = wp.min(
-        slack_in_seat(load_vec3(xpos, w, pressing), c, h, below, above),
-        (contact_force[w, pressing] - min_force) / stiffness,
-    )
+    pressing = most_pressing(xpos, contact_force, bodies, c, h, w, below, above, min_force, stiffness)
+    m = slack_pressing(xpos, contact_force, c, h, w, pressing, below, above, min_force, stiffness)
+    second = second_deepest(xpos, bodies, c, h, w, below, above)
     if second >= 0:
         m = wp.max(m, slack_in_seat(load_vec3(xpos, w, second), c, h, below, above))
     margin[w] = m
@@ -336,6 +385,26 @@ def fist_distance(
     return wp.sqrt(wp.dot(d, d) + 1.0e-12)
 
 
+@wp.func
+def nearest_fist(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    target: wp.vec3,
+    palm_body: wp.array[int],
+    palm_offset: wp.array[wp.vec3],
+    world: int,
+) -> int:
+    """The palm nearest to a point. A function of its own: backward, a kernel does not run its loops anew."""
+    best = int(0)
+    best_distance = float(FAR)
+    for k in range(palm_body.shape[0]):
+        d = fist_distance(xpos, xquat, target, palm_body, palm_offset, world, k)
+        if d < best_distance:
+            best_distance = d
+            best = k
+    return best
+
+
 @wp.kernel
 def boxing_kernel(
     xpos: wp.array3d[float],
@@ -356,14 +425,7 @@ def boxing_kernel(
     centre = box_centre(xpos, xquat, target_body, target_pos, w, 0)
     h = target_half[0]
     reach = wp.max(wp.max(wp.max(h[0], h[1]), h[2]), min_radius) + pad
-    best = int(0)
-    best_distance = float(FAR)
-    for k in range(palm_body.shape[0]):
-        d = fist_distance(xpos, xquat, centre, palm_body, palm_offset, w, k)
-        if d < best_distance:
-            best_distance = d
-            best = k
-    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    best = nearest_fist(xpos, xquat, centre, palm_body, palm_offset, w)
     m = reach - fist_distance(xpos, xquat, centre, palm_body, palm_offset, w, best)
     margin[w] = m
     success[w] = holds(m)
@@ -411,6 +473,21 @@ def foot_slack(
     return slack_xy(wp.quat_rotate_inv(q, load_vec3(xpos, world, feet[foot]) - centre), half)
 
 
+@wp.func
+def worst_foot(
+    xpos: wp.array3d[float], feet: wp.array[int], centre: wp.vec3, q: wp.quat, half: wp.vec3, world: int
+) -> int:
+    """The foot with the smallest slack. A function of its own: backward, a kernel does not run its loops anew."""
+    worst = int(0)
+    worst_slack = float(FAR)
+    for k in range(feet.shape[0]):
+        s = foot_slack(xpos, feet, centre, q, half, world, k)
+        if s < worst_slack:
+            worst_slack = s
+            worst = k
+    return worst
+
+
 @wp.kernel
 def vis_navi_kernel(
     xpos: wp.array3d[float],
@@ -431,14 +508,7 @@ def vis_navi_kernel(
     w = wp.tid()
     q = box_rotation(xquat, zone_body, zone_quat, w, 0)
     c = box_centre(xpos, xquat, zone_body, zone_pos, w, 0)
-    worst = int(0)
-    worst_slack = float(FAR)
-    for k in range(feet.shape[0]):
-        s = foot_slack(xpos, feet, c, q, zone_half[0], w, k)
-        if s < worst_slack:
-            worst_slack = s
-            worst = k
-    # Judged again outside the loop: gradients of values carried through a dynamic loop are not kept.
+    worst = worst_foot(xpos, feet, c, q, zone_half[0], w)
     m = foot_slack(xpos, feet, c, q, zone_half[0], w, worst)
     m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
     margin[w] = m

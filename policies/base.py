@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
 
 __all__ = ["Chunk", "Observation", "Policy", "PolicyError", "get", "names", "register", "world_mask"]
 
 ENTRY_POINT_GROUP = "arena_newton.policies"
-"""Other packages offer policies under this entry point group: a callable that takes the text after the colon or None."""
+"""Other packages offer policies under this entry point group: a callable that takes the text after the colon, if any."""
 
 _BUILT_IN = {
     "remote": "arena_newton.policies.remote:from_spec",

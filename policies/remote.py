@@ -1,8 +1,8 @@
 """The policy that runs elsewhere: a client of the original benchmark's HTTP protocol.
 
-`POST /reset {"seed": int}` begins an episode, `POST /infer` sends image and state and returns a chunk of actions. A server
-of that protocol knows one robot only, so every world that asks is one request. A world whose request fails ends as
-`error`; the others go on.
+`POST /reset {"seed": int}` begins an episode, `POST /infer` sends image and state and returns a chunk of actions. A
+server of that protocol knows one robot only, so every world that asks is one request. A world whose request fails ends
+as `error`; the others go on.
 """
 
 from __future__ import annotations

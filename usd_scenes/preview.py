@@ -27,7 +27,7 @@ _LABEL = 18
 _GAP = 4
 
 
-def preview(targets: list[str], out: Path, size: int = 240, mode: str = "base") -> Path:
+def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") -> Path:
     """Render a contact sheet: one row per target and mode, ego view left, world view right.
 
     Objects are where the file puts them, dropped until they rest; the robot is held in its spawn pose.
@@ -35,7 +35,7 @@ def preview(targets: list[str], out: Path, size: int = 240, mode: str = "base") 
     Args:
         targets: Task names or scene files.
         out: PNG to write.
-        size: Height of a picture [px].
+        size: Width of the head camera's picture [px]; the other view has the same height.
         mode: base, semantic, visual, or all for the three of them.
 
     Returns:
@@ -52,15 +52,16 @@ def preview(targets: list[str], out: Path, size: int = 240, mode: str = "base") 
         raise InputError(f"--size {size}: must be at least 16 px")
     if not targets:
         raise InputError("preview: name at least one task or scene file")
+    height = round(size / _VIEWS[0][1])
     rows = []
     for target in targets:
         for name in MODES if mode == "all" else (mode,):
-            rows.append((f"{target} | {name}", _views(target, size, name)))
-    widths = [round(size * aspect) for _, aspect in _VIEWS]
-    sheet = Image.new("RGB", (sum(widths) + _GAP * (len(widths) + 1), (size + _LABEL + _GAP) * len(rows)), (24, 24, 24))
+            rows.append((f"{target} | {name}", _views(target, height, name)))
+    widths = [round(height * aspect) for _, aspect in _VIEWS]
+    sheet = Image.new("RGB", (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows)), (24, 24, 24))
     text = ImageDraw.Draw(sheet)
     for row, (label, pictures) in enumerate(rows):
-        y, x = row * (size + _LABEL + _GAP), _GAP
+        y, x = row * (height + _LABEL + _GAP), _GAP
         for (view, _), width, picture in zip(_VIEWS, widths, pictures, strict=True):
             text.text((x, y + 3), f"{label} | {view}", fill=(235, 235, 235))
             sheet.paste(Image.fromarray(picture), (x, y + _LABEL))
@@ -74,8 +75,8 @@ def preview(targets: list[str], out: Path, size: int = 240, mode: str = "base") 
     return out
 
 
-def _views(target: str, size: int, mode: str) -> list[np.ndarray]:
-    """Pictures of one scene in one mode, uint8 [size, width, 3] each."""
+def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
+    """Pictures of one scene in one mode, uint8 [height, width, 3] each."""
     from arena_newton.camera import Camera, WorldLights
     from arena_newton.scene import load_scene
 
@@ -86,13 +87,13 @@ def _views(target: str, size: int, mode: str) -> list[np.ndarray]:
     state = _settled(scene)
     pictures = []
     for view, aspect in _VIEWS:
-        camera = Camera.from_scene(scene, None, view, round(size * aspect), size, lights, samples=2)
+        camera = Camera.from_scene(scene, None, view, round(height * aspect), height, lights, samples=2)
         pictures.append(camera.render(state)[0].cpu().numpy().copy())
     return pictures
 
 
-def _variant(target: str, mode: str) -> str | None:
-    """The variant of `semantics` to load: a task's own, or for a file the one that it selects unless asked for semantic."""
+def _variant(target: str, mode: str) -> str:
+    """The variant of `semantics` to load: the one that the scene selects by itself, unless asked for semantic."""
     if mode == "semantic":
         return "semantic"
     return _selected(target) or "base"

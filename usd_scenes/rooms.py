@@ -141,7 +141,8 @@ def workshop(
         plane, inward = {"-x": (x0, 1), "+x": (x1, -1), "-y": (y0, 1), "+y": (y1, -1)}[wall]
 
         def place(along: float, height: float, out: float, axis=axis, plane=plane, inward=inward) -> np.ndarray:
-            return np.array([along, plane + inward * out, height] if axis == 0 else [plane + inward * out, along, height])
+            off = plane + inward * out
+            return np.array([along, off, height] if axis == 0 else [off, along, height])
 
         def bar(half_along: float, half_height: float, out: float, axis=axis) -> tuple[float, float, float]:
             return (half_along, out, half_height) if axis == 0 else (out, half_along, half_height)
@@ -153,7 +154,8 @@ def workshop(
         for height in (sill, sill + (head - sill) * 0.36, head):
             frames.box(bar(width / 2 + 0.04, 0.04, 0.05), place(at, height, 0.05))
         panes.box(bar(width / 2, half_height, 0.01), place(at, middle, 0.02))
-    frames.write(stage, "/World/Room/WindowFrames", look=author.material(stage, "/World/Looks/black", (0.01, 0.01, 0.01)))
+    black = author.material(stage, "/World/Looks/black", (0.01, 0.01, 0.01))
+    frames.write(stage, "/World/Room/WindowFrames", look=black)
     panes.write(stage, "/World/Room/Panes")
     return {
         "base": {

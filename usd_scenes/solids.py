@@ -50,8 +50,9 @@ class Solids:
 
     def box(self, half: Vec, centre: Vec = (0, 0, 0), *, yaw: float = 0.0, tile: float | None = None) -> "Solids":
         """A box with half sizes `half` [m] around `centre`, turned by `yaw` [rad] about z."""
-        h, turn = np.asarray(half, dtype=float), np.array(
-            [(np.cos(yaw), -np.sin(yaw), 0), (np.sin(yaw), np.cos(yaw), 0), (0, 0, 1)]
+        h, turn = (
+            np.asarray(half, dtype=float),
+            np.array([(np.cos(yaw), -np.sin(yaw), 0), (np.sin(yaw), np.cos(yaw), 0), (0, 0, 1)]),
         )
         # Normal, then the direction of u; v follows. Side faces keep v upright.
         for normal, u in (

@@ -40,7 +40,7 @@ class Required:
 
     path: str
     kind: str
-    """`body`, `fixture`, `articulation`, `hinge`, `latch`, `marker`, `collider`, `camera`, `light`, `physics`, `robot`, `prim`."""
+    """A key of `_KIND_WORDS`, which says what is expected."""
     variants: tuple[str, ...] = ()
     """Variants of `semantics` that need it; empty: all of them."""
 
@@ -180,23 +180,23 @@ def _prims(stage: "Usd.Stage", file: Path, task: str | None, *, robot_lost: bool
     """Faults of the prims, in the authored selection and in every variant of `semantics`."""
     from pxr import Usd
 
+    seen: set[tuple[str, str]] = set()
     with Usd.EditContext(stage, stage.GetSessionLayer()):
-        world = stage.GetPrimAtPath("/World")
-        names = world.GetVariantSets().GetVariantSet("semantics").GetVariantNames() or [""]
+        choice = stage.GetPrimAtPath("/World").GetVariantSets().GetVariantSet("semantics")
+        names = sorted(choice.GetVariantNames(), key=lambda name: name != "base") or ["base"]
         for name in names:
-            if name:
-                world.GetVariantSets().GetVariantSet("semantics").SetVariantSelection(name)
-            where = f" (variant {name})" if len(names) > 1 and name != "base" else ""
-            needed = (*COMMON, *(REQUIRED[task] if task else ()))
-            for item in needed:
-                if item.variants and name not in item.variants:
-                    continue
-                if item.kind == "robot" and robot_lost:
-                    continue
-                fault = _fault(stage, item)
-                if fault is not None:
-                    yield Problem(str(file), fault[0], fault[1] + where)
-            yield from (Problem(str(file), p, text + where) for p, text in _masses(stage))
+            if len(names) > 1:
+                choice.SetVariantSelection(name)
+            faults = [
+                _fault(stage, item)
+                for item in (*COMMON, *(REQUIRED[task] if task else ()))
+                if not (item.variants and name not in item.variants) and not (item.kind == "robot" and robot_lost)
+            ]
+            for prim, message in [*(fault for fault in faults if fault), *_masses(stage)]:
+                # A fault of every variant is told once; a variant's own fault names the variant.
+                if (prim, message) not in seen:
+                    yield Problem(str(file), prim, message + ("" if name == names[0] else f" (variant {name})"))
+                seen.add((prim, message))
 
 
 def _fault(stage: "Usd.Stage", item: Required) -> tuple[str, str] | None:
@@ -344,7 +344,8 @@ def _masses(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
             continue
         mass = api.GetMassAttr().Get()
         if not mass or mass <= 0:
-            yield path, f"physics:mass is {mass if api.GetMassAttr().HasAuthoredValue() else 'missing'}: expected kg > 0"
+            value = mass if api.GetMassAttr().HasAuthoredValue() else "missing"
+            yield path, f"physics:mass is {value}: expected kg > 0"
         inertia = api.GetDiagonalInertiaAttr().Get()
         if not api.GetDiagonalInertiaAttr().HasAuthoredValue() or min(inertia) <= 0:
             yield path, "physics:diagonalInertia is missing or not positive: expected three values in kg·m²"
@@ -435,6 +436,8 @@ def _asset_paths(layer: "Sdf.Layer") -> Iterator[tuple[str, str, bool]]:
 
     def visit(path: "Sdf.Path") -> None:
         spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.VariantSpec):
+            spec = spec.primSpec
         if isinstance(spec, Sdf.PrimSpec):
             for arcs in (spec.referenceList, spec.payloadList):
                 for item in arcs.GetAddedOrExplicitItems():

@@ -32,7 +32,7 @@ FLOOR_Y = (-6.5, 5.2)
 """Extent of the room along y [m]."""
 VARIANTS = ("base", "semantic")
 """Variants of these scenes; the first is selected."""
-_HEIGHT = 4.4
+_HEIGHT = 3.3
 _SKIRTING = 0.09
 
 _FACES = (
@@ -68,7 +68,7 @@ def rounded_box(
     position=(0, 0, 0),
     *,
     radius: float = 0.05,
-    steps: int = 3,
+    steps: int = 2,
     look=None,
 ) -> Usd.Prim:
     """A visual box with rounded edges, for cushions; `half` sizes include the rounding."""
@@ -102,7 +102,7 @@ def rounded_box(
                     first + (j + 1) * n + i,
                 )
                 faces.extend([[a, b, c], [a, c, d]] if outward else [[a, c, b], [a, d, c]])
-    return author.mesh(stage, path, points, faces, position, uv=uv, look=look)
+    return author.mesh(stage, path, np.round(points, 5), faces, position, uv=np.round(uv, 4), look=look)
 
 
 def _plane(stage: Usd.Stage, path: str, position, quat, surface: Usd.Prim) -> Usd.Prim:

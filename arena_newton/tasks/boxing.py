@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from arena_newton import seeding
 from arena_newton.rules import ByRules, CylinderRange, RuleSet, TaskRules
@@ -42,8 +42,8 @@ class BoxingJudge(Judge):
         super().__init__(scene)
         self.rule: BoxingRule = rules.task("boxing").success
         palms = [scene.frame(name) for name in PALMS]
-        self.palm_body = wp.array([p.body_id for p in palms], dtype=wp.int32, device=self.device)
-        self.palm_offset = wp.array([wp.vec3(*p.pos) for p in palms], dtype=wp.vec3, device=self.device)
+        self.palm_body: Any = wp.array([p.body_id for p in palms], dtype=wp.int32, device=self.device)
+        self.palm_offset: Any = wp.array([wp.vec3(*p.pos) for p in palms], dtype=wp.vec3, device=self.device)
         self.target = Boxes.upload([scene.marker(f"{TARGET}/Frame/Bounds")], self.device)
 
     def evaluate(self, physics: Physics) -> None:

@@ -46,7 +46,7 @@ class DoubleDeskJudge(Judge):
 
         state = (physics.xpos, physics.xquat, physics.xipos)
         common = {"hammer_body": self.hammer, "inside": self.inside, **self.outputs()}
-        if self.rule.crate_frame:
+        if self.rule.crate_frame or self.rule.min_z is None:
             success.launch_double_desk_paper(*state, **common)
         else:
             success.launch_double_desk_released(*state, min_z=self.rule.min_z, **common)

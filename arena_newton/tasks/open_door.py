@@ -57,7 +57,7 @@ class OpenDoorJudge(Judge):
         self.handle = scene.joint_qpos(f"{DOOR}/HandleHinge")
         self.handle_rest = float(scene.mj_model.qpos0[self.handle])
         self.doorway = Boxes.upload([scene.marker(f"{DOOR}/Frame/Doorway")], self.device)
-        self.locked = wp.full(self.worlds, 1, dtype=wp.int32, device=self.device)
+        self.locked: Any = wp.full(self.worlds, 1, dtype=wp.int32, device=self.device)
         """1 = the latch holds the leaf, shape [worlds]."""
 
     def evaluate(self, physics: Physics) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from arena_newton.robot import TICK
 from arena_newton.rules import ByRules, PoseRange, RuleSet
@@ -59,15 +59,32 @@ class PPBoxJudge(Judge):
         self.box_half = wp.vec3(*(float(v) for v in scene.mj_model.geom_aabb[scene.geom_ids(BOX)[0], 3:]))
         self.decks = Boxes.upload([scene.marker(path) for path in DECKS], self.device)
         self.slow = self.counter()
+        centred = float(abs(scene.mj_model.body_ipos[self.box]).max()) < 1e-6
+        self._centres = (
+            None if centred else wp.zeros((self.worlds, scene.mj_model.nbody, 3), dtype=wp.float32, device=self.device)
+        )
+        """Body positions with the box's centre of mass in place of its origin, which lies at its base."""
+
+    def positions(self, physics: Physics) -> Any:
+        """Body positions in which the box stands for its centre, shape [worlds, nbody, 3]."""
+        import warp as wp
+
+        if self._centres is None:
+            return physics.xpos
+        wp.copy(self._centres, physics.xpos)
+        row = slice(self.box, self.box + 1)
+        wp.copy(self._centres[:, row], physics.xipos[:, row])
+        return self._centres
 
     def evaluate(self, physics: Physics) -> None:
         """See `Judge.evaluate`."""
         from arena_newton.kernels import success
 
+        positions = self.positions(physics)
         common = {"box_body": self.box, "box_half": self.box_half, "decks": self.decks, **self.outputs()}
         if isinstance(self.rule, PPBoxAnyDeckRule):
             success.launch_pp_box_paper(
-                physics.xpos,
+                positions,
                 physics.xquat,
                 physics.qvel,
                 box_qvel_adr=self.box_qvel,
@@ -80,7 +97,7 @@ class PPBoxJudge(Judge):
             )
         else:
             success.launch_pp_box_released(
-                physics.xpos,
+                positions,
                 physics.xquat,
                 deck=self.rule.deck,
                 plane_z=self.rule.plane_z,
@@ -101,8 +118,6 @@ TASK = TaskSpec(
             prim=BOX,
             base=PoseRange(x=(-0.58, -0.40), y=(-5.63, -3.92), z=(0.75, 0.75), yaw=(-0.785398, 0.785398)),
             execution=PoseRange(x=(-0.58, -0.40), y=(-5.97, -3.92), z=(0.75, 0.75), yaw=(-0.785398, 0.785398)),
-            # z = 0.75 m is 5 mm above the table: the original's cube has its origin at its base, ours at its centre.
-            lift=0.105,
         ),
         ObjectSpec(
             record="shelf",

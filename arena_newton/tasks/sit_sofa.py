@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from arena_newton.rules import ByRules, PoseRange, RuleSet
 from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, TaskSpec
@@ -64,7 +64,7 @@ class SitSofaJudge(Judge):
         pressing = {scene.link(name) for name in PRESSING_LINKS}
         self.pressing_geoms = [g for g, b in enumerate(scene.mj_model.geom_bodyid) if int(b) in pressing]
         touching = [scene.link(name) for name in TOUCHING_LINKS]
-        self.touching = wp.array(touching, dtype=wp.int32, device=self.device)
+        self.touching: Any = wp.array(touching, dtype=wp.int32, device=self.device)
         self.seated = self.counter()
         self._bound: Physics | None = None
 

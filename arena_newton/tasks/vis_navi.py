@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -42,7 +42,7 @@ class VisNaviJudge(Judge):
         rule: VisNaviRule = rules.task("vis_navi").success
         self.standing = rules.standing
         self.root = scene.robot.root_qpos
-        self.feet = wp.array([scene.link(name) for name in rule.feet], dtype=wp.int32, device=self.device)
+        self.feet: Any = wp.array([scene.link(name) for name in rule.feet], dtype=wp.int32, device=self.device)
         self.zone = Boxes.upload([scene.marker(f"{SIGN}/Frame/Zone")], self.device)
 
     def evaluate(self, physics: Physics) -> None:

@@ -116,8 +116,8 @@ def test_shelf_and_door_are_offsets_in_both_sets():
 
 
 def test_cubes_stand_above_their_support():
-    """The box starts 5 mm above the table top 0.745 m, cartons drop 0.1 m; prim origins are the cubes' centres."""
-    assert draw("pp_box").placed["/World/Box"].pos[2] - 0.105 == pytest.approx(0.75)
+    """The box (origin at its base) starts 5 mm above the table top 0.745 m, cartons (at the centre) drop 0.1 m."""
+    assert draw("pp_box").placed["/World/Box"].pos[2] == pytest.approx(0.75)
     for carton in ("/World/Carton_1", "/World/Carton_2"):
         assert draw("sit_sofa").placed[carton].pos[2] - 0.21 == pytest.approx(0.1)
 
@@ -246,3 +246,74 @@ def test_a_changed_rule_set_is_honoured():
     own = dataclasses.replace(football, objects=(dataclasses.replace(football.objects[0], base=near),))
     mine = dataclasses.replace(PAPER, tasks=(own, *PAPER.tasks[1:]))
     assert draw("football", rule_set=mine).placed["/World/Ball"].pos[0] == 0.5
+
+
+def stage_of(task: str):
+    """The task's stage."""
+    from pxr import Usd
+
+    from arena_newton.scene import scene_path
+
+    return Usd.Stage.Open(str(scene_path(task)))
+
+
+@pytest.mark.parametrize("task", tasks.names())
+def test_scene_agrees_with_the_task(task):
+    """The stage has every randomised prim, and its robot stands where the task spawns it."""
+    from pxr import Gf, UsdGeom
+
+    stage, spec = stage_of(task), tasks.get(task)
+    for o in spec.objects:
+        assert stage.GetPrimAtPath(o.prim), o.prim
+    robot = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/World/Robot"))
+    assert tuple(robot.ExtractTranslation()) == pytest.approx(spec.spawn_position, abs=1e-6)
+    turn = Gf.Transform(robot).GetRotation().GetQuat()
+    dot = turn.GetReal() * spec.spawn_quat[0] + sum(np.array(turn.GetImaginary()) * spec.spawn_quat[1:])
+    assert abs(dot) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_goal_marker_is_the_box_that_the_rules_state():
+    """The stage's goal volume equals the numbers of the rule table."""
+    from pxr import UsdGeom
+
+    stage = stage_of("football")
+    prim = stage.GetPrimAtPath("/World/Goal/Volume")
+    centre = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim).ExtractTranslation())
+    half = 0.5 * np.array(prim.GetAttribute("arena:size").Get())
+    rule = PAPER.task("football").success
+    expected = np.array([rule.goal_x, rule.goal_y, rule.goal_z])
+    np.testing.assert_allclose(np.stack([centre - half, centre + half], axis=1), expected, atol=1e-6)
+
+
+def test_cube_origins_are_where_placement_expects_them():
+    """Placed at the sampled height, the box's and the cartons' bottoms are at that height."""
+    from pxr import Usd, UsdGeom
+
+    for task, prim, sampled_z in (
+        ("pp_box", "/World/Box", 0.75),
+        ("sit_sofa", "/World/Carton_1", 0.1),
+        ("sit_sofa", "/World/Carton_2", 0.1),
+    ):
+        stage = stage_of(task)
+        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])
+        bottom = cache.ComputeUntransformedBound(stage.GetPrimAtPath(prim)).ComputeAlignedRange().GetMin()[2]
+        assert draw(task).placed[prim].pos[2] + bottom == pytest.approx(sampled_z, abs=2e-3), prim
+
+
+def test_latch_stays_released_until_reset():
+    """The handle releases at its angle, letting go does not lock again, a reset locks the masked worlds only."""
+    import warp as wp
+
+    from arena_newton.kernels import latch
+
+    release = math.radians(-20.0)
+    qpos = wp.zeros((3, 2), dtype=wp.float32, device="cpu")
+    locked = wp.full(3, 1, dtype=wp.int32, device="cpu")
+    qpos.assign(np.array([[9.0, -0.3], [9.0, -0.36], [9.0, -0.5]], dtype=np.float32))
+    latch.launch_release(qpos, 1, release, locked)
+    assert locked.numpy().tolist() == [1, 0, 0]
+    qpos.zero_()
+    latch.launch_release(qpos, 1, release, locked)
+    assert locked.numpy().tolist() == [1, 0, 0]
+    latch.launch_lock(wp.array([0, 1, 0], dtype=wp.int32, device="cpu"), locked)
+    assert locked.numpy().tolist() == [1, 1, 0]

@@ -60,7 +60,9 @@ def _limit(a: wp.array2d[float], b: wp.array2d[float], limit: float, out: wp.arr
 
 def _run(kernel, device, columns, *inputs):
     rows = inputs[0].shape[0]
-    arrays = [wp.array(np.float32(a), dtype=wp.float32, device=device) if isinstance(a, np.ndarray) else a for a in inputs]
+    arrays = [
+        wp.array(np.float32(a), dtype=wp.float32, device=device) if isinstance(a, np.ndarray) else a for a in inputs
+    ]
     out = wp.zeros((rows, columns) if columns else rows, dtype=wp.float32, device=device)
     wp.launch(kernel, rows, inputs=arrays, outputs=[out], device=device)
     return out.numpy()

@@ -77,9 +77,7 @@ def test_hammer_inertia_is_that_of_its_geoms():
     built = scene("double_desk")
     body = built.body_id("/World/Hammer")
     np.testing.assert_allclose(built.mj_model.body_ipos[body], oracle.body_ipos[1], atol=1e-6)
-    np.testing.assert_allclose(
-        np.sort(built.mj_model.body_inertia[body]), np.sort(oracle.body_inertia[1]), rtol=2e-3
-    )
+    np.testing.assert_allclose(np.sort(built.mj_model.body_inertia[body]), np.sort(oracle.body_inertia[1]), rtol=2e-3)
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.005])

@@ -33,9 +33,7 @@ def ball(stage: Usd.Stage, path: str, position, radius: float, mass: float, look
     sets it when the scene is loaded.
     """
     body = author.rigid_body(stage, path, position, mass=mass, inertia=[0.4 * mass * radius**2] * 3)
-    surface = author.physics_material(
-        stage, f"{path}/Surface", static=0.7, dynamic=0.7, restitution=0.1
-    )
+    surface = author.physics_material(stage, f"{path}/Surface", static=0.7, dynamic=0.7, restitution=0.1)
     geom = author.sphere(stage, f"{path}/Collider", radius, visual=False, surface=surface)
     rooms.contact(geom, condim=3, priority=1)
     Solids().ball(radius).write(stage, f"{path}/Look", look=look)

@@ -45,7 +45,7 @@ HAND_BOXES: dict[str, tuple[tuple[float, float, float], tuple[float, float, floa
     "index_1": ((0.0285, 0.0078, 0.0115), (0.0235, 0.0, 0.0)),
 }
 """Finger collision boxes of the left hand (half sizes, centre) [m] with which the hand grasped in all trials; no box on
-thumb_0, which would jam the palm. The right hand mirrors y."""
+thumb_0. The right hand mirrors y."""
 
 PALM_BOX = ((0.0395, 0.0195, 0.041), (0.081, 0.0035, 0.0))
 """Palm collision box of the left hand on the wrist_yaw link, same source."""

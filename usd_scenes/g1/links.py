@@ -4,7 +4,7 @@ Source: Unitree's public G1 model as TWIST2 publishes it for MuJoCo (`g1_sim2sim
 inertias, joint axes, ranges and torque limits. Body joint armatures come from the sister file without hands
 (`g1_sim2sim_29dof.xml`; zero for the waist pitch and the wrists there), since the file with hands gives them to one leg's
 hip alone. Finger armature 0.01 is the value with which the soft finger drive grasped in trials. The pelvis row includes
-the massless-looking `pelvis_contour_link` (1 g). Rows stand depth first, parents before children, left before right.
+the jointless `pelvis_contour_link` (1 g). Rows stand depth first, parents before children, left before right.
 """
 
 from dataclasses import dataclass

@@ -97,23 +97,19 @@ def _leaf(stage, path: str, origin, rough) -> None:
     """The leaf's origin is its hinge line at the height of the frame's origin."""
     half = 0.5 * np.asarray(LEAF_SIZE)
     centre = (half[0], 0.0, LEAF_CLEARANCE + half[2])
-    inertia = (
-        LEAF_MASS
-        / 3.0
-        * np.array([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2])
-    )
+    inertia = LEAF_MASS / 3.0 * (np.sum(half**2) - half**2)
     author.rigid_body(stage, path, origin, mass=LEAF_MASS, inertia=inertia, com=centre)
     author.box(stage, f"{path}/Solid", half, centre, visual=False, surface=rough)
 
 
 def _leaf_looks(stage, path: str, base: bool) -> None:
-    """What the leaf looks like: wood with two recessed panels, or a blue steel door with a window and stripes."""
+    """What the leaf looks like: tan with two framed panels, or blue steel with a window and hazard stripes."""
     half = 0.5 * np.asarray(LEAF_SIZE)
     cx, cz = half[0], LEAF_CLEARANCE + half[2]
     if base:
-        board = author.material(stage, "/World/Looks/Leaf", (0.50, 0.40, 0.30), texture="../textures/wood.png")
-        dark = author.material(stage, "/World/Looks/LeafPanel", (0.36, 0.27, 0.19))
-        warehouse.boxes(stage, f"{path}/Board", [(half, (cx, 0, cz))], look=board, tile=1.0)
+        board = author.material(stage, "/World/Looks/Leaf", (0.36, 0.28, 0.21))
+        dark = author.material(stage, "/World/Looks/LeafPanel", (0.25, 0.19, 0.14))
+        warehouse.boxes(stage, f"{path}/Board", [(half, (cx, 0, cz))], look=board)
         lines = []
         for low, high in ((0.25, 0.85), (1.10, 1.95)):
             lines += [((0.30, half[1] + 0.002, 0.008), (cx, 0, z)) for z in (low, high)]
@@ -122,7 +118,7 @@ def _leaf_looks(stage, path: str, base: bool) -> None:
             ]
         warehouse.boxes(stage, f"{path}/Mouldings", lines, look=dark)
         return
-    paint = author.material(stage, "/World/Looks/Leaf", (0.10, 0.28, 0.55), texture=None)
+    paint = author.material(stage, "/World/Looks/Leaf", (0.05, 0.16, 0.38))
     glass = author.material(stage, "/World/Looks/LeafGlass", (0.62, 0.74, 0.78), roughness=0.2)
     hazard = author.material(stage, "/World/Looks/LeafHazard", (0.8, 0.7, 0.1), texture="../textures/hazard.png")
     warehouse.boxes(stage, f"{path}/Board", [(half, (cx, 0, cz))], look=paint)

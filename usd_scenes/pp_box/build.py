@@ -82,8 +82,9 @@ def shelf(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
     lattice = Solids()
     for sx in (-1, 1):
         for low in (0.25, 0.75, 1.25, 1.75):
-            for a, b in (((-1), 1), (1, -1)):
-                lattice.tube((sx * (hx - POST), a * (hy - 2 * POST), low), (sx * (hx - POST), b * (hy - 2 * POST), low + 0.3), 0.01, sides=6)
+            for sy in (-1, 1):
+                x, y = sx * (hx - POST), sy * (hy - 2 * POST)
+                lattice.tube((x, y, low), (x, -y, low + 0.3), 0.01, sides=6)
     lattice.write(stage, f"{frame}/Lattice", look=blue)
     beams = Solids()
     for height in (*DECKS, TOP):

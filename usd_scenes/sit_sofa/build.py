@@ -116,7 +116,7 @@ def build(folder: Path) -> None:
         base = variant == "base"
         warehouse.room_looks(
             stage,
-            floor="concrete" if base else "wood",
+            floor="concrete" if base else "tiles",
             wall=None if base else "brick",
             skirting=(0.9, 0.9, 0.88) if base else (0.25, 0.16, 0.10),
         )

@@ -37,9 +37,7 @@ OBSTACLES = {
 
 def _obstacle(stage, name: str, position, size, mass: float, look, rough) -> None:
     half = 0.5 * np.asarray(size)
-    inertia = (
-        mass / 3.0 * np.array([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2])
-    )
+    inertia = mass / 3.0 * (np.sum(half**2) - half**2)
     author.rigid_body(stage, f"/World/{name}", position, mass=mass, inertia=inertia)
     author.box(stage, f"/World/{name}/Geom", half, look=look, surface=rough)
 

@@ -1,0 +1,86 @@
+"""The torch module made from an ONNX file computes what ONNX Runtime computes."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from networks import Builder, twist2_like
+
+from arena_newton import trackers
+from arena_newton.errors import InputError
+from arena_newton.trackers import onnx_mlp
+
+OFFICIAL = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2"
+
+
+def difference(path: Path, in_width: int, out_width: int, *, rows: int = 1000) -> float:
+    x = np.random.default_rng(1).standard_normal((rows, in_width)).astype(np.float32)
+    expected = onnxruntime.InferenceSession(str(path)).run(None, {"input": x})[0]
+    network = onnx_mlp.load(path, in_width=in_width, out_width=out_width)
+    with torch.inference_mode():
+        whole = network(torch.from_numpy(x)).numpy()
+        blocks = torch.cat([network(torch.from_numpy(x[i : i + 8])) for i in range(0, rows, 8)]).numpy()
+    assert expected.std() > 1e-2
+    return max(np.abs(whole - expected).max(), np.abs(blocks - expected).max())
+
+
+@pytest.mark.parametrize("name", ["twist2_1017_20k.onnx", "twist2_1017_25k.onnx"])
+def test_official_network(name):
+    """The official TWIST2 files agree with ONNX Runtime to 1e-5 on 1,000 random observations."""
+    if not (OFFICIAL / name).is_file():
+        pytest.skip(f"the official {name} is not next to this checkout")
+    assert difference(OFFICIAL / name, 1432, 29) < 1e-5
+
+
+def test_same_operators(tmp_path):
+    """A network with the same operators agrees to 1e-5; its weights and structure are read, not assumed."""
+    assert difference(twist2_like(tmp_path / "a.onnx"), 1432, 29) < 1e-5
+    small = twist2_like(tmp_path / "b.onnx", frame=50, command=9, history=8, out=5)
+    assert difference(small, 459, 5) < 1e-5
+
+
+def test_shape_arithmetic_is_gone(tmp_path):
+    """Activations and layer norm are one call each; no shape arithmetic is left."""
+    network = onnx_mlp.load(twist2_like(tmp_path / "a.onnx"), in_width=1432, out_width=29)
+    kinds = [type(layer).__name__ for layer in network.layers]
+    assert kinds.count("SiLU") == 8 and len(kinds) < 50
+
+
+@pytest.mark.parametrize("activation", ["Relu", "Elu", "Tanh", "LeakyRelu", "Softplus", "Softmax"])
+def test_plain_mlp(tmp_path, activation):
+    """Plain layers with MatMul and Add and other activations are read too."""
+    b = Builder()
+    x = b.add("Add", b.add("MatMul", "input", b.weight(12, 20)), b.weight(20))
+    b.add("Add", b.add("MatMul", b.add(activation, x), b.weight(20, 4)), b.weight(4), output="output")
+    assert difference(b.save(tmp_path / "plain.onnx", 12, 4), 12, 4, rows=100) < 1e-5
+
+
+def test_wrong_width(tmp_path):
+    """A network of the wrong width is refused with flag, file and both widths."""
+    path = twist2_like(tmp_path / "narrow.onnx", frame=50, command=9, history=8, out=5)
+    with pytest.raises(InputError, match=r"^--checkpoint .*narrow.onnx: the network takes 459 numbers, expected 1432$"):
+        trackers.get("twist2", path)
+    path = twist2_like(tmp_path / "few.onnx", out=28)
+    with pytest.raises(InputError, match=r"few.onnx: the network gives 28 numbers, expected 29$"):
+        trackers.get("twist2", path)
+
+
+def test_unknown_operator(tmp_path):
+    """An operator that cannot be read is named."""
+    b = Builder()
+    b.add("Selu", "input", output="output")
+    path = b.save(tmp_path / "odd.onnx", 1432, 1432)
+    with pytest.raises(InputError, match="Selu"):
+        trackers.get("twist2", path)
+
+
+def test_weights_elsewhere(tmp_path):
+    """A file whose weights lie in another file is refused."""
+    path = twist2_like(tmp_path / "a.onnx")
+    model = onnx.load(str(path))
+    onnx.save(model, str(tmp_path / "b.onnx"), save_as_external_data=True, size_threshold=16, location="b.bin")
+    with pytest.raises(InputError, match="another file"):
+        trackers.get("twist2", tmp_path / "b.onnx")

@@ -1,0 +1,105 @@
+"""Trackers are found by name and bad input is answered with one clear line."""
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import trackers
+from arena_newton.errors import InputError
+from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
+
+
+def message(spec: str, checkpoint=None) -> str:
+    with pytest.raises(InputError) as caught:
+        trackers.get(spec, checkpoint)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_names():
+    """The built-in trackers are listed."""
+    assert {"pd", "twist2"} <= set(trackers.names())
+
+
+def test_unknown_name():
+    """An unknown tracker is named together with the known ones."""
+    assert "--tracker sonick" in message("sonick") and "pd" in message("sonick")
+
+
+def test_twist2_needs_checkpoint():
+    """TWIST2 without weights says what to do."""
+    text = message("twist2")
+    assert "--checkpoint" in text and "--tracker pd" in text
+
+
+def test_missing_checkpoint(tmp_path):
+    """A checkpoint that does not exist is named with its flag."""
+    path = tmp_path / "none.onnx"
+    assert message("twist2", path) == f"--checkpoint {path}: no such file"
+
+
+def test_damaged_checkpoint(tmp_path):
+    """A file that is no ONNX is refused."""
+    path = tmp_path / "noise.onnx"
+    path.write_bytes(np.random.default_rng(0).bytes(5000))
+    assert str(path) in message("twist2", path)
+    path.write_bytes(b"")
+    assert str(path) in message("twist2", path)
+
+
+def test_wrong_suffix(tmp_path):
+    """A file of another kind is refused by its name."""
+    path = tmp_path / "weights.pt"
+    path.write_bytes(b"x")
+    assert ".onnx" in message("twist2", path)
+
+
+def test_pd_takes_no_checkpoint(tmp_path):
+    """The PD tracker does not swallow a checkpoint silently."""
+    path = tmp_path / "a.onnx"
+    path.write_bytes(b"x")
+    assert "pd" in message("pd", path)
+
+
+def test_pd_passes_reference():
+    """The PD tracker hands the reference joints on without a copy."""
+    tracker = trackers.get("pd")
+    tracker.bind(3)
+    joints = torch.randn(3, 29)
+    command = trackers.TrackerCommand(torch.zeros(3, 35), joints, torch.zeros(3, 29), torch.zeros(3, 4))
+    state = trackers.RobotState(torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3, 29), torch.zeros(3, 29))
+    tracker.reset(torch.ones(3, dtype=torch.bool))
+    tracker.prefill(command, state)
+    assert tracker.step(command, state) is joints
+    assert tracker.joints == MUJOCO_JOINTS and tracker.drive is TWIST2_DRIVE
+
+
+def test_registration():
+    """A third party's tracker is found under its name and described."""
+
+    class Mine(trackers.Tracker):
+        name = "mine"
+
+    trackers.register("mine", lambda checkpoint: Mine())
+    tracker = trackers.get("mine")
+    assert "mine" in trackers.names() and tracker.describe()["name"] == "mine"
+    assert tracker.rate(fast=True) == tracker.fast_physics_rate
+    with pytest.raises(TypeError, match="mine"):
+        tracker.step(None, None)
+
+
+def test_entry_point(monkeypatch):
+    """A tracker offered by another package's entry point is listed and loaded; a broken one is one line."""
+    from importlib.metadata import EntryPoint
+
+    from arena_newton.trackers import base
+
+    points = [
+        EntryPoint("theirs", "arena_newton.trackers.pd:from_checkpoint", base.ENTRY_POINT_GROUP),
+        EntryPoint("broken", "no_such_package:make", base.ENTRY_POINT_GROUP),
+    ]
+    monkeypatch.setattr(base.importlib.metadata, "entry_points", lambda group: points)
+    assert {"theirs", "broken"} <= set(trackers.names())
+    assert trackers.get("theirs").name == "pd"
+    assert "no_such_package" in message("broken")
