@@ -96,7 +96,7 @@ class ArenaEnv:
             task,
             worlds=worlds,
             device=device,
-            variant=self.spec.variant(mode, self.rules) if variant_file is None else "base",
+            variant=None if variant_file and mode != "semantic" else self.spec.variant(mode, self.rules),
             rules=self.rules,
             drive=tracker.drive,
             variant_file=variant_file,
@@ -138,9 +138,12 @@ class ArenaEnv:
         t = wp.to_torch
         self._t_qpos, self._t_qvel = t(self.physics.qpos), t(self.physics.qvel)
         self._t_action, self._t_state = t(self._action), t(self._state64)
-        long = {"dtype": torch.long, "device": self.torch_device}
-        self._i_q, self._i_v = torch.tensor(h.joint_qpos, **long), torch.tensor(h.joint_qvel, **long)
-        self._to_mujoco = torch.tensor(g1.MUJOCO_TO_CANONICAL, **long)
+
+        def indices(values: Sequence[int]) -> Any:
+            return torch.tensor(values, dtype=torch.long, device=self.torch_device)
+
+        self._i_q, self._i_v = indices(h.joint_qpos), indices(h.joint_qvel)
+        self._to_mujoco = indices(g1.MUJOCO_TO_CANONICAL)
         self._t_stand = torch.tensor(STAND_ACTION, device=self.torch_device)
         self._t_ref_joints, self._t_ref_vel = t(self.reference.joints), t(self.reference.joint_vel)
         self._t_mimic, self._t_ref_quat = t(self.reference.mimic), t(self.reference.quat)
@@ -152,8 +155,8 @@ class ArenaEnv:
         """Worlds that run an episode."""
         self._fresh = np.zeros(worlds, dtype=bool)
         self.draws: list[Any] = [None] * worlds
-        self.lights = None
-        self.camera = None
+        self.lights: Any = None
+        self.camera: Any = None
         if camera is not None:
             self.add_camera(camera)
 
@@ -295,7 +298,7 @@ class ArenaEnv:
         canonical.launch_validate_action(self._action, self._bad_action)
         tick.launch_sanitize(self._bad_action, self._stand, self._action)
         mask = self._upload(np.flatnonzero(self.active))
-        canonical.launch_integrate(self.reference, self._action, mask, getattr(self.tracker, 'max_root_delta_deg', 0.0))
+        canonical.launch_integrate(self.reference, self._action, mask, self.tracker.max_root_delta_deg)
         command = TrackerCommand(
             mimic=self._t_mimic,
             joints=self._t_ref_joints.index_select(1, self._to_mujoco),
@@ -392,7 +395,7 @@ class ArenaEnv:
             policy.reset(seeds, [self.spec.gym_id] * self.worlds, mask)
 
         def finish(w: int, outcome: str, reason: str, error: str | None = None) -> None:
-            index, episode = running[w]
+            index, episode = running[w]  # type: ignore[misc]
             startup = outcome == "fall" and self.tick[w] <= 0
             result = EpisodeResult(
                 episode=episode,

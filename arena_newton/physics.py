@@ -52,6 +52,18 @@ class Physics:
     """State views, reset and one 50 Hz tick; see the engines below."""
 
     engine: str
+    qpos: Any
+    """Positions, shape [worlds, nq]."""
+    qvel: Any
+    """Velocities, shape [worlds, nv]."""
+    ctrl: Any
+    """Actuator targets, shape [worlds, nu]."""
+    xpos: Any
+    """Body positions [m], shape [worlds, nbody, 3]."""
+    xquat: Any
+    """Body orientations wxyz, shape [worlds, nbody, 4]."""
+    xipos: Any
+    """Body centres of mass [m], shape [worlds, nbody, 3]."""
 
     def __init__(self, scene: Scene, rate: PhysicsRate):
         """Bind a scene; `rate` is the tracker's physics rate."""
@@ -99,6 +111,13 @@ class Physics:
 
     def read_contacts(self) -> None:
         """Contact forces and overflow flags of the last physics step."""
+
+    def set_active(self, mask: np.ndarray) -> None:
+        """Say which worlds run an episode, bool [worlds]."""
+
+    def mj_step_only(self) -> None:
+        """Nothing but the solver: what `bench` divides by."""
+        raise TypeError("use make_physics() for an engine")
 
     def reset_worlds(self, worlds: np.ndarray, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray) -> None:
         """Put worlds at rest in a state, clearing every trace of their past.

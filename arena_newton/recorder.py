@@ -15,7 +15,8 @@ class _Frames:
     """At most 2·n evenly spaced frames of a stream of unknown length."""
 
     def __init__(self, n: int):
-        self.limit, self.stride, self.count, self.kept = 2 * n, 1, 0, []
+        self.limit, self.stride, self.count = 2 * n, 1, 0
+        self.kept: list[Any] = []
 
     def add(self, frame: Any) -> None:
         if self.count % self.stride == 0:

@@ -264,7 +264,7 @@ class Scene:
         )
 
 
-def _open_stage(path: Path, variant: str, hands: str) -> Any:
+def _open_stage(path: Path, variant: str | None, hands: str) -> Any:
     from pxr import Tf, Usd
 
     try:
@@ -279,6 +279,8 @@ def _open_stage(path: Path, variant: str, hands: str) -> Any:
         raise InputError(f"{path}: prim {ROBOT} has no variant set 'hands'")
     world = stage.GetPrimAtPath("/World")
     sets = world.GetVariantSets()
+    if variant is None:
+        return stage
     if variant != "base":
         if not sets.HasVariantSet("semantics") or variant not in sets.GetVariantSet("semantics").GetVariantNames():
             raise InputError(f"{path}: prim /World has no variant {variant!r} in variant set 'semantics'")
@@ -339,7 +341,7 @@ def load_scene(
     *,
     worlds: int = 1,
     device: str | None = None,
-    variant: str = "base",
+    variant: str | None = "base",
     hands: str = "dex3",
     rules: RuleSet | None = None,
     drive: g1.DriveGains = g1.TWIST2_DRIVE,
@@ -354,7 +356,7 @@ def load_scene(
         task: Task name, or path of a stage.
         worlds: Number of parallel worlds.
         device: Warp device of the Newton model.
-        variant: Variant of the set `semantics` on `/World`.
+        variant: Variant of the set `semantics` on `/World`; None keeps the layer's own selection.
         hands: `dex3` or `fixed`.
         rules: Rule set; decides the ball's restitution.
         drive: Gains of the robot's position drives.
@@ -368,6 +370,8 @@ def load_scene(
     """
     import newton
     import warp as wp
+
+    import arena_newton.kernels  # noqa: F401  (quiets Warp's module log)
 
     path = scene_path(variant_file or task)
     stage = _open_stage(path, variant, hands)
@@ -415,7 +419,7 @@ def load_scene(
 
     scene = Scene(
         path=path,
-        variant=variant,
+        variant=variant or "own",
         hands=hands,
         worlds=worlds,
         device=model.device,

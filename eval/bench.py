@@ -191,6 +191,7 @@ def _as_before(physics: Any) -> Iterator[None]:
 
 def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> tuple[float, float, str]:
     """Median seconds of a full tick and of its bare physics, taken in turn on the same worlds, and a note."""
+    import numpy as np
     import torch
 
     from arena_newton.env import SETTLE_TICKS, STAND_ACTION, ArenaEnv
@@ -199,11 +200,12 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
     env = ArenaEnv("football", worlds=worlds, tracker=tracker, engine=engine, fast_physics=fast)
     env.reset(list(range(worlds)))
     action = torch.tensor(STAND_ACTION, device=env.torch_device).repeat(worlds, 1)
+    status = np.zeros(worlds, dtype=np.int32)
 
     def ticks(count: int) -> None:
         for _ in range(count):
             env.observe()
-            env.step(action)
+            status[:] = env.step(action)
 
     def bare(count: int) -> None:
         for _ in range(count):
@@ -224,6 +226,9 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
         with _as_before(env.physics):
             alone.append(timed(bare))
         full.append(timed(ticks))
+        ended = np.flatnonzero(status)
+        if len(ended):  # as in an evaluation, a world that ended begins anew
+            env.reset([int(w) for w in ended], ended)
     return statistics.median(full), statistics.median(alone), note
 
 

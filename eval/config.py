@@ -39,7 +39,7 @@ PROTOCOL_SEEDS = (0, 1, 2)
 PROTOCOL_REPEATS = 20
 """Repeats per group seed of the benchmark's protocol."""
 QUICK_SEEDS = (0,)
-QUICK_REPEATS = 2
+QUICK_REPEATS = 4
 """Repeats of the default look at all seven tasks, sized to end within two minutes on a bare CPU."""
 QUICK_MAX_STEPS = 250
 """Step cap of that look [ticks of 0.02 s]."""
@@ -196,14 +196,10 @@ def resolve(options: RunOptions) -> RunConfig:
     repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else PROTOCOL_REPEATS)
     checkpoint = _existing("--checkpoint", options.checkpoint)
     scheme, _, target = options.policy.partition(":")
-    policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES else None
-    if scheme == "remote" and not target.startswith(("http://", "https://")):
-        raise InputError(f"--policy {options.policy}: expected remote:http://host:port or remote:https://...")
+    policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
-    quiet_warp()
-    engine, device = resolve_engine(options.engine, options.device)
     config = RunConfig(
         tasks=tasks,
         modes=tuple(options.mode) or ("base",),
@@ -217,8 +213,8 @@ def resolve(options: RunOptions) -> RunConfig:
         seeds=seeds,
         repeats=repeats,
         max_steps=QUICK_MAX_STEPS if quick else options.max_steps,
-        engine=engine,
-        device=device,
+        engine=options.engine,
+        device=options.device or "",
         variant=variant,
         variant_hash=_hash_scene(variant) if variant else None,
         fast_physics=options.fast_physics,
@@ -226,8 +222,10 @@ def resolve(options: RunOptions) -> RunConfig:
         video=options.video,
         strip=options.strip,
     )
-    episodes(config)
-    return config
+    episodes(config)  # names and numbers are wrong at once, before Warp starts
+    quiet_warp()
+    engine, device = resolve_engine(options.engine, options.device)
+    return dataclasses.replace(config, engine=engine, device=device)
 
 
 def episodes(config: RunConfig) -> list[Episode]:

@@ -112,6 +112,8 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
             return 130
         except StorageError as error:
             raise StorageError(f"{error}; free space, then: {resume}") from None
+        finally:
+            policy.close()
     results = report.write_reports(report.load_run(folder))
     print(f"\n{report.table(results)}")
     for note in report.notes(results):
@@ -180,6 +182,7 @@ def _check_parts(config: RunConfig, factories: Factories) -> Any:
     """Build tracker and policy and look into the variant, so that wrong input shows before the first episode."""
     factories.tracker(config.tracker, config.checkpoint)
     policy = factories.policy(config.policy)
+    policy.check()
     if config.variant is not None:
         factories.check_variant(config.variant, config.tasks[0])
     return policy
@@ -294,11 +297,14 @@ class _TickRate:
     """Shows simulated world-ticks per second on the progress bar."""
 
     def __init__(self, bar: Any):
-        self._bar, self._world_ticks, self._since = bar, 0, time.perf_counter()
+        self._bar, self._world_ticks, self._since = bar, 0, 0.0
 
     def tick(self, active: int) -> None:
-        self._world_ticks += active
         now = time.perf_counter()
+        if not self._since:
+            self._since = now
+            return
+        self._world_ticks += active
         if now - self._since >= 1.0:
             self._bar.set_postfix_str(f"{self._world_ticks / (now - self._since):.0f} world-ticks/s, {active} worlds")
             self._world_ticks, self._since = 0, now

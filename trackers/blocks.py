@@ -4,12 +4,15 @@ Matrix products and vectorised activations on a CPU give a row other last bits i
 and a walking robot amplifies that to another trajectory. Rows are therefore padded to a multiple of a fixed block size.
 Which size leaves a row's bits alone wherever it stands in a block depends on the network, the library and the
 processor, so it is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it
-replaces the separate ones. On other devices the batch runs whole, without that promise.
+replaces the separate ones. All of it runs on one thread: results then do not depend on the number of threads either,
+and for networks of this size a second thread wins little and loses much when the processor is busy. On other devices
+the batch runs whole, without that promise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 
 import torch
 
@@ -19,6 +22,16 @@ BLOCK_SIZES = (8, 16, 32)
 """Block sizes tried, in this order; rows run one at a time where none keeps the bits."""
 
 _PROBE_SEED = 20240
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class BlockRunner:
@@ -53,7 +66,7 @@ class BlockRunner:
         self._rows = -(-worlds // padding) * padding
         self._buffer = torch.zeros(self._rows, in_width, device=self.device)
         self.input = self._buffer[:worlds]
-        self._plans: dict[int, tuple[int, bool]] = {}
+        self._plan: tuple[int, bool] | None = None
 
     @torch.inference_mode()
     def run(self) -> torch.Tensor:
@@ -62,17 +75,18 @@ class BlockRunner:
             return self.network(self.input)
         block, merged = self.plan()
         rows = -(-self.worlds // block) * block
-        if merged or rows == block:
-            return self.network(self._buffer[:rows])[: self.worlds]
-        blocks = [self.network(self._buffer[i : i + block].clone()) for i in range(0, rows, block)]
+        with _one_thread():
+            if merged or rows == block:
+                return self.network(self._buffer[:rows])[: self.worlds]
+            blocks = [self.network(self._buffer[i : i + block].clone()) for i in range(0, rows, block)]
         return torch.cat(blocks)[: self.worlds]
 
     def plan(self) -> tuple[int, bool]:
-        """Block size, and whether all blocks may run as one product, for the present number of threads."""
-        threads = torch.get_num_threads()
-        if threads not in self._plans:
-            self._plans[threads] = self._find_plan()
-        return self._plans[threads]
+        """Block size, and whether all blocks may run as one product."""
+        if self._plan is None:
+            with _one_thread():
+                self._plan = self._find_plan()
+        return self._plan
 
     @torch.inference_mode()
     def _find_plan(self) -> tuple[int, bool]:

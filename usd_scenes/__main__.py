@@ -7,7 +7,7 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 
-MODES = ("base", "semantic", "visual")
+MODES = ("base", "semantic", "visual", "all")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -58,7 +58,9 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
         for name in MODES if mode == "all" else (mode,):
             rows.append((f"{target} | {name}", _views(target, height, name)))
     widths = [round(height * aspect) for _, aspect in _VIEWS]
-    sheet = Image.new("RGB", (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows)), (24, 24, 24))
+    sheet = Image.new(
+        "RGB", (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows)), (24, 24, 24)
+    )
     text = ImageDraw.Draw(sheet)
     for row, (label, pictures) in enumerate(rows):
         y, x = row * (height + _LABEL + _GAP), _GAP

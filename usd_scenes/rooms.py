@@ -118,7 +118,7 @@ def workshop(
         stage: The scene.
         low: Lower corner (x, y) of the room [m].
         high: Upper corner (x, y).
-        windows: Per window the wall (`-x`, `+x`, `-y`, `+y`), its centre along the wall, its width and its lower edge [m].
+        windows: Per window the wall (`-x`, `+x`, `-y`, `+y`), its centre along the wall, width and lower edge [m].
     """
     top, thick = 4.0, 0.05
     (x0, y0), (x1, y1) = low, high

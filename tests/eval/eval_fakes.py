@@ -69,7 +69,7 @@ def fake_tracker(spec, checkpoint):
 
 def fake_policy(spec):
     """A policy that does not see."""
-    return SimpleNamespace(name=spec, needs_image=False)
+    return SimpleNamespace(name=spec, needs_image=False, check=lambda: None, close=lambda: None)
 
 
 def factories(**changes):

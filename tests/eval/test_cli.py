@@ -61,7 +61,6 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["--tracker", "nobody"], "--tracker nobody"),
         (["--checkpoint", "absent.onnx"], "--checkpoint absent.onnx: no such file"),
         (["--policy", "replay:absent.npz"], "--policy absent.npz: no such file"),
-        (["--policy", "remote:host"], "--policy remote:host"),
         (["--variant", "absent.usda"], "--variant absent.usda: no such file"),
         (["--repeats", "0"], "--repeats 0"),
         (["--worlds", "0"], "--worlds 0"),

@@ -1,11 +1,14 @@
-"""What the kernel tests share: devices, markers, and rotations in plain NumPy (matrices, float64)."""
+"""What the kernel tests share: devices, random stages, and rotations and boxes in plain NumPy (matrices, float64)."""
 
+import itertools
 from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
+
+from arena_newton.kernels import success
 
 wp.config.quiet = True
 
@@ -90,6 +93,62 @@ def box_pose(marker: Marker, xpos: np.ndarray, xquat: np.ndarray) -> tuple[np.nd
     return p + r @ np.float32(marker.pos).astype(np.float64), r @ matrix(np.float32(marker.quat))
 
 
+class Stage:
+    """Random body poses on a device, and outputs that start dirty."""
+
+    def __init__(self, device, worlds=400, seed=0, spread=0.3, quats=None):
+        """Draws positions within `spread` of the origin."""
+        rng = np.random.default_rng(seed)
+        self.device, self.worlds, self.rng = device, worlds, rng
+        self.xpos = rng.uniform(-spread, spread, (worlds, 8, 3)).astype(np.float32)
+        self.xquat = np.tile(np.float32([1, 0, 0, 0]), (worlds, 8, 1)) if quats is None else quats
+        self.qpos = np.zeros((worlds, 20), np.float32)
+        self.qpos[:, 6:10] = [1, 0, 0, 0]
+        self.qpos[:, 5] = 0.75
+        self.outputs = {
+            name: wp.full(worlds, 9, dtype=dtype, device=device)
+            for name, dtype in (("success", wp.int32), ("margin", wp.float32), ("event", wp.int32))
+        }
+        self.counter = wp.zeros(worlds, dtype=wp.int32, device=device)
+
+    def up(self, values, dtype=wp.float32):
+        """Uploads."""
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+    def boxes(self, *markers):
+        """Uploads markers."""
+        return success.Boxes.upload(markers, self.device)
+
+    def judge(self, launch, *arrays, outputs=("success", "margin"), **options):
+        """Runs a launch on uploaded arrays; gives its outputs as NumPy."""
+        for name in outputs:
+            options[name] = self.counter if name == "counter" else self.outputs[name]
+        launch(*(self.up(a) if isinstance(a, np.ndarray) else a for a in arrays), **options)
+        return [options[name].numpy().copy() for name in outputs]
+
+
+def check(verdict: np.ndarray, margin: np.ndarray, expected: np.ndarray) -> None:
+    """Margins agree, success is their sign, and the draw has some of both."""
+    expected = np.asarray(expected)
+    np.testing.assert_allclose(margin, expected, atol=2e-6)
+    clear = np.abs(expected) > 4e-6
+    assert np.array_equal(verdict[clear], (expected[clear] >= 0).astype(int))
+    assert np.array_equal(verdict, (margin >= 0).astype(int))
+    assert 0.02 < (expected >= 0).mean() < 0.98
+
+
+def world_box(centre: np.ndarray, rotation: np.ndarray, half: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the world-axis box, from the eight corners."""
+    corners = np.array(list(itertools.product(*[(-h, h) for h in np.float32(half).astype(np.float64)])))
+    corners = centre[:, None] + corners @ np.swapaxes(rotation, 1, 2)
+    return corners.min(1), corners.max(1)
+
+
+def inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Smallest distance of points to the faces of an axis-aligned box, negative outside."""
+    return np.minimum(points - low, high - points).min(-1)
+
+
 @pytest.fixture(scope="session")
 def twin() -> SimpleNamespace:
     """The NumPy side."""
@@ -101,4 +160,8 @@ def twin() -> SimpleNamespace:
         gram_schmidt=gram_schmidt,
         random_quats=random_quats,
         box_pose=box_pose,
+        Stage=Stage,
+        check=check,
+        world_box=world_box,
+        inside=inside,
     )

@@ -193,7 +193,7 @@ def test_reference_on_edge_stays_finite(device):
 
 
 def test_masked_worlds_stay_as_they_are(device, twin):
-    """Reset and integration leave unmasked worlds bit for bit, and a world's result does not depend on its neighbours."""
+    """Reset and integration leave unmasked worlds bit for bit; a world's result does not depend on its neighbours."""
     rng = np.random.default_rng(4)
     qpos, actions = _robot(rng, twin, 4), _actions(rng, twin, 3, 4)
     ones = wp.full(4, 1, dtype=wp.int32, device=device)

@@ -7,7 +7,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from networks import Builder, twist2_like
+from onnx_files import Builder, twist2_like
 
 from arena_newton import trackers
 from arena_newton.errors import InputError

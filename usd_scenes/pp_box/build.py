@@ -39,7 +39,7 @@ CARTONS = (
 
 
 def carton_box(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
-    """The box to move: origin in the middle of its underside (the original's cube is placed by it), mass in its centre."""
+    """The box to move: origin in the middle of its underside, by which the original places it; mass in its centre."""
     half, m = BOX_SIDE / 2, BOX_MASS
     author.rigid_body(
         stage,
@@ -58,7 +58,8 @@ def carton_box(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
 
 def shelf(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
     """Four decks and a top between blue uprights, long side along x; first, third and fourth deck stocked."""
-    author.fixture(stage, "/World/Shelf", (-2.7, -0.15, 0))
+    # The middle of the range of its placement; every episode poses it anew.
+    author.fixture(stage, "/World/Shelf", (-2.2, -2.9, 0))
     frame = "/World/Shelf/Frame"
     blue = author.material(stage, "/World/Looks/upright", (0.01, 0.05, 0.19))
     black = author.material(stage, "/World/Looks/deck", (0.016, 0.016, 0.018))

@@ -1,0 +1,134 @@
+"""Motion clips are read without running what a pickle may hold."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arena_newton.errors import InputError
+from arena_newton.trackers.motions import load_actions, load_clip
+
+CLIPS = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2" / "example_motions"
+
+
+def clip(frames: int = 60, **changes) -> dict:
+    content = {
+        "fps": np.array(30.0),
+        "root_pos": np.tile([0.0, 0.0, 0.8], (frames, 1)) + np.linspace(0, 1, frames)[:, None] * [1.0, 0, 0],
+        "root_rot": np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1)),
+        "dof_pos": np.zeros((frames, 29)),
+        "local_body_pos": np.zeros((frames, 38, 3), dtype=np.float32),
+        "link_body_list": ["pelvis"],
+    }
+    return content | changes
+
+
+def write(path: Path, content, protocol: int = 4) -> Path:
+    path.write_bytes(pickle.dumps(content, protocol=protocol))
+    return path
+
+
+class Evil:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, target: Path):
+        self.target = target
+
+    def __reduce__(self):
+        return (exec, (f"open({str(self.target)!r}, 'w').close()",))
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 3, 4, 5])
+def test_reads_clip(tmp_path, protocol):
+    """Clips of every pickle protocol are read; quaternions become wxyz."""
+    got = load_clip(write(tmp_path / "a.pkl", clip(), protocol))
+    assert got.fps == 30.0 and got.joint_pos.shape == (60, 29) and got.trimmed == 0
+    assert got.root_quat[0].tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 5])
+def test_evil_pickle(tmp_path, protocol):
+    """A pickle that wants to run code is refused, nothing of it runs, and the message names what it held."""
+    mark = tmp_path / "ran"
+    for content in (Evil(mark), clip(fps=Evil(mark)), clip(root_pos=np.array([Evil(mark)], dtype=object))):
+        with pytest.raises(InputError, match=r"exec.*refused"):
+            load_clip(write(tmp_path / "evil.pkl", content, protocol))
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("name", [b"cos\nsystem\n", b"cnumpy\nload\n", b"cbuiltins\ngetattr\n", b"cnumpy\nndarray.tofile\n"])
+def test_other_callables(tmp_path, name):
+    """Functions of NumPy and of the language itself are refused as well."""
+    path = tmp_path / "evil.pkl"
+    path.write_bytes(name + b"(S'echo'\ntR.")
+    with pytest.raises(InputError, match="refused"):
+        load_clip(path)
+
+
+def test_bad_content(tmp_path):
+    """Every defect is one line that names the file and the field."""
+    nan = np.zeros((60, 29))
+    nan[3, 4] = np.nan
+    cases = {
+        r"dof_pos has 23 joints, expected 29": clip(dof_pos=np.zeros((60, 23))),
+        r"field dof_pos holds NaN": clip(dof_pos=nan),
+        r"field fps must be": clip(fps=np.array(0.0)),
+        r"root_rot has shape \[50, 4\]": clip(root_rot=np.tile([0.0, 0, 0, 1], (50, 1))),
+        r"not of length 1": clip(root_rot=np.zeros((60, 4))),
+        r"field root_pos holds no numbers": clip(root_pos="here"),
+        r"field root_pos is missing": {"fps": 30.0},
+        r"holds list": [1, 2],
+    }
+    for i, (text, content) in enumerate(cases.items()):
+        path = write(tmp_path / f"{i}.pkl", content)
+        with pytest.raises(InputError, match=text) as caught:
+            load_clip(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    path = tmp_path / "cut.pkl"
+    path.write_bytes(pickle.dumps(clip())[:500])
+    with pytest.raises(InputError, match="not a readable pickle"):
+        load_clip(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_clip(tmp_path / "none.pkl")
+
+
+def test_trims_start_jump(tmp_path):
+    """The first frames of a capture that begins with a jump are cut off and counted."""
+    content = clip()
+    content["root_pos"][:2, 2] = (1.83, 1.2)
+    got = load_clip(write(tmp_path / "jump.pkl", content))
+    assert got.trimmed == 2 and got.root_pos[0, 2] == 0.8
+    assert load_clip(tmp_path / "jump.pkl", trim=False).trimmed == 0
+
+
+@pytest.mark.skipif(not CLIPS.is_dir(), reason="TWIST2's example motions are not next to this checkout")
+def test_official_clips():
+    """The example clips that are known to begin with a jump are trimmed, the others stay whole."""
+    trimmed = {path.stem[-3:]: load_clip(path).trimmed for path in CLIPS.glob("*.pkl")}
+    assert {name for name, frames in trimmed.items() if frames} == {"001", "004", "005", "007", "009", "010"}
+    assert max(trimmed.values()) <= 5
+
+
+def test_actions(tmp_path):
+    """Action files are checked for width, NaN and a missing array."""
+    good = np.zeros((7, 40), dtype=np.float32)
+    good[:, [3, 6]] = 1.0
+    np.savez(tmp_path / "good.npz", action=good)
+    assert load_actions(tmp_path / "good.npz").shape == (7, 40)
+    bad = good.copy()
+    bad[4, 30] = np.nan
+    for name, content, text in (
+        ("narrow", {"action": good[:, :39]}, "39 numbers, expected 40"),
+        ("nan", {"action": bad}, "nan, expected a finite number"),
+        ("other", {"state": good}, "array action is missing"),
+        ("objects", {"action": np.array([{}], dtype=object)}, "not a readable NPZ"),
+        ("empty", {"action": good[:0]}, "expected \\[ticks, 40\\]"),
+    ):
+        np.savez(tmp_path / f"{name}.npz", **content)
+        with pytest.raises(InputError, match=text) as caught:
+            load_actions(tmp_path / f"{name}.npz")
+        assert str(tmp_path / f"{name}.npz") in str(caught.value)
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(InputError, match="not a readable NPZ"):
+        load_actions(tmp_path / "text.npz")

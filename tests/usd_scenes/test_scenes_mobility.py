@@ -1,0 +1,277 @@
+"""OpenDoor, SitSofa, Boxing and VisNavi: what their files promise, in the model that the engines step."""
+
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from arena_newton.scene import SCENES, load_scene
+
+TASKS = ("open_door", "sit_sofa", "boxing", "vis_navi")
+SPAWN = {  # original benchmark: robot spawn per task
+    "open_door": ((-1.6, 0.2, 0.8), 90.0),
+    "sit_sofa": ((-1.6, 2.0, 0.8), -90.0),
+    "boxing": ((-1.6, -2.0, 0.8), -90.0),
+    "vis_navi": ((-1.9, -5.2, 0.8), 90.0),
+}
+OBSTACLES = tuple(f"/World/{kind}_{letter}" for kind in ("Beam", "Block") for letter in "abc")
+_LOADED: dict[tuple, object] = {}
+
+
+def scene_of(task, **options):
+    """One load per scene for the whole file."""
+    key = (str(task), *sorted(options.items()))
+    if key not in _LOADED:
+        _LOADED[key] = load_scene(task, device="cpu", native=True, **options)
+    return _LOADED[key]
+
+
+def fresh(scene, dt=0.005):
+    """State with the robot out of everything's way."""
+    m = scene.mj_model
+    m.opt.timestep = dt
+    data = mujoco.MjData(m)
+    data.qpos[scene.robot.root_qpos : scene.robot.root_qpos + 3] = (-6.3, -5.6, 0.8)
+    return m, data
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_robot_spawns_where_the_task_says(task):
+    """The robot's root is at the original's spawn pose."""
+    scene = scene_of(task)
+    q = scene.mj_model.qpos0[scene.robot.root_qpos :][:7]
+    position, yaw = SPAWN[task]
+    assert np.allclose(q[:3], position, atol=1e-6)
+    assert np.degrees(2 * np.arctan2(q[6], q[3])) == pytest.approx(yaw, abs=1e-3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_scene_is_light_enough(task):
+    """A scene with its robot holds fewer than 150 shapes and fewer than 30 solids of its own."""
+    scene = scene_of(task)
+    assert scene.model.shape_count < 150
+    assert sum(not label.startswith("/World/Robot") for label in scene.geom_labels) < 30
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_world_camera_sees_the_robot_and_the_goal(task):
+    """The world camera's pose is the original's: robot and goal project into its picture."""
+    from pxr import Gf, UsdGeom
+
+    goal = {
+        "open_door": (-1.614, 2.314, 1.0),
+        "sit_sofa": (-3.2, -1.1, 0.4),
+        "boxing": (-0.97, -3.55, 0.8),
+        "vis_navi": (-2.05, -0.31, 0.0),
+    }[task]
+    stage = scene_of(task).stage
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/WorldCamera"))
+    to_camera = UsdGeom.XformCache().GetLocalToWorldTransform(camera.GetPrim()).GetInverse()
+    half = 0.5 * camera.GetHorizontalApertureAttr().Get() / camera.GetFocalLengthAttr().Get()
+    for point in (SPAWN[task][0], goal):
+        x, y, z = to_camera.Transform(Gf.Vec3d(*point))
+        assert z < 0 and abs(x / z) < half and abs(y / z) < half * 9 / 16
+
+
+def test_door_is_a_chain_under_a_posable_frame():
+    """Frame is a mocap body that carries the leaf, which carries the handle."""
+    scene = scene_of("open_door")
+    m = scene.mj_model
+    frame, leaf, handle = (scene.body_id(f"/World/Door/{n}") for n in ("Frame", "Leaf", "Handle"))
+    assert m.body_mocapid[frame] >= 0
+    assert m.body_parentid[leaf] == frame and m.body_parentid[handle] == leaf
+    assert m.body_mass[leaf] == pytest.approx(20.0)
+
+
+def test_door_hinge_values_reach_the_model():
+    """Damping, friction, spring and limits arrive in radians and newton metres."""
+    scene = scene_of("open_door")
+    m = scene.mj_model
+    leaf, handle = (scene.joint(f"/World/Door/{n}") for n in ("LeafHinge", "HandleHinge"))
+    assert np.degrees(m.jnt_range[leaf]) == pytest.approx([-2, 110], abs=1e-4)
+    assert np.degrees(m.jnt_range[handle]) == pytest.approx([-50, 2], abs=1e-4)
+    assert m.dof_damping[m.jnt_dofadr[leaf]] == pytest.approx(1.5, rel=1e-5)
+    assert m.dof_frictionloss[m.jnt_dofadr[leaf]] == pytest.approx(0.5)
+    assert m.dof_damping[m.jnt_dofadr[handle]] == pytest.approx(0.1, rel=1e-5)
+    spring = next(a for a in range(m.nu) if m.actuator_trnid[a, 0] == handle)
+    assert m.actuator_gainprm[spring, 0] == pytest.approx(2.5, rel=1e-5)
+    assert m.jnt_solref[leaf] == pytest.approx([0.02, 1.0])
+
+
+@pytest.mark.parametrize("shift", [(0, 0, 0), (-0.754, -0.8, 0), (0.55, 0.1, 0)])
+def test_leaf_swings_through_its_frame(shift):
+    """Unlatched and pushed, the leaf opens to its stop and closes again without touching frame or lever."""
+    scene = scene_of("open_door")
+    m, d = fresh(scene)
+    d.eq_active[:] = 0
+    d.mocap_pos[scene.mocap_id("/World/Door")] += shift
+    q, v = scene.joint_qpos("/World/Door/LeafHinge"), scene.joint_qvel("/World/Door/LeafHinge")
+    door = set(scene.geom_ids("/World/Door"))
+    angles = []
+    for torque, steps in ((6.0, 700), (-6.0, 1100)):
+        for _ in range(steps):
+            d.qfrc_applied[v] = torque
+            mujoco.mj_step(m, d)
+            assert not any(c.geom1 in door or c.geom2 in door for c in d.contact[: d.ncon])
+        angles.append(np.degrees(d.qpos[q]))
+    assert angles[0] == pytest.approx(110, abs=1) and angles[1] == pytest.approx(-2, abs=1)
+    # The hinge is at the robot's left and the leaf opens away from it.
+    d.qpos[q] = np.pi / 2
+    mujoco.mj_forward(m, d)
+    solid = d.geom_xpos[scene.geom_ids("/World/Door/Leaf")[0]] - d.mocap_pos[scene.mocap_id("/World/Door")]
+    assert solid[:2] == pytest.approx([-0.5, 0.5], abs=1e-3)
+
+
+def test_latch_holds_against_a_hard_push():
+    """Latched, the leaf gives way by less than half a degree under 60 N·m."""
+    scene = scene_of("open_door")
+    m, d = fresh(scene)
+    for _ in range(200):
+        d.qfrc_applied[scene.joint_qvel("/World/Door/LeafHinge")] = 60.0
+        mujoco.mj_step(m, d)
+    assert abs(np.degrees(d.qpos[scene.joint_qpos("/World/Door/LeafHinge")])) < 0.5
+
+
+def test_lever_goes_down_to_negative_and_springs_back():
+    """7 N on the lever's tip turn it past −20°, its tip goes down, and it returns when let go."""
+    scene = scene_of("open_door")
+    m, d = fresh(scene)
+    handle, lever = scene.body_id("/World/Door/Handle"), scene.geom_ids("/World/Door/Handle")[0]
+    q = scene.joint_qpos("/World/Door/HandleHinge")
+    mujoco.mj_forward(m, d)
+    rest = d.geom_xpos[lever].copy()
+    assert rest[2] == pytest.approx(0.952, abs=0.005) and rest[0] < d.xpos[handle][0]
+    for _ in range(300):
+        d.qfrc_applied[:] = 0
+        tip = 2 * d.geom_xpos[lever] - d.xpos[handle]
+        mujoco.mj_applyFT(m, d, np.array([0, 0, -9.0]), np.zeros(3), tip, handle, d.qfrc_applied)
+        mujoco.mj_step(m, d)
+    assert np.degrees(d.qpos[q]) < -20.0
+    assert d.geom_xpos[lever][2] < rest[2] - 0.015
+    d.qfrc_applied[:] = 0
+    for _ in range(200):
+        mujoco.mj_step(m, d)
+    assert abs(np.degrees(d.qpos[q])) < 1.0
+
+
+def test_doorway_is_centred_on_the_leaf():
+    """The doorway's plane is the frame's y = 0 and its x centre the leaf's."""
+    scene = scene_of("open_door")
+    way = scene.marker("/World/Door/Frame/Doorway")
+    assert way.body_id == scene.body_id("/World/Door/Frame")
+    assert way.pos[:2] == pytest.approx((0, 0)) and way.half[0] == pytest.approx(0.55)
+    m, d = fresh(scene)
+    mujoco.mj_forward(m, d)
+    leaf = d.geom_xpos[scene.geom_ids("/World/Door/Leaf")[0]]
+    assert leaf[:2] == pytest.approx([-1.614, 2.314], abs=1e-4)
+
+
+def test_seat_is_the_measured_box():
+    """Seat marker and cushion are the measured seat, top at 0.42 m, stiff, friction 1."""
+    scene = scene_of("sit_sofa")
+    m, seat = scene.mj_model, scene.marker("/World/Sofa/Seat")
+    low, high = np.subtract(seat.pos, seat.half), np.add(seat.pos, seat.half)
+    assert low == pytest.approx([-4.17, -1.30, 0.30], abs=1e-5)
+    assert high == pytest.approx([-2.38, -0.83, 0.42], abs=1e-5)
+    (cushion,) = scene.geom_ids("/World/Sofa/SeatCushion")
+    assert m.geom_pos[cushion] == pytest.approx(seat.pos) and m.geom_size[cushion] == pytest.approx(seat.half)
+    assert m.geom_solref[cushion] == pytest.approx([0.02, 1.0]) and m.geom_friction[cushion, 0] == pytest.approx(1.0)
+
+
+def test_cartons_drop_and_rest():
+    """Cartons of 0.05 kg come to rest on their undersides."""
+    scene = scene_of("sit_sofa")
+    m, d = fresh(scene)
+    for _ in range(300):
+        mujoco.mj_step(m, d)
+    for name in ("/World/Carton_1", "/World/Carton_2"):
+        assert m.body_mass[scene.body_id(name)] == pytest.approx(0.05)
+        q = d.qpos[scene.joint_qpos(name) :][:7]
+        assert q[2] == pytest.approx(0.21, abs=2e-3) and abs(q[3]) > 0.999
+        assert np.abs(d.qvel[scene.joint_qvel(name) :][:6]).max() < 0.01
+
+
+@pytest.mark.parametrize(("variant", "edge"), [("base", 0.10), ("semantic", 0.08)])
+def test_boxing_target_bounds_follow_the_look(variant, edge):
+    """The bounds are the sphere's, or the cube's in the semantic variant; the target cannot be touched."""
+    scene = scene_of("boxing", variant=variant)
+    bounds = scene.marker("/World/Target/Frame/Bounds")
+    assert bounds.half == pytest.approx((edge / 2,) * 3)
+    assert scene.mocap_id("/World/Target") >= 0
+    assert not any(label.startswith("/World/Target") for label in scene.geom_labels)
+    assert all(scene.mj_model.geom_bodyid[g] == 0 for n in (1, 2) for g in scene.geom_ids(f"/World/Bag_{n}"))
+
+
+def test_dropped_obstacles_settle():
+    """Beams and blocks are dynamic, fall from a drawn layout and come to rest on the floor or on each other."""
+    scene = scene_of("vis_navi")
+    m, d = fresh(scene)
+    rng = np.random.default_rng(3)
+    spans = [(-0.5, -0.4), (-2.2, -1.7), (-4.6, -4.5), (-1.8, -0.7), (-5.2, -4.0), (-3.1, -2.0)]  # original's layout
+    for name, span, z in zip(OBSTACLES, spans, (0.16, 0.56, 1.06, 1.56, 1.3, 1.8), strict=True):
+        yaw = rng.uniform(-0.785, 0.785)
+        pose = (rng.uniform(*span), rng.uniform(-2.5, -1.2), z, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+        d.qpos[scene.joint_qpos(name) :][:7] = pose
+    for _ in range(800):
+        mujoco.mj_step(m, d)
+    for name in OBSTACLES:
+        assert np.abs(d.qvel[scene.joint_qvel(name) :][:6]).max() < 0.05, name
+        assert 0.1 < d.qpos[scene.joint_qpos(name) + 2] < 1.2
+
+
+def test_zone_is_the_outline():
+    """The zone is the yellow outline's 0.97 m square, offset from the sign's origin."""
+    scene = scene_of("vis_navi")
+    zone = scene.marker("/World/TargetSign/Frame/Zone")
+    assert zone.pos[:2] == pytest.approx((-0.05, -0.06)) and zone.half[:2] == pytest.approx((0.485, 0.485))
+    assert scene.mocap_id("/World/TargetSign") >= 0 and len(scene.geom_ids("/World/TargetSign")) == 1
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_semantic_variant_changes_looks_not_matter(task):
+    """The semantic variant looks different and has the same bodies, solids and masses."""
+    base, changed = scene_of(task), scene_of(task, variant="semantic")
+    assert base.geom_labels == changed.geom_labels
+    assert np.array_equal(base.mj_model.body_mass, changed.mj_model.body_mass)
+    colours = [s.model.shape_color.numpy() for s in (base, changed)]
+    assert base.model.shape_label != changed.model.shape_label or not np.array_equal(*colours)
+
+
+def test_variant_by_override_alone(tmp_path):
+    """The example of docs/authoring.md: a layer over the scene paints, moves and adds without code."""
+    scene = os.path.relpath(SCENES.resolve() / "sit_sofa" / "scene.usda", tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "authoring.md").read_text()
+    example = page.split("```usda\n")[1].split("```")[0].replace("../usd_scenes/sit_sofa/scene.usda", scene)
+    room = tmp_path / "my_room.usda"
+    room.write_text(example)
+    built = scene_of(room)
+    assert built.geom_ids("/World/Stool")
+    assert built.has_body("/World/Carton_1") and built.robot.root_body > 0
+    shape = built.model.shape_label.index("/World/Sofa/SeatCover_0")
+    red, green, blue = built.model.shape_color.numpy()[shape]
+    assert green > 1.3 * max(red, blue)
+
+
+def test_preview_writes_a_sheet(tmp_path):
+    """One row per target with both views, not black and not uniform."""
+    from PIL import Image
+
+    from arena_newton.usd_scenes.preview import preview
+
+    out = preview(["boxing"], tmp_path / "sheet.png", 64, "semantic")
+    picture = np.asarray(Image.open(out))
+    assert picture.shape == (48 + 18 + 4, 64 + 85 + 12, 3)
+    assert picture[20:64, 6:60].std() > 10 and picture[20:64, 75:140].std() > 10
+
+
+def test_preview_refuses_what_it_does_not_know(tmp_path):
+    """An unknown mode or scene is one clear error."""
+    from arena_newton.errors import InputError
+    from arena_newton.usd_scenes.preview import preview
+
+    with pytest.raises(InputError, match="--mode night"):
+        preview(["boxing"], tmp_path / "a.png", 64, "night")
+    with pytest.raises(InputError, match="no_such_task"):
+        preview(["no_such_task"], tmp_path / "a.png", 64, "base")
