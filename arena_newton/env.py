@@ -124,7 +124,9 @@ class ArenaEnv:
         hands = len(h.hand_ctrl)
         close = (g1.HAND_CLOSE_LEFT + g1.HAND_CLOSE_RIGHT)[:hands]
         self._hand_close = wp.array(np.array(close, np.float32), dtype=wp.float32, device=self.device)
-        self._hand_open = wp.array(np.array((g1.HAND_OPEN * 2)[:hands], np.float32), dtype=wp.float32, device=self.device)
+        self._hand_open = wp.array(
+            np.array((g1.HAND_OPEN * 2)[:hands], np.float32), dtype=wp.float32, device=self.device
+        )
         self._critical = ints(h.critical_bodies)
         self.reference = canonical.ReferencePose.allocate(
             worlds, self.device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK
@@ -239,7 +241,14 @@ class ArenaEnv:
 
         p, h = self.physics, self.scene.robot
         canonical.launch_state64(
-            p.qpos, p.qvel, h.root_qpos, h.root_qvel, self._canonical_qpos, self._canonical_qvel, self.reference.heading, self._state64
+            p.qpos,
+            p.qvel,
+            h.root_qpos,
+            h.root_qvel,
+            self._canonical_qpos,
+            self._canonical_qvel,
+            self.reference.heading,
+            self._state64,
         )
         picture = None
         if image:

@@ -25,6 +25,10 @@ BALL_STIFFNESS = 10000.0
 """Contact stiffness of the ball [1/s²·kg-normalised, MuJoCo direct solref], measured to give the stated bounce at 5 ms."""
 
 
+LATCH_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Constraint impedance of the latch: at the default, the light handle softens it and 10 N·m turn the locked leaf 12°."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """A pose fixed to a MuJoCo body (body 0 is the world)."""
@@ -325,13 +329,19 @@ def _add_latch(builder: Any, stage: Any) -> bool:
         if prim.HasAttribute("arena:latch") and prim.GetAttribute("arena:latch").Get():
             leaf = builder.joint_label.index(str(prim.GetPath()))
             handle = next(
-                (j for j, label in enumerate(builder.joint_label) if label == str(prim.GetPath().GetParentPath()) + "/HandleHinge"),
+                (
+                    j
+                    for j, label in enumerate(builder.joint_label)
+                    if label == str(prim.GetPath().GetParentPath()) + "/HandleHinge"
+                ),
                 None,
             )
             if handle is None:
                 raise InputError(f"{stage.GetRootLayer().identifier}: {prim.GetPath()} has a latch but no HandleHinge")
             # leaf = 0 + 0·handle: the leaf is held at its closed angle while the equality is active.
-            mujoco.add_equality_joint(builder, leaf, handle, polycoef=(0.0, 0.0), label="latch", enabled=True)
+            mujoco.add_equality_joint(
+                builder, leaf, handle, polycoef=(0.0, 0.0), label="latch", enabled=True, solimp=LATCH_SOLIMP
+            )
             return True
     return False
 

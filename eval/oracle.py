@@ -233,7 +233,9 @@ def _padded(streams: Sequence[Reference]) -> np.ndarray:
     return out
 
 
-def run_ours(checkpoint: str | Path, streams: Sequence[Reference], *, tracker: str = "twist2", fast: bool = True) -> list[Track]:
+def run_ours(
+    checkpoint: str | Path, streams: Sequence[Reference], *, tracker: str = "twist2", fast: bool = True
+) -> list[Track]:
     """Play references in the environment, each in a world of one batch."""
     import torch
 

@@ -133,7 +133,9 @@ def _smooth(share: float) -> float:
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
 
 
-def _actions(positions: Sequence[np.ndarray], rotations: Sequence[np.ndarray], joints: Sequence[np.ndarray]) -> np.ndarray:
+def _actions(
+    positions: Sequence[np.ndarray], rotations: Sequence[np.ndarray], joints: Sequence[np.ndarray]
+) -> np.ndarray:
     """Canonical actions of a root path and joints: displacement in the root frame of the tick, then the rest."""
     path, turn = np.asarray(positions), np.asarray(rotations)
     actions = np.zeros((len(path), ACTION_WIDTH))

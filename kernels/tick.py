@@ -2,7 +2,16 @@
 
 import warp as wp
 
-__all__ = ["ERROR_ACTION", "ERROR_STATE", "FALL", "RUNNING", "SUCCESS", "launch_sanitize", "launch_status", "launch_write_ctrl"]
+__all__ = [
+    "ERROR_ACTION",
+    "ERROR_STATE",
+    "FALL",
+    "RUNNING",
+    "SUCCESS",
+    "launch_sanitize",
+    "launch_status",
+    "launch_write_ctrl",
+]
 
 RUNNING = 0
 SUCCESS = 1

@@ -15,7 +15,7 @@ from arena_newton.interfaces import Chunk, Observation
 __all__ = ["Chunk", "Observation", "Policy", "PolicyError", "get", "names", "register", "world_mask"]
 
 ENTRY_POINT_GROUP = "arena_newton.policies"
-"""Other packages offer policies under this entry point group: a callable that takes the text after the colon, if any."""
+"""Other packages offer policies under this entry point group: a callable of the text after the colon (or None)."""
 
 _BUILT_IN = {
     "remote": "arena_newton.policies.remote:from_spec",

@@ -104,6 +104,9 @@ class _Connection:
             data += piece
             if len(data) > MAX_REPLY:
                 raise ValueError(f"the reply is longer than {MAX_REPLY >> 20} MiB")
+        if reply.length:
+            raise ConnectionError("the reply broke off")
+        reply.close()  # all of it is read; without this the kept connection takes no further request
         if reply.will_close:
             self.close()
         return reply.status, bytes(data)

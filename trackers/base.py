@@ -49,6 +49,8 @@ class Tracker:
     """Physics rate under `--fast-physics`."""
     ignores: tuple[str, ...] = ()
     """Parts of the 40-number action that cannot reach the robot through this tracker."""
+    max_root_delta_deg: float = 0.0
+    """Largest turn of the reference root between ticks [deg], 0 = no limit (the original limits SONIC's to 26)."""
     worlds: int = 0
     """Worlds this tracker is bound to."""
 

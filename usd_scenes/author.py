@@ -151,7 +151,18 @@ def box(
     return _finish(geom.GetPrim(), collide, visual, look, surface)
 
 
-def sphere(stage, path, radius: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, *, collide=True, visual=True, look=None, surface=None):
+def sphere(
+    stage,
+    path,
+    radius: float,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    *,
+    collide=True,
+    visual=True,
+    look=None,
+    surface=None,
+):
     """A sphere of `radius` [m]."""
     geom = UsdGeom.Sphere.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
@@ -159,7 +170,20 @@ def sphere(stage, path, radius: float, position: Vec = (0, 0, 0), quat: Vec = ID
     return _finish(geom.GetPrim(), collide, visual, look, surface)
 
 
-def capsule(stage, path, radius: float, length: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, axis="Z", *, collide=True, visual=True, look=None, surface=None):
+def capsule(
+    stage,
+    path,
+    radius: float,
+    length: float,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    axis="Z",
+    *,
+    collide=True,
+    visual=True,
+    look=None,
+    surface=None,
+):
     """A capsule of `radius` [m] and cylinder `length` [m] (caps come on top) along local `axis`."""
     geom = UsdGeom.Capsule.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
@@ -169,7 +193,20 @@ def capsule(stage, path, radius: float, length: float, position: Vec = (0, 0, 0)
     return _finish(geom.GetPrim(), collide, visual, look, surface)
 
 
-def cylinder(stage, path, radius: float, length: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, axis="Z", *, collide=True, visual=True, look=None, surface=None):
+def cylinder(
+    stage,
+    path,
+    radius: float,
+    length: float,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    axis="Z",
+    *,
+    collide=True,
+    visual=True,
+    look=None,
+    surface=None,
+):
     """A cylinder of `radius` [m] and `length` [m] along local `axis`."""
     geom = UsdGeom.Cylinder.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
@@ -179,7 +216,20 @@ def cylinder(stage, path, radius: float, length: float, position: Vec = (0, 0, 0
     return _finish(geom.GetPrim(), collide, visual, look, surface)
 
 
-def mesh(stage, path, points, faces, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, *, uv=None, collide=False, visual=True, look=None, surface=None):
+def mesh(
+    stage,
+    path,
+    points,
+    faces,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    *,
+    uv=None,
+    collide=False,
+    visual=True,
+    look=None,
+    surface=None,
+):
     """A triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
     geom = UsdGeom.Mesh.Define(stage, path)
     faces = np.asarray(faces, dtype=np.int32)
@@ -198,7 +248,17 @@ def mesh(stage, path, points, faces, position: Vec = (0, 0, 0), quat: Vec = IDEN
     return _finish(geom.GetPrim(), collide, visual, look, surface)
 
 
-def quad(stage, path, half_x: float, half_y: float, position: Vec = (0, 0, 0), quat: Vec = IDENTITY, *, repeat: Vec = (1, 1), look=None):
+def quad(
+    stage,
+    path,
+    half_x: float,
+    half_y: float,
+    position: Vec = (0, 0, 0),
+    quat: Vec = IDENTITY,
+    *,
+    repeat: Vec = (1, 1),
+    look=None,
+):
     """A visual rectangle in the local xy plane facing +z, its texture repeated `repeat` times."""
     points = [(-half_x, -half_y, 0), (half_x, -half_y, 0), (half_x, half_y, 0), (-half_x, half_y, 0)]
     uv = [(0, 0), (repeat[0], 0), (repeat[0], repeat[1]), (0, repeat[1])]
@@ -212,7 +272,9 @@ def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0), qu
     return prim
 
 
-def material(stage, path, color: Vec = (0.8, 0.8, 0.8), *, roughness=0.8, metallic=0.0, texture: str | None = None) -> Usd.Prim:
+def material(
+    stage, path, color: Vec = (0.8, 0.8, 0.8), *, roughness=0.8, metallic=0.0, texture: str | None = None
+) -> Usd.Prim:
     """A UsdPreviewSurface look; `texture` is an asset path relative to the layer and replaces the colour."""
     look = UsdShade.Material.Define(stage, path)
     shader = UsdShade.Shader.Define(stage, f"{path}/Surface")
@@ -283,7 +345,9 @@ def dome_light(stage, path="/World/Light", *, intensity: float = 3000.0, color: 
     return light.GetPrim()
 
 
-def distant_light(stage, path="/World/Light", *, intensity=5000.0, color: Vec = (0.75, 0.75, 0.75), quat: Vec = IDENTITY) -> Usd.Prim:
+def distant_light(
+    stage, path="/World/Light", *, intensity=5000.0, color: Vec = (0.75, 0.75, 0.75), quat: Vec = IDENTITY
+) -> Usd.Prim:
     """A distant light shining along its local −z."""
     light = UsdLux.DistantLight.Define(stage, path)
     light.CreateIntensityAttr(float(intensity))

@@ -44,7 +44,13 @@ class Network(trackers.base.Tracker):
         from arena_newton.trackers.blocks import BlockRunner
 
         torch.manual_seed(0)
-        layers = [torch.nn.Linear(64, 512), torch.nn.ELU(), torch.nn.Linear(512, 256), torch.nn.ELU(), torch.nn.Linear(256, 29)]
+        layers = [
+            torch.nn.Linear(64, 512),
+            torch.nn.ELU(),
+            torch.nn.Linear(512, 256),
+            torch.nn.ELU(),
+            torch.nn.Linear(256, 29),
+        ]
         self.run = BlockRunner(torch.nn.Sequential(*layers), 64, worlds, device)
         self.default = torch.tensor(DEFAULT_POSE)
 

@@ -47,20 +47,32 @@ def test_wheel_holds_one_top_level_package(tmp_path):
 def test_imports_run_one_way():
     """No floor imports a floor above it."""
     above = {
-        "kernels": ("arena_newton.trackers", "arena_newton.policies", "arena_newton.eval", "arena_newton.scene", "torch"),
+        "kernels": (
+            "arena_newton.trackers",
+            "arena_newton.policies",
+            "arena_newton.eval",
+            "arena_newton.scene",
+            "torch",
+        ),
         "trackers": ("arena_newton.policies", "arena_newton.eval"),
         "policies": ("arena_newton.eval",),
         "arena_newton": ("arena_newton.trackers", "arena_newton.policies", "arena_newton.eval"),
     }
     for floor, banned in above.items():
-        files = [p for p in (ROOT / floor).rglob("*.py") if not any(part in FLOORS for part in p.parts[len(ROOT.parts) + 1 :])]
+        files = [
+            p
+            for p in (ROOT / floor).rglob("*.py")
+            if not any(part in FLOORS for part in p.parts[len(ROOT.parts) + 1 :])
+        ]
         for path in files:
             for line in path.read_text().splitlines():
                 text = line.strip()
                 if text.startswith(("import ", "from ")):
                     parts = text.split()
                     module = parts[1]
-                    full = [module] + [f"{module}.{n.strip(',')}" for n in parts[3:]] if parts[0] == "from" else [module]
+                    full = (
+                        [module] + [f"{module}.{n.strip(',')}" for n in parts[3:]] if parts[0] == "from" else [module]
+                    )
                     bad = [b for b in banned for f in full if f == b or f.startswith(b + ".")]
                     assert not bad, f"{path.relative_to(ROOT)}: {text}"
 

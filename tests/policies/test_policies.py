@@ -43,7 +43,9 @@ def matrix(quat: np.ndarray) -> np.ndarray:
 
 def walking_clip(frames: int = 90, fps: float = 29.9) -> Clip:
     t = np.arange(frames) / fps
-    quat = multiply(rotation(2, 2.0 + 0.7 * t), multiply(rotation(1, 0.2 * np.sin(3 * t)), rotation(0, 0.1 * np.cos(2 * t))))
+    quat = multiply(
+        rotation(2, 2.0 + 0.7 * t), multiply(rotation(1, 0.2 * np.sin(3 * t)), rotation(0, 0.1 * np.cos(2 * t)))
+    )
     pos = np.stack([3 + 0.5 * np.sin(t), -1 + 0.4 * t, 0.78 + 0.03 * np.sin(5 * t)], axis=1)
     joints = np.sin(t[:, None] + np.arange(29))
     return Clip(fps, pos, quat, joints)

@@ -163,7 +163,7 @@ def test_single_action(server, policy):
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
-        ("nan", "joint_pos[left_ankle_pitch_joint]"),
+        ("nan", "is nan, expected a finite number"),
         ("39", "39 numbers, expected 40"),
         ("words", "no number"),
         ("500", "status 500, CUDA out of memory"),
@@ -178,8 +178,6 @@ def test_bad_reply_ends_one_world(server, policy, kind, text):
     server.behave = {1.0: kind}
     chunk = policy.act(observation(3))
     assert set(chunk.errors) == {1}
-    if kind == "nan":
-        text = "is nan, expected a finite number"
     assert text in chunk.errors[1] and server.url in chunk.errors[1] and "\n" not in chunk.errors[1]
     assert chunk.actions[2, 0, 38] == 2.0 and np.isfinite(chunk.actions).all()
     server.behave = {}

@@ -92,14 +92,11 @@ def twist2_like(path: Path, *, frame: int = 127, command: int = 35, history: int
 
     memory = b.silu(b.linear(b.rows_of(past, past, -1, times=history), frame, 20))
     memory = b.add("Transpose", b.rows_of(memory, past, history, -1), perm=[0, 2, 1])
-    memory = b.add(
-        "Conv", memory, b.weight(16, 20, 4), b.weight(16), kernel_shape=[4], strides=[2], pads=[0, 0], dilations=[1], group=1
-    )  # fmt: skip
+    common = {"pads": [0, 0], "dilations": [1], "group": 1}
+    memory = b.add("Conv", memory, b.weight(16, 20, 4), b.weight(16), kernel_shape=[4], strides=[2], **common)
     length = (history - 4) // 2 + 1
     memory = b.silu(memory)
-    memory = b.add(
-        "Conv", memory, b.weight(8, 16, 2), b.weight(8), kernel_shape=[2], strides=[1], pads=[0, 0], dilations=[1], group=1
-    )  # fmt: skip
+    memory = b.add("Conv", memory, b.weight(8, 16, 2), b.weight(8), kernel_shape=[2], strides=[1], **common)
     memory = b.linear(b.add("Flatten", b.silu(memory), axis=1), 8 * (length - 1), 32)
 
     future = b.add("Reshape", future, b.constant(np.array([-1, 1, command])))

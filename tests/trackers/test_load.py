@@ -57,7 +57,9 @@ def test_evil_pickle(tmp_path, protocol):
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("name", [b"cos\nsystem\n", b"cnumpy\nload\n", b"cbuiltins\ngetattr\n", b"cnumpy\nndarray.tofile\n"])
+@pytest.mark.parametrize(
+    "name", [b"cos\nsystem\n", b"cnumpy\nload\n", b"cbuiltins\ngetattr\n", b"cnumpy\nndarray.tofile\n"]
+)
 def test_other_callables(tmp_path, name):
     """Functions of NumPy and of the language itself are refused as well."""
     path = tmp_path / "evil.pkl"
