@@ -49,7 +49,7 @@ class CameraConfig:
     """`ego`, `left_wrist`, `right_wrist`, `world`, or the path of a camera prim."""
     fit: Fit = "pad"
     """`native`: the lens fills width × height with square pixels, horizontal view kept; `pad`: the sensor's own aspect
-    (4:3 for the robot's cameras) fitted into width × height, black around it, as the original prepares policy images."""
+    (4:3 for the robot's cameras) inside width × height, black around it, as the original prepares policy images."""
     samples: int = 1
     """Rays per pixel along each axis (2 is 4 rays a pixel: smooth edges for videos)."""
 
@@ -150,6 +150,107 @@ def _stage_light(stage: Any) -> tuple[tuple[float, ...] | None, float, tuple[flo
     return tuple(pose.TransformDir(Gf.Vec3d(0, 0, -1)).GetNormalized()), intensity, color
 
 
+def _srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Linear value of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _as_mesh(kind: int, size: np.ndarray, source: Any) -> tuple[Any, np.ndarray]:
+    """A shape as a triangle mesh and the scale of its vertices."""
+    from newton import Axis, GeoType, Mesh
+
+    quiet = {"compute_inertia": False}
+    # Newton's shapes stand along z, its mesh makers along y unless told.
+    along_z = {"up_axis": Axis.Z, **quiet}
+    size = [float(v) for v in size]
+    if kind == GeoType.SPHERE:
+        return Mesh.create_sphere(size[0], **quiet), np.ones(3)
+    if kind == GeoType.BOX:
+        return Mesh.create_box(*size, duplicate_vertices=True, **quiet), np.ones(3)
+    if kind == GeoType.CAPSULE:
+        return Mesh.create_capsule(size[0], size[1], **along_z), np.ones(3)
+    if kind == GeoType.CYLINDER:
+        return Mesh.create_cylinder(size[0], size[1], barrel_radius=size[2], **along_z), np.ones(3)
+    if kind == GeoType.CONE:
+        return Mesh.create_cone(size[0], size[1], **along_z), np.ones(3)
+    if kind == GeoType.ELLIPSOID:
+        return Mesh.create_ellipsoid(*size, **quiet), np.ones(3)
+    if kind == GeoType.PLANE:
+        # 0 is an unbounded plane: as far as the renderer's rays reach.
+        return Mesh.create_plane(size[0] or 2000.0, size[1] or 2000.0, **quiet), np.ones(3)
+    if source is None or not hasattr(source, "vertices"):
+        raise InputError(f"a shape of type {GeoType(kind).name} cannot be drawn: use a mesh or a primitive")
+    return source, np.asarray(size)
+
+
+def _triangles(model: Any) -> Any:
+    """Every visible shape of a model as triangles, meshes stored once for all worlds."""
+    import warp as wp
+    from newton.utils import load_texture, normalize_texture
+
+    from arena_newton.kernels.lighting import Soup
+
+    count = model.shape_count
+    shapes = np.sort(model.bvh_shape_enabled.numpy()[: model.bvh_shape_count_enabled].astype(np.int64))
+    kinds, sizes, worlds = model.shape_type.numpy(), model.shape_scale.numpy(), model.shape_world.numpy()
+    scales, spheres = np.ones((count, 3), np.float32), np.zeros((count, 4), np.float32)
+    face_range, texture = np.zeros((count, 2), np.int32), np.full(count, -1, np.int32)
+    vertices, normals, uvs, faces, texels, places = [], [], [], [], [], []
+    placed: dict[Any, tuple[Any, np.ndarray, tuple[int, int]]] = {}
+    images: dict[Any, int] = {}
+    at_vertex = at_face = at_texel = 0
+    for s in shapes:
+        source = model.shape_source[s]
+        key = (int(kinds[s]), id(source)) if source is not None else (int(kinds[s]), *sizes[s].tolist())
+        if key not in placed:
+            mesh, scale = _as_mesh(int(kinds[s]), sizes[s], source)
+            points = np.asarray(mesh.vertices, np.float32).reshape(-1, 3)
+            corner = np.asarray(mesh.indices, np.int32).reshape(-1, 3)
+            vertices.append(points)
+            normals.append(np.zeros_like(points) if mesh.normals is None else np.asarray(mesh.normals, np.float32))
+            st = np.zeros((len(points), 2), np.float32)
+            if mesh.uvs is not None:
+                affine = np.asarray(mesh.texture_transform, np.float32)
+                st = np.asarray(mesh.uvs, np.float32).reshape(-1, 2) @ affine[:, :2].T + affine[:, 2]
+            uvs.append(st)
+            faces.append(corner + at_vertex)
+            placed[key] = (mesh, points, (at_face, at_face + len(corner)))
+            at_vertex, at_face = at_vertex + len(points), at_face + len(corner)
+        mesh, points, face_range[s] = placed[key]
+        scales[s] = sizes[s] if source is not None else 1.0
+        low, high = (points * scales[s]).min(axis=0), (points * scales[s]).max(axis=0)
+        spheres[s, :3] = 0.5 * (low + high)
+        spheres[s, 3] = np.linalg.norm(points * scales[s] - spheres[s, :3], axis=1).max()
+        image = getattr(source, "texture", None)
+        if image is not None and mesh.uvs is not None:
+            if source.texture_hash not in images:
+                pixels = normalize_texture(load_texture(image), require_channels=True)[..., :3]
+                images[source.texture_hash] = len(places)
+                places.append((at_texel, pixels.shape[1], pixels.shape[0]))
+                texels.append(np.ascontiguousarray(pixels).reshape(-1))
+                at_texel += pixels.shape[0] * pixels.shape[1]
+            texture[s] = images[source.texture_hash]
+
+    order = np.where(worlds[shapes] < 0, model.world_count, worlds[shapes])
+    sort = np.argsort(order, kind="stable")
+    start = np.searchsorted(order[sort], np.arange(model.world_count + 2))
+
+    def array(values: Any, dtype: Any) -> Any:
+        return wp.array(values, dtype=dtype, device=model.device)
+
+    soup = Soup()
+    soup.world_start, soup.shapes = array(start, wp.int32), array(shapes[sort], wp.int32)
+    soup.face_start, soup.spheres = array(face_range.reshape(-1), wp.int32), array(spheres, wp.vec4)
+    soup.scales, soup.transforms = array(scales, wp.vec3), model.bvh_shape_world_transforms
+    soup.colors = array(_srgb_to_linear(model.shape_color.numpy()), wp.vec3)
+    soup.texture = array(texture, wp.int32)
+    soup.faces, soup.vertices = array(np.concatenate(faces), wp.vec3i), array(np.concatenate(vertices), wp.vec3)
+    soup.normals, soup.uvs = array(np.concatenate(normals), wp.vec3), array(np.concatenate(uvs), wp.vec2)
+    soup.texels = array(np.concatenate(texels) if texels else np.zeros(0, np.uint8), wp.uint8)
+    soup.texture_place = array(np.array(places, np.int32).reshape(-1, 3), wp.vec3i)
+    return soup
+
+
 class _Tracer:
     """What the cameras of one model share: Newton's sensor with its textures, and the shadow casters."""
 
@@ -191,9 +292,8 @@ class _Tracer:
         self.occluders.sizes = model.shape_scale
         self.occluders.transforms = model.bvh_shape_world_transforms
         self.occluders.meshes = model.shape_source_ptr
-        byte = np.arange(256) / 255.0
-        linear = np.where(byte <= 0.04045, byte / 12.92, ((byte + 0.055) / 1.055) ** 2.4)
-        self.decode = wp.array(linear, dtype=wp.float32, device=model.device)
+        self.decode = wp.array(_srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=model.device)
+        self.soup = None if on_cuda else _triangles(model)
 
     @classmethod
     def of(cls, model: Any) -> _Tracer:
@@ -274,6 +374,8 @@ class Camera:
             vertical_aperture=horizontal_aperture * h / w,
             device=self.device,
         )
+        half = 0.5 * horizontal_aperture / focal_length
+        self._tangents = (half, half * h / w)
         qw, qx, qy, qz = (float(v) for v in quat)
         self._local = wp.transform(wp.vec3(*(float(v) for v in position)), wp.normalize(wp.quat(qx, qy, qz, qw)))
         with wp.ScopedDevice(self.device):
@@ -284,6 +386,10 @@ class Camera:
             self._albedo = sensor.allocate_image_albedo(self.worlds, w, h)
             self._normals = sensor.allocate_image_normal(self.worlds, w, h)
             self._depth = sensor.allocate_image_depth(self.worlds, w, h)
+            if self._tracer.soup is not None:
+                self._nearness = wp.zeros((self.worlds, h, w), dtype=wp.float32)
+                self._hit_shape = wp.zeros((self.worlds, h, w), dtype=wp.int32)
+                self._hit_face = wp.zeros((self.worlds, h, w), dtype=wp.int32)
             self.image = wp.zeros((self.worlds, height, width, 3), dtype=wp.uint8)
             """The pictures of the last render, uint8 [worlds, height, width, 3]."""
         self._torch_image = wp.to_torch(self.image)
@@ -370,15 +476,10 @@ class Camera:
         lights.upload()
         self.model.bvh_refit_shapes(state)
         lighting.launch_camera_poses(state.body_q, self._body, self._local, self.poses)
-        tracer.sensor.update(
-            state,
-            self.poses,
-            self._rays,
-            albedo_image=self._albedo,
-            normal_image=self._normals,
-            depth_image=self._depth,
-            world_indices=self._view_world,
-        )
+        if tracer.soup is None:
+            self._trace(state)
+        else:
+            self._draw()
         lighting.launch_shade(
             tracer.ray_primitive,
             tracer.mesh_type,
@@ -399,6 +500,36 @@ class Camera:
             image=self.image,
         )
         return self._torch_image
+
+    def _trace(self, state: Any) -> None:
+        """Albedo, normal and depth by rays: the way of a GPU."""
+        self._tracer.sensor.update(
+            state,
+            self.poses,
+            self._rays,
+            albedo_image=self._albedo,
+            normal_image=self._normals,
+            depth_image=self._depth,
+            world_indices=self._view_world,
+        )
+
+    def _draw(self) -> None:
+        """The same by drawing triangles: the way of one CPU core."""
+        from arena_newton.kernels import lighting
+
+        lighting.launch_rasterize(
+            view_world=self._view_world,
+            poses=self.poses,
+            rays=self._rays,
+            soup=self._tracer.soup,
+            tangents=self._tangents,
+            nearness=self._nearness,
+            hit_shape=self._hit_shape,
+            hit_face=self._hit_face,
+            albedo=self._albedo,
+            normals=self._normals,
+            depth=self._depth,
+        )
 
 
 def _path_under_robot(stage: Any, name: str) -> str:

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,8 +24,22 @@ from arena_newton.interfaces import RobotState, TrackerCommand
 if TYPE_CHECKING:
     from arena_newton.eval.oracle_references import Reference
 
-__all__ = ["MimicCommand", "Row", "compare", "load_official", "main", "references", "run_ours", "run_oracle", "table"]
+__all__ = [
+    "MimicCommand",
+    "Options",
+    "Row",
+    "Track",
+    "compare",
+    "load_official",
+    "main",
+    "measure",
+    "references",
+    "run_oracle",
+    "run_ours",
+    "table",
+]
 
+PROG = "python -m arena_newton.eval.oracle"
 FALL_TILT = 60.0
 """A pelvis tilted beyond this has fallen [deg]."""
 FALL_HEIGHT = 0.3
@@ -176,6 +190,8 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
 
     import mujoco
 
+    from arena_newton.eval.oracle_references import FEET
+
     path = Path(mjcf)
     if not path.is_file():
         raise InputError(f"--mjcf {path}: no such file")
@@ -183,6 +199,8 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
         tree = ElementTree.fromstring(path.read_text())
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
         raise InputError(f"--mjcf {path}: not a readable XML file ({error})") from None
+    if tree.find("worldbody") is None:
+        raise InputError(f"--mjcf {path}: holds no worldbody, expected an MJCF")
     for parent in tree.iter():
         for child in list(parent):
             if (child.tag == "mesh" and parent.tag == "asset") or (child.tag == "geom" and child.get("mesh")):
@@ -197,11 +215,15 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
             motors[name].set_to_position(kp=drive.kp[i], kv=drive.kd[i])
         spec.option.timestep = dt
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        return spec.compile()
+        model = spec.compile()
     except KeyError as error:
         raise InputError(f"--mjcf {path}: no motor for joint {error.args[0]}") from None
     except ValueError as error:
         raise InputError(f"--mjcf {path}: MuJoCo cannot compile it ({' '.join(str(error).split())})") from None
+    for name in ("pelvis", *FEET):
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
+            raise InputError(f"--mjcf {path}: no body {name}")
+    return model
 
 
 def references(model: Any, clips: Sequence[str | Path], clip_seconds: float | None = None) -> list[Reference]:
@@ -414,36 +436,31 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
+@dataclass(frozen=True)
+class Options:
+    """Compare a tracker on our G1 with the same tracker on its official MJCF in plain MuJoCo."""
+
+    checkpoint: Path
+    """Weights of the tracker."""
+    mjcf: Path
+    """The official MJCF, g1_sim2sim_29dof.xml."""
+    clip: tuple[Path, ...] = ()
+    """A motion clip (.pkl); repeat for more."""
+    clip_seconds: float | None = None
+    """Keep so much of each clip [s]."""
+    tracker: str = "twist2"
+    """Name of the tracker."""
+    fast_physics: bool = False
+    """Use the tracker's fast physics rate."""
+    json: bool = False
+    """Print JSON instead of the table."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; exit code 0 done, 2 bad input."""
     import tyro
 
-    @dataclass(frozen=True)
-    class Options:
-        """Compare a tracker on our G1 with the same tracker on its official MJCF in plain MuJoCo."""
-
-        checkpoint: Path
-        """Weights of the tracker."""
-        mjcf: Path
-        """The official MJCF, g1_sim2sim_29dof.xml."""
-        clip: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-        """A motion clip (.pkl); repeat for more."""
-        clip_seconds: float | None = None
-        """Keep so much of each clip [s]."""
-        tracker: str = "twist2"
-        """Name of the tracker."""
-        fast_physics: bool = False
-        """Use the tracker's fast physics rate."""
-        json: bool = False
-        """Print JSON instead of the table."""
-
-    # Names of a nested class do not resolve from strings.
-    Options.__annotations__.update(
-        checkpoint=Path,
-        mjcf=Path,
-        clip=Annotated[tuple[Path, ...], tyro.conf.UseAppendAction],
-    )
-    options = tyro.cli(Options, args=argv, prog="python -m arena_newton.eval.oracle")
+    options = tyro.cli(Options, args=argv, prog=PROG, config=(tyro.conf.UseAppendAction,))
     try:
         rows = compare(
             options.checkpoint,

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from arena_newton.canonical import ACTION, ACTION_WIDTH
+from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, MUJOCO_JOINTS, TICK
 
-__all__ = ["LegSolver", "Reference", "clip", "squat", "stand", "walk"]
+__all__ = ["FEET", "Gait", "LegSolver", "Reference", "clip", "squat", "stand", "walk"]
 
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 SOLE_HEIGHT = 0.035
@@ -172,6 +173,9 @@ def squat(
         move: Time of going down, and of going up [s].
         hold: Time at the bottom [s].
         lean: Forward lean of the pelvis at the bottom [rad].
+
+    Raises:
+        InputError: The legs do not reach.
     """
     solver = LegSolver(model)
     solver.forward(np.array([0.0, 0.0, top]), np.eye(3))
@@ -189,7 +193,7 @@ def squat(
             left = solver.solve(position, rotation, feet, iterations=3)
             x += target - solver.centre_of_mass[0]
         if left > 0.02:
-            raise ValueError(f"squat: the legs do not reach at {t:.2f} s, {left:.3f} m or rad are left")
+            raise InputError(f"squat: the legs do not reach at {t:.2f} s, {left:.3f} m or rad are left")
         positions.append(position)
         rotations.append(rotation)
         joints.append(solver.joints.copy())
@@ -199,23 +203,27 @@ def squat(
 def walk(model: Any, speed: float = 0.3, seconds: float = 8.0, gait: Gait | None = None) -> Reference:
     """Walk straight on: footsteps planned ahead of the body, legs by inverse kinematics.
 
+    The nominal place of an ankle is beside the pelvis, neither ahead nor behind: a walk with the middle of the soles
+    there instead runs 0.4 m ahead of its reference in 8 s.
+
     Args:
         model: The official MJCF, compiled.
         speed: Speed after the ramp [m/s].
         seconds: Length without the start [s].
         gait: Shape of the steps.
+
+    Raises:
+        InputError: The legs do not reach.
     """
     g = gait or Gait()
     solver = LegSolver(model)
     rotation = _lean(g.pitch)
-    start = -SOLE_CENTRE
-    """Ankles so far behind the pelvis that it stands above the middle of the soles [m]."""
 
     def travelled(t: float) -> float:
         return speed * (t - g.ramp / 2) if t > g.ramp else speed * t * t / (2 * g.ramp)
 
     def nominal(side: int, t: float) -> np.ndarray:
-        return np.array([travelled(t) + start, (0.5 - side) * g.width, SOLE_HEIGHT])
+        return np.array([travelled(t), (0.5 - side) * g.width, SOLE_HEIGHT])
 
     feet = np.array([nominal(0, 0.0), nominal(1, 0.0)])
     solver.solve(np.array([0.0, 0.0, g.height]), rotation, feet, iterations=50)
@@ -235,7 +243,7 @@ def walk(model: Any, speed: float = 0.3, seconds: float = 8.0, gait: Gait | None
         position = np.array([travelled(t), sway, g.height])
         left = solver.solve(position, rotation, feet)
         if left > 0.02:
-            raise ValueError(f"walk: the legs do not reach at {t:.2f} s, {left:.3f} m or rad are left")
+            raise InputError(f"walk: the legs do not reach at {t:.2f} s, {left:.3f} m or rad are left")
         positions.append(position)
         rotations.append(rotation)
         joints.append(solver.joints.copy())

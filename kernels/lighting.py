@@ -1,4 +1,4 @@
-"""Camera poses and shading per world: Lambert under a uniform dome or a distant light with shadow rays.
+"""Camera poses, visible surfaces, and shading per world: Lambert under a dome or a distant light with shadow rays.
 
 Every world of a batch has its own light. A surface of linear albedo a, normal n (turned towards the viewer) and a
 light of radiance L (intensity · colour) gives the linear radiance
@@ -8,7 +8,7 @@ light of radiance L (intensity · colour) gives the linear radiance
 
 with A(n) = BOUNCE + (1 − BOUNCE) · (n_z + 1)/2, the light from above and what the floor gives back, l towards the light
 and v = 0 in its shadow. A ray that leaves the scene shows L · SKY_DOME or L · SKY_DISTANT. The picture is
-sRGB(1 − exp(−EXPOSURE · radiance)): a dome of intensity 3000 and colour 0.75 puts a mid grey (albedo 0.5) at 0.48 linear,
+sRGB(1 − exp(−EXPOSURE · radiance)): the dome of intensity 3000 and colour 0.75 puts albedo 0.5 at 0.48 linear,
 and no light of the visual mode (3000 to 7000, colour 0.65 to 0.85) clips a white wall.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["Occluders", "launch_camera_poses", "launch_shade"]
+__all__ = ["Occluders", "Soup", "launch_camera_poses", "launch_rasterize", "launch_shade"]
 
 EXPOSURE = wp.constant(wp.float32(1.0 / 1700.0))
 """Scale from light intensity units to the tone curve; puts the original's dome (3000 · 0.75) at 1.32."""
@@ -36,6 +36,10 @@ SHADOW_BIAS = wp.constant(wp.float32(1.0e-3))
 """Start of a shadow ray above its surface [m]."""
 SHADOW_RANGE = wp.constant(wp.float32(100.0))
 """Length of a shadow ray [m]."""
+NEAR = wp.constant(wp.float32(0.002))
+"""What is closer to the camera's plane than this is not drawn [m]."""
+EDGE = wp.constant(wp.float32(1.0e-3))
+"""Overlap of neighbouring triangles, against cracks by rounding [px]."""
 
 
 @wp.struct
@@ -79,6 +83,299 @@ def launch_camera_poses(body_q: wp.array, body: wp.array, local: wp.transform, p
     wp.launch(_camera_poses, dim=poses.shape[0], inputs=[body_q, body, local], outputs=[poses], device=poses.device)
 
 
+@wp.struct
+class Soup:
+    """The visible shapes as triangles, for the CPU: what `launch_rasterize` draws."""
+
+    world_start: wp.array[wp.int32]
+    """First entry of each world in `shapes`, then of the shapes of no world, then the end, shape [worlds + 2]."""
+    shapes: wp.array[wp.int32]
+    face_start: wp.array[wp.int32]
+    """First and last + 1 triangle of each shape, shape [2 · shapes]."""
+    spheres: wp.array[wp.vec4]
+    """Bounding sphere of each shape in its own frame, scaled: centre and radius [m]."""
+    scales: wp.array[wp.vec3]
+    transforms: wp.array[wp.transform]
+    """World pose of each shape [m]."""
+    colors: wp.array[wp.vec3]
+    """Linear albedo of each shape."""
+    texture: wp.array[wp.int32]
+    """Texture of each shape, −1 for none."""
+    faces: wp.array[wp.vec3i]
+    vertices: wp.array[wp.vec3]
+    normals: wp.array[wp.vec3]
+    """Normal of each vertex, zero for flat shading."""
+    uvs: wp.array[wp.vec2]
+    texels: wp.array[wp.uint8]
+    """sRGB bytes of all textures, row by row from the top, RGB."""
+    texture_place: wp.array[wp.vec3i]
+    """First texel, width and height of each texture."""
+
+
+@wp.func
+def _corner(soup: Soup, shape: wp.int32, vertex: wp.int32, pose: wp.transform) -> wp.vec3:
+    return wp.transform_point(pose, wp.cw_mul(soup.scales[shape], soup.vertices[vertex]))
+
+
+@wp.kernel(enable_backward=False)
+def _rasterize(
+    view_world: wp.array[wp.int32],
+    poses: wp.array[wp.transform],
+    soup: Soup,
+    tan_x: wp.float32,
+    tan_y: wp.float32,
+    nearness: wp.array3d[wp.float32],
+    hit_shape: wp.array3d[wp.int32],
+    hit_face: wp.array3d[wp.int32],
+):
+    view = wp.tid()
+    world = view_world[view]
+    if world < 0:
+        return
+    height = nearness.shape[1]
+    width = nearness.shape[2]
+    for y in range(height):
+        for x in range(width):
+            nearness[view, y, x] = 0.0
+            hit_shape[view, y, x] = -1
+    to_camera = wp.transform_inverse(poses[view])
+    # A pixel's ray is (x0 + px · dx, y0 − py · dy, −1).
+    dx = 2.0 * tan_x / wp.float32(width)
+    dy = 2.0 * tan_y / wp.float32(height)
+    x0 = -tan_x + 0.5 * dx
+    y0 = tan_y - 0.5 * dy
+    slope_x = wp.sqrt(1.0 + tan_x * tan_x)
+    slope_y = wp.sqrt(1.0 + tan_y * tan_y)
+    for group in range(int(2)):  # noqa: UP018  (int() keeps Warp from unrolling the loop)
+        first = soup.world_start[world]
+        last = soup.world_start[world + 1]
+        if group == 1:
+            first = soup.world_start[soup.world_start.shape[0] - 2]
+            last = soup.world_start[soup.world_start.shape[0] - 1]
+        for entry in range(first, last):
+            shape = soup.shapes[entry]
+            pose = to_camera * soup.transforms[shape]
+            ball = soup.spheres[shape]
+            centre = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
+            if centre[2] - ball[3] > -NEAR:
+                continue
+            if wp.abs(centre[0]) > -centre[2] * tan_x + ball[3] * slope_x:
+                continue
+            if wp.abs(centre[1]) > -centre[2] * tan_y + ball[3] * slope_y:
+                continue
+            for face in range(soup.face_start[2 * shape], soup.face_start[2 * shape + 1]):
+                corners = soup.faces[face]
+                p0 = _corner(soup, shape, corners[0], pose)
+                p1 = _corner(soup, shape, corners[1], pose)
+                p2 = _corner(soup, shape, corners[2], pose)
+                if wp.min(p0[2], wp.min(p1[2], p2[2])) > -NEAR:
+                    continue
+                lower = wp.vec2(1.0e9, 1.0e9)
+                upper = wp.vec2(-1.0e9, -1.0e9)
+                for k in range(3):
+                    a = p0
+                    b = p1
+                    if k == 1:
+                        a = p1
+                        b = p2
+                    elif k == 2:
+                        a = p2
+                        b = p0
+                    if a[2] <= -NEAR:
+                        q = wp.vec2(a[0] / -a[2], a[1] / -a[2])
+                        lower = wp.min(lower, q)
+                        upper = wp.max(upper, q)
+                    if (a[2] <= -NEAR) != (b[2] <= -NEAR):
+                        s = (-NEAR - a[2]) / (b[2] - a[2])
+                        c = a + (b - a) * s
+                        q = wp.vec2(c[0] / NEAR, c[1] / NEAR)
+                        lower = wp.min(lower, q)
+                        upper = wp.max(upper, q)
+                left = wp.int32(wp.ceil(wp.max((lower[0] - x0) / dx - EDGE, 0.0)))
+                right = wp.int32(wp.floor(wp.min((upper[0] - x0) / dx + EDGE, wp.float32(width - 1))))
+                top = wp.int32(wp.ceil(wp.max((y0 - upper[1]) / dy - EDGE, 0.0)))
+                bottom = wp.int32(wp.floor(wp.min((y0 - lower[1]) / dy + EDGE, wp.float32(height - 1))))
+                if left > right or top > bottom:
+                    continue
+                normal = wp.cross(p1 - p0, p2 - p0)
+                volume = wp.dot(normal, p0)
+                if wp.abs(volume) < 1.0e-16:
+                    continue
+                side = wp.sign(volume)
+                # Edge functions e · ray, positive inside; edge vectors keep the digits of small triangles.
+                e0 = wp.cross(p1, p2 - p1) * side
+                e1 = wp.cross(p2, p0 - p2) * side
+                e2 = wp.cross(p0, p1 - p0) * side
+                slope = normal / volume
+                for y in range(top, bottom + 1):
+                    ray_y = y0 - wp.float32(y) * dy
+                    low = wp.float32(left)
+                    high = wp.float32(right)
+                    for k in range(3):
+                        e = e0
+                        if k == 1:
+                            e = e1
+                        elif k == 2:
+                            e = e2
+                        step = e[0] * dx
+                        start = e[0] * x0 + e[1] * ray_y - e[2]
+                        if step > 0.0:
+                            low = wp.max(low, -start / step - EDGE)
+                        elif step < 0.0:
+                            high = wp.min(high, -start / step + EDGE)
+                        elif start < 0.0:
+                            high = -1.0
+                    if low <= high:
+                        base = slope[0] * x0 + slope[1] * ray_y - slope[2]
+                        for x in range(wp.int32(wp.ceil(low)), wp.int32(wp.floor(high)) + 1):
+                            near = base + slope[0] * dx * wp.float32(x)
+                            if near > nearness[view, y, x] and near < 1.0 / NEAR:
+                                nearness[view, y, x] = near
+                                hit_shape[view, y, x] = shape
+                                hit_face[view, y, x] = face
+
+
+@wp.func
+def _srgb(value: wp.float32) -> wp.float32:
+    """Encode a linear value in [0, 1] as sRGB (IEC 61966-2-1)."""
+    if value <= 0.0031308:
+        return 12.92 * value
+    return 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
+
+
+@wp.func
+def _linear(value: wp.float32) -> wp.float32:
+    """Linear value of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    if value <= 0.04045:
+        return value / 12.92
+    return wp.pow((value + 0.055) / 1.055, 2.4)
+
+
+@wp.func
+def _texel(soup: Soup, place: wp.vec3i, x: wp.int32, y: wp.int32) -> wp.vec3:
+    """Texel as sRGB in [0, 1], repeating."""
+    column = x % place[1]
+    row = y % place[2]
+    if column < 0:
+        column += place[1]
+    if row < 0:
+        row += place[2]
+    i = (place[0] + row * place[1] + column) * 3
+    scale = 1.0 / 255.0
+    return wp.vec3(wp.float32(soup.texels[i]), wp.float32(soup.texels[i + 1]), wp.float32(soup.texels[i + 2])) * scale
+
+
+@wp.kernel(enable_backward=False)
+def _resolve(
+    view_world: wp.array[wp.int32],
+    poses: wp.array[wp.transform],
+    rays: wp.array4d[wp.vec3],
+    soup: Soup,
+    hit_shape: wp.array3d[wp.int32],
+    hit_face: wp.array3d[wp.int32],
+    albedo: wp.array3d[wp.uint32],
+    normals: wp.array3d[wp.vec3],
+    depth: wp.array3d[wp.float32],
+):
+    view, y, x = wp.tid()
+    if view_world[view] < 0:
+        return
+    shape = hit_shape[view, y, x]
+    if shape < 0:
+        depth[view, y, x] = 0.0
+        return
+    pose = soup.transforms[shape]
+    inverse = wp.transform_inverse(pose)
+    # The ray in the shape's frame, where the triangle needs no transform.
+    start = wp.transform_point(inverse, wp.transform_get_translation(poses[view]))
+    along = wp.transform_vector(inverse, wp.transform_vector(poses[view], rays[y, x, 0, 1]))
+    corners = soup.faces[hit_face[view, y, x]]
+    scale = soup.scales[shape]
+    p0 = wp.cw_mul(scale, soup.vertices[corners[0]]) - start
+    p1 = wp.cw_mul(scale, soup.vertices[corners[1]]) - start
+    p2 = wp.cw_mul(scale, soup.vertices[corners[2]]) - start
+    normal = wp.cross(p1 - p0, p2 - p0)
+    t = wp.dot(normal, p0) / wp.dot(normal, along)
+    # Weights from the triangle's own edges around the hit point; outside by rounding at most.
+    hit = along * t
+    square = wp.dot(normal, normal)
+    w1 = wp.clamp(wp.dot(wp.cross(p2 - hit, p0 - hit), normal) / square, 0.0, 1.0)
+    w2 = wp.clamp(wp.dot(wp.cross(p0 - hit, p1 - hit), normal) / square, 0.0, 1.0)
+    w0 = wp.max(1.0 - w1 - w2, 0.0)
+    smooth = soup.normals[corners[0]] * w0 + soup.normals[corners[1]] * w1 + soup.normals[corners[2]] * w2
+    if wp.dot(smooth, smooth) > 0.0:
+        normal = wp.cw_div(smooth, scale)
+    colour = soup.colors[shape]
+    if soup.texture[shape] >= 0:
+        place = soup.texture_place[soup.texture[shape]]
+        uv = soup.uvs[corners[0]] * w0 + soup.uvs[corners[1]] * w1 + soup.uvs[corners[2]] * w2
+        u = uv[0] * wp.float32(place[1]) - 0.5
+        v = (1.0 - uv[1]) * wp.float32(place[2]) - 0.5
+        column = wp.int32(wp.floor(u))
+        row = wp.int32(wp.floor(v))
+        fu = u - wp.floor(u)
+        fv = v - wp.floor(v)
+        above = _texel(soup, place, column, row) * (1.0 - fu) + _texel(soup, place, column + 1, row) * fu
+        below = _texel(soup, place, column, row + 1) * (1.0 - fu) + _texel(soup, place, column + 1, row + 1) * fu
+        seen = above * (1.0 - fv) + below * fv
+        colour = wp.cw_mul(colour, wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
+    albedo[view, y, x] = (
+        wp.uint32(wp.clamp(_srgb(colour[0]), 0.0, 1.0) * 255.0)
+        | (wp.uint32(wp.clamp(_srgb(colour[1]), 0.0, 1.0) * 255.0) << wp.uint32(8))
+        | (wp.uint32(wp.clamp(_srgb(colour[2]), 0.0, 1.0) * 255.0) << wp.uint32(16))
+    )
+    normals[view, y, x] = wp.normalize(wp.transform_vector(pose, normal))
+    depth[view, y, x] = t
+
+
+def launch_rasterize(
+    *,
+    view_world: wp.array,
+    poses: wp.array,
+    rays: wp.array,
+    soup: Soup,
+    tangents: tuple[float, float],
+    nearness: wp.array,
+    hit_shape: wp.array,
+    hit_face: wp.array,
+    albedo: wp.array,
+    normals: wp.array,
+    depth: wp.array,
+) -> None:
+    """Albedo, normal and depth of the nearest triangle of each pixel, one view after the other (CPU).
+
+    Each ray searches every tree anew; drawing each triangle once was measured 3 to 4 times faster on one core.
+
+    Args:
+        view_world: int32 [views], world of each view, negative to leave its picture as it is.
+        poses: Camera poses [m], shape [views].
+        rays: Camera-space origin (zero) and unit direction, shape [H, W, 1, 2].
+        soup: Triangles of the model.
+        tangents: Tangents of half the horizontal and half the vertical view.
+        nearness: Work space, float32 [views, H, W]: 1/distance along the view axis [1/m].
+        hit_shape: Work space, int32, same shape: shape of the nearest triangle, −1 for none.
+        hit_face: Work space, int32, same shape: the triangle.
+        albedo: Out, sRGB packed as RGBA, uint32, same shape.
+        normals: Out, world-space normals, same shape.
+        depth: Out, distance along the ray [m], 0 where it met nothing, same shape.
+    """
+    device = depth.device
+    wp.launch(
+        _rasterize,
+        dim=poses.shape[0],
+        inputs=[view_world, poses, soup, *tangents],
+        outputs=[nearness, hit_shape, hit_face],
+        device=device,
+    )
+    wp.launch(
+        _resolve,
+        dim=depth.shape,
+        inputs=[view_world, poses, rays, soup, hit_shape, hit_face],
+        outputs=[albedo, normals, depth],
+        device=device,
+    )
+
+
 @wp.func
 def _radiance(
     albedo: wp.vec3, normal: wp.vec3, distant: wp.int32, to_light: wp.vec3, light: wp.vec3, visible: wp.float32
@@ -93,11 +390,8 @@ def _radiance(
 
 @wp.func
 def _display(radiance: wp.float32) -> wp.float32:
-    """Tone curve and sRGB encoding (IEC 61966-2-1) to [0, 1]."""
-    y = 1.0 - wp.exp(-EXPOSURE * radiance)
-    if y <= 0.0031308:
-        return 12.92 * y
-    return 1.055 * wp.pow(y, 1.0 / 2.4) - 0.055
+    """Tone curve and sRGB encoding to [0, 1]."""
+    return _srgb(1.0 - wp.exp(-EXPOSURE * radiance))
 
 
 @wp.func

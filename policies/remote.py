@@ -46,7 +46,7 @@ class _Connection:
     def __init__(self, url: str, context: ssl.SSLContext | None):
         parts = urlsplit(url)
         self._url, self._path = url, parts.path.rstrip("/")
-        self._host, self._port, self._context = parts.hostname, parts.port, context
+        self._host, self._port, self._context = parts.hostname or "", parts.port, context
         self._http: http.client.HTTPConnection | None = None
         self._aborted = False
 

@@ -62,12 +62,15 @@ class _Unfit(Exception):
 class _Linear(torch.nn.Module):
     """A matrix product whose weights are packed for the processor (about twice as fast on a CPU for few rows)."""
 
+    weight: torch.Tensor
+    bias: torch.Tensor | None
+
     def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None):
         super().__init__()
         self.register_buffer("weight", weight.contiguous())
         self.register_buffer("bias", bias)
         self._packed: torch.Tensor | None = None
-        self._product: Callable | None = None
+        self._product: Callable[..., torch.Tensor] = functional.linear
         if weight.device.type == "cpu" and weight.numel() >= _PACK_FROM and torch.backends.mkldnn.is_available():
             try:
                 self._packed = torch.ops.mkldnn._reorder_linear_weight(self.weight, _PACK_ROWS)
@@ -102,7 +105,8 @@ class _Call(torch.nn.Module):
     def __init__(self, function: Callable[..., torch.Tensor], constants: dict[int, torch.Tensor] | None = None):
         super().__init__()
         self.function = function
-        self.places = tuple(sorted(constants or {}))
+        constants = constants or {}
+        self.places = tuple(sorted(constants))
         for place in self.places:
             self.register_buffer(f"constant_{place}", constants[place])
 
@@ -319,7 +323,7 @@ def _slices(shape: torch.Size, static: dict[int, torch.Tensor]) -> tuple[slice, 
     return tuple(slices)
 
 
-def _evaluate(op: str, x: list[torch.Tensor | None], attributes: dict[str, Any]) -> torch.Tensor:
+def _evaluate(op: str, x: list[Any], attributes: dict[str, Any]) -> torch.Tensor:
     """One ONNX operator in torch (operator set 11 and later)."""
     if op in _UNARY:
         return _UNARY[op](x[0])

@@ -18,7 +18,9 @@ OFFICIAL = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2"
 
 def difference(path: Path, in_width: int, out_width: int, *, rows: int = 1000) -> float:
     x = np.random.default_rng(1).standard_normal((rows, in_width)).astype(np.float32)
-    expected = onnxruntime.InferenceSession(str(path)).run(None, {"input": x})[0]
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    expected = onnxruntime.InferenceSession(str(path), options).run(None, {"input": x})[0]
     network = onnx_mlp.load(path, in_width=in_width, out_width=out_width)
     with torch.inference_mode():
         whole = network(torch.from_numpy(x)).numpy()

@@ -72,7 +72,8 @@ def test_pd_passes_reference():
     tracker.reset(torch.ones(3, dtype=torch.bool))
     tracker.prefill(command, state)
     assert tracker.step(command, state) is joints
-    assert tracker.joints == MUJOCO_JOINTS and tracker.drive is TWIST2_DRIVE
+    assert tracker.joints == MUJOCO_JOINTS and tracker.drive.effort == TWIST2_DRIVE.effort
+    assert len(tracker.drive.kp) == len(tracker.drive.kd) == 29
 
 
 def test_registration():

@@ -74,7 +74,7 @@ def _admitted() -> dict[tuple[str, str], Any]:
     for package in ("numpy._core", "numpy.core"):
         admitted[f"{package}.multiarray", "_reconstruct"] = multiarray._reconstruct
         admitted[f"{package}.multiarray", "scalar"] = multiarray.scalar
-        admitted[f"{package}.numeric", "_frombuffer"] = numeric._frombuffer
+        admitted[f"{package}.numeric", "_frombuffer"] = getattr(numeric, "_frombuffer")  # noqa: B009 (private)
     return admitted
 
 

@@ -1,0 +1,217 @@
+"""Promises of the cameras, on a small Newton model with one light per world."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+newton = pytest.importorskip("newton")
+wp = pytest.importorskip("warp")
+
+from arena_newton.camera import Camera, CameraConfig, WorldLights  # noqa: E402
+from arena_newton.errors import InputError  # noqa: E402
+
+WORLDS = 3
+DOWN = (0.0, 0.0, -1.0)
+
+
+def _light(direction, intensity=5000.0, color=(0.75, 0.75, 0.75)):
+    direction = np.asarray(direction, float)
+    return SimpleNamespace(direction=direction / np.linalg.norm(direction), intensity=intensity, color=color)
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Ground, a textured mesh, a sphere and a free box at (0, 0, 1) in each of three worlds."""
+    world = newton.ModelBuilder()
+    world.add_ground_plane(color=(0.6, 0.6, 0.6))
+    body = world.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()))
+    world.add_shape_box(body, hx=0.2, hy=0.2, hz=0.2, color=(0.8, 0.1, 0.1))
+    # One of each primitive, lying at different angles beyond what the other tests look at.
+    tilt = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.5, 0.2)), 0.9)
+    world.add_shape_capsule(-1, xform=wp.transform(wp.vec3(-1.5, -1.2, 0.3), tilt), radius=0.1, half_height=0.3)
+    world.add_shape_cylinder(-1, xform=wp.transform(wp.vec3(-0.5, -1.2, 0.3), tilt), radius=0.1, half_height=0.3)
+    world.add_shape_cone(-1, xform=wp.transform(wp.vec3(0.5, -1.2, 0.3), tilt), radius=0.2, half_height=0.3)
+    world.add_shape_ellipsoid(-1, xform=wp.transform(wp.vec3(1.5, -1.2, 0.3), tilt), rx=0.1, ry=0.2, rz=0.3)
+    ball = wp.transform(wp.vec3(-1.0, 0.0, 0.3), wp.quat_identity())
+    world.add_shape_sphere(-1, xform=ball, radius=0.3, color=(0.1, 0.1, 0.8))
+    stripes = np.zeros((8, 8, 3), np.uint8)
+    stripes[:, ::2] = 255
+    quad = newton.Mesh(
+        np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], np.float32),
+        np.array([0, 1, 2, 0, 2, 3], np.int32),
+        uvs=np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32),
+        texture=stripes,
+        compute_inertia=False,
+    )
+    carpet = wp.transform(wp.vec3(1.2, 0.0, 0.01), wp.quat_identity())
+    world.add_shape_mesh(-1, xform=carpet, mesh=quad, color=(1.0, 1.0, 1.0))
+    builder = newton.ModelBuilder()
+    builder.replicate(world, WORLDS)
+    return builder.finalize(device="cpu")
+
+
+def _camera(model, lights, width=80, height=60, **options):
+    # 5 m above the floor, looking straight down, +x to the right and +y up.
+    lens = {"focal_length": 7.6, "horizontal_aperture": 7.6}
+    body = np.full(WORLDS, -1)
+    position, quat = (0.0, 0.0, 5.0), (1.0, 0.0, 0.0, 0.0)
+    options = lens | options
+    return Camera(model, body, position, quat, width=width, height=height, lights=lights, **options)
+
+
+def _pixel(x, y, z=0.0, width=80, height=60):
+    scale = width / (5.0 - z)
+    return int(height / 2 - y * scale), int(width / 2 + x * scale)
+
+
+def test_light_differs_by_world_in_one_batch(model):
+    """One render shows a dome without shadow, and two suns whose shadows fall to opposite sides."""
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    lights.set(1, _light((1, 0, -2)))
+    lights.set(2, _light((-1, 0, -2), color=(0.85, 0.65, 0.65)))
+    image = _camera(model, lights).render(model.state()).numpy().astype(int)
+    # The box hangs 0.8 to 1.2 m above the floor: light that travels along +x throws its shadow to 0.2 < x < 0.8.
+    shadow, open_floor = _pixel(0.55, 0.0), _pixel(0.4, 1.2)
+    dome, right, left = (image[w] for w in range(WORLDS))
+    assert abs(dome[shadow] - dome[open_floor]).max() <= 2
+    assert right[shadow].sum() < 0.75 * right[open_floor].sum()
+    assert left[shadow].sum() > 0.95 * left[open_floor].sum()
+    # Likewise beside the ball that lies at x = -1.
+    assert right[_pixel(-0.6, 0.0)].sum() < 0.75 * right[open_floor].sum()
+    assert left[open_floor][0] > left[open_floor][1]
+
+
+def test_texture_and_colour_arrive(model):
+    """The carpet shows its eight stripes, the box is red, the ball blue."""
+    image = _camera(model, WorldLights.allocate(WORLDS, "cpu"), 320, 240).render(model.state()).numpy()[0].astype(int)
+    row, left = _pixel(0.72, 0.2, width=320, height=240)
+    _, right = _pixel(1.68, 0.2, width=320, height=240)
+    bright = image[row, left:right].mean(-1) > 120
+    assert np.abs(np.diff(bright.astype(int))).sum() >= 6
+    red, blue = (
+        image[_pixel(0, 0, 1.2, 320, 240)],
+        image[_pixel(-1, 0, 0.6, 320, 240)],
+    )
+    assert red[0] > 1.5 * red[2]
+    assert blue[2] > 1.5 * blue[0]
+
+
+def test_mask_leaves_other_worlds_alone(model):
+    """Only the worlds asked for are drawn; torch tensors and arrays are accepted as masks."""
+    import torch
+
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    camera = _camera(model, lights)
+    before = camera.render(model.state()).numpy().copy()
+    for world in range(WORLDS):
+        lights.set(world, None, dome_intensity=1000.0)
+    for mask in (np.array([False, True, False]), torch.tensor([False, True, False])):
+        after = camera.render(model.state(), mask).numpy()
+        assert (after[0] == before[0]).all()
+        assert (after[2] == before[2]).all()
+        assert after[1].mean() < before[1].mean() - 20
+
+
+def test_camera_rides_its_body(model):
+    """A camera fixed to a body moves with it, each in its own world."""
+    body = np.arange(WORLDS) * (model.body_count // WORLDS)
+    state = model.state()
+    poses = state.body_q.numpy()
+    poses[body[1], 2] = 3.0
+    state.body_q.assign(poses)
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    camera = Camera(
+        model, body, (0, 0, 1), (1, 0, 0, 0), width=16, height=16, focal_length=1, horizontal_aperture=1, lights=lights
+    )
+    camera.render(state)
+    np.testing.assert_allclose(camera.poses.numpy()[:, 2], [2.0, 4.0, 2.0], atol=1e-6)
+
+
+def test_pad_keeps_the_sensor_aspect(model):
+    """`pad` puts the 4:3 picture in the middle of a square with black above and below."""
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    square = _camera(model, lights, 64, 64, fit="pad").render(model.state()).numpy()[0]
+    plain = _camera(model, lights, 64, 48).render(model.state()).numpy()[0]
+    assert (square[:8] == 0).all()
+    assert (square[-8:] == 0).all()
+    assert (square[8:-8] == plain).all()
+    assert CameraConfig().fit == "pad"
+
+
+def test_samples_smooth_edges(model):
+    """Several rays a pixel keep the picture's brightness and add shades between box and floor."""
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    hard = _camera(model, lights).render(model.state()).numpy()[0].astype(float)
+    soft = _camera(model, lights, samples=3).render(model.state()).numpy()[0].astype(float)
+    assert abs(hard.mean() - soft.mean()) < 2
+    assert len(np.unique(soft.reshape(-1, 3), axis=0)) > len(np.unique(hard.reshape(-1, 3), axis=0))
+
+
+def test_drawing_agrees_with_ray_tracing(model):
+    """What the CPU draws is what Newton's ray tracer sees: albedo, normal and depth, but for silhouettes."""
+    camera = _camera(model, WorldLights.allocate(WORLDS, "cpu"), 160, 120)
+    camera.render(model.state())
+    drawn = [a.numpy().copy() for a in (camera._depth, camera._normals, camera._albedo)]
+    camera._trace(model.state())
+    traced = [a.numpy() for a in (camera._depth, camera._normals, camera._albedo)]
+    # Tessellated round shapes lie up to 1 % of their radius inside the exact ones.
+    assert (np.abs(drawn[0] - traced[0]) > 1e-2).mean() < 0.003
+    assert (np.abs(drawn[1] - traced[1]).max(-1) > 0.05).mean() < 0.006
+    albedo = [a.view(np.uint8).reshape(*a.shape, 4)[..., :3].astype(int) for a in (drawn[2], traced[2])]
+    assert (np.abs(albedo[0] - albedo[1]).max(-1) > 2).mean() < 0.01
+
+
+def test_stage_light_is_the_base_light():
+    """The base light is the stage's: a dome, or a distant light along its local −z."""
+    pxr = pytest.importorskip("pxr")
+    from pxr import Gf, Usd, UsdGeom, UsdLux
+
+    assert pxr
+    stage = Usd.Stage.CreateInMemory()
+    dome = UsdLux.DomeLight.Define(stage, "/World/Light")
+    dome.CreateIntensityAttr(1200.0)
+    dome.CreateColorAttr(Gf.Vec3f(0.5, 0.5, 1.0))
+    lights = WorldLights.allocate(2, "cpu", stage)
+    lights.upload()
+    np.testing.assert_allclose(lights.radiance.numpy()[1], [600, 600, 1200])
+    assert (lights.distant.numpy() == 0).all()
+
+    stage = Usd.Stage.CreateInMemory()
+    sun = UsdLux.DistantLight.Define(stage, "/World/Light")
+    sun.CreateIntensityAttr(5000.0)
+    UsdGeom.Xformable(sun.GetPrim()).AddRotateXOp().Set(90.0)
+    lights = WorldLights.allocate(1, "cpu", stage)
+    lights.upload()
+    assert lights.distant.numpy()[0] == 1
+    np.testing.assert_allclose(lights.direction.numpy()[0], [0, 1, 0], atol=1e-6)
+
+
+def test_bad_input_is_named(model):
+    """Wrong sizes, fits, lights and light directions are answered with one clear line."""
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    with pytest.raises(InputError, match="positive"):
+        _camera(model, lights, width=0)
+    with pytest.raises(InputError, match="native or pad"):
+        _camera(model, lights, fit="stretch")
+    with pytest.raises(InputError, match="lights of 1 worlds"):
+        _camera(model, WorldLights.allocate(1, "cpu"))
+    with pytest.raises(InputError, match="direction"):
+        lights.set(0, SimpleNamespace(direction=(0, 0, 0), intensity=1.0, color=(1, 1, 1)))
+
+
+def test_frame_cost_on_one_core(model):
+    """A 224×224 frame with shadows and textures stays far from a tenth of a second of CPU time."""
+    import time
+
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    lights.set(0, _light(DOWN))
+    camera = _camera(model, lights, 224, 224)
+    state, mask = model.state(), np.array([True, False, False])
+    camera.render(state, mask)
+    spent = []
+    for _ in range(5):
+        start = time.process_time()
+        camera.render(state, mask)
+        spent.append(time.process_time() - start)
+    assert min(spent) < 0.1

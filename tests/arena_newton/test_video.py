@@ -1,0 +1,81 @@
+"""Promises of videos and film strips."""
+
+import numpy as np
+import pytest
+
+from arena_newton.errors import ArenaError
+from arena_newton.video import VideoWriter, film_strip
+
+
+def _frames(n, height=48, width=64):
+    frames = np.zeros((n, height, width, 3), np.uint8)
+    for i in range(n):
+        frames[i] = (i * 20) % 256
+    return frames
+
+
+def test_video_is_h264_with_every_frame(tmp_path):
+    """The file is H.264 yuv420p of the given size and rate, holds every frame, and appears only when closed."""
+    av = pytest.importorskip("av")
+    path = tmp_path / "a" / "run.mp4"
+    writer = VideoWriter(path, 64, 48, fps=25.0)
+    for frame in _frames(12):
+        writer.write(frame)
+    assert not path.exists()
+    writer.close()
+    writer.close()
+    assert sorted(p.name for p in path.parent.iterdir()) == ["run.mp4"]
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 48, "yuv420p")
+        assert float(stream.average_rate) == 25.0
+        decoded = [f.to_ndarray(format="rgb24") for f in container.decode(stream)]
+    assert len(decoded) == 12
+    assert abs(int(decoded[5].mean()) - 100) < 6
+
+
+def test_odd_sizes_are_padded(tmp_path):
+    """A frame of odd size gets one black row or column."""
+    av = pytest.importorskip("av")
+    with VideoWriter(tmp_path / "odd.mp4", 33, 21) as writer:
+        writer.write(np.full((21, 33, 3), 255, np.uint8))
+    with av.open(str(tmp_path / "odd.mp4")) as container:
+        frame = next(container.decode(video=0)).to_ndarray(format="rgb24")
+    assert frame.shape == (22, 34, 3)
+    assert frame[:20, :32].mean() > 240
+
+
+def test_failed_video_leaves_nothing(tmp_path):
+    """Neither an interrupted video nor one without frames leaves a file."""
+    with pytest.raises(RuntimeError), VideoWriter(tmp_path / "x.mp4", 64, 48) as writer:
+        writer.write(_frames(1)[0])
+        raise RuntimeError
+    VideoWriter(tmp_path / "y.mp4", 64, 48).close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_frame_is_refused(tmp_path):
+    """A frame of another size or type is answered with one clear line."""
+    writer = VideoWriter(tmp_path / "x.mp4", 64, 48)
+    with pytest.raises(ArenaError, match="expected frames of 64×48"):
+        writer.write(np.zeros((40, 64, 3), np.uint8))
+    with pytest.raises(ArenaError, match="uint8"):
+        writer.write(np.zeros((48, 64, 3), np.float32))
+    writer.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_film_strip_spaces_frames_evenly(tmp_path):
+    """Ten frames side by side, first and last included, with a label line above on request."""
+    image = pytest.importorskip("PIL.Image")
+    frames = _frames(12)
+    plain = np.asarray(image.open(film_strip(frames, tmp_path / "s.png")))
+    assert plain.shape == (48, 10 * 64 + 9 * 4, 3)
+    assert plain[10, 10, 0] == frames[0, 0, 0, 0]
+    assert plain[10, -10, 0] == frames[11, 0, 0, 0]
+    labelled = np.asarray(image.open(film_strip(list(frames[:3]), tmp_path / "t.png", label="football success")))
+    assert labelled.shape[0] > 48
+    assert labelled.shape[1] == 3 * 64 + 2 * 4
+    with pytest.raises(ArenaError, match="at least one frame"):
+        film_strip([], tmp_path / "u.png")

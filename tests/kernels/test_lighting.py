@@ -1,0 +1,197 @@
+"""Promises of the camera kernels."""
+
+import numpy as np
+import pytest
+
+wp = pytest.importorskip("warp")
+
+from arena_newton.kernels import lighting  # noqa: E402
+
+EXPOSURE, BOUNCE, AMBIENT, DIRECT = 1.0 / 1700.0, 0.45, 0.2, 0.5
+
+
+@wp.kernel
+def _colour(
+    albedo: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    distant: wp.array[wp.int32],
+    to_light: wp.array[wp.vec3],
+    light: wp.array[wp.vec3],
+    visible: wp.array[wp.float32],
+    out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    seen = lighting._radiance(albedo[i], normal[i], distant[i], to_light[i], light[i], visible[i])
+    out[i] = wp.vec3(lighting._display(seen[0]), lighting._display(seen[1]), lighting._display(seen[2]))
+
+
+@wp.func
+def _nothing(
+    pose: wp.transform, size: wp.vec3, kind: wp.int32, origin: wp.vec3, direction: wp.vec3, cull: wp.bool
+) -> tuple[float, wp.vec3]:
+    return -1.0, wp.vec3(0.0)
+
+
+def srgb(value):
+    """NumPy twin of the sRGB encoding."""
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055)
+
+
+def shade(albedo, normal, distant, to_light, light, visible):
+    """NumPy twin of the shading, before quantisation."""
+    ambient = BOUNCE + (1 - BOUNCE) * 0.5 * (normal[:, 2] + 1)
+    sun = AMBIENT * ambient + DIRECT * np.maximum((normal * to_light).sum(1), 0) * visible
+    share = np.where(distant == 1, sun, ambient)
+    return srgb(1 - np.exp(-EXPOSURE * albedo * light * share[:, None]))
+
+
+def _unit(rng, n):
+    v = rng.normal(size=(n, 3))
+    return (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_shading_equals_its_numpy_twin():
+    """Dome and distant shading, tone curve and sRGB encoding agree with NumPy to 1e-6 before quantisation."""
+    rng, n = np.random.default_rng(0), 4000
+    albedo = rng.random((n, 3), dtype=np.float32)
+    normal, to_light = _unit(rng, n), _unit(rng, n)
+    distant = rng.integers(0, 2, n).astype(np.int32)
+    light = (rng.uniform(1000, 7000, n)[:, None] * rng.uniform(0.65, 0.85, (n, 3))).astype(np.float32)
+    visible = rng.integers(0, 2, n).astype(np.float32)
+    out = wp.zeros(n, dtype=wp.vec3, device="cpu")
+    arrays = [albedo, normal, distant, to_light, light, visible]
+    kinds = [wp.vec3, wp.vec3, wp.int32, wp.vec3, wp.vec3, wp.float32]
+    inputs = [wp.array(a, dtype=k, device="cpu") for a, k in zip(arrays, kinds, strict=True)]
+    wp.launch(_colour, dim=n, inputs=inputs, outputs=[out], device="cpu")
+    expected = shade(*(a.astype(np.float64) for a in arrays))
+    assert np.abs(out.numpy() - expected).max() < 1e-6
+
+
+def test_exposure_is_as_documented():
+    """A mid grey floor is well exposed under the dome, and no light of the visual mode clips a white wall."""
+    up = np.array([[0.0, 0, 1]])
+    dome = shade(np.full((1, 3), 0.5), up, np.array([0]), up, np.full((1, 3), 2250.0), np.ones(1))
+    assert srgb(np.array(0.48)) == pytest.approx(dome.max(), abs=0.01)
+    brightest = shade(np.full((1, 3), 0.9), up, np.array([1]), up, np.full((1, 3), 7000 * 0.85), np.ones(1))
+    darkest = shade(np.full((1, 3), 0.5), up, np.array([1]), up, np.full((1, 3), 3000 * 0.65), np.ones(1))
+    assert brightest.max() < 0.95
+    assert darkest.min() > 0.5
+
+
+def test_camera_pose_follows_its_body():
+    """The camera pose is body pose times local pose, and the local pose itself without a body."""
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), np.pi / 2)
+    body_q = wp.array([wp.transform(wp.vec3(1, 2, 3), turn)], dtype=wp.transform, device="cpu")
+    poses = wp.zeros(2, dtype=wp.transform, device="cpu")
+    local = wp.transform(wp.vec3(1.0, 0.0, 0.0), wp.quat_identity())
+    lighting.launch_camera_poses(body_q, wp.array([0, -1], dtype=wp.int32, device="cpu"), local, poses)
+    found = poses.numpy()
+    np.testing.assert_allclose(found[0], [1, 3, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-6)
+    np.testing.assert_allclose(found[1], [1, 0, 0, 0, 0, 0, 1], atol=1e-6)
+
+
+def _soup(vertices, faces, color):
+    soup = lighting.Soup()
+
+    def array(values, kind):
+        return wp.array(values, dtype=kind, device="cpu")
+
+    soup.world_start, soup.shapes = array([0, 1, 1], wp.int32), array([0], wp.int32)
+    soup.face_start = array([0, len(faces)], wp.int32)
+    soup.spheres, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
+    soup.transforms = array([[0, 0, 0, 0, 0, 0, 1]], wp.transform)
+    soup.colors, soup.texture = array([color], wp.vec3), array([-1], wp.int32)
+    soup.faces, soup.vertices = array(faces, wp.vec3i), array(vertices, wp.vec3)
+    soup.normals, soup.uvs = array(np.zeros((len(vertices), 3)), wp.vec3), array(np.zeros((len(vertices), 2)), wp.vec2)
+    soup.texels = array(np.zeros(0, np.uint8), wp.uint8)
+    soup.texture_place = array(np.zeros((0, 3), np.int32), wp.vec3i)
+    return soup
+
+
+def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48):
+    x = (np.arange(width) + 0.5) / width * 2 - 1
+    y = 1 - (np.arange(height) + 0.5) / height * 2
+    rays = np.zeros((height, width, 1, 2, 3), np.float32)
+    rays[:, :, 0, 1] = np.stack(np.broadcast_arrays(x[None] * tangents[0], y[:, None] * tangents[1], -1.0), -1)
+    rays[:, :, 0, 1] /= np.linalg.norm(rays[:, :, 0, 1], axis=-1, keepdims=True)
+
+    def empty(kind):
+        return wp.zeros((1, height, width), dtype=kind, device="cpu")
+
+    out = {"albedo": empty(wp.uint32), "normals": empty(wp.vec3), "depth": empty(wp.float32)}
+    lighting.launch_rasterize(
+        view_world=wp.zeros(1, dtype=wp.int32, device="cpu"),
+        poses=wp.array([[0, 0, 0, 0, 0, 0, 1]], dtype=wp.transform, device="cpu"),
+        rays=wp.array(rays, dtype=wp.vec3, device="cpu"),
+        soup=_soup(vertices, faces, (0.25, 0.5, 1.0)),
+        tangents=tangents,
+        nearness=empty(wp.float32),
+        hit_shape=empty(wp.int32),
+        hit_face=empty(wp.int32),
+        **out,
+    )
+    return rays[:, :, 0, 1], {k: v.numpy()[0] for k, v in out.items()}
+
+
+def test_drawn_triangles_meet_the_rays():
+    """Random triangles, some through the camera's plane, are found where ray–triangle intersection finds them."""
+    rng = np.random.default_rng(3)
+    vertices = rng.uniform(-3, 3, (60, 3)).astype(np.float32)
+    faces = np.arange(60).reshape(-1, 3)
+    rays, out = _draw(vertices, faces)
+    best = np.full(rays.shape[:2], np.inf)
+    for p0, p1, p2 in vertices[faces].astype(np.float64):
+        d = rays.astype(np.float64)
+        h = np.cross(d, p2 - p0)
+        det = h @ (p1 - p0)
+        u = h @ -p0 / det
+        q = np.cross(-p0, p1 - p0)
+        v, t = d @ q / det, q @ (p2 - p0) / det
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t * -d[..., 2] > 0.002)
+        best = np.where(hit & (t < best), t, best)
+    found = np.where(out["depth"] > 0, out["depth"], np.inf)
+    same = (found == best) | (np.abs(found - best) < 1e-3 * np.maximum(1, best))
+    assert same.mean() > 0.995
+    assert np.isfinite(best).mean() > 0.3
+
+
+def test_a_floor_has_no_cracks():
+    """A fan of triangles covers its plane without a hole, and its colour and depth are the plane's."""
+    angle = np.linspace(0, 2 * np.pi, 40)[:-1]
+    rim = np.stack([30 * np.cos(angle), 30 * np.sin(angle), np.full_like(angle, -2.0)], 1)
+    vertices = np.vstack([[0.1, -0.2, -2.0], rim]).astype(np.float32)
+    faces = [[0, 1 + i, 1 + (i + 1) % 39] for i in range(39)]
+    rays, out = _draw(vertices, np.array(faces))
+    np.testing.assert_allclose(out["depth"] * -rays[..., 2], 2.0, rtol=1e-4)
+    colour = out["albedo"].view(np.uint8).reshape(*out["albedo"].shape, 4)[..., :3]
+    assert np.abs(colour.astype(int) - np.round(srgb(np.array([0.25, 0.5, 1.0])) * 255)).max() <= 1
+
+
+def test_masked_view_keeps_its_picture():
+    """A view whose world index is negative is not written."""
+    image = wp.full((1, 2, 2, 3), 7, dtype=wp.uint8, device="cpu")
+    one = wp.zeros((1, 2, 2), dtype=wp.float32, device="cpu")
+    box = wp.Bvh(wp.zeros(1, dtype=wp.vec3, device="cpu"), wp.zeros(1, dtype=wp.vec3, device="cpu"))
+    scene = lighting.Occluders()
+    scene.bvh = box.id
+    for world, expected in ((-101, 7), (0, 255)):
+        lighting.launch_shade(
+            _nothing,
+            7,
+            view_world=wp.array([world], dtype=wp.int32, device="cpu"),
+            poses=wp.zeros(1, dtype=wp.transform, device="cpu"),
+            rays=wp.zeros((2, 2, 1, 2), dtype=wp.vec3, device="cpu"),
+            albedo=wp.zeros((1, 2, 2), dtype=wp.uint32, device="cpu"),
+            normals=wp.zeros((1, 2, 2), dtype=wp.vec3, device="cpu"),
+            depth=one,
+            decode=wp.zeros(256, dtype=wp.float32, device="cpu"),
+            scene=scene,
+            distant=wp.zeros(1, dtype=wp.int32, device="cpu"),
+            direction=wp.zeros(1, dtype=wp.vec3, device="cpu"),
+            light=wp.array([[1e5, 1e5, 1e5]], dtype=wp.vec3, device="cpu"),
+            samples=1,
+            size=(2, 2),
+            origin=(0, 0),
+            image=image,
+        )
+        assert (image.numpy() == expected).all()
