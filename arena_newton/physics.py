@@ -7,6 +7,7 @@ shape [worlds, n]; the free joint's quaternion is wxyz, its angular velocity is 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -175,29 +176,28 @@ class MujocoPhysics(Physics):
         self._np["overflow"] = self.overflow.numpy()
         self._np["latch"] = self.latch_locked.numpy()
         self.threads = max(1, min(threads or len(os.sched_getaffinity(0)), self.worlds))
-        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
-        self._shares = np.array_split(np.arange(self.worlds), self.threads)
+        self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
+        self._every = np.arange(self.worlds)
         self._active = np.ones(self.worlds, dtype=bool)
-        every = np.arange(self.worlds)
         mocap = (np.tile(self.mocap_pos0, (self.worlds, 1, 1)), np.tile(self.mocap_quat0, (self.worlds, 1, 1)))
-        self.reset_worlds(every, self.qpos0, *mocap)
+        self.reset_worlds(self._every, self.qpos0, *mocap)
 
-    def _each(self, work: Any) -> None:
-        if self._pool is None:
-            work(self._shares[0])
-        else:
-            list(self._pool.map(work, self._shares))
+    def _each(self, work: Any, worlds: np.ndarray) -> None:
+        # One iterator for all threads: each takes the next world when it is free, so that a slow core delays nobody.
+        shared = iter(worlds.tolist())
+        others = [self._pool.submit(work, shared) for _ in range(self.threads - 1)] if self._pool else []
+        work(shared)
+        for other in others:
+            other.result()
 
     def set_active(self, mask: np.ndarray) -> None:
         """Step only the worlds of a bool mask [worlds]; the others keep their state."""
         self._active[:] = mask
 
-    def _step_share(self, share: np.ndarray) -> None:
+    def _step_share(self, share: Iterator[int]) -> None:
         m, n, step = self._m, self.rate.substeps, self._mj.mj_step
         ctrl, latch, equality = self._np["ctrl"], self._np["latch"], self.scene.latch_equality
         for w in share:
-            if not self._active[w]:
-                continue
             d = self._data[w]
             d.ctrl[:] = ctrl[w]
             if equality >= 0:
@@ -215,18 +215,18 @@ class MujocoPhysics(Physics):
         out["xquat"][w] = d.xquat
         out["xipos"][w] = d.xipos
 
-    def _bare_share(self, share: np.ndarray) -> None:
+    def _bare_share(self, share: Iterator[int]) -> None:
         m, n, step, data = self._m, self.rate.substeps, self._mj.mj_step, self._data
         for w in share:
             step(m, data[w], n)
 
     def mj_step_only(self) -> None:
         """Nothing but `mj_step` on the same threads: what `bench` divides by."""
-        self._each(self._bare_share)
+        self._each(self._bare_share, self._every)
 
     def bare_step(self) -> None:
         """Only the physics of one tick."""
-        self._each(self._step_share)
+        self._each(self._step_share, np.flatnonzero(self._active))
 
     def read_contacts(self) -> None:
         """Contact forces and overflow flags of the last physics step."""

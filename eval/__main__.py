@@ -89,7 +89,8 @@ def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | No
             raise
         text = re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue())
         lines = [line.strip(" │╭╮╰╯─┃") for line in text.splitlines()]
-        message = " ".join(line for line in lines if line)
+        lines = [line for line in lines if line]
+        message = " ".join(lines[1:] or lines)  # the first is the title of tyro's box
         raise InputError(re.sub(r"\s*For full helptext,? .*$", "", message)) from None
 
 
@@ -124,6 +125,8 @@ def _resume(arguments: list[str], factories: Factories | None) -> int:
     from arena_newton.eval.run import execute, stored_options
 
     options = _parse(RunOptions, arguments, "resume", default=stored_options(folder))
+    if options.out != str(folder):
+        raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
     return execute(options, factories)
 
 

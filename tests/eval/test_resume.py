@@ -140,6 +140,13 @@ def test_finished_run_is_not_run_again(uninterrupted, capsys):
     assert tables(uninterrupted) == before
 
 
+def test_resume_stays_in_its_folder(tmp_path, uninterrupted, capsys):
+    """`resume` does not write elsewhere."""
+    assert main(["resume", str(uninterrupted), "--out", str(tmp_path / "o")], factories()) == 2
+    assert "drop --out" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
 class BreaksOnce(FakeEnv):
     """Breaks after two episodes of boxing."""
 
