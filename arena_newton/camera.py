@@ -1,7 +1,8 @@
-"""Ego, wrist and world cameras: one batched ray tracer, one light per world.
+"""Ego, wrist and world cameras: all worlds in one batch, one light per world.
 
-Newton's `SensorCamera` traces albedo, normal and depth; its lights are global to the sensor, so `kernels.lighting`
-shades those three per world and casts the shadow rays. Formula and exposure are documented there.
+Newton's `SensorCamera` has lights that are global to the sensor, so `kernels.lighting` shades albedo, normal and depth
+per world and casts the shadow rays (formula and exposure are documented there). It also draws those three from triangles:
+on the football scene 3 times faster than the sensor's ray tracer on one CPU core, 5 times on an H200 with 1024 worlds.
 """
 
 from __future__ import annotations
@@ -183,8 +184,8 @@ def _as_mesh(kind: int, size: np.ndarray, source: Any) -> tuple[Any, np.ndarray]
     return source, np.asarray(size)
 
 
-def _triangles(model: Any) -> Any:
-    """Every visible shape of a model as triangles, meshes stored once for all worlds."""
+def _triangles(model: Any) -> tuple[Any, int]:
+    """Every visible shape as triangles, meshes stored once for all worlds, and the most triangles a view can see."""
     import warp as wp
     from newton.utils import load_texture, normalize_texture
 
@@ -233,14 +234,18 @@ def _triangles(model: Any) -> Any:
 
     order = np.where(worlds[shapes] < 0, model.world_count, worlds[shapes])
     sort = np.argsort(order, kind="stable")
-    start = np.searchsorted(order[sort], np.arange(model.world_count + 2))
+    first, length = face_range[shapes[sort], 0], np.diff(face_range[shapes[sort]], axis=1)[:, 0]
+    entry_shape = np.repeat(shapes[sort], length)
+    entry_face = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length - first, length)
+    start = np.searchsorted(np.repeat(order[sort], length), np.arange(model.world_count + 2))
+    most = int(np.diff(start)[:-1].max() + start[-1] - start[-2])
 
     def array(values: Any, dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=model.device)
 
     soup = Soup()
-    soup.world_start, soup.shapes = array(start, wp.int32), array(shapes[sort], wp.int32)
-    soup.face_start, soup.spheres = array(face_range.reshape(-1), wp.int32), array(spheres, wp.vec4)
+    soup.world_start, soup.spheres = array(start, wp.int32), array(spheres, wp.vec4)
+    soup.shape, soup.face = array(entry_shape, wp.int32), array(entry_face, wp.int32)
     soup.scales, soup.transforms = array(scales, wp.vec3), model.bvh_shape_world_transforms
     soup.colors = array(_srgb_to_linear(model.shape_color.numpy()), wp.vec3)
     soup.texture = array(texture, wp.int32)
@@ -248,11 +253,11 @@ def _triangles(model: Any) -> Any:
     soup.normals, soup.uvs = array(np.concatenate(normals), wp.vec3), array(np.concatenate(uvs), wp.vec2)
     soup.texels = array(np.concatenate(texels) if texels else np.zeros(0, np.uint8), wp.uint8)
     soup.texture_place = array(np.array(places, np.int32).reshape(-1, 3), wp.vec3i)
-    return soup
+    return soup, most
 
 
 class _Tracer:
-    """What the cameras of one model share: Newton's sensor with its textures, and the shadow casters."""
+    """What the cameras of one model share: triangles and textures, shadow casters, and Newton's sensor."""
 
     _of_model: weakref.WeakKeyDictionary[Any, _Tracer] = weakref.WeakKeyDictionary()
 
@@ -293,7 +298,7 @@ class _Tracer:
         self.occluders.transforms = model.bvh_shape_world_transforms
         self.occluders.meshes = model.shape_source_ptr
         self.decode = wp.array(_srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=model.device)
-        self.soup = None if on_cuda else _triangles(model)
+        self.soup, self.triangles = _triangles(model)
 
     @classmethod
     def of(cls, model: Any) -> _Tracer:
@@ -386,10 +391,7 @@ class Camera:
             self._albedo = sensor.allocate_image_albedo(self.worlds, w, h)
             self._normals = sensor.allocate_image_normal(self.worlds, w, h)
             self._depth = sensor.allocate_image_depth(self.worlds, w, h)
-            if self._tracer.soup is not None:
-                self._nearness = wp.zeros((self.worlds, h, w), dtype=wp.float32)
-                self._hit_shape = wp.zeros((self.worlds, h, w), dtype=wp.int32)
-                self._hit_face = wp.zeros((self.worlds, h, w), dtype=wp.int32)
+            self._nearest = wp.zeros((self.worlds, h, w), dtype=wp.uint64)
             self.image = wp.zeros((self.worlds, height, width, 3), dtype=wp.uint8)
             """The pictures of the last render, uint8 [worlds, height, width, 3]."""
         self._torch_image = wp.to_torch(self.image)
@@ -476,10 +478,7 @@ class Camera:
         lights.upload()
         self.model.bvh_refit_shapes(state)
         lighting.launch_camera_poses(state.body_q, self._body, self._local, self.poses)
-        if tracer.soup is None:
-            self._trace(state)
-        else:
-            self._draw()
+        self._draw()
         lighting.launch_shade(
             tracer.ray_primitive,
             tracer.mesh_type,
@@ -502,7 +501,7 @@ class Camera:
         return self._torch_image
 
     def _trace(self, state: Any) -> None:
-        """Albedo, normal and depth by rays: the way of a GPU."""
+        """The same by Newton's ray tracer: exact round shapes, slower; what `_draw` is tested against."""
         self._tracer.sensor.update(
             state,
             self.poses,
@@ -514,7 +513,7 @@ class Camera:
         )
 
     def _draw(self) -> None:
-        """The same by drawing triangles: the way of one CPU core."""
+        """Albedo, normal and depth by drawing triangles."""
         from arena_newton.kernels import lighting
 
         lighting.launch_rasterize(
@@ -523,9 +522,8 @@ class Camera:
             rays=self._rays,
             soup=self._tracer.soup,
             tangents=self._tangents,
-            nearness=self._nearness,
-            hit_shape=self._hit_shape,
-            hit_face=self._hit_face,
+            triangles=self._tracer.triangles,
+            nearest=self._nearest,
             albedo=self._albedo,
             normals=self._normals,
             depth=self._depth,

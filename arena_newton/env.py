@@ -413,7 +413,7 @@ class ArenaEnv:
                 steps=max(int(self.tick[w]), 0),
                 margin=float(self.judge.margin.numpy()[w]),
                 startup_fall=startup,
-                overflow=bool(self.physics.overflow.numpy()[w]),
+                overflow=self.physics.overflowed(w),
                 sim_s=float((self.tick[w] + SETTLE_TICKS) * g1.TICK),
                 wall_s=time.perf_counter() - started[w],
                 error=error,

@@ -85,7 +85,6 @@ class Physics:
         with wp.ScopedDevice(self.device):
             self.contact_force = wp.zeros((self.worlds, m.nbody), dtype=wp.float32)
             self.pair_force = wp.zeros(self.worlds, dtype=wp.float32)
-            self.overflow = wp.zeros(self.worlds, dtype=wp.int32)
             self.latch_locked = wp.full(self.worlds, 1, dtype=wp.int32)
         self._pair: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -111,7 +110,11 @@ class Physics:
         raise TypeError("use make_physics() for an engine")
 
     def read_contacts(self) -> None:
-        """Contact forces and overflow flags of the last physics step."""
+        """Contact forces of the last physics step."""
+
+    def overflowed(self, world: int) -> bool:
+        """Whether a contact or constraint buffer overflowed in this world since its reset."""
+        raise TypeError("use make_physics() for an engine")
 
     def set_active(self, mask: np.ndarray) -> None:
         """Say which worlds run an episode, bool [worlds]."""
@@ -173,7 +176,6 @@ class MujocoPhysics(Physics):
         shared("xipos", m.nbody, 3)
         self._np["contact_force"] = self.contact_force.numpy()
         self._np["pair_force"] = self.pair_force.numpy()
-        self._np["overflow"] = self.overflow.numpy()
         self._np["latch"] = self.latch_locked.numpy()
         self.threads = max(1, min(threads or len(os.sched_getaffinity(0)), self.worlds))
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
@@ -207,7 +209,6 @@ class MujocoPhysics(Physics):
 
     def _publish(self, w: int, d: Any) -> None:
         self._mj.mj_kinematics(self._m, d)
-        self._mj.mj_comPos(self._m, d)
         out = self._np
         out["qpos"][w] = d.qpos
         out["qvel"][w] = d.qvel
@@ -229,41 +230,57 @@ class MujocoPhysics(Physics):
         self._each(self._step_share, np.flatnonzero(self._active))
 
     def read_contacts(self) -> None:
-        """Contact forces and overflow flags of the last physics step."""
-        warn = (self._mj.mjtWarning.mjWARN_CONTACTFULL, self._mj.mjtWarning.mjWARN_CNSTRFULL)
+        """Contact forces of the last physics step."""
         root = self.scene.robot.root_qpos
         q = self._np["qpos"][:, root + 3 : root + 7]
         tilted = 1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2) < 0.5
         self._np["pair_force"][:] = 0.0
-        for w in np.flatnonzero(self._active):
-            d = self._data[w]
-            if d.warning[warn[0]].number or d.warning[warn[1]].number:
-                self._np["overflow"][w] = 1
-            if self.want_forces or tilted[w]:
-                self._np["contact_force"][w] = self._body_forces(d)
-            if self._pair is not None and d.ncon:
-                self._np["pair_force"][w] = self._pair_normal(d)
+        for w in np.flatnonzero(self._active if self.want_forces else self._active & tilted):
+            self._np["contact_force"][w] = self._body_forces(self._data[w])
+        if self._pair is not None:
+            for w in np.flatnonzero(self._active):
+                self._np["pair_force"][w] = self._pair_normal(self._data[w])
+
+    def overflowed(self, world: int) -> bool:
+        """Whether a contact or constraint buffer overflowed in this world since its reset."""
+        warning = self._data[world].warning
+        full = (self._mj.mjtWarning.mjWARN_CONTACTFULL, self._mj.mjtWarning.mjWARN_CNSTRFULL)
+        return any(warning[kind].number for kind in full)
 
     def _body_forces(self, d: Any) -> np.ndarray:
+        """Norm of the net contact force on each body [N], shape [nbody]."""
         total = np.zeros((self.nbody, 3))
-        wrench = np.zeros(6)
-        for c in range(d.ncon):
-            contact = d.contact[c]
-            self._mj.mj_contactForce(self._m, d, c, wrench)
-            force = contact.frame.reshape(3, 3).T @ wrench[:3]
-            total[self._m.geom_bodyid[contact.geom[1]]] += force
-            total[self._m.geom_bodyid[contact.geom[0]]] -= force
+        normal, tangent, frame, bodies = self._contact_forces(d, slice(None))
+        if len(normal):
+            force = np.einsum("ck,ckj->cj", np.column_stack([normal, tangent]), frame)
+            np.add.at(total, bodies[:, 1], force)
+            np.subtract.at(total, bodies[:, 0], force)
         return np.linalg.norm(total, axis=1)
 
+    def _contact_forces(self, d: Any, pick: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Normal [c], tangential [c, 2], frame [c, 3, 3] and bodies [c, 2] of contacts under the pyramidal cone, condim 3.
+
+        Normal force is the sum of the four edge forces, a tangent's is μ times the difference of its two edges
+        (MuJoCo's `mju_decodePyramid`).
+        """
+        contact = d.contact
+        rows = np.asarray(contact.efc_address)[pick]
+        live = rows >= 0
+        rows = rows[live]
+        edges = d.efc_force[rows[:, None] + np.arange(4)] if len(rows) else np.zeros((0, 4))
+        mu = np.asarray(contact.friction)[pick][live][:, :2]
+        tangent = np.stack([edges[:, 0] - edges[:, 1], edges[:, 2] - edges[:, 3]], axis=1) * mu
+        frame = np.asarray(contact.frame)[pick][live].reshape(-1, 3, 3)
+        bodies = self._m.geom_bodyid[np.asarray(contact.geom)[pick][live]]
+        return edges.sum(axis=1), tangent, frame, bodies
+
     def _pair_normal(self, d: Any) -> float:
+        if not d.ncon or self._pair is None:
+            return 0.0
         a, b = self._pair
         geom = d.contact.geom
         hit = np.flatnonzero((a[geom[:, 0]] & b[geom[:, 1]]) | (b[geom[:, 0]] & a[geom[:, 1]]))
-        wrench, total = np.zeros(6), 0.0
-        for c in hit:
-            self._mj.mj_contactForce(self._m, d, int(c), wrench)
-            total += wrench[0]
-        return total
+        return float(self._contact_forces(d, hit)[0].sum()) if len(hit) else 0.0
 
     def reset_worlds(self, worlds, qpos, mocap_pos, mocap_quat) -> None:
         """See `Physics.reset_worlds`."""
@@ -280,7 +297,6 @@ class MujocoPhysics(Physics):
             self._np["ctrl"][w] = 0
             self._np["contact_force"][w] = 0
             self._np["pair_force"][w] = 0
-            self._np["overflow"][w] = 0
             self._publish(w, d)
 
 
@@ -315,6 +331,8 @@ class WarpPhysics(Physics):
         with wp.ScopedDevice(self.device):
             self._geom_body = wp.array(m.geom_bodyid, dtype=wp.int32)
             self._geom_group = wp.zeros(m.ngeom, dtype=wp.int32)
+            self.overflow = wp.zeros(self.worlds, dtype=wp.int32)
+            """1 where a buffer overflowed since the reset, shape [worlds]."""
             self._force_vector = wp.zeros((self.worlds, m.nbody), dtype=wp.vec3)
         self._graph: Any = None
         self._full_graph: Any = None
@@ -375,6 +393,10 @@ class WarpPhysics(Physics):
             if self._graph is None:
                 self._graph = self._capture(self._solver_tick)
             wp.capture_launch(self._graph)
+
+    def overflowed(self, world: int) -> bool:
+        """See `Physics.overflowed`."""
+        return bool(self.overflow.numpy()[world])
 
     def set_active(self, mask: np.ndarray) -> None:
         """All worlds of a batch step together; idle ones are stepped and ignored."""

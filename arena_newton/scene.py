@@ -5,6 +5,7 @@ Handles (bodies, joints, geoms, markers, frames) are found by prim path; nothing
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -400,7 +401,9 @@ def load_scene(
         builder.replicate(template, count)
         return builder.finalize(device=device)
 
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice(device), warnings.catch_warnings():
+        # Fixtures hang on the world by one fixed joint each, on purpose.
+        warnings.filterwarnings("ignore", message=".*outside articulations as standalone world roots.*")
         model = finalize(worlds)
         solver = newton.solvers.SolverMuJoCo(
             finalize(1) if native and worlds > 1 else model,

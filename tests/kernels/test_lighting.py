@@ -96,8 +96,8 @@ def _soup(vertices, faces, color):
     def array(values, kind):
         return wp.array(values, dtype=kind, device="cpu")
 
-    soup.world_start, soup.shapes = array([0, 1, 1], wp.int32), array([0], wp.int32)
-    soup.face_start = array([0, len(faces)], wp.int32)
+    soup.world_start = array([0, len(faces), len(faces)], wp.int32)
+    soup.shape, soup.face = array(np.zeros(len(faces)), wp.int32), array(np.arange(len(faces)), wp.int32)
     soup.spheres, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
     soup.transforms = array([[0, 0, 0, 0, 0, 0, 1]], wp.transform)
     soup.colors, soup.texture = array([color], wp.vec3), array([-1], wp.int32)
@@ -125,9 +125,8 @@ def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48):
         rays=wp.array(rays, dtype=wp.vec3, device="cpu"),
         soup=_soup(vertices, faces, (0.25, 0.5, 1.0)),
         tangents=tangents,
-        nearness=empty(wp.float32),
-        hit_shape=empty(wp.int32),
-        hit_face=empty(wp.int32),
+        triangles=len(faces),
+        nearest=empty(wp.uint64),
         **out,
     )
     return rays[:, :, 0, 1], {k: v.numpy()[0] for k, v in out.items()}
