@@ -1,8 +1,8 @@
 """Ego, wrist and world cameras: all worlds in one batch, one light per world.
 
 Newton's `SensorCamera` has lights that are global to the sensor, so `kernels.lighting` shades albedo, normal and depth
-per world and casts the shadow rays (formula and exposure are documented there). It also draws those three from triangles:
-on the football scene 3 times faster than the sensor's ray tracer on one CPU core, 5 times on an H200 with 1024 worlds.
+per world and casts the shadow rays (formula and exposure are documented there). It also draws those three from
+triangles: on the football scene 3 times faster than the sensor's ray tracer on one CPU core, 5 times on an H200.
 """
 
 from __future__ import annotations
