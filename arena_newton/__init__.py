@@ -1,4 +1,7 @@
-"""HumanoidArena on Newton/Warp: a policy decides a 40D whole-body action, a tracker executes it, a world moves, a rule judges."""
+"""HumanoidArena on Newton/Warp.
+
+A policy decides a 40D whole-body action, a tracker executes it, a world moves, a rule judges.
+"""
 
 import sys
 from pathlib import Path

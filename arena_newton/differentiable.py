@@ -76,7 +76,7 @@ def _stream(tensor: "torch.Tensor") -> Any:
     return wp.ScopedStream(wp.stream_from_torch(tensor.device))
 
 
-def _function() -> type:
+def _function() -> "type[torch.autograd.Function]":
     """The autograd function, made once torch is there."""
     import torch
 
@@ -106,7 +106,7 @@ def _function() -> type:
     return _Recorded
 
 
-_RECORDED: list[type] = []
+_RECORDED: list["type[torch.autograd.Function]"] = []
 
 
 def _apply(record: Callable, *tensors: "torch.Tensor") -> tuple["torch.Tensor", ...]:
@@ -140,8 +140,9 @@ def reference_step(
 
     def record(action_array: wp.array, *floats: wp.array) -> tuple[wp.Tape, list[wp.array]]:
         device = action_array.device
-        order = {"canonical_to_mujoco": CANONICAL_TO_MUJOCO, "tick": TICK}
-        after = ReferencePose.allocate(worlds, device, **order, requires_grad=True)
+        after = ReferencePose.allocate(
+            worlds, device, canonical_to_mujoco=CANONICAL_TO_MUJOCO, tick=TICK, requires_grad=True
+        )
         before = dataclasses.replace(
             after,
             heading=wp.from_torch(state.heading.detach().contiguous()),

@@ -141,7 +141,7 @@ class ArenaEnv:
         self._t_qpos, self._t_qvel = t(self.physics.qpos), t(self.physics.qvel)
         self._t_action, self._t_state = t(self._action), t(self._state64)
 
-        def indices(values: Sequence[int]) -> Any:
+        def indices(values: Sequence[int] | np.ndarray) -> Any:
             return torch.tensor(values, dtype=torch.long, device=self.torch_device)
 
         self._i_q, self._i_v = indices(h.joint_qpos), indices(h.joint_qvel)
@@ -180,7 +180,7 @@ class ArenaEnv:
                 self.lights.set(w, draws.light if draws is not None else None)
         return self.lights
 
-    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | None = None) -> None:
+    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone.
 
         Args:

@@ -8,4 +8,4 @@ class ArenaError(Exception):
 
 
 class InputError(ArenaError):
-    """The user's input (flag, file, prim, field) is wrong; the command line prints the message and exits with code 2."""
+    """The user's input (flag, file, prim, field) is wrong; the command line prints it and exits with code 2."""

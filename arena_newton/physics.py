@@ -258,7 +258,7 @@ class MujocoPhysics(Physics):
         return np.linalg.norm(total, axis=1)
 
     def _contact_forces(self, d: Any, pick: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Normal [c], tangential [c, 2], frame [c, 3, 3] and bodies [c, 2] of contacts under the pyramidal cone, condim 3.
+        """Normal [c], tangential [c, 2], frame [c, 3, 3] and bodies [c, 2] of contacts, pyramidal cone, condim 3.
 
         Normal force is the sum of the four edge forces, a tangent's is μ times the difference of its two edges
         (MuJoCo's `mju_decodePyramid`).
@@ -406,7 +406,7 @@ class WarpPhysics(Physics):
         from arena_newton.kernels import contact
 
         super().watch_pair(geoms_a, geoms_b)
-        a, b = self._pair
+        a, b = self._pair  # type: ignore[misc]  # the line above has set it
         self._geom_group.assign(a * contact.GROUP_A + b * contact.GROUP_B)
 
     def _launch_contacts(self) -> None:

@@ -23,11 +23,11 @@ __all__ = ["Frame", "Marker", "RobotHandles", "Scene", "ball_solref", "load_scen
 SCENES = Path(__file__).resolve().parent / "usd_scenes"
 ROBOT = "/World/Robot"
 BALL_STIFFNESS = 10000.0
-"""Contact stiffness of the ball [1/s²·kg-normalised, MuJoCo direct solref], measured to give the stated bounce at 5 ms."""
+"""Contact stiffness of the ball [1/s²·kg-normalised, MuJoCo direct solref], measured: the stated bounce at 5 ms."""
 
 
 LATCH_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Constraint impedance of the latch: at the default, the light handle softens it and 10 N·m turn the locked leaf 12°."""
+"""Constraint impedance of the latch: at the default, the light handle softens it, 10 N·m turn the locked leaf 12°."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,8 @@ class Scene:
         if size is None:
             raise InputError(f"{self.path}: marker {prim_path} has no attribute arena:size")
         body, pos, quat = self._local_pose(prim)
-        return Marker(body, pos, quat, tuple(0.5 * float(v) for v in size))
+        x, y, z = (0.5 * float(v) for v in size)
+        return Marker(body, pos, quat, (x, y, z))
 
     def _find(self, name_or_path: str) -> Any:
         prim = self.stage.GetPrimAtPath(name_or_path) if name_or_path.startswith("/") else None
@@ -297,7 +298,9 @@ def _open_stage(path: Path, variant: str | None, hands: str) -> Any:
 def _set_drives(builder: Any, drive: g1.DriveGains) -> None:
     from newton import JointTargetMode
 
-    gains = {n: (drive.kp[i], drive.kd[i], drive.effort[i], None) for i, n in enumerate(g1.MUJOCO_JOINTS)}
+    gains: dict[str, tuple[float, float, float, float | None]] = {
+        n: (drive.kp[i], drive.kd[i], drive.effort[i], None) for i, n in enumerate(g1.MUJOCO_JOINTS)
+    }
     finger = (drive.finger_kp, drive.finger_kd, drive.finger_effort, drive.finger_armature)
     gains |= dict.fromkeys(g1.HAND_JOINTS, finger)
     for joint, label in enumerate(builder.joint_label):

@@ -199,7 +199,8 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
         tree = ElementTree.fromstring(path.read_text())
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
         raise InputError(f"--mjcf {path}: not a readable XML file ({error})") from None
-    if tree.find("worldbody") is None:
+    worldbody = tree.find("worldbody")
+    if worldbody is None:
         raise InputError(f"--mjcf {path}: holds no worldbody, expected an MJCF")
     for parent in tree.iter():
         for child in list(parent):
@@ -207,7 +208,7 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
                 parent.remove(child)
     if not any(geom.get("type") == "plane" for geom in tree.iter("geom")):
         attributes = {"name": "floor", "type": "plane", "size": "0 0 0.01", "condim": "3"}
-        ElementTree.SubElement(tree.find("worldbody"), "geom", attributes)
+        ElementTree.SubElement(worldbody, "geom", attributes)
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(tree, encoding="unicode"))
         motors = {motor.target: motor for motor in spec.actuators}
@@ -238,7 +239,7 @@ def references(model: Any, clips: Sequence[str | Path], clip_seconds: float | No
     ]
 
 
-def _tracks(streams: Sequence[Reference], history: list[tuple[np.ndarray, ...]]) -> list[Track]:
+def _tracks(streams: Sequence[Reference], history: Sequence[tuple[np.ndarray, ...]]) -> list[Track]:
     """Rows of every tick to one track a reference, cut to its length."""
     columns = [np.stack(column) for column in zip(*history, strict=True)]
     return [Track(*(c[: len(s.actions), w] for c in columns)) for w, s in enumerate(streams)]
@@ -412,8 +413,9 @@ def compare(
     ours = run_ours(checkpoint, streams, tracker=tracker, fast=fast)
     rows = []
     for stream, a, b in zip(streams, ours, oracle, strict=True):
-        pairs = [value for pair in zip(measure(stream, a), measure(stream, b), strict=True) for value in pair]
-        rows.append(Row(stream.name, len(stream.actions) * g1.TICK, *pairs))
+        pairs = zip(measure(stream, a), measure(stream, b), strict=True)
+        values: list[Any] = [value for pair in pairs for value in pair]
+        rows.append(Row(stream.name, len(stream.actions) * g1.TICK, *values))
     return rows
 
 

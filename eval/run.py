@@ -64,7 +64,7 @@ def stored_options(folder: Path) -> RunOptions:
     """The flags that a results folder was made with, to be resumed."""
     stored = report.read_config(folder)["options"]
     known = {field.name for field in dataclasses.fields(RunOptions)}
-    values = {key: tuple(v) if isinstance(v, list) else v for key, v in stored.items() if key in known}
+    values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in stored.items() if key in known}
     return dataclasses.replace(RunOptions(**values), out=str(folder))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 __all__ = ["SUITES", "aggregate", "cell", "pooled", "population_std", "wilson"]
@@ -78,7 +78,7 @@ def cell(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def pooled(records_by_task: dict[str, Sequence[dict[str, Any]]], tasks: Sequence[str]) -> dict[str, Any] | None:
+def pooled(records_by_task: Mapping[str, Sequence[dict[str, Any]]], tasks: Sequence[str]) -> dict[str, Any] | None:
     """Average over a suite: mean and population std over all task x seed rates pooled, falls over all its episodes.
 
     For instance 3 tasks x 3 seeds for HOI. Returns None unless every task of the suite has episodes.

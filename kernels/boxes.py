@@ -34,10 +34,25 @@ FAR = wp.constant(1.0e6)
 class BoxLike(Protocol):
     """What a marker of a scene offers."""
 
-    body_id: int
-    pos: Iterable[float]
-    quat: Iterable[float]
-    half: Iterable[float]
+    @property
+    def body_id(self) -> int:
+        """Carrying body, 0 = world."""
+        ...
+
+    @property
+    def pos(self) -> Iterable[float]:
+        """Centre [m] in the body's frame, 3 numbers."""
+        ...
+
+    @property
+    def quat(self) -> Iterable[float]:
+        """Orientation in the body's frame, wxyz."""
+        ...
+
+    @property
+    def half(self) -> Iterable[float]:
+        """Half extents [m], 3 numbers."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ class _Linear(torch.nn.Module):
                 probe = torch.linspace(-1.0, 1.0, 2 * weight.shape[1]).reshape(2, -1)
                 plain = functional.linear(probe, self.weight, bias)
                 torch.testing.assert_close(self(probe), plain, rtol=1e-3, atol=1e-3)
-            except (AttributeError, RuntimeError, NotImplementedError, AssertionError):
+            except (AttributeError, RuntimeError, AssertionError):
                 self._packed = None  # this build of torch packs differently: the plain product serves
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:

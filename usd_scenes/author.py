@@ -10,6 +10,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
 __all__ = [
+    "Vec",
     "anchor",
     "attribute",
     "bind",
@@ -32,7 +33,8 @@ __all__ = [
     "xform",
 ]
 
-Vec = Sequence[float]
+Vec = Sequence[float] | np.ndarray
+"""A vector or quaternion, of Python or NumPy numbers."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -112,7 +114,7 @@ def anchor(stage: Usd.Stage, path: str, body: str, position: Vec = (0, 0, 0), qu
 
 
 def fixture(stage: Usd.Stage, path: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
-    """An immovable body that is posed once an episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
+    """An immovable body posed once an episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
     root = xform(stage, path)
     UsdPhysics.ArticulationRootAPI.Apply(root)
     frame = rigid_body(stage, f"{path}/Frame", position, quat, mass=1.0, inertia=(0.1, 0.1, 0.1))

@@ -8,11 +8,10 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.usd_scenes import author
+from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
 
 __all__ = ["SEMANTICS", "bench", "bind_in", "contact", "edit", "floor", "task_stage", "variant_layer", "workshop"]
-
-Vec = Sequence[float]
 
 SEMANTICS = "semantics"
 """Name of the variant set on `/World` that holds the changed looks."""

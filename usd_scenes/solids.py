@@ -6,10 +6,9 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.usd_scenes import author
+from arena_newton.usd_scenes.author import Vec
 
 __all__ = ["Solids"]
-
-Vec = Sequence[float]
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
@@ -55,7 +54,7 @@ class Solids:
             np.array([(np.cos(yaw), -np.sin(yaw), 0), (np.sin(yaw), np.cos(yaw), 0), (0, 0, 1)]),
         )
         # Normal, then the direction of u; v follows. Side faces keep v upright.
-        for normal, u in (
+        for normal, along in (
             ((1, 0, 0), (0, 1, 0)),
             ((-1, 0, 0), (0, -1, 0)),
             ((0, 1, 0), (-1, 0, 0)),
@@ -63,7 +62,7 @@ class Solids:
             ((0, 0, 1), (1, 0, 0)),
             ((0, 0, -1), (-1, 0, 0)),
         ):
-            n, u, v = np.array(normal), np.array(u), np.cross(normal, u)
+            n, u, v = np.array(normal), np.array(along), np.cross(normal, along)
             corners = [(n + a * u + b * v) * h @ turn.T + centre for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             self.quad(corners, tile=tile)
         return self

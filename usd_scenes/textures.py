@@ -125,17 +125,17 @@ def _directions(height: int, width: int) -> np.ndarray:
 def football() -> np.ndarray:
     """The classic ball: a truncated icosahedron, its 12 pentagons black, 20 hexagons white, grey seams."""
     golden = (1 + 5**0.5) / 2
-    corners = [(0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
-    corners = np.array([np.roll(c, k) for k in range(3) for c in corners])
+    signs = [(0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
+    corners = np.array([np.roll(c, k) for k in range(3) for c in signs])
     corners /= np.linalg.norm(corners[0])
-    faces = []
+    sums = []
     for i in range(12):
         for j in range(i):
             for k in range(j):
                 trio = corners[[i, j, k]]
                 if np.min([trio[0] @ trio[1], trio[1] @ trio[2], trio[0] @ trio[2]]) > 0.4:
-                    faces.append(trio.sum(axis=0))
-    faces = np.array(faces) / np.linalg.norm(faces[0])
+                    sums.append(trio.sum(axis=0))
+    faces = np.array(sums) / np.linalg.norm(sums[0])
     # Distances of pentagons and hexagons from the centre, edge length 1: 2.32744 and 2.26728.
     planes = np.concatenate([corners / 2.32744, faces / 2.26728])
     reach = np.sort(_directions(SIDE, 2 * SIDE) @ planes.T, axis=-1)

@@ -411,7 +411,7 @@ def _walk_layers(file: Path) -> _Walk:
             if fault:
                 walk.problems.append(Problem(shown, prim, fault))
                 walk.lost |= composes
-            elif target.suffix in _LAYERS:
+            elif target is not None and target.suffix in _LAYERS:
                 queue.append(target)
     return walk
 

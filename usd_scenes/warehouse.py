@@ -11,6 +11,7 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.usd_scenes import author, rooms
+from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
 
 __all__ = [
@@ -49,7 +50,7 @@ _FACES = (
 def boxes(
     stage: Usd.Stage,
     path: str,
-    parts: Iterable[tuple[Sequence[float], Sequence[float]]],
+    parts: Iterable[tuple[Vec, Vec]],
     *,
     look=None,
     tile: float = 1.0,
@@ -64,7 +65,7 @@ def boxes(
 def rounded_box(
     stage: Usd.Stage,
     path: str,
-    half: Sequence[float],
+    half: Vec,
     position=(0, 0, 0),
     *,
     radius: float = 0.05,
@@ -72,9 +73,9 @@ def rounded_box(
     look=None,
 ) -> Usd.Prim:
     """A visual box with rounded edges, for cushions; `half` sizes include the rounding."""
-    half = np.asarray(half, dtype=float)
-    radius = min(radius, *half)
-    inner = half - radius
+    extent = np.asarray(half, dtype=float)
+    radius = min(radius, *extent)
+    inner = extent - radius
     points, faces, uv = [], [], []
     # Each face: corner fan, flat middle, corner fan.
     angles = np.linspace(0.0, np.pi / 4, steps + 1)
@@ -91,7 +92,7 @@ def rounded_box(
                 corner[axis], corner[u], corner[v] = sign * inner[axis], side[i] * inner[u], side[j] * inner[v]
                 p = corner + radius * direction / np.linalg.norm(direction)
                 points.append(p)
-                uv.append((p[u] + half[u], p[v] + half[v]))
+                uv.append((p[u] + extent[u], p[v] + extent[v]))
         outward = sign > 0 if axis != 1 else sign < 0
         for j in range(n - 1):
             for i in range(n - 1):

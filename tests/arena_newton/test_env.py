@@ -81,7 +81,7 @@ def _run(worlds, episodes):
 
 
 def test_results_do_not_depend_on_batch_or_order():
-    """Engine mujoco: 1, 3 and 20 worlds, forward and backward, give bit-identical episodes, tracker network included."""
+    """Engine mujoco: 1, 3 and 20 worlds, forward and backward, give bit-identical episodes, tracker included."""
     episodes = _episodes(6)
     alone = _run(1, episodes)
     three = _run(3, episodes)

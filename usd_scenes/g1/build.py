@@ -236,8 +236,16 @@ def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Bar | Rod], l
     for k, shape in enumerate(shapes):
         path = f"{parent}/visual_{k}"
         if isinstance(shape, Rod):
-            size = {"radius": shape.radius, "length": shape.length, "position": shape.center, "axis": shape.axis}
-            author.cylinder(stage, path, **size, collide=False, look=looks[shape.look])
+            author.cylinder(
+                stage,
+                path,
+                shape.radius,
+                shape.length,
+                shape.center,
+                axis=shape.axis,
+                collide=False,
+                look=looks[shape.look],
+            )
         else:
             _mesh(stage, path, *grid(shape), looks[shape.look])
 

@@ -74,7 +74,9 @@ def _profile(bevel: float) -> list[tuple[int, float, float]]:
     return [(-1, d, e) for d, e in ends] + [(1, d, e) for d, e in reversed(ends)]
 
 
-def _loft(rows: Sequence[Sequence[float]], axis: int, roundness: float, around: int) -> tuple[np.ndarray, ...]:
+def _loft(
+    rows: Sequence[Sequence[float]], axis: int, roundness: float, around: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if rows[-1][0] < rows[0][0]:
         rows = rows[::-1]
     angle = (np.arange(around) + 0.5) * (2 * np.pi / around)

@@ -79,8 +79,8 @@ def _partition(stage, frame: str, rough) -> None:
     }
     for name, (half, centre) in solids.items():
         author.box(stage, f"{frame}/{name}", half, centre, look=panel, surface=rough)
-    seams = [x for x in np.arange(x0 + 0.2, x1, 1.25) if abs(x) > opening + 0.1]
-    parts = [((0.012, t + 0.008, h), (x, 0, h)) for x in seams]
+    seams = [float(x) for x in np.arange(x0 + 0.2, x1, 1.25) if abs(x) > opening + 0.1]
+    parts: list[tuple[author.Vec, author.Vec]] = [((0.012, t + 0.008, h), (x, 0, h)) for x in seams]
     parts += [((0.035, t + 0.012, top / 2 + 0.03), (k * (opening + 0.035), 0, top / 2 + 0.03)) for k in (-1, 1)]
     parts += [((opening, t + 0.012, 0.035), (0, 0, top + 0.035))]
     parts += [(((x1 - opening) / 2 - 0.05, t + 0.008, 0.02), ((x1 + opening) / 2, 0, 1.2))]
