@@ -42,6 +42,8 @@ class Policy:
     """Name in reports."""
     needs_image: bool = False
     """Whether the head camera must be rendered for `act`."""
+    camera: CameraConfig | None = None
+    """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
     chunk_size: int = 1
     """Actions a chunk, where the policy knows it beforehand."""
 

@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
+from arena_newton.camera import CameraConfig
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.base import Chunk, Observation, Policy, PolicyError, world_mask
 
@@ -155,6 +156,8 @@ class RemotePolicy(Policy):
 
     name = "remote"
     needs_image = True
+    camera = CameraConfig(width=640, height=480, fit="native")
+    """The original's client sends the head camera as it is, 640×480; resizing is the server's work."""
 
     def __init__(
         self,
