@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
+
+if TYPE_CHECKING:
+    from arena_newton.camera import CameraConfig
 
 __all__ = ["Chunk", "Observation", "Policy", "PolicyError", "get", "names", "register", "world_mask"]
 

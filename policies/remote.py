@@ -21,8 +21,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
 from arena_newton.camera import CameraConfig
+from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.base import Chunk, Observation, Policy, PolicyError, world_mask
 
