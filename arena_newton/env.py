@@ -136,6 +136,9 @@ class ArenaEnv:
         self._streak, self._fallen = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
         self._bad_state, self._bad_action = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
         self._status, self._mask = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
+        self._mask_host = np.zeros(worlds, dtype=np.int32)
+        self._targets: Any = None
+        self._targets_at = 0
 
         t = wp.to_torch
         self._t_qpos, self._t_qvel = t(self.physics.qpos), t(self.physics.qvel)
@@ -167,7 +170,14 @@ class ArenaEnv:
         from arena_newton.camera import Camera
 
         self.camera = Camera.from_scene(
-            self.scene, self.physics, prim=config.prim, width=config.width, height=config.height, lights=self._lights()
+            self.scene,
+            self.physics,
+            prim=config.prim,
+            width=config.width,
+            height=config.height,
+            lights=self._lights(),
+            fit=config.fit,
+            samples=config.samples,
         )
         return self.camera
 
@@ -175,7 +185,7 @@ class ArenaEnv:
         from arena_newton.camera import WorldLights
 
         if self.lights is None:
-            self.lights = WorldLights.allocate(self.worlds, self.device)
+            self.lights = WorldLights.allocate(self.worlds, self.device, self.scene.stage)
             for w, draws in enumerate(self.draws):
                 self.lights.set(w, draws.light if draws is not None else None)
         return self.lights
@@ -225,8 +235,19 @@ class ArenaEnv:
     def _upload(self, rows: np.ndarray) -> Any:
         host = np.zeros(self.worlds, dtype=np.int32)
         host[rows] = 1
-        self._mask.assign(host)
+        if not np.array_equal(host, self._mask_host):
+            self._mask_host = host
+            self._mask.assign(host)
         return self._mask
+
+    def _as_warp(self, targets: Any) -> Any:
+        """Warp view of a tracker's answer; most trackers fill the same buffer each tick."""
+        if targets.data_ptr() != self._targets_at:
+            targets = targets.contiguous()
+            import warp as wp
+
+            self._targets, self._targets_at = wp.from_torch(targets, dtype=wp.float32), targets.data_ptr()
+        return self._targets
 
     def _torch_mask(self, rows: np.ndarray) -> Any:
         import torch
@@ -292,7 +313,6 @@ class ArenaEnv:
             Status codes of `arena_newton.kernels.tick`, int32 [worlds].
         """
         import torch
-        import warp as wp
 
         from arena_newton.kernels import canonical, fall, reset, tick
 
@@ -324,7 +344,7 @@ class ArenaEnv:
         if self._fresh.any():
             self.tracker.prefill(command, state, self._torch_mask(np.flatnonzero(self._fresh)))
             self._fresh[:] = False
-        targets = wp.from_torch(self.tracker.step(command, state).contiguous(), dtype=wp.float32)
+        targets = self._as_warp(self.tracker.step(command, state))
         tick.launch_write_ctrl(
             targets, self._joint_ctrl, self.reference.hands, self._hand_ctrl, self._hand_open, self._hand_close, p.ctrl
         )
