@@ -1,6 +1,7 @@
 """Contact forces per body and between two groups agree with MuJoCo's own decoding of its constraint forces."""
 
 import mujoco
+import mujoco_warp
 import numpy as np
 import pytest
 import warp as wp
@@ -48,7 +49,6 @@ def _launch(model, data, worlds, nbody, geom_body, groups, pyramidal, device):
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_agrees_with_mujoco(device, cone, condim):
     """On a tumbling stack the net forces and the force between lower box and plane are those of mj_contactForce."""
-    mujoco_warp = pytest.importorskip("mujoco_warp")
     model = mujoco.MjModel.from_xml_string(SCENE.format(cone=cone, condim=condim))
     data = mujoco.MjData(model)
     rng = np.random.default_rng(condim)

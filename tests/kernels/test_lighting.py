@@ -5,7 +5,7 @@ import pytest
 
 wp = pytest.importorskip("warp")
 
-from arena_newton.kernels import lighting  # noqa: E402
+from arena_newton.kernels import lighting, shadow  # noqa: E402
 
 EXPOSURE, BOUNCE, AMBIENT, DIRECT = 1.0 / 1700.0, 0.45, 0.2, 0.5
 
@@ -23,13 +23,6 @@ def _colour(
     i = wp.tid()
     seen = lighting._radiance(albedo[i], normal[i], distant[i], to_light[i], light[i], visible[i])
     out[i] = wp.vec3(lighting._display(seen[0]), lighting._display(seen[1]), lighting._display(seen[2]))
-
-
-@wp.func
-def _nothing(
-    pose: wp.transform, size: wp.vec3, kind: wp.int32, origin: wp.vec3, direction: wp.vec3, cull: wp.bool
-) -> tuple[float, wp.vec3]:
-    return -1.0, wp.vec3(0.0)
 
 
 def srgb(value):
@@ -90,93 +83,15 @@ def test_camera_pose_follows_its_body():
     np.testing.assert_allclose(found[1], [1, 0, 0, 0, 0, 0, 1], atol=1e-6)
 
 
-def _soup(vertices, faces, color):
-    soup = lighting.Soup()
-
-    def array(values, kind):
-        return wp.array(values, dtype=kind, device="cpu")
-
-    soup.world_start = array([0, len(faces), len(faces)], wp.int32)
-    soup.shape, soup.face = array(np.zeros(len(faces)), wp.int32), array(np.arange(len(faces)), wp.int32)
-    soup.spheres, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
-    soup.transforms = array([[0, 0, 0, 0, 0, 0, 1]], wp.transform)
-    soup.colors, soup.texture = array([color], wp.vec3), array([-1], wp.int32)
-    soup.faces, soup.vertices = array(faces, wp.vec3i), array(vertices, wp.vec3)
-    soup.normals, soup.uvs = array(np.zeros((len(vertices), 3)), wp.vec3), array(np.zeros((len(vertices), 2)), wp.vec2)
-    soup.texels = array(np.zeros(0, np.uint8), wp.uint8)
-    soup.texture_place = array(np.zeros((0, 3), np.int32), wp.vec3i)
-    return soup
-
-
-def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48):
-    x = (np.arange(width) + 0.5) / width * 2 - 1
-    y = 1 - (np.arange(height) + 0.5) / height * 2
-    rays = np.zeros((height, width, 1, 2, 3), np.float32)
-    rays[:, :, 0, 1] = np.stack(np.broadcast_arrays(x[None] * tangents[0], y[:, None] * tangents[1], -1.0), -1)
-    rays[:, :, 0, 1] /= np.linalg.norm(rays[:, :, 0, 1], axis=-1, keepdims=True)
-
-    def empty(kind):
-        return wp.zeros((1, height, width), dtype=kind, device="cpu")
-
-    out = {"albedo": empty(wp.uint32), "normals": empty(wp.vec3), "depth": empty(wp.float32)}
-    lighting.launch_rasterize(
-        view_world=wp.zeros(1, dtype=wp.int32, device="cpu"),
-        poses=wp.array([[0, 0, 0, 0, 0, 0, 1]], dtype=wp.transform, device="cpu"),
-        rays=wp.array(rays, dtype=wp.vec3, device="cpu"),
-        soup=_soup(vertices, faces, (0.25, 0.5, 1.0)),
-        tangents=tangents,
-        triangles=len(faces),
-        nearest=empty(wp.uint64),
-        **out,
-    )
-    return rays[:, :, 0, 1], {k: v.numpy()[0] for k, v in out.items()}
-
-
-def test_drawn_triangles_meet_the_rays():
-    """Random triangles, some through the camera's plane, are found where ray–triangle intersection finds them."""
-    rng = np.random.default_rng(3)
-    vertices = rng.uniform(-3, 3, (60, 3)).astype(np.float32)
-    faces = np.arange(60).reshape(-1, 3)
-    rays, out = _draw(vertices, faces)
-    best = np.full(rays.shape[:2], np.inf)
-    for p0, p1, p2 in vertices[faces].astype(np.float64):
-        d = rays.astype(np.float64)
-        h = np.cross(d, p2 - p0)
-        det = h @ (p1 - p0)
-        u = h @ -p0 / det
-        q = np.cross(-p0, p1 - p0)
-        v, t = d @ q / det, q @ (p2 - p0) / det
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t * -d[..., 2] > 0.002)
-        best = np.where(hit & (t < best), t, best)
-    found = np.where(out["depth"] > 0, out["depth"], np.inf)
-    same = (found == best) | (np.abs(found - best) < 1e-3 * np.maximum(1, best))
-    assert same.mean() > 0.995
-    assert np.isfinite(best).mean() > 0.3
-
-
-def test_a_floor_has_no_cracks():
-    """A fan of triangles covers its plane without a hole, and its colour and depth are the plane's."""
-    angle = np.linspace(0, 2 * np.pi, 40)[:-1]
-    rim = np.stack([30 * np.cos(angle), 30 * np.sin(angle), np.full_like(angle, -2.0)], 1)
-    vertices = np.vstack([[0.1, -0.2, -2.0], rim]).astype(np.float32)
-    faces = [[0, 1 + i, 1 + (i + 1) % 39] for i in range(39)]
-    rays, out = _draw(vertices, np.array(faces))
-    np.testing.assert_allclose(out["depth"] * -rays[..., 2], 2.0, rtol=1e-4)
-    colour = out["albedo"].view(np.uint8).reshape(*out["albedo"].shape, 4)[..., :3]
-    assert np.abs(colour.astype(int) - np.round(srgb(np.array([0.25, 0.5, 1.0])) * 255)).max() <= 1
-
-
 def test_masked_view_keeps_its_picture():
     """A view whose world index is negative is not written."""
     image = wp.full((1, 2, 2, 3), 7, dtype=wp.uint8, device="cpu")
     one = wp.zeros((1, 2, 2), dtype=wp.float32, device="cpu")
-    box = wp.Bvh(wp.zeros(1, dtype=wp.vec3, device="cpu"), wp.zeros(1, dtype=wp.vec3, device="cpu"))
-    scene = lighting.Occluders()
-    scene.bvh = box.id
     for world, expected in ((-101, 7), (0, 255)):
         lighting.launch_shade(
-            _nothing,
-            7,
+            shadow.MAPPED,
+            shadow.ShadowMaps(),
+            views=(0, 1),
             view_world=wp.array([world], dtype=wp.int32, device="cpu"),
             poses=wp.zeros(1, dtype=wp.transform, device="cpu"),
             rays=wp.zeros((2, 2, 1, 2), dtype=wp.vec3, device="cpu"),
@@ -184,7 +99,6 @@ def test_masked_view_keeps_its_picture():
             normals=wp.zeros((1, 2, 2), dtype=wp.vec3, device="cpu"),
             depth=one,
             decode=wp.zeros(256, dtype=wp.float32, device="cpu"),
-            scene=scene,
             distant=wp.zeros(1, dtype=wp.int32, device="cpu"),
             direction=wp.zeros(1, dtype=wp.vec3, device="cpu"),
             light=wp.array([[1e5, 1e5, 1e5]], dtype=wp.vec3, device="cpu"),

@@ -1,0 +1,310 @@
+"""Triangles to pictures: albedo, normal and depth of the nearest surface of each pixel, all worlds in one launch.
+
+Each triangle is drawn once into a depth buffer of 64-bit keys (nearness above, triangle below), on CPU and CUDA alike.
+"""
+
+import warp as wp
+
+__all__ = ["Soup", "launch_rasterize"]
+
+NEAR = wp.constant(wp.float32(0.002))
+"""What is closer to the camera's plane than this is not drawn [m]."""
+EDGE = wp.constant(wp.float32(1.0e-3))
+"""Overlap of neighbouring triangles, against cracks by rounding [px]."""
+
+
+@wp.struct
+class Soup:
+    """The visible shapes as triangles: what `launch_rasterize` draws."""
+
+    world_start: wp.array[wp.int32]
+    """First entry of each world in `shape` and `face`, then of no world's shapes, then the end, shape [worlds + 2]."""
+    large_end: wp.array[wp.int32]
+    """End of the entries, first of their world's, that cast shadows and are large, shape [worlds + 1]."""
+    small_end: wp.array[wp.int32]
+    """End of the smaller ones, which follow; what comes after casts no shadow, shape [worlds + 1]."""
+    shape: wp.array[wp.int32]
+    """Shape of each entry, one entry for every visible triangle of every world."""
+    face: wp.array[wp.int32]
+    """Triangle in `faces` of each entry."""
+    spheres: wp.array[wp.vec4]
+    """Bounding sphere of each shape in its own frame, scaled: centre and radius [m]."""
+    scales: wp.array[wp.vec3]
+    transforms: wp.array[wp.transform]
+    """World pose of each shape [m]."""
+    colors: wp.array[wp.vec3]
+    """Linear albedo of each shape."""
+    texture: wp.array[wp.int32]
+    """Texture of each shape, −1 for none."""
+    faces: wp.array[wp.vec3i]
+    vertices: wp.array[wp.vec3]
+    normals: wp.array[wp.vec3]
+    """Normal of each vertex, zero for flat shading."""
+    uvs: wp.array[wp.vec2]
+    texels: wp.array[wp.uint8]
+    """sRGB bytes of all textures, row by row from the top, RGB."""
+    texture_place: wp.array[wp.vec3i]
+    """First texel, width and height of each texture."""
+
+
+@wp.func
+def corner(soup: Soup, shape: wp.int32, vertex: wp.int32, pose: wp.transform) -> wp.vec3:
+    """A vertex of a shape under a pose."""
+    return wp.transform_point(pose, wp.cw_mul(soup.scales[shape], soup.vertices[vertex]))
+
+
+@wp.kernel(enable_backward=False)
+def _clear(view_world: wp.array[wp.int32], nearest: wp.array3d[wp.uint64]):
+    view, y, x = wp.tid()
+    if view_world[view] >= 0:
+        nearest[view, y, x] = wp.uint64(0)
+
+
+@wp.kernel(enable_backward=False)
+def _rasterize(
+    view_world: wp.array[wp.int32],
+    poses: wp.array[wp.transform],
+    soup: Soup,
+    tan_x: wp.float32,
+    tan_y: wp.float32,
+    nearest: wp.array3d[wp.uint64],
+):
+    view, number = wp.tid()
+    world = view_world[view]
+    if world < 0:
+        return
+    # The triangles of the view's world, then those that belong to no world.
+    entry = soup.world_start[world] + number
+    own = soup.world_start[world + 1] - soup.world_start[world]
+    if number >= own:
+        entry = soup.world_start[soup.world_start.shape[0] - 2] + number - own
+        if entry >= soup.world_start[soup.world_start.shape[0] - 1]:
+            return
+    height = nearest.shape[1]
+    width = nearest.shape[2]
+    # A pixel's ray is (x0 + px · dx, y0 − py · dy, −1).
+    dx = 2.0 * tan_x / wp.float32(width)
+    dy = 2.0 * tan_y / wp.float32(height)
+    x0 = -tan_x + 0.5 * dx
+    y0 = tan_y - 0.5 * dy
+    shape = soup.shape[entry]
+    pose = wp.transform_inverse(poses[view]) * soup.transforms[shape]
+    ball = soup.spheres[shape]
+    centre = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
+    if centre[2] - ball[3] > -NEAR:
+        return
+    if wp.abs(centre[0]) > -centre[2] * tan_x + ball[3] * wp.sqrt(1.0 + tan_x * tan_x):
+        return
+    if wp.abs(centre[1]) > -centre[2] * tan_y + ball[3] * wp.sqrt(1.0 + tan_y * tan_y):
+        return
+    corners = soup.faces[soup.face[entry]]
+    p0 = corner(soup, shape, corners[0], pose)
+    p1 = corner(soup, shape, corners[1], pose)
+    p2 = corner(soup, shape, corners[2], pose)
+    if wp.min(p0[2], wp.min(p1[2], p2[2])) > -NEAR:
+        return
+    lower = wp.vec2(1.0e9, 1.0e9)
+    upper = wp.vec2(-1.0e9, -1.0e9)
+    for k in range(3):
+        a = p0
+        b = p1
+        if k == 1:
+            a = p1
+            b = p2
+        elif k == 2:
+            a = p2
+            b = p0
+        if a[2] <= -NEAR:
+            q = wp.vec2(a[0] / -a[2], a[1] / -a[2])
+            lower = wp.min(lower, q)
+            upper = wp.max(upper, q)
+        if (a[2] <= -NEAR) != (b[2] <= -NEAR):
+            s = (-NEAR - a[2]) / (b[2] - a[2])
+            c = a + (b - a) * s
+            q = wp.vec2(c[0] / NEAR, c[1] / NEAR)
+            lower = wp.min(lower, q)
+            upper = wp.max(upper, q)
+    columns = wp.float32(width)
+    rows = wp.float32(height)
+    left = wp.int32(wp.ceil(wp.clamp((lower[0] - x0) / dx - EDGE, 0.0, columns)))
+    right = wp.int32(wp.floor(wp.clamp((upper[0] - x0) / dx + EDGE, -1.0, columns - 1.0)))
+    top = wp.int32(wp.ceil(wp.clamp((y0 - upper[1]) / dy - EDGE, 0.0, rows)))
+    bottom = wp.int32(wp.floor(wp.clamp((y0 - lower[1]) / dy + EDGE, -1.0, rows - 1.0)))
+    if left > right or top > bottom:
+        return
+    normal = wp.cross(p1 - p0, p2 - p0)
+    volume = wp.dot(normal, p0)
+    if wp.abs(volume) < 1.0e-16:
+        return
+    side = wp.sign(volume)
+    # Edge functions e · ray, positive inside; edge vectors keep the digits of small triangles.
+    e0 = wp.cross(p1, p2 - p1) * side
+    e1 = wp.cross(p2, p0 - p2) * side
+    e2 = wp.cross(p0, p1 - p0) * side
+    slope = normal / volume
+    for y in range(top, bottom + 1):
+        ray_y = y0 - wp.float32(y) * dy
+        low = wp.float32(left)
+        high = wp.float32(right)
+        for k in range(3):
+            e = e0
+            if k == 1:
+                e = e1
+            elif k == 2:
+                e = e2
+            step = e[0] * dx
+            start = e[0] * x0 + e[1] * ray_y - e[2]
+            if step > 0.0:
+                low = wp.max(low, -start / step - EDGE)
+            elif step < 0.0:
+                high = wp.min(high, -start / step + EDGE)
+            elif start < 0.0:
+                high = -1.0
+        if low <= high:
+            base = slope[0] * x0 + slope[1] * ray_y - slope[2]
+            for x in range(wp.int32(wp.ceil(low)), wp.int32(wp.floor(high)) + 1):
+                near = base + slope[0] * dx * wp.float32(x)
+                if near > 0.0 and near < 1.0 / NEAR:
+                    # Positive floats are ordered as their bits, so the nearest triangle wins whatever the order.
+                    key = (wp.uint64(wp.cast(near, wp.uint32)) << wp.uint64(32)) | wp.uint64(entry)
+                    wp.atomic_max(nearest, view, y, x, key)
+
+
+@wp.func
+def srgb(value: wp.float32) -> wp.float32:
+    """Encode a linear value in [0, 1] as sRGB (IEC 61966-2-1)."""
+    if value <= 0.0031308:
+        return 12.92 * value
+    return 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
+
+
+@wp.func
+def _linear(value: wp.float32) -> wp.float32:
+    """Linear value of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    if value <= 0.04045:
+        return value / 12.92
+    return wp.pow((value + 0.055) / 1.055, 2.4)
+
+
+@wp.func
+def _texel(soup: Soup, place: wp.vec3i, x: wp.int32, y: wp.int32) -> wp.vec3:
+    """Texel as sRGB in [0, 1], repeating."""
+    column = x % place[1]
+    row = y % place[2]
+    if column < 0:
+        column += place[1]
+    if row < 0:
+        row += place[2]
+    i = (place[0] + row * place[1] + column) * 3
+    scale = 1.0 / 255.0
+    return wp.vec3(wp.float32(soup.texels[i]), wp.float32(soup.texels[i + 1]), wp.float32(soup.texels[i + 2])) * scale
+
+
+@wp.kernel(enable_backward=False)
+def _resolve(
+    view_world: wp.array[wp.int32],
+    poses: wp.array[wp.transform],
+    rays: wp.array4d[wp.vec3],
+    soup: Soup,
+    nearest: wp.array3d[wp.uint64],
+    albedo: wp.array3d[wp.uint32],
+    normals: wp.array3d[wp.vec3],
+    depth: wp.array3d[wp.float32],
+):
+    view, y, x = wp.tid()
+    if view_world[view] < 0:
+        return
+    if nearest[view, y, x] == wp.uint64(0):
+        depth[view, y, x] = 0.0
+        return
+    entry = wp.int32(nearest[view, y, x] & wp.uint64(0xFFFFFFFF))
+    shape = soup.shape[entry]
+    pose = soup.transforms[shape]
+    inverse = wp.transform_inverse(pose)
+    # The ray in the shape's frame, where the triangle needs no transform.
+    start = wp.transform_point(inverse, wp.transform_get_translation(poses[view]))
+    along = wp.transform_vector(inverse, wp.transform_vector(poses[view], rays[y, x, 0, 1]))
+    corners = soup.faces[soup.face[entry]]
+    scale = soup.scales[shape]
+    p0 = wp.cw_mul(scale, soup.vertices[corners[0]]) - start
+    p1 = wp.cw_mul(scale, soup.vertices[corners[1]]) - start
+    p2 = wp.cw_mul(scale, soup.vertices[corners[2]]) - start
+    normal = wp.cross(p1 - p0, p2 - p0)
+    t = wp.dot(normal, p0) / wp.dot(normal, along)
+    # Weights from the triangle's own edges around the hit point; outside by rounding at most.
+    hit = along * t
+    square = wp.dot(normal, normal)
+    w1 = wp.clamp(wp.dot(wp.cross(p2 - hit, p0 - hit), normal) / square, 0.0, 1.0)
+    w2 = wp.clamp(wp.dot(wp.cross(p0 - hit, p1 - hit), normal) / square, 0.0, 1.0)
+    w0 = wp.max(1.0 - w1 - w2, 0.0)
+    smooth = soup.normals[corners[0]] * w0 + soup.normals[corners[1]] * w1 + soup.normals[corners[2]] * w2
+    if wp.dot(smooth, smooth) > 0.0:
+        normal = wp.cw_div(smooth, scale)
+    colour = soup.colors[shape]
+    if soup.texture[shape] >= 0:
+        place = soup.texture_place[soup.texture[shape]]
+        uv = soup.uvs[corners[0]] * w0 + soup.uvs[corners[1]] * w1 + soup.uvs[corners[2]] * w2
+        u = uv[0] * wp.float32(place[1]) - 0.5
+        v = (1.0 - uv[1]) * wp.float32(place[2]) - 0.5
+        column = wp.int32(wp.floor(u))
+        row = wp.int32(wp.floor(v))
+        fu = u - wp.floor(u)
+        fv = v - wp.floor(v)
+        above = _texel(soup, place, column, row) * (1.0 - fu) + _texel(soup, place, column + 1, row) * fu
+        below = _texel(soup, place, column, row + 1) * (1.0 - fu) + _texel(soup, place, column + 1, row + 1) * fu
+        seen = above * (1.0 - fv) + below * fv
+        colour = wp.cw_mul(colour, wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
+    albedo[view, y, x] = (
+        wp.uint32(wp.clamp(srgb(colour[0]), 0.0, 1.0) * 255.0)
+        | (wp.uint32(wp.clamp(srgb(colour[1]), 0.0, 1.0) * 255.0) << wp.uint32(8))
+        | (wp.uint32(wp.clamp(srgb(colour[2]), 0.0, 1.0) * 255.0) << wp.uint32(16))
+    )
+    normals[view, y, x] = wp.normalize(wp.transform_vector(pose, normal))
+    depth[view, y, x] = t
+
+
+def launch_rasterize(
+    *,
+    view_world: wp.array,
+    poses: wp.array,
+    rays: wp.array,
+    soup: Soup,
+    tangents: tuple[float, float],
+    triangles: int,
+    nearest: wp.array,
+    albedo: wp.array,
+    normals: wp.array,
+    depth: wp.array,
+) -> None:
+    """Albedo, normal and depth of the nearest triangle of each pixel.
+
+    A ray searches every tree anew; drawing each triangle once costs a third of that on a CPU core, a fifth on a GPU.
+
+    Args:
+        view_world: int32 [views], world of each view, negative to leave its picture as it is.
+        poses: Camera poses [m], shape [views].
+        rays: Camera-space origin (zero) and unit direction, shape [H, W, 1, 2].
+        soup: Triangles of the model.
+        tangents: Tangents of half the horizontal and half the vertical view.
+        triangles: Largest number of triangles that a view can see, those of no world included.
+        nearest: Work space, uint64 [views, H, W]: nearness (bits of 1/distance along the view axis) and entry.
+        albedo: Out, sRGB packed as RGBA, uint32, same shape.
+        normals: Out, world-space normals, same shape.
+        depth: Out, distance along the ray [m], 0 where it met nothing, same shape.
+    """
+    device = depth.device
+    wp.launch(_clear, dim=nearest.shape, inputs=[view_world], outputs=[nearest], device=device)
+    wp.launch(
+        _rasterize,
+        dim=(poses.shape[0], triangles),
+        inputs=[view_world, poses, soup, *tangents],
+        outputs=[nearest],
+        device=device,
+    )
+    wp.launch(
+        _resolve,
+        dim=depth.shape,
+        inputs=[view_world, poses, rays, soup, nearest],
+        outputs=[albedo, normals, depth],
+        device=device,
+    )

@@ -1,0 +1,142 @@
+"""Promises of the kernels that draw triangles, from the camera and from the light."""
+
+import numpy as np
+import warp as wp
+
+from arena_newton.kernels import raster, shadow
+
+
+def srgb(value):
+    """NumPy twin of the sRGB encoding."""
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055)
+
+
+def _soup(vertices, faces, color):
+    soup = raster.Soup()
+
+    def array(values, kind):
+        return wp.array(values, dtype=kind, device="cpu")
+
+    soup.world_start = array([0, len(faces), len(faces)], wp.int32)
+    soup.large_end, soup.small_end = array([0, len(faces)], wp.int32), array([len(faces), len(faces)], wp.int32)
+    soup.shape, soup.face = array(np.zeros(len(faces)), wp.int32), array(np.arange(len(faces)), wp.int32)
+    soup.spheres, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
+    soup.transforms = array([[0, 0, 0, 0, 0, 0, 1]], wp.transform)
+    soup.colors, soup.texture = array([color], wp.vec3), array([-1], wp.int32)
+    soup.faces, soup.vertices = array(faces, wp.vec3i), array(vertices, wp.vec3)
+    soup.normals, soup.uvs = array(np.zeros((len(vertices), 3)), wp.vec3), array(np.zeros((len(vertices), 2)), wp.vec2)
+    soup.texels = array(np.zeros(0, np.uint8), wp.uint8)
+    soup.texture_place = array(np.zeros((0, 3), np.int32), wp.vec3i)
+    return soup
+
+
+def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48):
+    x = (np.arange(width) + 0.5) / width * 2 - 1
+    y = 1 - (np.arange(height) + 0.5) / height * 2
+    rays = np.zeros((height, width, 1, 2, 3), np.float32)
+    rays[:, :, 0, 1] = np.stack(np.broadcast_arrays(x[None] * tangents[0], y[:, None] * tangents[1], -1.0), -1)
+    rays[:, :, 0, 1] /= np.linalg.norm(rays[:, :, 0, 1], axis=-1, keepdims=True)
+
+    def empty(kind):
+        return wp.zeros((1, height, width), dtype=kind, device="cpu")
+
+    out = {"albedo": empty(wp.uint32), "normals": empty(wp.vec3), "depth": empty(wp.float32)}
+    raster.launch_rasterize(
+        view_world=wp.zeros(1, dtype=wp.int32, device="cpu"),
+        poses=wp.array([[0, 0, 0, 0, 0, 0, 1]], dtype=wp.transform, device="cpu"),
+        rays=wp.array(rays, dtype=wp.vec3, device="cpu"),
+        soup=_soup(vertices, faces, (0.25, 0.5, 1.0)),
+        tangents=tangents,
+        triangles=len(faces),
+        nearest=empty(wp.uint64),
+        **out,
+    )
+    return rays[:, :, 0, 1], {k: v.numpy()[0] for k, v in out.items()}
+
+
+def test_drawn_triangles_meet_the_rays():
+    """Random triangles, some through the camera's plane, are found where ray–triangle intersection finds them."""
+    rng = np.random.default_rng(3)
+    vertices = rng.uniform(-3, 3, (60, 3)).astype(np.float32)
+    faces = np.arange(60).reshape(-1, 3)
+    rays, out = _draw(vertices, faces)
+    best = np.full(rays.shape[:2], np.inf)
+    for p0, p1, p2 in vertices[faces].astype(np.float64):
+        d = rays.astype(np.float64)
+        h = np.cross(d, p2 - p0)
+        det = h @ (p1 - p0)
+        u = h @ -p0 / det
+        q = np.cross(-p0, p1 - p0)
+        v, t = d @ q / det, q @ (p2 - p0) / det
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t * -d[..., 2] > 0.002)
+        best = np.where(hit & (t < best), t, best)
+    found = np.where(out["depth"] > 0, out["depth"], np.inf)
+    same = (found == best) | (np.abs(found - best) < 1e-3 * np.maximum(1, best))
+    assert same.mean() > 0.995
+    assert np.isfinite(best).mean() > 0.3
+
+
+def test_a_floor_has_no_cracks():
+    """A fan of triangles covers its plane without a hole, and its colour and depth are the plane's."""
+    angle = np.linspace(0, 2 * np.pi, 40)[:-1]
+    rim = np.stack([30 * np.cos(angle), 30 * np.sin(angle), np.full_like(angle, -2.0)], 1)
+    vertices = np.vstack([[0.1, -0.2, -2.0], rim]).astype(np.float32)
+    faces = [[0, 1 + i, 1 + (i + 1) % 39] for i in range(39)]
+    rays, out = _draw(vertices, np.array(faces))
+    np.testing.assert_allclose(out["depth"] * -rays[..., 2], 2.0, rtol=1e-4)
+    colour = out["albedo"].view(np.uint8).reshape(*out["albedo"].shape, 4)[..., :3]
+    assert np.abs(colour.astype(int) - np.round(srgb(np.array([0.25, 0.5, 1.0])) * 255)).max() <= 1
+
+
+def test_a_shadow_map_holds_the_highest_surface():
+    """Every texel has the depth of the triangle nearest to the light there, and its window encloses what is seen."""
+    rng = np.random.default_rng(4)
+    vertices = rng.uniform(-3, 3, (60, 3)).astype(np.float32)
+    faces = np.arange(60).reshape(-1, 3)
+    vertices[:, 2] -= 4.0
+    width, height, size = 64, 48, 96
+    x, y = (np.arange(width) + 0.5) / width * 2 - 1, 1 - (np.arange(height) + 0.5) / height * 2
+    along = np.stack(np.broadcast_arrays(x[None], y[:, None], -1.0), -1)
+    length = np.linalg.norm(along, axis=-1)
+    rays = np.zeros((height, width, 1, 2, 3), np.float32)
+    rays[:, :, 0, 1] = along / length[..., None]
+    maps = shadow.ShadowMaps()
+    with wp.ScopedDevice("cpu"):
+        maps.frames = wp.zeros(1, dtype=wp.transform)
+        maps.window = wp.zeros((2, 4), dtype=wp.float32)
+        maps.depth = wp.zeros((2, size, size), dtype=wp.uint32)
+        # The view shows a floor 4 m below the camera, so all of it belongs to the far map.
+        shadow.launch_shadow_maps(
+            first=0,
+            view_world=wp.zeros(1, dtype=wp.int32),
+            poses=wp.array([[0, 0, 0, 0, 0, 0, 1]], dtype=wp.transform),
+            rays=wp.array(rays, dtype=wp.vec3),
+            normals=wp.array(np.tile(np.float32([0, 0, 1]), (1, height, width, 1)), dtype=wp.vec3),
+            depth=wp.array(4.0 * length[None].astype(np.float32), dtype=wp.float32),
+            soup=_soup(vertices, faces, (1, 1, 1)),
+            casters=(0, len(faces)),
+            distant=wp.ones(1, dtype=wp.int32),
+            direction=wp.array([[0, 0, -1]], dtype=wp.vec3),
+            maps=maps,
+        )
+    window = maps.window.numpy()
+    assert window[0, 0] > 1e8
+    np.testing.assert_allclose(np.sort(np.abs(window[1]))[[0, 3]], [4 * y.max(), 4 * x.max()], rtol=1e-5)
+    found = maps.depth.numpy()[1].view(np.float32).astype(float)
+    low, extent = window[1, :2].astype(float), -window[1, 2:] - window[1, :2].astype(float)
+    low, texel = low - 0.02 * extent, 1.04 * extent / size
+    u, v = np.meshgrid(low[0] + (np.arange(size) + 0.5) * texel[0], low[1] + (np.arange(size) + 0.5) * texel[1])
+    turn = maps.frames.numpy()[0, 3:]
+    right = np.array(wp.quat_rotate(wp.quat(*turn), wp.vec3(1.0, 0.0, 0.0)))
+    forward = np.array(wp.quat_rotate(wp.quat(*turn), wp.vec3(0.0, 1.0, 0.0)))
+    points = vertices[faces].astype(float)
+    best = np.full(u.shape, -np.inf)
+    for p0, p1, p2 in np.stack([points @ right, points @ forward, points[..., 2]], -1):
+        (a, b), (c, d) = (p1 - p0)[:2], (p2 - p0)[:2]
+        s = ((u - p0[0]) * d - (v - p0[1]) * c) / (a * d - b * c)
+        t = ((v - p0[1]) * a - (u - p0[0]) * b) / (a * d - b * c)
+        z = p0[2] + s * (p1 - p0)[2] + t * (p2 - p0)[2]
+        best = np.where((s >= 0) & (t >= 0) & (s + t <= 1), np.maximum(best, z), best)
+    expected = np.where(np.isfinite(best), best + 256.0, 0.0)
+    assert (np.abs(found - expected) < 2e-3).mean() > 0.995
+    assert 0.2 < np.isfinite(best).mean() < 1.0
