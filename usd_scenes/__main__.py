@@ -75,8 +75,11 @@ def _preview(args: argparse.Namespace) -> int:
     if args.size < 16:
         raise InputError(f"--size {args.size}: expected at least 16 pixels")
     from arena_newton.usd_scenes.preview import preview
-    from arena_newton.usd_scenes.validate import REQUIRED
+    from arena_newton.usd_scenes.validate import REQUIRED, check_files
 
+    for target in args.targets:
+        if target not in REQUIRED:
+            check_files(target)
     print(preview(args.targets or list(REQUIRED), args.out, args.size, args.mode))
     return 0
 

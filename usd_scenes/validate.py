@@ -4,34 +4,19 @@
 of every rigid body, and that nothing is loaded from outside the folder tree or over a network.
 """
 
-import re
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, walk
 
 if TYPE_CHECKING:
-    from pxr import Sdf, Usd
+    from pxr import Usd
 
-__all__ = ["REQUIRED", "Problem", "Required", "check", "task_of", "validate"]
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One thing that is wrong with a layer."""
-
-    file: str
-    """The layer that was checked, or the layer in its stack that holds the fault."""
-    prim: str
-    """Path of the prim, or of the property; empty for a fault of the whole layer."""
-    message: str
-    """What is wrong and what was expected."""
-
-    def __str__(self) -> str:
-        """One line: file, prim, message."""
-        return f"{self.file}: {self.prim + ': ' if self.prim else ''}{self.message}"
+__all__ = ["REQUIRED", "Problem", "Required", "check", "check_files", "layers", "task_of", "validate"]
 
 
 @dataclass(frozen=True)
@@ -104,10 +89,6 @@ REQUIRED: dict[str, tuple[Required, ...]] = {
 }
 """What each task needs besides `COMMON`."""
 
-_SCHEME = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+:")
-_DRIVE = re.compile(r"^[A-Za-z]:")
-_LAYERS = {".usd", ".usda", ".usdc", ".usdz"}
-
 
 def validate(path: str | Path, task: str | None = None) -> list[Problem]:
     """All faults of the layer at `path` as a scene of `task`.
@@ -119,17 +100,16 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
     Raises:
         InputError: `task` is no task.
     """
-    from pxr import UsdUtils
+    from pxr import Tf, UsdUtils
 
     if task is not None and task not in REQUIRED:
         raise InputError(f"unknown task {task!r}; tasks are {', '.join(REQUIRED)}")
-    file = Path(path)
-    if not file.is_file():
-        return [Problem(str(path), "", "no such file")]
     # Composition warnings repeat on stderr what is reported here; the delegate swallows them.
     silence = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        return _validate(file, task)
+        return _validate(Path(path), task)
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
+        return [Problem(str(path), "", f"cannot be composed: {reason(error)}")]
     finally:
         del silence
 
@@ -148,39 +128,38 @@ def check(path: str | Path, task: str | None = None) -> None:
 
 def task_of(path: str | Path) -> str | None:
     """The task whose folder the layer, or a layer it builds on, lies in; `None` if that is none or several."""
-    return _deduce(_walk_layers(Path(path)).files)
+    return _deduce(walk(Path(path)).files)
 
 
 def _validate(file: Path, task: str | None) -> list[Problem]:
-    from pxr import Tf, Usd
+    from pxr import Usd
 
-    walk = _walk_layers(file)
-    if walk.broken:
-        return walk.problems
-    problems = list(walk.problems)
-    task = task or _deduce(walk.files)
+    found = walk(file)
+    if found.fatal:
+        return found.problems
+    problems = list(found.problems)
+    task = task or _deduce(found.files)
     if task is None:
         problems.append(
             Problem(str(file), "", f"cannot tell the task from the folders; pass --task ({', '.join(REQUIRED)})")
         )
-    try:
-        stage = Usd.Stage.Open(str(file))
-    except Tf.ErrorException as error:
-        return [*problems, Problem(str(file), "", f"cannot be composed: {_first_line(error)}")]
-    problems += _units(stage, file)
+    stage = Usd.Stage.Open(str(found.files[0]))
+    problems += [*_units(stage, file), *_composition(stage, file)]
     world = stage.GetPrimAtPath("/World")
     if not world:
         return [*problems, Problem(str(file), "/World", "missing: the scene's default prim")]
     if stage.GetDefaultPrim() != world:
         problems.append(Problem(str(file), "/World", "is not the layer's defaultPrim"))
-    return _unique(problems + list(_prims(stage, file, task, robot_lost=walk.lost)))
+    problems += [Problem(str(file), prim, message) for prim, message in _selections(stage)]
+    problems += [*_prims(stage, file, task), *_strangers(stage, file, found)]
+    return list(dict.fromkeys(problems))
 
 
-def _prims(stage: "Usd.Stage", file: Path, task: str | None, *, robot_lost: bool) -> Iterator[Problem]:
+def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem]:
     """Faults of the prims, in the authored selection and in every variant of `semantics`."""
     from pxr import Usd
 
-    seen: set[tuple[str, str]] = set()
+    seen: set[tuple[str, str]] = set(_selections(stage))
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         choice = stage.GetPrimAtPath("/World").GetVariantSets().GetVariantSet("semantics")
         names = sorted(choice.GetVariantNames(), key=lambda name: name != "base") or ["base"]
@@ -190,13 +169,42 @@ def _prims(stage: "Usd.Stage", file: Path, task: str | None, *, robot_lost: bool
             faults = [
                 _fault(stage, item)
                 for item in (*COMMON, *(REQUIRED[task] if task else ()))
-                if not (item.variants and name not in item.variants) and not (item.kind == "robot" and robot_lost)
+                if not (item.variants and name not in item.variants)
             ]
-            for prim, message in [*(fault for fault in faults if fault), *_masses(stage)]:
+            for prim, message in [*(fault for fault in faults if fault), *_masses(stage), *_selections(stage)]:
                 # A fault of every variant is told once; a variant's own fault names the variant.
                 if (prim, message) not in seen:
                     yield Problem(str(file), prim, message + ("" if name == names[0] else f" (variant {name})"))
                 seen.add((prim, message))
+
+
+def _selections(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+    """Variant selections that name no variant; USD would silently compose the prim without any."""
+    for prim in stage.TraverseAll():
+        sets = prim.GetVariantSets()
+        for name, selected in sets.GetAllVariantSelections().items():
+            if not sets.HasVariantSet(name):
+                yield str(prim.GetPath()), f'selects "{selected}" of the unknown variant set "{name}"'
+                continue
+            known = sets.GetVariantSet(name).GetVariantNames()
+            if selected not in known:
+                wanted = ", ".join(known) or "no selection"
+                yield str(prim.GetPath()), f'variant {name} = "{selected}" is unknown: expected {wanted}'
+
+
+def _composition(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
+    """What USD could not compose: a reference to a prim that is not there, a cycle."""
+    for error in stage.GetCompositionErrors():
+        where = error.rootSite.path
+        yield Problem(str(file), "" if where.IsAbsoluteRootPath() else str(where), reason(error))
+
+
+def _strangers(stage: "Usd.Stage", file: Path, found: Walk) -> Iterator[Problem]:
+    """Layers that the stage uses and the walk did not look at; there should be none."""
+    for layer in stage.GetUsedLayers():
+        path = layer.realPath.split("[", 1)[0]
+        if not layer.anonymous and not (path and Path(path) in found.files):
+            yield Problem(str(file), "", f"is composed from @{layer.identifier}@, which no asset path in it names")
 
 
 def _fault(stage: "Usd.Stage", item: Required) -> tuple[str, str] | None:
@@ -278,9 +286,10 @@ def _marker_fault(prim: "Usd.Prim") -> str | None:
         return "has no attribute arena:size"
     try:
         lengths = [float(v) for v in size]
-    except TypeError:
+    except (TypeError, ValueError):
         return "arena:size is not three lengths"
-    return None if len(lengths) == 3 and min(lengths) > 0 else f"arena:size is {tuple(lengths)}"
+    good = len(lengths) == 3 and all(math.isfinite(v) and v > 0 for v in lengths)
+    return None if good else f"arena:size is {tuple(lengths)}"
 
 
 def _collider_fault(prim: "Usd.Prim") -> str | None:
@@ -343,15 +352,24 @@ def _masses(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
             yield path, "rigid body without PhysicsMassAPI: expected mass, inertia, centre of mass and principal axes"
             continue
         mass = api.GetMassAttr().Get()
-        if not mass or mass <= 0:
+        if not mass or not (math.isfinite(mass) and mass > 0):
             value = mass if api.GetMassAttr().HasAuthoredValue() else "missing"
             yield path, f"physics:mass is {value}: expected kg > 0"
         inertia = api.GetDiagonalInertiaAttr().Get()
-        if not api.GetDiagonalInertiaAttr().HasAuthoredValue() or min(inertia) <= 0:
+        known = api.GetDiagonalInertiaAttr().HasAuthoredValue()
+        if not known or not all(math.isfinite(value) and value > 0 for value in inertia):
             yield path, "physics:diagonalInertia is missing or not positive: expected three values in kg·m²"
-        for attribute in (api.GetCenterOfMassAttr(), api.GetPrincipalAxesAttr()):
+        axes = api.GetPrincipalAxesAttr().Get()
+        for attribute, numbers in (
+            (api.GetCenterOfMassAttr(), api.GetCenterOfMassAttr().Get()),
+            (api.GetPrincipalAxesAttr(), (axes.real, *axes.imaginary)),
+        ):
             if not attribute.HasAuthoredValue():
                 yield path, f"{attribute.GetName()} is missing: expected an authored value beside the inertia"
+            elif not all(map(math.isfinite, numbers)):
+                yield path, f"{attribute.GetName()} is not finite"
+        if api.GetPrincipalAxesAttr().HasAuthoredValue() and abs(axes.GetLength() - 1) > 0.01:
+            yield path, f"physics:principalAxes has length {axes.GetLength():g}: expected a unit quaternion"
 
 
 def _units(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
@@ -369,114 +387,6 @@ def _units(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
         yield Problem(str(file), "", f"kilogramsPerUnit is {UsdPhysics.GetStageKilogramsPerUnit(stage):g}: expected 1")
 
 
-@dataclass
-class _Walk:
-    """What following every asset path of a layer found."""
-
-    files: list[Path]
-    problems: list[Problem]
-    broken: bool = False
-    """The first layer itself is unreadable."""
-    lost: bool = False
-    """A layer that another one builds on is missing, so prims may be missing for that reason alone."""
-
-
-def _walk_layers(file: Path) -> _Walk:
-    """Follow sublayers, references, payloads and asset values through the layer files, without composing anything."""
-    from pxr import Sdf, Tf
-
-    walk = _Walk([], [])
-    queue, seen = [file.resolve()], set()
-    while queue:
-        path = queue.pop(0)
-        if path in seen:
-            continue
-        seen.add(path)
-        walk.files.append(path)
-        shown = str(file) if len(seen) == 1 else str(path)
-        try:
-            layer = Sdf.Layer.FindOrOpen(str(path))
-        except Tf.ErrorException as error:
-            layer, reason = None, f"not a readable USD layer: {_first_line(error)}"
-        else:
-            reason = "not a readable USD layer"
-        if layer is None:
-            walk.problems.append(Problem(shown, "", reason))
-            walk.broken |= len(seen) == 1
-            continue
-        if len(seen) > 1:
-            walk.problems += _layer_units(layer, shown)
-        for prim, asset, composes in _asset_paths(layer):
-            fault, target = _locate(asset, path.parent)
-            if fault:
-                walk.problems.append(Problem(shown, prim, fault))
-                walk.lost |= composes
-            elif target is not None and target.suffix in _LAYERS:
-                queue.append(target)
-    return walk
-
-
-def _locate(asset: str, folder: Path) -> tuple[str | None, Path | None]:
-    """The fault of an asset path, or the file it means."""
-    if asset.startswith(("/", "\\")) or _DRIVE.match(asset):
-        return f"absolute asset path @{asset}@: expected a path relative to the layer", None
-    if _SCHEME.match(asset):
-        return f"remote asset path @{asset}@: expected a file next to the layer", None
-    target = (folder / asset.split("[", 1)[0]).resolve()
-    if not target.is_file():
-        return f"asset @{asset}@ does not exist: expected {target}", None
-    return None, target
-
-
-def _asset_paths(layer: "Sdf.Layer") -> Iterator[tuple[str, str, bool]]:
-    """Every asset path a layer names: (where, path, whether the layer is built on it)."""
-    from pxr import Sdf
-
-    found: list[tuple[str, str, bool]] = [("", asset, True) for asset in layer.subLayerPaths]
-
-    def visit(path: "Sdf.Path") -> None:
-        spec = layer.GetObjectAtPath(path)
-        if isinstance(spec, Sdf.VariantSpec):
-            spec = spec.primSpec
-        if isinstance(spec, Sdf.PrimSpec):
-            for arcs in (spec.referenceList, spec.payloadList):
-                for item in arcs.GetAddedOrExplicitItems():
-                    found.append((_plain(path), item.assetPath, True))
-            for _, clips in (spec.GetInfo("clips") if spec.HasInfo("clips") else {}).items():
-                for value in clips.values():
-                    found.extend((_plain(path), a, True) for a in _assets_in(value))
-        elif isinstance(spec, Sdf.AttributeSpec):
-            values = [spec.default, *(layer.QueryTimeSample(path, t) for t in layer.ListTimeSamplesForPath(path))]
-            for value in values:
-                found.extend((_plain(path), a, False) for a in _assets_in(value))
-
-    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    yield from (entry for entry in found if entry[1])
-
-
-def _assets_in(value: object) -> list[str]:
-    from pxr import Sdf
-
-    if isinstance(value, Sdf.AssetPath):
-        return [value.path]
-    if isinstance(value, Sdf.AssetPathArray):
-        return [item.path for item in value]
-    return []
-
-
-def _plain(path: "Sdf.Path") -> str:
-    """A path as it reads in the stage, its variant selections left out."""
-    return str(path.StripAllVariantSelections())
-
-
-def _layer_units(layer: "Sdf.Layer", shown: str) -> Iterator[Problem]:
-    """A layer that is built on must not speak other units: USD does not convert them."""
-    info = layer.pseudoRoot
-    for key, wanted in (("metersPerUnit", 1.0), ("upAxis", "Z"), ("kilogramsPerUnit", 1.0)):
-        if info.HasInfo(key) and info.GetInfo(key) != wanted:
-            yield Problem(shown, "", f"{key} is {info.GetInfo(key)}: expected {wanted} (USD does not convert units)")
-
-
 def _deduce(files: list[Path]) -> str | None:
     """The one task among the names of the files' folders; the nearest file decides."""
     for file in files:
@@ -484,11 +394,3 @@ def _deduce(files: list[Path]) -> str | None:
         if names:
             return names[0]
     return None
-
-
-def _first_line(error: Exception) -> str:
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), "unknown error")
-
-
-def _unique(problems: list[Problem]) -> list[Problem]:
-    return list(dict.fromkeys(problems))

@@ -1,7 +1,9 @@
 """Promises of videos and film strips."""
 
+import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from arena_newton.errors import ArenaError
 from arena_newton.video import VideoWriter, film_strip
@@ -16,7 +18,6 @@ def _frames(n, height=48, width=64):
 
 def test_video_is_h264_with_every_frame(tmp_path):
     """The file is H.264 yuv420p of the given size and rate, holds every frame, and appears only when closed."""
-    av = pytest.importorskip("av")
     path = tmp_path / "a" / "run.mp4"
     writer = VideoWriter(path, 64, 48, fps=25.0)
     for frame in _frames(12):
@@ -37,7 +38,6 @@ def test_video_is_h264_with_every_frame(tmp_path):
 
 def test_odd_sizes_are_padded(tmp_path):
     """A frame of odd size gets one black row or column."""
-    av = pytest.importorskip("av")
     with VideoWriter(tmp_path / "odd.mp4", 33, 21) as writer:
         writer.write(np.full((21, 33, 3), 255, np.uint8))
     with av.open(str(tmp_path / "odd.mp4")) as container:
@@ -68,13 +68,12 @@ def test_wrong_frame_is_refused(tmp_path):
 
 def test_film_strip_spaces_frames_evenly(tmp_path):
     """Ten frames side by side, first and last included, with a label line above on request."""
-    image = pytest.importorskip("PIL.Image")
     frames = _frames(12)
-    plain = np.asarray(image.open(film_strip(frames, tmp_path / "s.png")))
+    plain = np.asarray(Image.open(film_strip(frames, tmp_path / "s.png")))
     assert plain.shape == (48, 10 * 64 + 9 * 4, 3)
     assert plain[10, 10, 0] == frames[0, 0, 0, 0]
     assert plain[10, -10, 0] == frames[11, 0, 0, 0]
-    labelled = np.asarray(image.open(film_strip(list(frames[:3]), tmp_path / "t.png", label="football success")))
+    labelled = np.asarray(Image.open(film_strip(list(frames[:3]), tmp_path / "t.png", label="football success")))
     assert labelled.shape[0] > 48
     assert labelled.shape[1] == 3 * 64 + 2 * 4
     with pytest.raises(ArenaError, match="at least one frame"):

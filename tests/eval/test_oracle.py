@@ -6,8 +6,6 @@ import json
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
 from arena_newton import robot as g1
 from arena_newton.errors import InputError
 from arena_newton.eval import oracle
@@ -43,7 +41,6 @@ def one_thread():
 @pytest.fixture(scope="module")
 def rows(files, one_thread):
     """The five references on both sides, 5 ms physics, 8 s of each clip."""
-    pytest.importorskip("pxr")
     checkpoint, mjcf, clips = files
     return oracle.compare(checkpoint, mjcf, clips, fast=True, clip_seconds=8.0)
 

@@ -3,14 +3,12 @@
 import re
 from pathlib import Path
 
+import mujoco
+import newton
 import numpy as np
 import pytest
 
 from arena_newton.robot import HAND_JOINTS, MUJOCO_JOINTS
-
-mujoco = pytest.importorskip("mujoco")
-newton = pytest.importorskip("newton")
-pytest.importorskip("pxr")
 
 ORACLE = Path(__file__).parents[2] / ".." / "shared" / "reference" / "g1"
 WITH_HANDS = ORACLE / "g1_sim2sim_29dof_with_hands.xml"
@@ -27,6 +25,95 @@ GRASP_BOXES = {
     "hand_index_1_link": ((0.0285, 0.0078, 0.0115), (0.0235, 0.0, 0.0)),
 }
 """Half sizes and centres [m] of the left hand's boxes that grasped the hammer in 100 of 100 trials."""
+
+
+LINK_MASSES = {
+    "pelvis": 3.814,
+    "torso_link": 7.818,
+    "left_hip_yaw_link": 1.702,
+    "right_knee_link": 1.932,
+    "left_ankle_roll_link": 0.608,
+    "right_shoulder_yaw_link": 0.734,
+    "left_elbow_link": 0.6,
+    "right_wrist_yaw_link": 0.457415,
+    "left_hand_thumb_1_link": 0.0588507,
+    "right_hand_index_1_link": 0.0203063,
+}
+"""Masses [kg] as `g1_sim2sim_29dof_with_hands.xml` of TWIST2 states them."""
+TOTAL_MASS = 34.3952352
+"""Mass [kg] of all links of the same file."""
+TABLE_LINKS = (
+    "left_ankle_roll_link",
+    "right_ankle_roll_link",
+    "torso_link",
+    "left_hand_thumb_2_link",
+    "right_hand_index_1_link",
+)
+CROUCH = {
+    f"{side}_{joint}_joint": angle
+    for side in ("left", "right")
+    for joint, angle in (
+        ("hip_pitch", -0.9),
+        ("knee", 1.5),
+        ("ankle_pitch", -0.6),
+        ("shoulder_pitch", -0.8),
+        ("elbow", 0.4),
+    )
+}
+TURN = {
+    "waist_yaw_joint": 0.7,
+    "waist_roll_joint": -0.2,
+    "waist_pitch_joint": 0.3,
+    "left_hip_roll_joint": 0.4,
+    "left_hip_yaw_joint": -0.5,
+    "right_hip_yaw_joint": 0.6,
+    "right_ankle_roll_joint": -0.2,
+    "left_shoulder_roll_joint": 1.0,
+    "left_shoulder_yaw_joint": -0.6,
+    "right_shoulder_roll_joint": -0.8,
+    "right_shoulder_yaw_joint": 0.5,
+    "left_wrist_roll_joint": 0.9,
+    "right_wrist_pitch_joint": -0.7,
+    "right_wrist_yaw_joint": 0.5,
+    "left_wrist_yaw_joint": -0.4,
+    "left_hand_thumb_0_joint": 0.5,
+    "left_hand_thumb_1_joint": 0.6,
+    "right_hand_index_0_joint": 0.9,
+    "right_hand_index_1_joint": 0.8,
+}
+POSTURES = {
+    "zero": (
+        {},
+        (
+            (-0.000002, 0.118506, -0.756864),
+            (-0.000002, -0.118506, -0.756864),
+            (-0.003964, 0.0, 0.044),
+            (0.264262, 0.086549, 0.095226),
+            (0.364777, -0.153218, 0.123724),
+        ),
+    ),
+    "crouch": (
+        CROUCH,
+        (
+            (0.094265, 0.118506, -0.5771),
+            (0.094265, -0.118506, -0.5771),
+            (-0.003964, 0.0, 0.044),
+            (0.366739, 0.01572, 0.246147),
+            (0.46105, -0.059318, 0.313714),
+        ),
+    ),
+    "turn": (
+        TURN,
+        (
+            (0.004168, 0.416252, -0.680863),
+            (0.024108, -0.193546, -0.752603),
+            (-0.003031, -0.002553, 0.044),
+            (-0.029027, 0.295843, -0.108923),
+            (0.174903, 0.083587, 0.049213),
+        ),
+    ),
+}
+"""Joint angles [rad], and where MuJoCo puts the origins of `TABLE_LINKS` [m] in the same file, pelvis at the origin."""
 
 
 def _stage(hands: str = "dex3"):
@@ -123,6 +210,30 @@ def test_layer_states_units_variants_and_no_drives():
     text = PATH.read_text()
     assert "DriveAPI" not in text
     assert "@" not in text
+
+
+def test_masses_are_those_of_the_table(dex3):
+    """Total mass and ten links' masses, without the oracle's file."""
+    model = dex3[1]
+    bodies = _bodies(model)
+    assert model.body_mass.sum() == pytest.approx(TOTAL_MASS, rel=1e-6)
+    for name, mass in LINK_MASSES.items():
+        assert model.body_mass[bodies[name]] == pytest.approx(mass, rel=1e-5), name
+
+
+@pytest.mark.parametrize("posture", POSTURES)
+def test_forward_kinematics_of_the_table(dex3, posture):
+    """Five links in three postures are where the oracle puts them, without the oracle's file."""
+    model = dex3[1]
+    angles, places = POSTURES[posture]
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    data.qpos[3] = 1.0
+    joints, bodies = _joints(model), _bodies(model)
+    for name, angle in angles.items():
+        data.qpos[model.jnt_qposadr[joints[name]]] = angle
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose([data.xpos[bodies[name]] for name in TABLE_LINKS], places, atol=1e-5)
 
 
 @needs_oracle

@@ -1,16 +1,22 @@
 """The validator names every fault of a user's layer, and the command line answers bad input with code 2."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
+from pxr import Sdf
 
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.__main__ import main
 from arena_newton.usd_scenes.build import FOLDER
-from arena_newton.usd_scenes.validate import REQUIRED, check, task_of, validate
+from arena_newton.usd_scenes.validate import REQUIRED, check, layers, task_of, validate
+
+AUTHORING = Path(__file__).parents[2] / "docs" / "authoring.md"
+SNIPPETS = re.findall(r"^```usda\n(.*?)^```", AUTHORING.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 HEAD = """#usda 1.0
 (
@@ -217,6 +223,212 @@ def test_unreadable_files_are_one_line(tmp_path):
     only(broken, "not a readable USD layer")
 
 
+GARBAGE = {
+    "text.usda": (b"hello", "is not a valid usda layer"),
+    "empty.usda": (b"", "is not a valid usda layer"),
+    "bytes.usda": (b"#usda 1.0\n\xff\xfe\x1b[31m\x00\n", "bytes.usda:2:1: not understood"),
+    "name.usda": (b'#usda 1.0\ndef Xform "\xff" {\n}\n', "name.usda:2:12: not understood"),
+    "value.usda": (b'#usda 1.0\ndef Xform "W" {\n double x = = 3\n}\n', "value.usda:3:2: Expected }"),
+    "bytes.usd": (bytes(range(256)), "not a readable USD layer"),
+    "bytes.usdc": (bytes(range(256)), "not a readable USD layer"),
+    "bytes.usdz": (bytes(range(256)), "not a readable USD layer"),
+    "room.txt": (b"#usda 1.0\n", "is not a USD layer: expected one of .usda, .usd, .usdc, .usdz"),
+}
+
+
+@pytest.mark.parametrize("name", GARBAGE)
+@pytest.mark.parametrize("arc", ["", "subLayers", "references", "payload"])
+def test_garbage_is_one_line_wherever_it_stands(tmp_path, name, arc):
+    """A file that is no layer gives one printable line without USD's own source, by itself and when built on."""
+    data, words = GARBAGE[name]
+    (tmp_path / name).write_bytes(data)
+    if not arc:
+        path = tmp_path / name
+    elif arc == "subLayers":
+        path = layer(tmp_path, head=HEAD.replace("@{scene}@", f"@{{scene}}@, @{name}@"))
+    else:
+        path = layer(tmp_path, f'over "World" {{ def Xform "Room" ({arc} = @{name}@) {{}} }}')
+    found = texts(path)
+    assert len(found) == 1, found
+    assert words in found[0] and name in found[0]
+    assert found[0].isprintable() and "pxr" not in found[0] and "Error in" not in found[0]
+    with pytest.raises(InputError):
+        layers(path)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (os.mkfifo, "named pipe"),
+        (os.mkdir, "directory"),
+        (lambda path: path.symlink_to("/dev/zero"), "device"),
+        (lambda path: path.symlink_to(path), "cannot be read"),
+    ],
+    ids=["pipe", "folder", "device", "loop"],
+)
+@pytest.mark.parametrize("arc", ["", "subLayers", "references", "payload", "texture"])
+def test_what_is_no_regular_file_is_refused_unopened(tmp_path, make, word, arc):
+    """Pipes, folders and devices never reach USD, which would wait for them."""
+    name = "odd.png" if arc == "texture" else "odd.usda"
+    make(tmp_path / name)
+    if not arc:
+        path = tmp_path / name
+    elif arc == "subLayers":
+        path = layer(tmp_path, head=HEAD.replace("@{scene}@", f"@{{scene}}@, @{name}@"))
+    elif arc == "texture":
+        path = layer(tmp_path, f'over "World" {{ def Xform "Room" {{ asset inputs:file = @{name}@ }} }}')
+    else:
+        path = layer(tmp_path, f'over "World" {{ def Xform "Room" ({arc} = @{name}@) {{}} }}')
+    only(path, word, name)
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ('def Xform "Room" (references = @room.txt@) {}', "is not a USD layer"),
+        ('def Xform "Room" {\n asset inputs:file = @room.usda@ }', "is not an image"),
+        ('def Xform "Room" {\n asset inputs:file = @garbage.png@ }', "not a readable image"),
+        ('def Xform "Room" {\n asset[] files = [@garbage.png@] }', "not a readable image"),
+        ("def Xform \"Room\" (references = @`'room.usda'`@) {}", "expected a plain relative path"),
+        ('def Xform "Room" (references = @room.usda@</Nothing>) {}', "Unresolved reference prim path"),
+    ],
+)
+def test_assets_of_the_wrong_kind_are_named(tmp_path, body, words):
+    """Layers are built on, images are textures, and a reference must lead to a prim."""
+    (tmp_path / "room.txt").write_text("#usda 1.0\n")
+    (tmp_path / "room.usda").write_text('#usda 1.0\ndef Xform "R" {\n}\n')
+    (tmp_path / "garbage.png").write_bytes(b"\x89PNG garbage")
+    found = texts(layer(tmp_path, f'over "World" {{ {body} }}'))
+    assert len(found) == 1 and words in found[0], found
+
+
+def test_a_cycle_of_layers_is_named(tmp_path):
+    """A layer that sublayers itself is refused."""
+    path = layer(tmp_path, head=HEAD.replace("@{scene}@", "@{scene}@, @my_room.usda@"))
+    assert any("cycle" in line for line in texts(path))
+
+
+def test_layers_lists_every_file_of_the_scene(tmp_path):
+    """The layer, what it builds on in any variant, and textures; nothing else and nothing twice."""
+    Image.new("RGB", (2, 2)).save(tmp_path / "my.png")
+    (tmp_path / "room.usda").write_text('#usda 1.0\n(\n defaultPrim = "R"\n)\ndef Xform "R" {\n}\n')
+    path = layer(
+        tmp_path,
+        'over "World" { def Xform "Room" (variantSets = "look") {\n asset inputs:file = @my.png@\n'
+        'variantSet "look" = { "far" (references = @./room.usda@) {} }\n} }',
+    )
+    assert texts(path) == []
+    found = layers(path)
+    assert found[0] == path and len(set(found)) == len(found)
+    folder = FOLDER.resolve()
+    wanted = {
+        folder / "football" / "scene.usda",
+        folder / "g1" / "g1.usda",
+        tmp_path / "room.usda",
+        tmp_path / "my.png",
+    }
+    textures = {file for file in found if file.resolve().parent == folder / "textures"}
+    assert {file.resolve() for file in found} == {file.resolve() for file in {path, *wanted, *textures}}
+    assert folder / "textures" / "football.png" in {file.resolve() for file in textures}
+    # A link is followed by its name, as USD does it: what lies beside the link counts.
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "my_room.usda").symlink_to(path)
+    assert any("does not exist" in line for line in texts(tmp_path / "links" / "my_room.usda"))
+
+
+def test_a_package_is_followed_inside(tmp_path):
+    """A .usdz package is one file of the scene; what it lacks inside is named."""
+
+    def pack(name: str, texture: str) -> None:
+        text = f'#usda 1.0\n(\n defaultPrim = "R"\n)\ndef Xform "R" {{\n asset inputs:file = @{texture}@\n}}\n'
+        (tmp_path / "room.usda").write_text(text)
+        writer = Sdf.ZipFileWriter.CreateNew(str(tmp_path / name))
+        writer.AddFile(str(tmp_path / "room.usda"), "room.usda")
+        writer.AddFile(str(tmp_path / "my.png"), "my.png")
+        writer.Save()
+
+    Image.new("RGB", (2, 2)).save(tmp_path / "my.png")
+    pack("good.usdz", "my.png")
+    pack("bad.usdz", "../my.png")
+    path = layer(tmp_path, 'over "World" { def Xform "Room" (references = @good.usdz@) {} }')
+    assert texts(path) == []
+    assert tmp_path / "good.usdz" in layers(path) and tmp_path / "my.png" not in layers(path)
+    (line,) = texts(layer(tmp_path, 'over "World" { def Xform "Room" (references = @bad.usdz@) {} }'))
+    assert "bad.usdz" in line and "@../my.png@ does not exist" in line
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "double3 xformOp:translate = (nan, 0, 0)",
+        "float3 xformOp:scale = (1, inf, 1)",
+        "quatf xformOp:orient = (1, 0, nan, 0)",
+        "matrix4d xformOp:transform = ((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,nan))",
+        "double size = -inf",
+        "double size = 1e300",
+        "point3f[] points = [(0, 0, 0), (0, nan, 0)]",
+        "double2 mjc:solref = (nan, 1)",
+        "float newton:damping = nan",
+        "float3 arena:size = (1, 1, nan)",
+        "half arena:half = inf",
+        "timecode arena:time = nan",
+        "quatf[] arena:turns = [(1, 0, 0, nan)]",
+        "double size.timeSamples = {\n0: 1,\n1: nan,\n}",
+        "float physics:mass = nan",
+        "float3 physics:diagonalInertia = (1, nan, 1)",
+        "point3f physics:centerOfMass = (0, inf, 0)",
+        "quatf physics:principalAxes = (nan, 0, 0, 0)",
+    ],
+)
+def test_numbers_are_finite(tmp_path, line):
+    """Every number that is authored anywhere must be finite; prim and attribute are named."""
+    path = tmp_path / "my_room.usda"
+    layer(tmp_path)
+    path.write_text(path.read_text() + f'over "World"\n{{\n over "Ball"\n {{\n{line}\n }}\n}}\n')
+    only(path, "/World/Ball." + line.split()[1].removesuffix(".timeSamples"), "expected finite")
+
+
+def test_principal_axes_are_a_rotation(tmp_path):
+    """A quaternion of length 0 turns an inertia nowhere."""
+    path = layer(tmp_path, 'over "World" { over "Ball" { quatf physics:principalAxes = (0, 0, 0, 0) } }')
+    only(path, "/World/Ball", "physics:principalAxes", "unit quaternion")
+
+
+@pytest.mark.parametrize(
+    ("body", "prim", "words"),
+    [
+        ('over "World" (variants = { string semantics = "bogus" }) {}', "/World", "expected base, semantic"),
+        ('over "World" { over "Robot" (variants = { string hands = "three" }) {} }', "/World/Robot", "dex3, fixed"),
+        ('over "World" { over "Ball" (variants = { string look = "red" }) {} }', "/World/Ball", "unknown variant set"),
+    ],
+)
+def test_unknown_variants_are_named(tmp_path, body, prim, words):
+    """USD silently composes nothing for a selection that does not exist."""
+    found = texts(layer(tmp_path, body))
+    assert f": {prim}: " in found[0] and words in found[0], found
+
+
+@pytest.mark.parametrize("number", range(len(SNIPPETS)))
+def test_snippets_of_the_authoring_guide_are_usd(tmp_path, number):
+    """Whole layers of docs/authoring.md validate where the guide puts them; fragments parse inside the world."""
+    text = SNIPPETS[number]
+    if not text.startswith("#usda"):
+        Sdf.Layer.CreateAnonymous(".usda").ImportFromString(f'#usda 1.0\nover "World"\n{{\n{text}\n}}\n')
+        return
+    (tmp_path / "usd_scenes").symlink_to(FOLDER.resolve())
+    (tmp_path / "rooms").mkdir()
+    path = tmp_path / "rooms" / "my_room.usda"
+    path.write_text(text)
+    assert texts(path) == []
+    assert task_of(path) == "sit_sofa"
+
+
+def test_the_guide_shows_a_layer_and_a_fragment():
+    """Both kinds of snippet are found, so that the test above looks at something."""
+    assert {text.startswith("#usda") for text in SNIPPETS} == {True, False}
+
+
 def test_a_layer_of_no_task_asks_for_one(tmp_path):
     """A stage that builds on no scene is judged with --task only."""
     path = tmp_path / "alone.usda"
@@ -245,6 +457,8 @@ def test_command_line_prints_a_line_per_problem(tmp_path, capsys):
         ["validate", "no_such.usda"],
         ["build", "tennis"],
         ["preview", "--size", "3"],
+        ["preview", "/dev/zero"],
+        ["validate", "/dev/zero"],
     ],
 )
 def test_bad_input_ends_with_code_2_and_one_line(arguments, capsys):
