@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import statistics
 import subprocess
@@ -81,13 +82,24 @@ def run(options: BenchOptions) -> int:
     quiet_warp()
     figures: list[Figure] = []
     for name in wanted:
-        for figure in known[name](options):
+        for figure in _guarded(name, known[name](options)):
             figures.append(figure)
             if not options.json:
                 print(_line(figure), flush=True)
     if options.json:
         print(json.dumps([asdict(figure) | {"verdict": figure.verdict} for figure in figures], indent=2))
     return 1 if any(figure.verdict == "MISS" for figure in figures) else 0
+
+
+def _guarded(name: str, figures: Iterator[Figure]) -> Iterator[Figure]:
+    """The figures of one item; one that breaks is a miss with its reason and does not stop the other items."""
+    try:
+        yield from figures
+    except InputError:
+        raise
+    except Exception as error:
+        reason = f"failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        yield Figure(name, 0.0, "", True, math.inf, reason)
 
 
 def _line(figure: Figure) -> str:

@@ -115,6 +115,10 @@ class RunConfig:
     worlds: int
     video: bool
     strip: bool
+    scenes_hash: str = ""
+    """Built-in scenes of the run's tasks, by content."""
+    code_hash: str = ""
+    """The package's own code that moves and judges, by content."""
 
     def identity(self) -> dict[str, Any]:
         """What the results depend on, by flag name; two runs with equal identity may share a results folder.
@@ -138,6 +142,8 @@ class RunConfig:
             "device": self.device.split(":")[0],
             "variant": self.variant_hash,
             "fast_physics": self.fast_physics,
+            "scenes": self.scenes_hash,
+            "code": self.code_hash,
         }
 
     @property
@@ -187,6 +193,8 @@ def resolve(options: RunOptions) -> RunConfig:
     from arena_newton.physics import resolve_engine
 
     quick = not (options.task or options.mode or options.seeds) and (options.repeats, options.max_steps) == (None, None)
+    if "all" in options.task and len(options.task) > 1:
+        raise InputError("--task all: stands alone, name either all or single tasks")
     tasks = task_specs.names() if tuple(options.task) in ((), ("all",)) else tuple(options.task)
     seeds = tuple(options.seeds) or (QUICK_SEEDS if quick else PROTOCOL_SEEDS)
     if min(seeds) < 0:
@@ -200,8 +208,11 @@ def resolve(options: RunOptions) -> RunConfig:
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
+    scenes_hash, code_hash = _hash_package(tasks)
     config = RunConfig(
         tasks=tasks,
+        scenes_hash=scenes_hash,
+        code_hash=code_hash,
         modes=tuple(options.mode) or ("base",),
         tracker=options.tracker,
         checkpoint=checkpoint,
@@ -296,14 +307,25 @@ def policy_label(policy: str) -> str:
 
 
 def _hash_scene(path: Path) -> str:
-    """Hash of a USD file with every layer and asset that it loads."""
-    from pxr import UsdUtils
+    """Hash of a USD file with every layer and asset that it names; the validator walks them before USD composes any."""
+    from arena_newton.usd_scenes import validate
 
-    silence = UsdUtils.CoalescingDiagnosticDelegate()
-    layers, assets, _ = UsdUtils.ComputeAllDependencies(str(path))
-    del silence
-    files = {layer.realPath for layer in layers} | {str(asset) for asset in assets} | {str(path)}
-    return config_hash(sorted(hash_path(Path(file)) for file in files if file and Path(file).is_file()))
+    return config_hash(sorted(hash_path(file) for file in validate.layers(path)))
+
+
+def _hash_package(tasks: tuple[str, ...]) -> tuple[str, str]:
+    """Hashes of the built-in scenes of some tasks (robot and textures included) and of the package's own code."""
+    root = Path(__file__).resolve().parent.parent / "arena_newton"
+    root = root if root.is_dir() else Path(__file__).resolve().parent.parent
+    scenes = root / "usd_scenes"
+    layers = [f for part in ("g1", "textures", *tasks) for f in sorted((scenes / part).rglob("*")) if f.suffix != ".py"]
+    parts = [root, root / "tasks", root / "kernels", root / "trackers", root / "policies"]
+    code = [f for part in parts for f in sorted(part.glob("*.py"))]
+
+    def digest(files: list[Path]) -> str:
+        return config_hash([[f.relative_to(root).as_posix(), hash_path(f)] for f in files if f.is_file()])
+
+    return digest(layers), digest(code)
 
 
 def _existing(flag: str, given: str | None) -> Path | None:
@@ -312,4 +334,6 @@ def _existing(flag: str, given: str | None) -> Path | None:
     path = Path(given).expanduser()
     if not given or not path.exists():
         raise InputError(f"{flag} {given}: no such file")
+    if path.is_dir() and flag != "--policy":
+        raise InputError(f"{flag} {given}: is a folder, expected a file")
     return path.resolve()

@@ -91,6 +91,10 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
     for key, value in config.identity().items():
         print(f"  {key:<13} {_shown(value)}")
     print(f"  {len(episodes)} episodes -> {folder}", flush=True)
+    if config.tracker == "pd":
+        print(
+            "  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2 --checkpoint <its ONNX>"
+        )
 
     began = time.perf_counter()
     resume = f"python -m arena_newton.eval resume {shlex.quote(str(folder))}"
@@ -114,7 +118,11 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
             raise StorageError(f"{error}; free space, then: {resume}") from None
         finally:
             policy.close()
-    results = report.write_reports(report.load_run(folder))
+    try:
+        results = report.write_reports(report.load_run(folder))
+    except StorageError as error:
+        again = f"python -m arena_newton.eval report {shlex.quote(str(folder))}"
+        raise StorageError(f"{error}; free space, then: {again}") from None
     print(f"\n{report.table(results)}")
     for note in report.notes(results):
         print(note)
