@@ -51,6 +51,9 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments.pop(0) if arguments and arguments[0] in COMMANDS else "run"
+    if command == "run" and arguments and not arguments[0].startswith("-"):
+        print(f"error: {arguments[0]}: unknown command, known are {' '.join(COMMANDS)}", file=sys.stderr)
+        return 2
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -91,7 +94,9 @@ def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | No
         lines = [line.strip(" │╭╮╰╯─┃") for line in text.splitlines()]
         lines = [line for line in lines if line]
         message = " ".join(lines[1:] or lines)  # the first is the title of tyro's box
-        raise InputError(re.sub(r"\s*For full helptext,? .*$", "", message)) from None
+        message = re.sub(r"\s*(Argument helptext:|For full helptext,?) .*$", "", message)
+        unread = re.match(r"Error parsing (--[\w-]+): .*arguments: (\[.*\])", message)
+        raise InputError(f"{unread[1]}: cannot read {unread[2]}" if unread else message) from None
 
 
 def _folder(arguments: list[str], command: str) -> Path:
