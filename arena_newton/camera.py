@@ -77,7 +77,7 @@ class WorldLights:
             """Intensity times colour, linear RGB, shape [worlds]."""
         self._host = {
             "distant": np.zeros(worlds, dtype=np.int32),
-            "direction": np.tile(np.float32([0, 0, -1]), (worlds, 1)),
+            "direction": np.tile(np.array([0, 0, -1], dtype=np.float32), (worlds, 1)),
             "radiance": np.zeros((worlds, 3), dtype=np.float32),
         }
         self._base = _stage_light(stage)
@@ -111,6 +111,8 @@ class WorldLights:
             dome_intensity: With `light` None: a dome of this intensity instead of the base light.
             dome_color: With `light` None: a dome of this colour, linear RGB.
         """
+        direction: Sequence[float] | None
+        color: Sequence[float]
         if light is not None:
             direction, intensity, color = light.direction, light.intensity, light.color
         elif dome_intensity is None and dome_color is None:

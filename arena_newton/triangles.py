@@ -19,14 +19,14 @@ def srgb_to_linear(value: np.ndarray) -> np.ndarray:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def _as_mesh(kind: int, size: np.ndarray, source: Any) -> tuple[Any, np.ndarray]:
+def _as_mesh(kind: int, scale: np.ndarray, source: Any) -> tuple[Any, np.ndarray]:
     """A shape as a triangle mesh and the scale of its vertices."""
     from newton import Axis, GeoType, Mesh
 
     quiet = {"compute_inertia": False}
     # Newton's shapes stand along z, its mesh makers along y unless told.
     along_z = {"up_axis": Axis.Z, **quiet}
-    size = [float(v) for v in size]
+    size = [float(v) for v in scale]
     if kind == GeoType.SPHERE:
         return Mesh.create_sphere(size[0], **quiet), np.ones(3)
     if kind == GeoType.BOX:
@@ -44,7 +44,7 @@ def _as_mesh(kind: int, size: np.ndarray, source: Any) -> tuple[Any, np.ndarray]
         return Mesh.create_plane(size[0] or 2000.0, size[1] or 2000.0, **quiet), np.ones(3)
     if source is None or not hasattr(source, "vertices"):
         raise InputError(f"a shape of type {GeoType(kind).name} cannot be drawn: use a mesh or a primitive")
-    return source, np.asarray(size)
+    return source, np.asarray(scale)
 
 
 def triangles(model: Any) -> tuple[Any, int, tuple[int, int]]:
@@ -79,7 +79,7 @@ def triangles(model: Any) -> tuple[Any, int, tuple[int, int]]:
             corner = np.asarray(mesh.indices, np.int32).reshape(-1, 3)
             vertices.append(points)
             normals.append(np.zeros_like(points) if mesh.normals is None else np.asarray(mesh.normals, np.float32))
-            st = np.zeros((len(points), 2), np.float32)
+            st: np.ndarray = np.zeros((len(points), 2), np.float32)
             if mesh.uvs is not None:
                 affine = np.asarray(mesh.texture_transform, np.float32)
                 st = np.asarray(mesh.uvs, np.float32).reshape(-1, 2) @ affine[:, :2].T + affine[:, 2]
