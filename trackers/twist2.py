@@ -16,10 +16,10 @@ import torch
 from arena_newton.errors import InputError
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, PhysicsRate
 from arena_newton.trackers import onnx_mlp
-from arena_newton.trackers.base import RobotState, Tracker, TrackerCommand
-from arena_newton.trackers.blocks import BlockRunner
+from arena_newton.trackers.base import RobotState, TrackerCommand
+from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
 
-__all__ = ["FRAME", "HISTORY", "OBSERVATION", "Twist2Tracker", "from_checkpoint"]
+__all__ = ["FRAME", "HISTORY", "OBSERVATION", "OFFICIAL_FORM", "Twist2FrontEnd", "Twist2Tracker", "from_checkpoint"]
 
 COMMAND = 35
 """Width of the mimic command."""
@@ -40,98 +40,66 @@ _FUTURE = slice(FRAME + HISTORY * FRAME, OBSERVATION)
 
 ANG_VEL_SCALE = 0.25
 JOINT_VEL_SCALE = 0.05
-ACTION_SCALE = 0.5
-ACTION_CLIP = 10.0
+OFFICIAL_FORM = ActionForm("default", (0.5,) * JOINTS, clip=10.0)
+"""Action form of the official checkpoints."""
 OBSERVATION_CLIP = 100.0
 _VECTOR = 64
 """Rows are padded to a multiple of this for `atan2` and `asin`: two AVX-512 vectors and room."""
 
 
-class Twist2Tracker(Tracker):
-    """TWIST2's network behind the 35-number mimic command."""
+class Twist2FrontEnd(FrontEnd):
+    """TWIST2's observation around the 35-number mimic command."""
 
-    name = "twist2"
-    drive = TWIST2_DRIVE
-    physics_rate = PhysicsRate(dt=0.001, substeps=20)
-    fast_physics_rate = PhysicsRate(dt=0.005, substeps=4)
-    ignores = ("absolute heading", "absolute position")
+    interface = "twist2"
+    obs_width = OBSERVATION
+    default_pose = DEFAULT_POSE
 
-    def __init__(self, checkpoint: str | Path):
-        """Read the network.
+    def __init__(self, action_form: ActionForm = OFFICIAL_FORM):
+        """Take the official action form or another."""
+        super().__init__(action_form)
 
-        Args:
-            checkpoint: The official `.onnx` file.
-
-        Raises:
-            InputError: The file is absent or is no network of TWIST2's widths.
-        """
-        self.network = onnx_mlp.load(checkpoint, in_width=OBSERVATION, out_width=len(MUJOCO_JOINTS))
-        self.checkpoint = str(checkpoint)
-        self.checkpoint_hash = self.network.sha256[:12]
-
-    def bind(self, worlds: int, device: Any = "cpu", scene: Any = None) -> None:
-        """Allocate observation buffers for `worlds` worlds on `device`."""
-        super().bind(worlds, device, scene)
-        device = torch.device(device)
-        self.network.to(device)
-        self._runner = BlockRunner(self.network, OBSERVATION, worlds, device)
-        self._obs = self._runner.input
-        self._frame = self._obs[:, :FRAME]
-        self._past = self._obs[:, _PAST]
-        self._future = self._obs[:, _FUTURE]
-        self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=device)
+    def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
+        """Allocate buffers for `worlds` worlds on `device`."""
+        super().bind(worlds, device, obs)
+        self._frame = self.obs[:, :FRAME]
+        self._past = self.obs[:, _PAST]
+        self._future = self.obs[:, _FUTURE]
+        self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
-        self._quat = torch.zeros(4, padded, device=device)
-        self._tilt = torch.zeros(2, padded, device=device)
-        self._scratch = torch.zeros(4, padded, device=device)
-        self._default = torch.tensor(DEFAULT_POSE, device=device)
-        self._joint_vel_scale = torch.full((29,), JOINT_VEL_SCALE, device=device)
-        ankles = [i for i, name in enumerate(MUJOCO_JOINTS) if "ankle" in name]
-        self._joint_vel_scale[ankles] = 0.0
-        self.last_action = torch.zeros(worlds, 29, device=device)
-        """Last raw network output, unclipped, shape [worlds, 29]."""
-        self._targets = torch.zeros(worlds, 29, device=device)
-        self.reset()
+        self._quat = torch.zeros(4, padded, device=self.device)
+        self._tilt = torch.zeros(2, padded, device=self.device)
+        self._scratch = torch.zeros(4, padded, device=self.device)
+        self._joint_vel_scale = torch.full((JOINTS,), JOINT_VEL_SCALE, device=self.device)
+        self._joint_vel_scale[[i for i, name in enumerate(MUJOCO_JOINTS) if "ankle" in name]] = 0.0
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Set history and last action of the worlds in `mask` to zero."""
         if mask is None:
-            self._obs.zero_()
+            self.obs.zero_()
             self.last_action.zero_()
             return
-        row = mask.to(device=self._obs.device, dtype=torch.bool)[:, None]
-        self._obs.masked_fill_(row, 0.0)
+        row = column(mask, self.device)
+        self.obs.masked_fill_(row, 0.0)
         self.last_action.masked_fill_(row, 0.0)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the history of the worlds in `mask` with the present frame: a start is then no jump for the network."""
-        self._write_frame(command, state)
+        self._write(command, state)
         past = self._past.view(-1, HISTORY, FRAME)
         if mask is None:
             past.copy_(self._frame[:, None].expand_as(past))
         else:
-            row = mask.to(device=self._obs.device, dtype=torch.bool)[:, None, None]
-            past.copy_(torch.where(row, self._frame[:, None], past))
+            past.copy_(torch.where(column(mask, self.device)[:, None], self._frame[:, None], past))
 
-    @torch.inference_mode()
-    def step(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
-        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; the buffer is reused by the next call."""
-        self._write_frame(command, state)
-        raw = self._runner.run()
-        self.last_action.copy_(raw)
+    def _advance(self) -> None:
         # History takes the present frame only after the network has seen it.
         self._shifted.copy_(self._past[:, FRAME:])
         self._past[:, :-FRAME].copy_(self._shifted)
         self._past[:, -FRAME:].copy_(self._frame)
-        return torch.clamp(raw, -ACTION_CLIP, ACTION_CLIP, out=self._targets).mul_(ACTION_SCALE).add_(self._default)
 
-    def observation(self) -> torch.Tensor:
-        """What the network saw last, except that the history already holds that frame; shape [worlds, 1432]."""
-        return self._obs
-
-    def _write_frame(self, command: TrackerCommand, state: RobotState) -> None:
+    def _write(self, command: TrackerCommand, state: RobotState) -> None:
         frame = self._frame
         frame[:, :COMMAND] = command.mimic
         torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=frame[:, _ANG_VEL])
@@ -156,6 +124,28 @@ class Twist2Tracker(Tracker):
         torch.atan2(a, b, out=self._tilt[0])
         torch.asin(c, out=self._tilt[1])
         return self._tilt[:, : self.worlds].t()
+
+
+class Twist2Tracker(NetworkTracker):
+    """TWIST2's network behind the 35-number mimic command."""
+
+    name = "twist2"
+    drive = TWIST2_DRIVE
+    physics_rate = PhysicsRate(dt=0.001, substeps=20)
+    fast_physics_rate = PhysicsRate(dt=0.005, substeps=4)
+    ignores = ("absolute heading", "absolute position")
+
+    def __init__(self, checkpoint: str | Path):
+        """Read the official network.
+
+        Args:
+            checkpoint: The official `.onnx` file.
+
+        Raises:
+            InputError: The file is absent or is no network of TWIST2's widths.
+        """
+        network = onnx_mlp.load(checkpoint, in_width=OBSERVATION, out_width=JOINTS)
+        super().__init__(Twist2FrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
 
 
 def from_checkpoint(checkpoint: Path | None) -> Twist2Tracker:

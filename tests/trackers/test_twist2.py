@@ -70,7 +70,7 @@ def test_observation_and_targets(checkpoint):
     run = tracker._runner.run
 
     def spy():
-        seen.append(tracker._obs.clone())
+        seen.append(tracker.observation().clone())
         return run()
 
     tracker._runner.run = spy

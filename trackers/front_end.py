@@ -1,0 +1,204 @@
+"""What stands around a tracker's network: command and state in, observation out; raw output in, joint targets out.
+
+Training and deployment share it, so that a network meets in a rollout what it met in training:
+
+    observation = front_end.observe(command, state)
+    targets = front_end.act(network(observation))
+
+Everything runs on any torch device without waiting for it, so a CUDA graph can hold it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from arena_newton.errors import InputError
+from arena_newton.interfaces import RobotState, TrackerCommand
+from arena_newton.robot import MUJOCO_JOINTS, DriveGains
+from arena_newton.trackers.base import Tracker
+from arena_newton.trackers.blocks import BlockRunner
+
+__all__ = ["ActionForm", "FrontEnd", "NetworkTracker", "residual_form"]
+
+JOINTS = len(MUJOCO_JOINTS)
+
+
+@dataclass(frozen=True)
+class ActionForm:
+    """How a network's raw output becomes joint targets: base + scale * clip(raw)."""
+
+    kind: str
+    """`default`: the base is the tracker's default pose. `residual`: the base is the reference of the tick."""
+    scale: tuple[float, ...]
+    """Radians per unit of raw output, 29, MuJoCo order."""
+    clip: float = 0.0
+    """Largest magnitude of the raw output that counts, 0 = no limit."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("default", "residual"):
+            raise InputError(f"action form {self.kind!r}: known are default, residual")
+        if len(self.scale) != JOINTS or self.clip < 0.0:
+            raise InputError(f"action form {self.kind!r}: needs {JOINTS} scales and a clip of at least 0")
+
+
+def residual_form(drive: DriveGains, clip: float = 6.0) -> ActionForm:
+    """Corrections of the reference joints; one unit asks a quarter of a joint's torque limit of its spring.
+
+    Args:
+        drive: The drive that executes the targets.
+        clip: Largest magnitude of the raw output that counts.
+    """
+    return ActionForm("residual", tuple(0.25 * e / k for e, k in zip(drive.effort, drive.kp, strict=True)), clip)
+
+
+class FrontEnd:
+    """Base of all front ends; a subclass sets the widths and writes `reset`, `_write` and `_advance`."""
+
+    interface: str = ""
+    """Name of the interface in weights files, such as `twist2`."""
+    obs_width: int = 0
+    """Width of the observation."""
+    action_width: int = JOINTS
+    """Width of the raw action."""
+    default_pose: tuple[float, ...] = (0.0,) * JOINTS
+    """Pose that measured joints are taken relative to [rad], MuJoCo order."""
+
+    obs: torch.Tensor
+    """The observation's buffer, float32, shape [worlds, obs_width]."""
+    last_action: torch.Tensor
+    """Last raw output, unclipped, shape [worlds, action_width]."""
+
+    def __init__(self, action_form: ActionForm):
+        """Keep the action form; `bind` allocates."""
+        self.action_form = action_form
+
+    def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
+        """Allocate buffers.
+
+        Args:
+            worlds: Number of worlds.
+            device: Torch device.
+            obs: Buffer for the observation, float32, shape [worlds, obs_width]; a new one by default.
+        """
+        self.worlds, self.device = worlds, torch.device(device)
+        self.obs = torch.zeros(worlds, self.obs_width, device=self.device) if obs is None else obs
+        self.last_action = torch.zeros(worlds, self.action_width, device=self.device)
+        self._default = torch.tensor(self.default_pose, device=self.device)
+        self._scale = torch.tensor(self.action_form.scale, device=self.device)
+        self._base = self._default.repeat(worlds, 1)
+        self._targets = torch.zeros(worlds, JOINTS, device=self.device)
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Forget the past of the worlds in `mask` (all without one); shape [worlds], bool."""
+        raise NotImplementedError
+
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """Pretend that the worlds in `mask` have held this command and state for a while."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def observe(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+        """Observation of this tick, shape [worlds, obs_width]: the buffer itself, which `act` changes.
+
+        Calling it again before `act` replaces the tick's observation. Whoever keeps it must copy it.
+        """
+        if self.action_form.kind == "residual":
+            self._base.copy_(command.joints)
+        self._write(command, state)
+        return self.obs
+
+    @torch.no_grad()
+    def act(self, raw: torch.Tensor) -> torch.Tensor:
+        """Joint targets [rad], MuJoCo order, shape [worlds, 29]; ends the tick. The buffer is reused by the next call.
+
+        Args:
+            raw: The network's output, shape [worlds, action_width].
+        """
+        self.last_action.copy_(raw)
+        self._advance()
+        raw = self._to_mujoco(raw)
+        if self.action_form.clip > 0.0:
+            torch.clamp(raw, -self.action_form.clip, self.action_form.clip, out=self._targets)
+        else:
+            self._targets.copy_(raw)
+        return self._targets.mul_(self._scale).add_(self._base)
+
+    def _write(self, command: TrackerCommand, state: RobotState) -> None:
+        """Write this tick's observation into `obs`."""
+        raise NotImplementedError
+
+    def _advance(self) -> None:
+        """Move histories on, after `last_action` took the raw output."""
+        raise NotImplementedError
+
+    def _to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
+        """The raw output in MuJoCo order."""
+        return raw
+
+
+class NetworkTracker(Tracker):
+    """A front end and the network behind it."""
+
+    def __init__(
+        self,
+        front_end: FrontEnd,
+        network: Callable[[torch.Tensor], torch.Tensor],
+        *,
+        checkpoint: str | None = None,
+        checkpoint_hash: str = "none",
+    ):
+        """Join the two.
+
+        Args:
+            front_end: Makes observations and targets.
+            network: Maps [rows, obs_width] to [rows, action_width], each row by itself; modules move to the device.
+            checkpoint: File the weights came from.
+            checkpoint_hash: First 12 hexadecimal digits of its SHA-256.
+        """
+        self.front_end = front_end
+        self.network = network
+        self.checkpoint, self.checkpoint_hash = checkpoint, checkpoint_hash
+
+    def bind(self, worlds: int, device: Any = "cpu", scene: Any = None) -> None:
+        """Allocate observation buffers for `worlds` worlds on `device`."""
+        super().bind(worlds, device, scene)
+        device = torch.device(device)
+        if isinstance(self.network, torch.nn.Module):
+            self.network.to(device)
+        self._runner = BlockRunner(self.network, self.front_end.obs_width, worlds, device)
+        self.front_end.bind(worlds, device, self._runner.input)
+        self.reset()
+
+    @property
+    def last_action(self) -> torch.Tensor:
+        """Last raw network output, unclipped, shape [worlds, action_width]."""
+        return self.front_end.last_action
+
+    def observation(self) -> torch.Tensor:
+        """The observation's buffer, shape [worlds, obs_width]; after a step its histories hold that step already."""
+        return self.front_end.obs
+
+    @torch.inference_mode()
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Forget the past of the worlds in `mask` (all without one); shape [worlds], bool."""
+        self.front_end.reset(mask)
+
+    @torch.inference_mode()
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """Fill the history of the worlds in `mask` with the present: a start is then no jump for the network."""
+        self.front_end.prefill(command, state, mask)
+
+    @torch.inference_mode()
+    def step(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; the buffer is reused by the next call."""
+        self.front_end.observe(command, state)
+        return self.front_end.act(self._runner.run())
+
+
+def column(values: Sequence[bool] | torch.Tensor, device: torch.device) -> torch.Tensor:
+    """A mask of worlds as a bool column on `device`, shape [worlds, 1]."""
+    return torch.as_tensor(values, device=device).to(torch.bool)[:, None]
