@@ -1,4 +1,4 @@
-"""Build every layer of the project: textures, robot, and one scene a task."""
+"""Build every layer of the project: textures, robot, one scene a task, and the lab."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -11,7 +11,7 @@ __all__ = ["FOLDER", "PARTS", "build_all"]
 
 FOLDER = Path(__file__).resolve().parent
 """Where the layers live in the project."""
-PARTS = ("textures", "g1", *REQUIRED)
+PARTS = ("textures", "g1", *REQUIRED, "lab")
 """What can be built, in order."""
 
 
