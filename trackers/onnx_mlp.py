@@ -28,10 +28,6 @@ _CHECK_TOLERANCE = 1e-4
 """Largest allowed difference of the short list from the node-by-node evaluation, relative to the largest output."""
 _CONV_MATRIX_LIMIT = 1_000_000
 """Largest matrix [numbers] that replaces a convolution."""
-_PACK_ROWS = 8
-"""Rows that the packed weight layout is chosen for."""
-_PACK_FROM = 32_000
-"""Smallest weight [numbers] worth packing: below it the fixed cost of the packed product (15 microseconds) prevails."""
 
 _UNARY: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "Sigmoid": torch.sigmoid,
@@ -60,8 +56,6 @@ class _Unfit(Exception):
 
 
 class _Linear(torch.nn.Module):
-    """A matrix product whose weights are packed for the processor (about twice as fast on a CPU for few rows)."""
-
     weight: torch.Tensor
     bias: torch.Tensor | None
 
@@ -69,21 +63,8 @@ class _Linear(torch.nn.Module):
         super().__init__()
         self.register_buffer("weight", weight.contiguous())
         self.register_buffer("bias", bias)
-        self._packed: torch.Tensor | None = None
-        self._product: Callable[..., torch.Tensor] = functional.linear
-        if weight.device.type == "cpu" and weight.numel() >= _PACK_FROM and torch.backends.mkldnn.is_available():
-            try:
-                self._packed = torch.ops.mkldnn._reorder_linear_weight(self.weight, _PACK_ROWS)
-                self._product = torch.ops.mkldnn._linear_pointwise
-                probe = torch.linspace(-1.0, 1.0, 2 * weight.shape[1]).reshape(2, -1)
-                plain = functional.linear(probe, self.weight, bias)
-                torch.testing.assert_close(self(probe), plain, rtol=1e-3, atol=1e-3)
-            except (AttributeError, RuntimeError, AssertionError):
-                self._packed = None  # this build of torch packs differently: the plain product serves
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self._packed is not None and x.device.type == "cpu":
-            return self._product(x, self._packed, self.bias, "none", [], "")
         return functional.linear(x, self.weight, self.bias)
 
 
