@@ -1,0 +1,170 @@
+"""SONIC sees the observation of its released controller, world by world, and its two networks run as one."""
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton.robot import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
+from arena_newton.trackers import RobotState, TrackerCommand
+from arena_newton.trackers.networks import SonicNet
+from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicTracker
+
+ORDER = [MUJOCO_JOINTS.index(name) for name in CANONICAL_JOINTS]
+
+
+def inputs(seed: int, worlds: int) -> tuple[TrackerCommand, RobotState]:
+    rng = torch.Generator().manual_seed(seed)
+
+    def draw(width):
+        return torch.randn(worlds, width, generator=rng)
+
+    quat, target = (torch.nn.functional.normalize(draw(4)) for _ in range(2))
+    command = TrackerCommand(draw(35), draw(29), 5.0 * draw(29), target)
+    return command, RobotState(quat, draw(3), draw(29), 10.0 * draw(29))
+
+
+def rows(value, index):
+    return type(value)(**{name: tensor[index] for name, tensor in vars(value).items()})
+
+
+def matrix(quat: np.ndarray) -> np.ndarray:
+    w, x, y, z = quat
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * k + 2 * k @ k
+
+
+class Oracle:
+    """The observation of one world in NumPy, written from its description."""
+
+    def __init__(self):
+        self.histories = None
+
+    def observe(self, command, state, world):
+        def row(tensor):
+            return tensor[world].numpy().astype(float)
+
+        turn = matrix(row(state.quat)).T @ matrix(row(command.quat))
+        anchor = turn[:, :2].reshape(-1)
+        gravity = matrix(row(state.quat)).T @ [0.0, 0.0, -1.0]
+        joints = (row(state.joint_pos) - np.array(SONIC_DEFAULT_POSE))[ORDER]
+        speeds = row(state.joint_vel)[ORDER]
+        if self.histories is None:
+            zeros = [np.zeros(3)] * 10
+            self.histories = [zeros, [joints] * 10, [speeds] * 10, [np.zeros(29)] * 10, zeros]
+        spin, pos, vel, actions, down = self.histories
+        latest = zip((spin, pos, vel, down), (row(state.ang_vel_body), joints, speeds, gravity), strict=True)
+        spin, pos, vel, down = ([*old[1:], new] for old, new in latest)
+        self.histories = [spin, pos, vel, actions, down]
+        encoder = np.concatenate(
+            [
+                np.zeros(4),
+                np.tile(row(command.joints)[ORDER], 10),
+                np.tile(row(command.joint_vel)[ORDER], 10),
+                np.zeros(11),
+                anchor,
+                np.tile(anchor, 10),
+                np.zeros(1101),
+            ]
+        )
+        return encoder, np.concatenate([np.concatenate(h) for h in self.histories])
+
+    def advance(self, raw):
+        self.histories[3] = [*self.histories[3][1:], raw]
+
+
+def test_observation_and_targets():
+    """1762 encoder inputs of which mode 0 fills 646, 930 numbers of proprioception, targets without a clip."""
+    worlds = 5
+    front = SonicFrontEnd()
+    front.bind(worlds)
+    front.reset()
+    oracles = [Oracle() for _ in range(worlds)]
+    rng = torch.Generator().manual_seed(0)
+    for tick in range(14):
+        command, state = inputs(tick, worlds)
+        if tick == 8:
+            front.reset(torch.tensor([False, True, False, False, True]))
+            oracles[1], oracles[4] = Oracle(), Oracle()
+        front.observe(*inputs(99, worlds))  # an observation that is replaced before the tick ends leaves no trace
+        seen = front.observe(command, state).clone()
+        raw = 20.0 * torch.randn(worlds, 29, generator=rng)
+        targets = front.act(raw)
+        for world, oracle in enumerate(oracles):
+            encoder, proprio = oracle.observe(command, state, world)
+            assert encoder.shape == (1762,) and proprio.shape == (930,)
+            np.testing.assert_allclose(seen[world].numpy(), np.concatenate([encoder, proprio]), atol=2e-5)
+            oracle.advance(raw[world].numpy())
+            goal = np.array(SONIC_DEFAULT_POSE)
+            goal[ORDER] += raw[world].numpy() * np.array(SONIC_FORM.scale)[ORDER]
+            np.testing.assert_allclose(targets[world].numpy(), goal, atol=1e-5)
+
+
+def test_scales_and_gains():
+    """The action scales are a quarter of the controller's torque limits over its unraised stiffness."""
+    scale = dict(zip(MUJOCO_JOINTS, SONIC_FORM.scale, strict=True))
+    drive = dict(zip(MUJOCO_JOINTS, SONIC_DRIVE.kp, strict=True))
+    for joint, effort in {"left_knee": 139, "right_hip_yaw": 88, "waist_roll": 25, "left_wrist_yaw": 5}.items():
+        assert scale[f"{joint}_joint"] == pytest.approx(0.25 * effort / drive[f"{joint}_joint"], rel=2e-3)
+    assert scale["left_ankle_pitch_joint"] == scale["right_elbow_joint"] == scale["waist_pitch_joint"]
+
+
+def test_prefill():
+    """Prefill repeats the measured present ten times in the worlds of the mask; past actions stay zero."""
+    front = SonicFrontEnd()
+    front.bind(3)
+    front.reset()
+    command, state = inputs(0, 3)
+    front.prefill(command, state, torch.tensor([True, False, True]))
+    spin = front.obs[:, 1762:1792].view(3, 10, 3)
+    np.testing.assert_allclose(spin[2].numpy(), np.tile(state.ang_vel_body[2].numpy(), (10, 1)))
+    assert (spin[1, :9] == 0).all() and (front.obs[:, 1762 + 610 : 1762 + 900] == 0).all()
+
+
+def test_worlds_do_not_mix():
+    """Twenty worlds, three, and one alone, in any order, give the same bits, also after a reset of some."""
+    from arena_newton.trackers.front_end import NetworkTracker
+
+    torch.manual_seed(0)
+    network = SonicNet().eval()
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(3))
+    groups = [torch.arange(20), order, order[:3], order[7:8], torch.arange(13)]
+    bound = [NetworkTracker(SonicFrontEnd(), network) for _ in groups]
+    for tracker, group in zip(bound, groups, strict=True):
+        tracker.bind(len(group))
+    for tick in range(5):
+        command, state = inputs(tick, 20)
+        targets = []
+        for tracker, group in zip(bound, groups, strict=True):
+            if tick == 0:
+                tracker.prefill(rows(command, group), rows(state, group), group % 2 == 0)
+            if tick == 3:
+                tracker.reset(group % 3 == 0)
+            targets.append(tracker.step(rows(command, group), rows(state, group)).clone())
+        for group, got in zip(groups, targets, strict=True):
+            assert torch.equal(got, targets[0][group])
+
+
+def test_nan_leaves_with_reset():
+    """NaN in one world leaves the others' bits alone and is gone after that world's reset."""
+    clean, dirty = SonicFrontEnd(), SonicFrontEnd()
+    for front in (clean, dirty):
+        front.bind(3)
+        front.reset()
+    for tick in range(3):
+        command, state = inputs(tick, 3)
+        raw = torch.full((3, 29), float(tick))
+        expected, targets = clean.observe(command, state).clone(), clean.act(raw).clone()
+        state.joint_pos[1], state.quat[1] = float("nan"), float("nan")
+        assert torch.equal(dirty.observe(command, state)[[0, 2]], expected[[0, 2]])
+        assert torch.equal(dirty.act(raw), targets)
+    for front in (clean, dirty):
+        front.reset(torch.tensor([False, True, False]))
+    command, state = inputs(9, 3)
+    assert torch.equal(clean.observe(command, state), dirty.observe(command, state))
+
+
+def test_declares():
+    """SONIC declares what it cannot see, its gains, and 5 ms physics."""
+    assert SonicTracker.ignores == ("root xy", "root height") and SonicTracker.drive is SONIC_DRIVE
+    assert (SonicTracker.physics_rate.dt, SonicTracker.physics_rate.substeps) == (0.005, 4)
+    assert SonicTracker.max_root_delta_deg == 26.0

@@ -1,0 +1,196 @@
+"""The networks of our own trackers; training and deployment use the same modules.
+
+Input normalisation lives inside: a network takes the front end's observation as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from arena_newton.errors import InputError
+
+__all__ = ["InputNorm", "SonicNet", "Twist2Net", "make"]
+
+TWIST2_WIDTH = 1432
+"""Width of TWIST2's observation."""
+SONIC_ENCODER_WIDTH = 1762
+"""Width of the input of SONIC's encoder."""
+SONIC_PROPRIO_WIDTH = 930
+"""Width of what SONIC's decoder sees besides the latent."""
+SONIC_WIDTH = SONIC_ENCODER_WIDTH + SONIC_PROPRIO_WIDTH
+"""Width of SONIC's observation: encoder input, then proprioception."""
+SONIC_USED = (slice(4, 584), slice(595, 661))
+"""Encoder inputs of mode 0: joint positions and velocities of ten frames, the anchor, the anchor of ten frames."""
+JOINTS = 29
+
+_STD_FLOOR = 1e-2
+"""Added to the measured deviation, so that an input that never moved does not explode when it first does."""
+_LAST_LAYER_SCALE = 0.1
+"""A network starts near zero, that is near the reference or the default pose."""
+
+
+class InputNorm(nn.Module):
+    """(x - mean) / std with statistics kept in buffers."""
+
+    mean: torch.Tensor
+    std: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, width: int):
+        """Start as the identity."""
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("std", torch.ones(width))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64), persistent=False)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Normalised inputs, shape [rows, width]."""
+        return (x - self.mean) / self.std
+
+    @torch.no_grad()
+    def update(self, x: torch.Tensor) -> None:
+        """Take a batch into the running statistics, together with those of the other processes, if there are any.
+
+        Args:
+            x: Inputs, shape [rows, width].
+        """
+        rows = torch.full((), x.shape[0], dtype=torch.float64, device=x.device)
+        # Sums around the present mean keep their precision in float32.
+        centred = x - self.mean
+        sums = torch.stack([centred.mean(0), centred.square().mean(0)]).double() * rows
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.all_reduce(rows)
+            torch.distributed.all_reduce(sums)
+        total = self.count + rows
+        shift = sums[0] / total
+        old = torch.where(self.count > 0, (self.std - _STD_FLOOR).double().square(), 0.0) * self.count
+        variance = ((old + sums[1]) / total - shift.square()).clamp_min(0.0)
+        self.mean += shift.float()
+        self.std.copy_(variance.sqrt().float() + _STD_FLOOR)
+        self.count.copy_(total)
+
+
+def _mlp(widths: Sequence[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for a, b in zip(widths, widths[1:], strict=False):
+        layers += [nn.Linear(a, b), nn.ELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def _shrink_last(layers: nn.Sequential) -> None:
+    last = layers[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight.mul_(_LAST_LAYER_SCALE)
+        last.bias.zero_()
+
+
+class Twist2Net(nn.Module):
+    """1432 observations → 29 raw actions."""
+
+    interface = "twist2"
+    obs_width = TWIST2_WIDTH
+
+    def __init__(self, hidden: Sequence[int] = (512, 512, 256)):
+        """Make the layers.
+
+        Args:
+            hidden: Widths of the hidden layers.
+        """
+        super().__init__()
+        self.hidden = tuple(hidden)
+        self.norm = InputNorm(self.obs_width)
+        self.actor = _mlp((self.obs_width, *self.hidden, JOINTS))
+        _shrink_last(self.actor)
+
+    def config(self) -> dict[str, Any]:
+        """Arguments that make this network again."""
+        return {"hidden": list(self.hidden)}
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Raw actions, shape [rows, 29]."""
+        return self.actor(self.norm(obs))
+
+    def update_norm(self, obs: torch.Tensor) -> None:
+        """Take a batch of observations into the input statistics."""
+        self.norm.update(obs)
+
+
+class SonicNet(nn.Module):
+    """Encoder of the reference → bounded latent; latent and proprioception → decoder → 29 raw actions."""
+
+    interface = "sonic"
+    obs_width = SONIC_WIDTH
+
+    used: torch.Tensor
+    """Indices of the encoder inputs that the encoder reads, shape [646]."""
+
+    def __init__(
+        self,
+        encoder: Sequence[int] = (512, 256),
+        decoder: Sequence[int] = (512, 512, 256),
+        latent: int = 64,
+    ):
+        """Make the layers.
+
+        Args:
+            encoder: Widths of the encoder's hidden layers.
+            decoder: Widths of the decoder's hidden layers.
+            latent: Width of the latent.
+        """
+        super().__init__()
+        self.widths = tuple(encoder), tuple(decoder), latent
+        used = torch.cat([torch.arange(s.start, s.stop) for s in SONIC_USED])
+        self.register_buffer("used", used, persistent=False)
+        self.encoder_norm = InputNorm(len(used))
+        self.decoder_norm = InputNorm(SONIC_PROPRIO_WIDTH)
+        self.encoder = nn.Sequential(*_mlp((len(used), *encoder, latent)), nn.Tanh())
+        self.decoder = _mlp((latent + SONIC_PROPRIO_WIDTH, *decoder, JOINTS))
+        _shrink_last(self.decoder)
+
+    def config(self) -> dict[str, Any]:
+        """Arguments that make this network again."""
+        encoder, decoder, latent = self.widths
+        return {"encoder": list(encoder), "decoder": list(decoder), "latent": latent}
+
+    def encode(self, reference: torch.Tensor) -> torch.Tensor:
+        """Latent in (-1, 1) of encoder inputs [rows, 1762], shape [rows, latent]."""
+        return self.encoder(self.encoder_norm(reference.index_select(1, self.used)))
+
+    def decode(self, latent: torch.Tensor, proprio: torch.Tensor) -> torch.Tensor:
+        """Raw actions of latents [rows, latent] and proprioception [rows, 930], shape [rows, 29]."""
+        return self.decoder(torch.cat((latent, self.decoder_norm(proprio)), 1))
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Raw actions of observations [rows, 2692], shape [rows, 29]."""
+        return self.decode(self.encode(obs), obs[:, SONIC_ENCODER_WIDTH:])
+
+    def update_norm(self, obs: torch.Tensor) -> None:
+        """Take a batch of observations into the input statistics."""
+        self.encoder_norm.update(obs.index_select(1, self.used))
+        self.decoder_norm.update(obs[:, SONIC_ENCODER_WIDTH:])
+
+
+_NETWORKS: dict[str, type[Twist2Net] | type[SonicNet]] = {"twist2": Twist2Net, "sonic": SonicNet}
+
+
+def make(interface: str, config: Mapping[str, Any] | None = None) -> Twist2Net | SonicNet:
+    """A fresh network of an interface.
+
+    Args:
+        interface: `twist2` or `sonic`.
+        config: What `config()` of such a network gave; default widths without it.
+
+    Raises:
+        InputError: Unknown interface, or arguments that do not fit it.
+    """
+    if interface not in _NETWORKS:
+        raise InputError(f"network interface {interface!r}: known are {', '.join(_NETWORKS)}")
+    try:
+        return _NETWORKS[interface](**dict(config or {}))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"network of interface {interface!r}: unfit widths {dict(config or {})}: {error}") from error

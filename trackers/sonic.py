@@ -1,0 +1,224 @@
+"""SONIC: an encoder of the reference, a latent of 64 numbers, a decoder of latent and proprioception.
+
+Facts are those of the released controller as the original benchmark drives it (its joint-reference mode): the encoder
+takes 1762 numbers of which mode 0 fills the joint positions, the joint velocities and the orientation anchor; there is
+no look-ahead, the present frame stands ten times. Inside, joints are in canonical order. The elementwise arithmetic is
+exactly rounded, so a world's bits do not depend on the other worlds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from arena_newton.robot import (
+    CANONICAL_TO_MUJOCO,
+    MUJOCO_TO_CANONICAL,
+    SONIC_DRIVE,
+    PhysicsRate,
+)
+from arena_newton.trackers.base import RobotState, TrackerCommand
+from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker, column
+
+__all__ = [
+    "ENCODER_INPUT",
+    "OBSERVATION",
+    "PROPRIOCEPTION",
+    "SONIC_DEFAULT_POSE",
+    "SONIC_FORM",
+    "SonicFrontEnd",
+    "SonicTracker",
+]
+
+FRAMES = 10
+"""Frames of the reference window and of the histories."""
+ENCODER_INPUT = 1762
+"""Width of the encoder's input."""
+PROPRIOCEPTION = 930
+"""Width of the decoder's input besides the latent."""
+LATENT = 64
+"""Width of the latent."""
+DECODER_INPUT = LATENT + PROPRIOCEPTION
+"""Width of the decoder's input."""
+OBSERVATION = ENCODER_INPUT + PROPRIOCEPTION
+"""Width of the whole observation: encoder input, then proprioception."""
+
+# Encoder input: mode 4, joint positions 290, joint velocities 290, heights 10 + 1 (zero), anchor 6, anchors 60, then
+# 1101 numbers of the other modes (zero).
+_REF_POS = slice(4, 294)
+_REF_VEL = slice(294, 584)
+_ANCHOR = slice(595, 601)
+_ANCHORS = slice(601, 661)
+# Proprioception: each ten frames, oldest first.
+_ANG_VEL = slice(ENCODER_INPUT, ENCODER_INPUT + 30)
+_JOINT_POS = slice(_ANG_VEL.stop, _ANG_VEL.stop + 290)
+_JOINT_VEL = slice(_JOINT_POS.stop, _JOINT_POS.stop + 290)
+_ACTIONS = slice(_JOINT_VEL.stop, _JOINT_VEL.stop + 290)
+_GRAVITY = slice(_ACTIONS.stop, _ACTIONS.stop + 30)
+
+_LEG_POSE = (-0.312, 0.0, 0.0, 0.669, -0.363, 0.0)
+SONIC_DEFAULT_POSE: tuple[float, ...] = (
+    *_LEG_POSE, *_LEG_POSE, 0.0, 0.0, 0.0,
+    0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0,
+    0.2, -0.2, 0.0, 0.6, 0.0, 0.0, 0.0,
+)  # fmt: skip
+"""SONIC's default pose [rad], MuJoCo order."""
+
+_HIP, _YAW, _SMALL, _WRIST = 0.3506614566, 0.5475464463, 0.4385773242, 0.0745008737
+_LEG_SCALE = (_HIP, _HIP, _YAW, _HIP, _SMALL, _SMALL)
+_ARM_SCALE = (*(_SMALL,) * 5, _WRIST, _WRIST)
+SONIC_FORM = ActionForm("default", (*_LEG_SCALE, *_LEG_SCALE, _YAW, _SMALL, _SMALL, *_ARM_SCALE, *_ARM_SCALE))
+"""SONIC's action form: default pose plus scaled output, not clipped."""
+
+# Both tables speak of the 16 products a_i b_j (index 4 i + j) of two wxyz quaternions, with their factors.
+_RELATIVE = (
+    ((0, 1), (5, 1), (10, 1), (15, 1)),
+    ((1, 1), (4, -1), (11, -1), (14, 1)),
+    ((2, 1), (7, 1), (8, -1), (13, -1)),
+    ((3, 1), (6, -1), (9, 1), (12, -1)),
+)
+"""conj(a) b, from the products of a and b."""
+_R00, _R01 = ((10, -2), (15, -2)), ((6, 2), (3, -2))
+_R10, _R11 = ((6, 2), (3, 2)), ((5, -2), (15, -2))
+_R20, _R21, _R22 = ((7, 2), (2, -2)), ((11, 2), (1, 2)), ((5, -2), (10, -2))
+_ROT6D = (_R00, _R01, _R10, _R11, _R20, _R21)
+"""Two columns of the rotation matrix, row by row, less the identity's; from a quaternion's products with itself."""
+_DOWN = tuple(tuple((i, -f) for i, f in row) for row in (_R20, _R21, _R22))
+"""Minus the last row of the rotation matrix, less the identity's: where down is, seen from the body."""
+
+
+class _Quadratic:
+    """Sums of products of two quaternions: three elementwise operations instead of dozens."""
+
+    def __init__(self, table: Sequence[Sequence[tuple[int, int]]], constant: Sequence[float], device: torch.device):
+        self.index = torch.tensor([i for row in table for i, _ in row], device=device)
+        self.factor = torch.tensor([float(f) for row in table for _, f in row], device=device)
+        self.constant = torch.tensor(constant, device=device)
+        self.shape = (-1, len(table), len(table[0]))
+
+    def __call__(self, products: torch.Tensor) -> torch.Tensor:
+        """Shape [rows, 16] → [rows, table rows]."""
+        terms = products.index_select(1, self.index).mul_(self.factor).view(self.shape)
+        total = terms[..., 0]
+        for k in range(1, self.shape[2]):  # in this order for every row: the bits stay
+            total = total + terms[..., k]
+        return total + self.constant
+
+
+def _products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return (a[:, :, None] * b[:, None, :]).view(-1, 16)
+
+
+class SonicFrontEnd(FrontEnd):
+    """Encoder input (1762) and proprioception (930) side by side."""
+
+    interface = "sonic"
+    obs_width = OBSERVATION
+    default_pose = SONIC_DEFAULT_POSE
+
+    def __init__(self, action_form: ActionForm = SONIC_FORM):
+        """Take SONIC's action form or another."""
+        super().__init__(action_form)
+
+    def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
+        """Allocate buffers for `worlds` worlds on `device`."""
+        super().bind(worlds, device, obs)
+        self._to_canonical = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)
+        self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
+        self._relative = _Quadratic(_RELATIVE, (0.0,) * 4, self.device)
+        self._rot6d = _Quadratic(_ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
+        self._down = _Quadratic(_DOWN, (0.0, 0.0, -1.0), self.device)
+
+        def frames(part: slice) -> torch.Tensor:
+            return self.obs[:, part].view(worlds, FRAMES, -1)
+
+        self._ref_pos, self._ref_vel, self._anchors = frames(_REF_POS), frames(_REF_VEL), frames(_ANCHORS)
+        self._ang_vel, self._gravity = frames(_ANG_VEL), frames(_GRAVITY)
+        self._joint_pos, self._joint_vel, self._actions = frames(_JOINT_POS), frames(_JOINT_VEL), frames(_ACTIONS)
+        self._proprio = self.obs[:, ENCODER_INPUT:]
+        # Column from which each column of the histories takes its value when a tick ends; the newest stay.
+        source = []
+        for part in (_ANG_VEL, _JOINT_POS, _JOINT_VEL, _ACTIONS, _GRAVITY):
+            size = part.stop - part.start
+            newest = size - size // FRAMES
+            first = part.start - ENCODER_INPUT
+            source += [first + (i if i >= newest else i + size // FRAMES) for i in range(size)]
+        self._source = torch.tensor(source, device=self.device)
+        self._shifted = torch.zeros(worlds, PROPRIOCEPTION, device=self.device)
+        self._fresh = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
+
+    @torch.no_grad()
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Histories of the worlds in `mask` become zero; those of the joints take the first values measured."""
+        if mask is None:
+            self.obs.zero_()
+            self.last_action.zero_()
+            self._fresh.fill_(True)
+            return
+        row = column(mask, self.device)
+        self.obs.masked_fill_(row, 0.0)
+        self.last_action.masked_fill_(row, 0.0)
+        self._fresh.logical_or_(row[:, None])
+
+    @torch.no_grad()
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """Fill the measured histories of the worlds in `mask` with the present; past actions stay."""
+        self._write(command, state)
+        for history in (self._ang_vel, self._joint_pos, self._joint_vel, self._gravity):
+            present = history[:, -1:].expand_as(history)
+            if mask is None:
+                history.copy_(present.clone())
+            else:
+                history.copy_(torch.where(column(mask, self.device)[:, None], present, history))
+
+    def _write(self, command: TrackerCommand, state: RobotState) -> None:
+        self._ref_pos.copy_(command.joints.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_pos))
+        self._ref_vel.copy_(command.joint_vel.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_vel))
+        relative = self._relative(_products(state.quat, command.quat))
+        anchor = self._rot6d(_products(relative, relative))
+        self.obs[:, _ANCHOR] = anchor
+        self._anchors.copy_(anchor[:, None].expand_as(self._anchors))
+
+        self._ang_vel[:, -1] = state.ang_vel_body
+        self._gravity[:, -1] = self._down(_products(state.quat, state.quat))
+        joints = (state.joint_pos - self._default).index_select(1, self._to_canonical)
+        speeds = state.joint_vel.index_select(1, self._to_canonical)
+        for history, present in ((self._joint_pos, joints), (self._joint_vel, speeds)):
+            history[:, -1] = present
+            history.copy_(torch.where(self._fresh, present[:, None], history))
+
+    def _advance(self) -> None:
+        torch.index_select(self._proprio, 1, self._source, out=self._shifted)
+        self._proprio.copy_(self._shifted)
+        self._actions[:, -1] = self.last_action
+        self._fresh.fill_(False)
+
+    def _to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
+        return raw.index_select(1, self._from_canonical)
+
+
+class EncoderDecoder(torch.nn.Module):
+    """The two official networks as one: observation [rows, 2692] → raw action [rows, 29]."""
+
+    def __init__(self, encoder: torch.nn.Module, decoder: torch.nn.Module):
+        """Join an encoder of 1762 numbers and a decoder of 994."""
+        super().__init__()
+        self.encoder, self.decoder = encoder, decoder
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Raw actions, shape [rows, 29]."""
+        latent = self.encoder(obs[:, :ENCODER_INPUT].contiguous())
+        return self.decoder(torch.cat((latent, obs[:, ENCODER_INPUT:]), 1))
+
+
+class SonicTracker(NetworkTracker):
+    """SONIC behind joint positions, joint velocities and the root's orientation."""
+
+    name = "sonic"
+    drive = SONIC_DRIVE
+    physics_rate = PhysicsRate(dt=0.005, substeps=4)
+    fast_physics_rate = PhysicsRate(dt=0.005, substeps=4)
+    ignores = ("root xy", "root height")
+    max_root_delta_deg = 26.0
