@@ -100,12 +100,18 @@ def test_observation_and_targets():
 
 
 def test_scales_and_gains():
-    """The action scales are a quarter of the controller's torque limits over its unraised stiffness."""
+    """The action scales are a quarter of the actuator's torque over its stiffness before the benchmark raised some."""
     scale = dict(zip(MUJOCO_JOINTS, SONIC_FORM.scale, strict=True))
-    drive = dict(zip(MUJOCO_JOINTS, SONIC_DRIVE.kp, strict=True))
-    for joint, effort in {"left_knee": 139, "right_hip_yaw": 88, "waist_roll": 25, "left_wrist_yaw": 5}.items():
-        assert scale[f"{joint}_joint"] == pytest.approx(0.25 * effort / drive[f"{joint}_joint"], rel=2e-3)
-    assert scale["left_ankle_pitch_joint"] == scale["right_elbow_joint"] == scale["waist_pitch_joint"]
+    actuators = {
+        (139.0, 99.02755): ("left_hip_pitch", "right_hip_roll", "left_knee"),
+        (88.0, 40.168964): ("right_hip_yaw", "waist_yaw"),
+        (50.0, 28.445627): ("left_ankle_pitch", "right_ankle_roll", "waist_roll", "waist_pitch"),
+        (25.0, 14.222814): ("left_shoulder_pitch", "right_shoulder_yaw", "left_elbow", "right_wrist_roll"),
+        (5.0, 16.77876): ("left_wrist_pitch", "right_wrist_yaw"),
+    }
+    for (effort, stiffness), joints in actuators.items():
+        for joint in joints:
+            assert scale[f"{joint}_joint"] == pytest.approx(0.25 * effort / stiffness, rel=3e-3)
 
 
 def test_prefill():
