@@ -19,7 +19,7 @@ import numpy as np
 from arena_newton.canonical import ACTION_WIDTH, validate_action
 from arena_newton.errors import InputError
 
-__all__ = ["Clip", "load_actions", "load_clip", "load_plain_pickle"]
+__all__ = ["Clip", "load_actions", "load_clip", "load_plain_pickle", "resample"]
 
 JOINTS = 29
 START_FRAMES = 15
@@ -46,6 +46,8 @@ class Clip:
     """Joint positions [rad], MuJoCo order, shape [frames, 29]."""
     trimmed: int = 0
     """Frames of a motion capture jump that were cut off at the start."""
+    hands: np.ndarray | None = None
+    """Left and right hand, 1 closed, 0 open, shape [frames, 2]; None means open."""
 
     @property
     def duration(self) -> float:
@@ -164,6 +166,42 @@ def _start(root_pos: np.ndarray, joint_pos: np.ndarray, fps: float) -> int:
     bad = (speed > START_SPEED) | (joint_speed > START_JOINT_SPEED) | (root_pos[:-1, 2] > START_HEIGHT)
     hits = np.flatnonzero(bad[:START_FRAMES])
     return int(hits[-1]) + 1 if hits.size else 0
+
+
+def resample(clip: Clip, fps: float) -> Clip:
+    """The same motion at another frame rate: orientation by slerp, hands by the frame before, all else linearly.
+
+    Frames that already stand at that rate come back as they are.
+    """
+    if abs(clip.fps - fps) < 1e-6 * fps:
+        return clip
+    count = int(np.floor(clip.duration * fps + 1e-6)) + 1
+    at = np.minimum(np.arange(count) * (clip.fps / fps), len(clip.root_pos) - 1)
+    low = np.minimum(at.astype(int), len(clip.root_pos) - 2)
+    share = (at - low)[:, None]
+
+    def between(values: np.ndarray) -> np.ndarray:
+        return (1 - share) * values[low] + share * values[low + 1]
+
+    return Clip(
+        fps,
+        between(clip.root_pos),
+        _slerp(clip.root_quat[low], clip.root_quat[low + 1], share),
+        between(clip.joint_pos),
+        clip.trimmed,
+        None if clip.hands is None else clip.hands[low],
+    )
+
+
+def _slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Spherical interpolation of unit quaternions [n, 4] along the shorter arc; `share` [n, 1]."""
+    dot = (a * b).sum(axis=-1, keepdims=True)
+    b, dot = np.where(dot < 0, -b, b), np.abs(dot)
+    angle = np.arccos(np.clip(dot, 0.0, 1.0))
+    near = angle < 1e-6
+    sine = np.where(near, 1.0, np.sin(angle))
+    quat = np.where(near, a + share * (b - a), (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / sine)
+    return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
 
 
 def load_actions(path: str | Path, *, flag: str = "--policy replay:") -> np.ndarray:

@@ -1,0 +1,283 @@
+"""Frames of a motion, canonical 40D actions and 35D mimic commands: each made from the other, batched, in torch.
+
+A frame is a root position [m], a root orientation (wxyz), 29 joints in MuJoCo order [rad] and two hands, 50 times a
+second; frame k is where the robot should be after tick k. The formulas are those of `kernels.canonical`, which executes
+the actions: what it integrates from the actions of a motion is the motion again.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from arena_newton.canonical import ACTION, ACTION_WIDTH, HAND_CLOSED, MIMIC, MIMIC_WIDTH
+from arena_newton.robot import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, TICK
+
+__all__ = [
+    "Motion",
+    "actions_to_motion",
+    "frame_action",
+    "frame_mimic",
+    "heading",
+    "matrix_from_quat",
+    "motion_actions",
+    "motion_mimic",
+    "quat_apply",
+    "quat_conjugate",
+    "quat_from_matrix",
+    "quat_from_rot6d",
+    "quat_from_yaw",
+    "quat_multiply",
+    "roll_pitch",
+    "rotation_vector",
+    "wrap_angle",
+]
+
+_LEVEL_FLOOR = 1e-6
+"""Below this |R22| height no longer tells the displacement along the root's z axis (`kernels.canonical`)."""
+
+
+class Motion(NamedTuple):
+    """Frames in a row; leading axes are a batch."""
+
+    root_pos: Tensor
+    """Root position [m], shape [..., ticks, 3]."""
+    root_quat: Tensor
+    """Root orientation, wxyz, shape [..., ticks, 4]."""
+    joint_pos: Tensor
+    """Joint positions [rad], MuJoCo order, shape [..., ticks, 29]."""
+    hands: Tensor
+    """Left and right hand, 1 closed, 0 open, shape [..., ticks, 2]."""
+
+
+@lru_cache(maxsize=16)
+def _order(indices: tuple[int, ...], device: torch.device) -> Tensor:
+    """Indices on a device, uploaded once: a list would be uploaded at every use, which a CUDA graph cannot hold."""
+    return torch.tensor(indices, dtype=torch.int64, device=device)
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle within -pi..pi [rad]."""
+    return torch.atan2(torch.sin(angle), torch.cos(angle))
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Product of quaternions wxyz, shapes [..., 4]."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
+def quat_conjugate(quat: Tensor) -> Tensor:
+    """The inverse of unit quaternions wxyz, shape [..., 4]."""
+    return torch.cat([quat[..., :1], -quat[..., 1:]], dim=-1)
+
+
+def quat_apply(quat: Tensor, vector: Tensor) -> Tensor:
+    """Vectors [..., 3] turned by unit quaternions wxyz [..., 4]."""
+    w, u = quat[..., :1], quat[..., 1:]
+    u, vector = torch.broadcast_tensors(u, vector)
+    t = 2.0 * torch.cross(u, vector, dim=-1)
+    return vector + w * t + torch.cross(u, t, dim=-1)
+
+
+def quat_from_yaw(yaw: Tensor) -> Tensor:
+    """Rotation by `yaw` [rad] about world z, wxyz, shape [..., 4]."""
+    zero = torch.zeros_like(yaw)
+    return torch.stack([torch.cos(0.5 * yaw), zero, zero, torch.sin(0.5 * yaw)], dim=-1)
+
+
+def heading(quat: Tensor) -> Tensor:
+    """Heading of unit quaternions [rad], atan2(2(wz + xy), 1 - 2(y² + z²))."""
+    w, x, y, z = quat.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def roll_pitch(quat: Tensor) -> Tensor:
+    """Roll and pitch of unit quaternions (ZYX angles) [rad], shape [..., 2]."""
+    w, x, y, z = quat.unbind(-1)
+    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
+    return torch.stack([roll, pitch], dim=-1)
+
+
+def rotation_vector(quat: Tensor) -> Tensor:
+    """Axis times angle [rad] of unit quaternions along the shorter way, shape [..., 3]."""
+    quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
+    sine = torch.linalg.vector_norm(quat[..., 1:], dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(sine, quat[..., :1])
+    # angle / sine tends to 2 for small angles.
+    tiny = torch.finfo(quat.dtype).tiny
+    return quat[..., 1:] * torch.where(sine > 1e-9, angle / sine.clamp_min(tiny), torch.full_like(sine, 2.0))
+
+
+def matrix_from_quat(quat: Tensor) -> Tensor:
+    """Rotation matrices of unit quaternions wxyz, shape [..., 3, 3]."""
+    w, x, y, z = quat.unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
+    ]
+    return torch.stack(rows, dim=-2)
+
+
+def quat_from_matrix(matrix: Tensor) -> Tensor:
+    """Unit quaternions wxyz of rotation matrices [..., 3, 3], by the best conditioned of Shepperd's four formulas."""
+    m00, m11, m22 = matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 2, 2]
+    a, b, c = (
+        matrix[..., 2, 1] - matrix[..., 1, 2],
+        matrix[..., 0, 2] - matrix[..., 2, 0],
+        matrix[..., 1, 0] - matrix[..., 0, 1],
+    )
+    d, e, f = (
+        matrix[..., 1, 0] + matrix[..., 0, 1],
+        matrix[..., 0, 2] + matrix[..., 2, 0],
+        matrix[..., 2, 1] + matrix[..., 1, 2],
+    )
+    # Row i is 4 q_i q: the one with the largest diagonal has the least cancellation.
+    rows = torch.stack(
+        [
+            torch.stack([1 + m00 + m11 + m22, a, b, c], dim=-1),
+            torch.stack([a, 1 + m00 - m11 - m22, d, e], dim=-1),
+            torch.stack([b, d, 1 - m00 + m11 - m22, f], dim=-1),
+            torch.stack([c, e, f, 1 - m00 - m11 + m22], dim=-1),
+        ],
+        dim=-2,
+    )
+    best = torch.diagonal(rows, dim1=-2, dim2=-1).argmax(dim=-1)[..., None, None].expand(*rows.shape[:-2], 1, 4)
+    return torch.nn.functional.normalize(rows.gather(-2, best).squeeze(-2), dim=-1)
+
+
+def quat_from_rot6d(rot6d: Tensor) -> Tensor:
+    """Rotation next to each rot6d in row layout [..., 6] (Gram-Schmidt), wxyz, shape [..., 4]."""
+    columns = rot6d.unflatten(-1, (3, 2))
+    x = torch.nn.functional.normalize(columns[..., 0], dim=-1)
+    y = columns[..., 1] - x * (x * columns[..., 1]).sum(-1, keepdim=True)
+    y = torch.nn.functional.normalize(y, dim=-1)
+    return quat_from_matrix(torch.stack([x, y, torch.cross(x, y, dim=-1)], dim=-1))
+
+
+def frame_action(
+    previous_pos: Tensor, root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor, hands: Tensor, heading0: Tensor
+) -> Tensor:
+    """Canonical action of one frame.
+
+    Args:
+        previous_pos: Root position one tick earlier [m], shape [..., 3]; the same as `root_pos` on the first tick.
+        root_pos: Root position [m], shape [..., 3].
+        root_quat: Root orientation, wxyz, shape [..., 4].
+        joint_pos: Joint positions [rad], MuJoCo order, shape [..., 29].
+        hands: Left and right hand, closed from 0.5, shape [..., 2].
+        heading0: Heading that is taken out of the orientation [rad], shape [...].
+
+    Returns:
+        Shape [..., 40].
+    """
+    action = torch.empty(*joint_pos.shape[:-1], ACTION_WIDTH, dtype=joint_pos.dtype, device=joint_pos.device)
+    moved = quat_apply(quat_conjugate(root_quat), root_pos - previous_pos)
+    rotation = matrix_from_quat(quat_multiply(quat_from_yaw(-heading0), root_quat))
+    action[..., ACTION["root_xy_delta"]] = moved[..., :2]
+    action[..., ACTION["root_z"]] = root_pos[..., 2:]
+    action[..., ACTION["root_rot6d"]] = rotation[..., :2].flatten(-2)
+    action[..., ACTION["joint_pos"]] = joint_pos.index_select(-1, _order(CANONICAL_TO_MUJOCO, joint_pos.device))
+    action[..., ACTION["hands"]] = hands
+    return action
+
+
+def frame_mimic(
+    previous_pos: Tensor, previous_quat: Tensor, root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor
+) -> Tensor:
+    """Mimic command of one frame: what `kernels.canonical` makes of the frame's action.
+
+    Args:
+        previous_pos: Root position one tick earlier [m], shape [..., 3].
+        previous_quat: Root orientation one tick earlier, wxyz, shape [..., 4].
+        root_pos: Root position [m], shape [..., 3].
+        root_quat: Root orientation, wxyz, shape [..., 4].
+        joint_pos: Joint positions [rad], MuJoCo order, shape [..., 29].
+
+    Returns:
+        Shape [..., 35].
+    """
+    mimic = torch.empty(*joint_pos.shape[:-1], MIMIC_WIDTH, dtype=joint_pos.dtype, device=joint_pos.device)
+    moved = quat_apply(quat_conjugate(root_quat), root_pos - previous_pos)
+    mimic[..., MIMIC["velocity_xy"]] = moved[..., :2] / TICK
+    mimic[..., MIMIC["root_z"]] = root_pos[..., 2:]
+    mimic[..., MIMIC["roll_pitch"]] = roll_pitch(root_quat)
+    mimic[..., MIMIC["yaw_rate"]] = (wrap_angle(heading(root_quat) - heading(previous_quat)) / TICK)[..., None]
+    mimic[..., MIMIC["joint_pos"]] = joint_pos
+    return mimic
+
+
+def _delayed(values: Tensor) -> Tensor:
+    """Values one tick earlier, the first repeated; the ticks are the last axis but one."""
+    return torch.cat([values[..., :1, :], values[..., :-1, :]], dim=-2)
+
+
+def motion_actions(root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor, hands: Tensor | None = None) -> Tensor:
+    """Canonical actions of a motion, without its first heading; the first action holds no displacement.
+
+    Args:
+        root_pos: Root position [m], shape [..., ticks, 3].
+        root_quat: Root orientation, wxyz, shape [..., ticks, 4].
+        joint_pos: Joint positions [rad], MuJoCo order, shape [..., ticks, 29].
+        hands: Hands, shape [..., ticks, 2]; open by default.
+
+    Returns:
+        Shape [..., ticks, 40].
+    """
+    hands = joint_pos.new_zeros(*joint_pos.shape[:-1], 2) if hands is None else hands
+    start = heading(root_quat[..., :1, :]).expand(joint_pos.shape[:-1])
+    return frame_action(_delayed(root_pos), root_pos, root_quat, joint_pos, hands, start)
+
+
+def motion_mimic(root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor) -> Tensor:
+    """Mimic commands of a motion, shape [..., ticks, 35]; velocities of the first frame are zero."""
+    return frame_mimic(_delayed(root_pos), _delayed(root_quat), root_pos, root_quat, joint_pos)
+
+
+def actions_to_motion(actions: Tensor, root_xy: Tensor | None = None, yaw: Tensor | None = None) -> Motion:
+    """The motion that canonical actions integrate to.
+
+    Args:
+        actions: Shape [..., ticks, 40].
+        root_xy: Where the first displacement starts [m], shape [..., 2]; the origin by default.
+        yaw: Heading that the orientations are relative to [rad], shape [...]; 0 by default.
+
+    Returns:
+        Frames of the same number of ticks.
+    """
+    batch = actions.shape[:-2]
+    root_xy = actions.new_zeros(*batch, 2) if root_xy is None else root_xy
+    yaw = actions.new_zeros(batch) if yaw is None else yaw
+    quat = quat_from_rot6d(actions[..., ACTION["root_rot6d"]])
+    quat = quat_multiply(quat_from_yaw(yaw)[..., None, :].expand_as(quat), quat)
+    rotation = matrix_from_quat(quat)
+    moved = actions[..., ACTION["root_xy_delta"]]
+    z = actions[..., ACTION["root_z"]]
+    rise = (z - _delayed(z))[..., 0]
+    # Height fixes the displacement along the root's z axis, and with it that in the world's plane.
+    level = rotation[..., 2, 2]
+    along = rise - rotation[..., 2, 0] * moved[..., 0] - rotation[..., 2, 1] * moved[..., 1]
+    standing = level.abs() > _LEVEL_FLOOR
+    along = torch.where(standing, along / torch.where(standing, level, torch.ones_like(level)), torch.zeros_like(along))
+    local = torch.cat([moved, along[..., None]], dim=-1)
+    xy = root_xy[..., None, :] + (rotation @ local[..., None])[..., :2, 0].cumsum(dim=-2)
+    return Motion(
+        torch.cat([xy, z], dim=-1),
+        quat,
+        actions[..., ACTION["joint_pos"]].index_select(-1, _order(MUJOCO_TO_CANONICAL, actions.device)),
+        (actions[..., ACTION["hands"]] >= HAND_CLOSED).to(actions.dtype),
+    )

@@ -1,0 +1,483 @@
+"""A library of motions: many clips at 50 Hz in one NPZ file without pickles, each with its licence and its source.
+
+Frames of all clips stand one after the other. `MotionLibrary` is the file; `DeviceLibrary` is what training and
+evaluation read: torch tensors with velocities and mimic commands for every frame.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.robot import MUJOCO_JOINTS, TICK
+from arena_newton.usd_scenes.g1.links import LINKS
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from arena_newton.trackers.motions.load import Clip
+
+__all__ = [
+    "FORMAT",
+    "MIRROR_JOINTS",
+    "MIRROR_SIGNS",
+    "SUPPORTS",
+    "DeviceLibrary",
+    "MotionLibrary",
+]
+
+FORMAT = "arena-newton-motions-1"
+"""What the array `format` of a library file holds."""
+FPS = round(1.0 / TICK)
+SUPPORTS = ("none", "seat", "sill", "platform")
+"""Names of `support_kind`."""
+UNKNOWN = "unknown"
+"""Licence and source of a clip for which none was given."""
+
+_HINGE_AXIS = {link.hinge.name: link.hinge.axis for link in LINKS if link.hinge is not None}
+_OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+def _mirrored_joint(name: str) -> str:
+    side, _, rest = name.partition("_")
+    return f"{_OTHER_SIDE[side]}_{rest}" if side in _OTHER_SIDE else name
+
+
+MIRROR_JOINTS: tuple[int, ...] = tuple(MUJOCO_JOINTS.index(_mirrored_joint(name)) for name in MUJOCO_JOINTS)
+"""Joint (MuJoCo order) that each joint becomes in the mirror: `mirrored[i] = signs[i] * joints[MIRROR_JOINTS[i]]`."""
+MIRROR_SIGNS: tuple[float, ...] = tuple(1.0 if _HINGE_AXIS[name] == "Y" else -1.0 for name in MUJOCO_JOINTS)
+"""The mirror keeps rotations about the sideways axis and turns those about the other two round."""
+
+# Array → (type, shape after the first axis, what the first axis counts).
+_ARRAYS: dict[str, tuple[Any, tuple[int, ...], str]] = {
+    "root_pos": (np.float32, (3,), "frames"),
+    "root_quat": (np.float32, (4,), "frames"),
+    "joint_pos": (np.float32, (29,), "frames"),
+    "hands": (np.float32, (2,), "frames"),
+    "clip_start": (np.int64, (), "clips"),
+    "clip_length": (np.int64, (), "clips"),
+    "family": (np.int64, (), "clips"),
+    "clip_names": (np.str_, (), "clips"),
+    "licence": (np.str_, (), "clips"),
+    "source": (np.str_, (), "clips"),
+    "support_kind": (np.int64, (), "clips"),
+    "support_box": (np.float32, (7,), "clips"),
+    "family_names": (np.str_, (), "families"),
+}
+_PER_FRAME = tuple(name for name, (_, _, axis) in _ARRAYS.items() if axis == "frames")
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLibrary:
+    """Clips at 50 Hz. Arrays are checked when the library is made."""
+
+    root_pos: np.ndarray
+    """Root position [m], world of the clip, float32, shape [frames, 3]."""
+    root_quat: np.ndarray
+    """Root orientation, wxyz, float32, shape [frames, 4]."""
+    joint_pos: np.ndarray
+    """Joint positions [rad], MuJoCo order, float32, shape [frames, 29]."""
+    hands: np.ndarray
+    """Left and right hand, 1 closed, 0 open, float32, shape [frames, 2]."""
+    clip_start: np.ndarray
+    """First frame of each clip, int64, shape [clips]."""
+    clip_length: np.ndarray
+    """Frames of each clip, 2 or more, int64, shape [clips]."""
+    family: np.ndarray
+    """Index into `family_names` of each clip, int64, shape [clips]."""
+    family_names: np.ndarray
+    """What kinds of motion there are, str, shape [families]."""
+    clip_names: np.ndarray
+    """Name of each clip, str, shape [clips]."""
+    licence: np.ndarray
+    """Licence of each clip, str, shape [clips]."""
+    source: np.ndarray
+    """Where each clip is from, str, shape [clips]."""
+    support_kind: np.ndarray
+    """Index into `SUPPORTS` of what the clip stands or sits on beside the floor, int64, shape [clips]."""
+    support_box: np.ndarray
+    """That support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
+    top above the floor [m]; float32, shape [clips, 7]."""
+
+    def __post_init__(self) -> None:
+        """Bring the arrays to their types.
+
+        Raises:
+            InputError: An array is of the wrong shape, not finite, or contradicts another.
+        """
+        self._coerce("motion library")
+
+    def _coerce(self, where: str) -> None:
+        count: dict[str, int] = {}
+        for name, (kind, tail, axis) in _ARRAYS.items():
+            array = np.asarray(getattr(self, name))
+            if kind is not np.str_ and array.dtype.kind not in "fiub":
+                raise InputError(f"{where}: array {name} holds {array.dtype}, expected numbers")
+            if kind is np.str_ and array.dtype.kind != "U" and array.size:
+                raise InputError(f"{where}: array {name} holds {array.dtype}, expected text")
+            if kind is np.int64 and array.dtype.kind == "f":
+                raise InputError(f"{where}: array {name} holds {array.dtype}, expected whole numbers")
+            array = np.ascontiguousarray(array, dtype=kind)
+            length = count.setdefault(axis, len(array) if array.ndim else 0)
+            if array.shape != (length, *tail):
+                wanted = ", ".join([axis, *map(str, tail)])
+                shape = list(array.shape)
+                raise InputError(f"{where}: array {name} has shape {shape}, expected [{wanted}] with {length} {axis}")
+            if kind is np.float32 and not np.isfinite(array).all():
+                raise InputError(f"{where}: array {name} holds NaN or infinity")
+            object.__setattr__(self, name, array)
+        if not count["clips"]:
+            raise InputError(f"{where}: holds no clip")
+        if (self.clip_length < 2).any():
+            raise InputError(f"{where}: clip {self._first(self.clip_length < 2)} has fewer than 2 frames")
+        ends = np.cumsum(self.clip_length)
+        if not np.array_equal(self.clip_start, ends - self.clip_length) or ends[-1] != count["frames"]:
+            raise InputError(f"{where}: clip_start and clip_length do not cover the {count['frames']} frames in order")
+        for name, limit in (("family", count["families"]), ("support_kind", len(SUPPORTS))):
+            outside = (getattr(self, name) < 0) | (getattr(self, name) >= limit)
+            if outside.any():
+                raise InputError(f"{where}: {name} of clip {self._first(outside)} is not from 0 to {limit - 1}")
+        norm = np.linalg.norm(self.root_quat, axis=1, keepdims=True)
+        if (np.abs(norm - 1.0) > 1e-2).any():
+            raise InputError(f"{where}: root_quat holds a quaternion that is not of length 1")
+        object.__setattr__(self, "root_quat", self.root_quat / norm)
+
+    def _first(self, which: np.ndarray) -> str:
+        return str(self.clip_names[int(np.flatnonzero(which)[0])])
+
+    @property
+    def clips(self) -> int:
+        """Number of clips."""
+        return len(self.clip_start)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all clips."""
+        return len(self.root_pos)
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """Length of each clip [s], shape [clips]."""
+        return (self.clip_length - 1) * TICK
+
+    def __len__(self) -> int:
+        """Number of clips."""
+        return self.clips
+
+    def rows(self, clip: int) -> slice:
+        """The frames of a clip."""
+        start = int(self.clip_start[clip])
+        return slice(start, start + int(self.clip_length[clip]))
+
+    def clip_index(self, name_or_number: str) -> int:
+        """Index of a clip by its name or its number.
+
+        Raises:
+            InputError: There is no such clip.
+        """
+        found = np.flatnonzero(self.clip_names == name_or_number)
+        if found.size:
+            return int(found[0])
+        if name_or_number.isdecimal() and int(name_or_number) < self.clips:
+            return int(name_or_number)
+        raise InputError(f"clip {name_or_number}: the library has no clip of that name among its {self.clips}")
+
+    @classmethod
+    def from_clips(
+        cls,
+        clips: Sequence[Clip],
+        names: Sequence[str],
+        *,
+        family: str | Sequence[str] = "clips",
+        licence: str | Sequence[str] = UNKNOWN,
+        source: str | Sequence[str] = UNKNOWN,
+    ) -> MotionLibrary:
+        """Make a library of clips, resampled to 50 Hz.
+
+        Args:
+            clips: The clips, of any frame rate.
+            names: Their names.
+            family: Kind of motion, of all or of each.
+            licence: Licence, of all or of each.
+            source: Origin, of all or of each.
+
+        Raises:
+            InputError: No clips, or lists of unequal length.
+        """
+        from arena_newton.trackers.motions.load import resample
+
+        if not clips:
+            raise InputError("motion library: holds no clip")
+        families, licences, sources = (
+            [given] * len(clips) if isinstance(given, str) else list(given) for given in (family, licence, source)
+        )
+        for label, values in (("names", names), ("family", families), ("licence", licences), ("source", sources)):
+            if len(values) != len(clips):
+                raise InputError(f"motion library: {len(values)} {label} for {len(clips)} clips")
+        even = [resample(clip, FPS) for clip in clips]
+        kinds = list(dict.fromkeys(families))
+        lengths = np.array([len(clip.root_pos) for clip in even], dtype=np.int64)
+        return cls(
+            root_pos=np.concatenate([clip.root_pos for clip in even]),
+            root_quat=np.concatenate([clip.root_quat for clip in even]),
+            joint_pos=np.concatenate([clip.joint_pos for clip in even]),
+            hands=np.concatenate([_hands(clip) for clip in even]),
+            clip_start=np.cumsum(lengths) - lengths,
+            clip_length=lengths,
+            family=np.array([kinds.index(name) for name in families]),
+            family_names=np.array(kinds),
+            clip_names=np.array(list(names)),
+            licence=np.array(licences),
+            source=np.array(sources),
+            support_kind=np.zeros(len(clips), dtype=np.int64),
+            support_box=np.zeros((len(clips), 7)),
+        )
+
+    @classmethod
+    def from_random(
+        cls, generated: Mapping[str, Any], *, licence: str = "Apache-2.0", source: str = "generated"
+    ) -> MotionLibrary:
+        """Make a library of what `programs.random_clips` returns.
+
+        Args:
+            generated: Arrays or tensors root_pos [clips, ticks, 3], root_quat, joint_pos, hands, family [clips],
+                family_names, support_kind [clips], support_box [clips, 7].
+            licence: Licence of the clips.
+            source: Origin of the clips.
+        """
+        arrays = {name: _host(generated[name]) for name in (*_PER_FRAME, "family", "support_kind", "support_box")}
+        clips, ticks = arrays["root_pos"].shape[:2]
+        names = np.array([str(name) for name in generated["family_names"]])
+        numbers = np.zeros(clips, dtype=np.int64)
+        for kind in np.unique(arrays["family"]):
+            of_kind = arrays["family"] == kind
+            numbers[of_kind] = np.arange(of_kind.sum())
+        return cls(
+            **{
+                name: arrays[name].reshape(clips * ticks, -1)
+                for name in ("root_pos", "root_quat", "joint_pos", "hands")
+            },
+            clip_start=np.arange(clips) * ticks,
+            clip_length=np.full(clips, ticks),
+            family=arrays["family"].astype(np.int64),
+            family_names=names,
+            clip_names=np.array([f"{names[k]}-{i:04d}" for k, i in zip(arrays["family"], numbers, strict=True)]),
+            licence=np.full(clips, licence),
+            source=np.full(clips, source),
+            support_kind=arrays["support_kind"].astype(np.int64),
+            support_box=arrays["support_box"],
+        )
+
+    @classmethod
+    def concatenate(cls, libraries: Sequence[MotionLibrary]) -> MotionLibrary:
+        """All clips of several libraries; families of the same name become one.
+
+        Raises:
+            InputError: No library.
+        """
+        if not libraries:
+            raise InputError("motion library: nothing to put together")
+        kinds = list(dict.fromkeys(str(name) for library in libraries for name in library.family_names))
+        arrays = {
+            name: np.concatenate([getattr(library, name) for library in libraries])
+            for name in _ARRAYS
+            if name not in ("family", "family_names", "clip_start")
+        }
+        family = [np.array([kinds.index(n) for n in lib.family_names], dtype=np.int64)[lib.family] for lib in libraries]
+        length = arrays["clip_length"]
+        return cls(
+            **arrays,
+            clip_start=np.cumsum(length) - length,
+            family=np.concatenate(family),
+            family_names=np.array(kinds),
+        )
+
+    def select(self, clips: Sequence[int] | np.ndarray) -> MotionLibrary:
+        """Some of the clips, in the order given; a boolean mask does too.
+
+        Raises:
+            InputError: None is left.
+        """
+        picked = np.arange(self.clips)[np.asarray(clips)].reshape(-1)
+        if not picked.size:
+            raise InputError("motion library: holds no clip")
+        rows = np.concatenate([np.arange(self.rows(int(clip)).start, self.rows(int(clip)).stop) for clip in picked])
+        length = self.clip_length[picked]
+        arrays = {
+            name: getattr(self, name)[rows if axis == "frames" else picked]
+            for name, (_, _, axis) in _ARRAYS.items()
+            if axis != "families"
+        }
+        arrays["clip_start"] = np.cumsum(length) - length
+        return MotionLibrary(**arrays, family_names=self.family_names)
+
+    def mirrored(self) -> MotionLibrary:
+        """Every clip with left and right exchanged (about the plane of the world's x and z axes)."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        box = np.array([1, -1, 1, -1, 1, 1, 1], dtype=np.float32)
+        arrays |= {
+            "root_pos": self.root_pos * np.array([1, -1, 1], dtype=np.float32),
+            "root_quat": self.root_quat * np.array([1, -1, 1, -1], dtype=np.float32),
+            "joint_pos": self.joint_pos[:, list(MIRROR_JOINTS)] * np.array(MIRROR_SIGNS, dtype=np.float32),
+            "hands": self.hands[:, ::-1],
+            "clip_names": np.array([f"{name} mirrored" for name in self.clip_names]),
+            "support_box": self.support_box * box,
+        }
+        return MotionLibrary(**arrays)
+
+    def save(self, path: str | Path) -> None:
+        """Write an NPZ file, which appears under its name only when it is complete.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
+        path = Path(path)
+        part = path.with_name(path.name + ".part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(part, "wb") as file:
+                arrays = {name: getattr(self, name) for name in _ARRAYS}
+                np.savez(file, format=np.array(FORMAT), fps=np.array(FPS), **arrays)
+            os.replace(part, path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> MotionLibrary:
+        """Read a library file.
+
+        Raises:
+            InputError: The file is absent, damaged, or no motion library.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                if "format" not in file.files or str(file["format"]) != FORMAT:
+                    raise InputError(f"{path}: not a motion library (array format is not {FORMAT})")
+                missing = [name for name in _ARRAYS if name not in file.files]
+                if missing:
+                    raise InputError(f"{path}: array {missing[0]} is missing")
+                fps = float(file["fps"]) if "fps" in file.files else FPS
+                arrays = {name: file[name] for name in _ARRAYS}
+        except FileNotFoundError as error:
+            raise InputError(f"{path}: no such file") from error
+        except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError, MemoryError) as error:
+            raise InputError(f"{path}: not a readable NPZ file ({type(error).__name__})") from error
+        if fps != FPS:
+            raise InputError(f"{path}: has {fps:g} frames a second, expected {FPS}; convert it again")
+        try:
+            return cls(**arrays)
+        except InputError as error:
+            raise InputError(str(error).replace("motion library", str(path), 1)) from None
+
+    def to(self, device: str | torch.device = "cpu") -> DeviceLibrary:
+        """The frames as tensors, with velocities and mimic commands."""
+        return DeviceLibrary.build(self, device)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceLibrary:
+    """A library's frames on a device. Velocities are backward differences, zero on a clip's first frame."""
+
+    root_pos: Tensor
+    """Root position [m], float32, shape [frames, 3]."""
+    root_quat: Tensor
+    """Root orientation, wxyz, float32, shape [frames, 4]."""
+    joint_pos: Tensor
+    """Joint positions [rad], MuJoCo order, float32, shape [frames, 29]."""
+    joint_vel: Tensor
+    """Joint velocities [rad/s], MuJoCo order, float32, shape [frames, 29]."""
+    lin_vel: Tensor
+    """Root velocity [m/s], world, float32, shape [frames, 3]."""
+    ang_vel: Tensor
+    """Root angular velocity [rad/s], body frame, float32, shape [frames, 3]."""
+    mimic: Tensor
+    """Mimic command (canonical.MIMIC), float32, shape [frames, 35]."""
+    hands: Tensor
+    """Left and right hand, 1 closed, 0 open, float32, shape [frames, 2]."""
+    frame_clip: Tensor
+    """Clip of each frame, int64, shape [frames]."""
+    clip_start: Tensor
+    """First frame of each clip, int64, shape [clips]."""
+    clip_length: Tensor
+    """Frames of each clip, int64, shape [clips]."""
+    family: Tensor
+    """Index into `family_names` of each clip, int64, shape [clips]."""
+    support_kind: Tensor
+    """Index into `SUPPORTS` of each clip, int64, shape [clips]."""
+    support_box: Tensor
+    """Support of each clip (`MotionLibrary.support_box`), float32, shape [clips, 7]."""
+    family_names: tuple[str, ...]
+    """What kinds of motion there are."""
+    clip_names: tuple[str, ...]
+    """Name of each clip."""
+
+    @classmethod
+    def build(cls, library: MotionLibrary, device: str | torch.device) -> DeviceLibrary:
+        """Upload a library and derive its velocities."""
+        import torch
+
+        from arena_newton.trackers.motions import frames
+
+        def up(array: np.ndarray) -> Tensor:
+            return torch.as_tensor(np.array(array), device=device)
+
+        pos, quat, joints = up(library.root_pos), up(library.root_quat), up(library.joint_pos)
+        clip = np.repeat(np.arange(library.clips), library.clip_length)
+        before = up(np.maximum(np.arange(library.frames) - 1, library.clip_start[clip]))
+        # In double precision: a difference over a tick multiplies rounding by 50.
+        pos64, quat64 = pos.double(), torch.nn.functional.normalize(quat.double(), dim=-1)
+        turned = frames.quat_multiply(frames.quat_conjugate(quat64[before]), quat64)
+        mimic = frames.frame_mimic(pos64[before], quat64[before], pos64, quat64, joints.double())
+        return cls(
+            root_pos=pos,
+            root_quat=quat,
+            joint_pos=joints,
+            joint_vel=(joints - joints[before]) / TICK,
+            lin_vel=((pos64 - pos64[before]) / TICK).float(),
+            ang_vel=(frames.rotation_vector(turned) / TICK).float(),
+            mimic=mimic.float(),
+            hands=up(library.hands),
+            frame_clip=up(clip),
+            clip_start=up(library.clip_start),
+            clip_length=up(library.clip_length),
+            family=up(library.family),
+            support_kind=up(library.support_kind),
+            support_box=up(library.support_box),
+            family_names=tuple(str(name) for name in library.family_names),
+            clip_names=tuple(str(name) for name in library.clip_names),
+        )
+
+    @property
+    def clips(self) -> int:
+        """Number of clips."""
+        return len(self.clip_names)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.root_pos.device
+
+    def index(self, clip: Tensor, step: Tensor) -> Tensor:
+        """Frame of a clip at a step; the first and the last frame stand for what is outside. Shapes [...]."""
+        import torch
+
+        last = self.clip_length[clip] - 1
+        return self.clip_start[clip] + torch.minimum(step.clamp_min(0), last)
+
+
+def _hands(clip: Clip) -> np.ndarray:
+    return np.zeros((len(clip.root_pos), 2)) if clip.hands is None else clip.hands
+
+
+def _host(values: Any) -> np.ndarray:
+    """An array of an array or a tensor."""
+    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
