@@ -1,6 +1,8 @@
 """Motion clips are read without running what a pickle may hold."""
 
 import pickle
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 from arena_newton.errors import InputError
 from arena_newton.trackers.motions import load_actions, load_clip
+from arena_newton.trackers.motions.load import JOINTS_23
 
 CLIPS = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2" / "example_motions"
 
@@ -68,12 +71,89 @@ def test_other_callables(tmp_path, name):
         load_clip(path)
 
 
+class JoblibPickler(pickle._Pickler):
+    """Writes arrays as joblib does: a wrapper in the pickle, then padding and the array's bytes in the file."""
+
+    def save(self, obj, save_persistent_id=True):
+        if not isinstance(obj, np.ndarray) or obj.ndim == 0:
+            return super().save(obj, save_persistent_id)
+        wrapper = sys.modules["joblib.numpy_pickle"].NumpyArrayWrapper()
+        wrapper.__dict__ |= {
+            "subclass": np.ndarray,
+            "shape": obj.shape,
+            "order": "C" if obj.flags.c_contiguous else "F",
+            "dtype": obj.dtype,
+            "allow_mmap": True,
+            "numpy_array_alignment_bytes": 16,
+        }
+        super().save(wrapper)
+        self.framer.commit_frame(force=True)
+        self.file.write(b"\x05" + b"\xff" * 5 + (obj if wrapper.order == "C" else obj.T).tobytes())
+
+
+@pytest.fixture
+def joblib_file(tmp_path, monkeypatch):
+    """Writes content in joblib's way; the wrapper's class exists for the writer only."""
+    name = "joblib.numpy_pickle"
+    wrapper = type("NumpyArrayWrapper", (), {"__module__": name})
+
+    def write(content, protocol: int = 4) -> Path:
+        with monkeypatch.context() as patch:
+            module = types.ModuleType(name)
+            module.NumpyArrayWrapper = wrapper
+            patch.setitem(sys.modules, "joblib", types.ModuleType("joblib"))
+            patch.setitem(sys.modules, name, module)
+            path = tmp_path / "joblib.pkl"
+            with path.open("wb") as file:
+                pickler = JoblibPickler(file, protocol=protocol)
+                pickler.file = file
+                pickler.dump(content)
+        return path
+
+    return write
+
+
+def asap(frames: int = 60) -> dict:
+    content = clip(frames)
+    return {
+        "root_trans_offset": content["root_pos"],
+        "root_rot": content["root_rot"],
+        "dof": np.asfortranarray(np.arange(frames * 23.0).reshape(frames, 23) / 1e3),
+        "fps": 30,
+    }
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_joblib(joblib_file, protocol):
+    """ASAP's clips as joblib writes them are read, arrays in either memory order; wrists they lack stand at zero."""
+    content = asap()
+    got = load_clip(joblib_file({"a walk": content}, protocol))
+    np.testing.assert_array_equal(got.joint_pos[:, JOINTS_23], content["dof"])
+    assert not got.joint_pos[:, [19, 20, 21, 26, 27, 28]].any()
+    np.testing.assert_array_equal(got.root_pos, content["root_trans_offset"])
+
+
+def test_bad_joblib(joblib_file, tmp_path):
+    """A joblib file with objects, with code, cut short, or with several clips is refused in one line."""
+    with pytest.raises(InputError, match="an array of objects, which is refused"):
+        load_clip(joblib_file(clip(dof_pos=np.array([Evil(tmp_path / "ran")], dtype=object))))
+    with pytest.raises(InputError, match=r"exec.*refused"):
+        load_clip(joblib_file({"a": asap() | {"fps": Evil(tmp_path / "ran")}}))
+    with pytest.raises(InputError, match="holds 2 clips"):
+        load_clip(joblib_file({"a": asap(), "b": asap()}))
+    path = joblib_file(asap())
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(InputError, match="not a readable pickle"):
+        load_clip(path)
+    assert not (tmp_path / "ran").exists()
+
+
 def test_bad_content(tmp_path):
     """Every defect is one line that names the file and the field."""
     nan = np.zeros((60, 29))
     nan[3, 4] = np.nan
     cases = {
-        r"dof_pos has 23 joints, expected 29": clip(dof_pos=np.zeros((60, 23))),
+        r"dof_pos has 24 joints, expected 29 or 23": clip(dof_pos=np.zeros((60, 24))),
         r"field dof_pos holds NaN": clip(dof_pos=nan),
         r"field fps must be": clip(fps=np.array(0.0)),
         r"root_rot has shape \[50, 4\]": clip(root_rot=np.tile([0.0, 0, 0, 1], (50, 1))),

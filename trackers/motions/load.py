@@ -1,7 +1,8 @@
-"""Readers of motion clips (TWIST2/GMR pickles) and of action files (NPZ).
+"""Readers of motion clips in pickles (TWIST2/GMR, GMT, ASAP) and of action files (NPZ).
 
 Pickles run code when they are read. Only NumPy arrays, numbers, strings and plain containers are admitted here; a file
-that names anything else is refused before it is called.
+that names anything else is refused before it is called. Arrays may also stand between the pickle's frames, as joblib
+writes them.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,25 @@ import numpy as np
 from arena_newton.canonical import ACTION_WIDTH, validate_action
 from arena_newton.errors import InputError
 
-__all__ = ["Clip", "load_actions", "load_clip", "load_plain_pickle", "resample"]
+__all__ = [
+    "JOINTS_23",
+    "Clip",
+    "checked_clip",
+    "clip_from_fields",
+    "load_actions",
+    "load_clip",
+    "load_plain_pickle",
+    "motions_of",
+    "pad_joints",
+    "resample",
+    "trim_start",
+]
 
 JOINTS = 29
+JOINTS_23: tuple[int, ...] = (*range(19), *range(22, 26))
+"""The joints of 23-DoF clips (GMT, ASAP): legs, waist, shoulders and elbows; their wrists stand at zero."""
+FIELDS = {"root_pos": "root_trans_offset", "root_rot": "root_rot", "dof_pos": "dof"}
+"""TWIST2's name of a field → ASAP's."""
 START_FRAMES = 15
 """A motion capture jump is looked for in this many first frames."""
 START_HEIGHT = 1.3
@@ -72,6 +89,7 @@ def _admitted() -> dict[tuple[str, str], Any]:
         ("numpy", "ndarray"): np.ndarray,
         ("numpy", "dtype"): np.dtype,
         ("_codecs", "encode"): _latin1,
+        ("joblib.numpy_pickle", "NumpyArrayWrapper"): _JoblibArray,
     }
     for package in ("numpy._core", "numpy.core"):
         admitted[f"{package}.multiarray", "_reconstruct"] = multiarray._reconstruct
@@ -80,8 +98,36 @@ def _admitted() -> dict[tuple[str, str], Any]:
     return admitted
 
 
-class _PlainUnpickler(pickle.Unpickler):
+class _JoblibArray:
+    """Stands for joblib's `NumpyArrayWrapper`, which says what array follows in the file."""
+
+    shape: Any
+    dtype: Any
+    order: Any = "C"
+    numpy_array_alignment_bytes: Any = None
+
+    def read(self, file: io.BytesIO) -> np.ndarray:
+        """The array whose bytes come next (joblib 0.10 and later)."""
+        dtype, shape = self.dtype, tuple(int(n) for n in self.shape)
+        if not isinstance(dtype, np.dtype) or dtype.hasobject:
+            raise _RefusedError("an array of objects")
+        if self.numpy_array_alignment_bytes is not None:
+            file.read(file.read(1)[0])
+        size = dtype.itemsize * int(np.prod(shape, dtype=object))
+        data = file.read(size) if min(shape, default=1) >= 0 else b""
+        if len(data) != size:
+            raise EOFError
+        array = np.frombuffer(data, dtype=dtype).copy()
+        return array.reshape(shape[::-1]).T if self.order == "F" else array.reshape(shape)
+
+
+# The C unpickler cannot be told to read an array between two frames; the one in Python can.
+class _PlainUnpickler(pickle._Unpickler):
     """Admits NumPy arrays and plain containers only."""
+
+    def __init__(self, file: io.BytesIO):
+        super().__init__(file)
+        self._file = file
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
         admitted = _admitted().get((module, name))
@@ -91,6 +137,15 @@ class _PlainUnpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> Any:
         raise _RefusedError("a persistent id")
+
+    def load_build(self) -> None:
+        super().load_build()  # type: ignore[misc]
+        stack: list[Any] = self.stack  # type: ignore[attr-defined]
+        if isinstance(stack[-1], _JoblibArray):
+            stack[-1] = stack[-1].read(self._file)
+
+    dispatch = dict(pickle._Unpickler.dispatch)
+    dispatch[pickle.BUILD[0]] = load_build  # type: ignore[assignment]
 
 
 def load_plain_pickle(path: str | Path, *, flag: str = "--policy replay:") -> Any:
@@ -114,7 +169,9 @@ def load_plain_pickle(path: str | Path, *, flag: str = "--policy replay:") -> An
 
 
 def load_clip(path: str | Path, *, flag: str = "--policy replay:", trim: bool = True) -> Clip:
-    """Read a TWIST2/GMR clip: fields `fps`, `root_pos`, `root_rot` (xyzw) and `dof_pos` (29 joints, MuJoCo order).
+    """Read a pickled clip: fields `fps`, `root_pos`, `root_rot` (xyzw) and `dof_pos` (MuJoCo order; TWIST2, GMR, GMT).
+
+    29 joints, or the 23 without wrists, which are then zero. ASAP's names of the fields do as well.
 
     Args:
         path: The `.pkl` file.
@@ -122,40 +179,122 @@ def load_clip(path: str | Path, *, flag: str = "--policy replay:", trim: bool = 
         trim: Cut a motion capture jump off the start.
 
     Raises:
-        InputError: A field is missing, of the wrong shape, or not finite.
+        InputError: A field is missing, of the wrong shape, or not finite; or the file holds several clips.
     """
-    where = f"{flag}{path}"
-    content = load_plain_pickle(path, flag=flag)
+    motions = motions_of(load_plain_pickle(path, flag=flag), f"{flag}{path}")
+    if len(motions) != 1:
+        raise InputError(f"{flag}{path}: holds {len(motions)} clips, expected one; `motions convert` reads them all")
+    return clip_from_fields(next(iter(motions.values())), f"{flag}{path}", trim=trim)
+
+
+def motions_of(content: Any, where: str) -> dict[str, Mapping[str, Any]]:
+    """The clips of an unpickled file by name: ASAP nests them under names, the others hold one (named "").
+
+    Raises:
+        InputError: The content is no clip.
+    """
     if not isinstance(content, dict):
         raise InputError(f"{where}: holds {type(content).__name__}, expected a clip with named fields")
+    if content and all(isinstance(value, dict) for value in content.values()):
+        return {str(name): value for name, value in content.items()}
+    return {"": content}
+
+
+def clip_from_fields(content: Mapping[str, Any], where: str, *, trim: bool = True) -> Clip:
+    """A clip of the fields of an unpickled one; see `load_clip`.
+
+    Raises:
+        InputError: A field is missing, of the wrong shape, or not finite.
+    """
+    asap = "root_trans_offset" in content
     arrays = {}
     for field in ("fps", "root_pos", "root_rot", "dof_pos"):
-        if field not in content:
-            raise InputError(f"{where}: field {field} is missing")
+        name = FIELDS.get(field, field) if asap else field
+        if name not in content:
+            raise InputError(f"{where}: field {name} is missing")
         try:
-            arrays[field] = np.asarray(content[field], dtype=np.float64)
+            arrays[field] = np.asarray(content[name], dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{where}: field {field} holds no numbers") from error
+            raise InputError(f"{where}: field {name} holds no numbers") from error
         if not np.isfinite(arrays[field]).all():
-            raise InputError(f"{where}: field {field} holds NaN or infinity")
-    fps, frames = arrays["fps"], arrays["root_pos"].shape[0] if arrays["root_pos"].ndim == 2 else 0
-    if fps.size != 1 or not 1.0 <= float(fps.reshape(())) <= 1000.0:
+            raise InputError(f"{where}: field {name} holds NaN or infinity")
+    if arrays["fps"].size != 1:
         raise InputError(f"{where}: field fps must be one number from 1 to 1000")
-    if arrays["dof_pos"].ndim == 2 and arrays["dof_pos"].shape[1] != JOINTS:
-        raise InputError(f"{where}: dof_pos has {arrays['dof_pos'].shape[1]} joints, expected {JOINTS}")
-    for field, width in (("root_pos", 3), ("root_rot", 4), ("dof_pos", JOINTS)):
-        if arrays[field].shape != (frames, width) or frames < 2:
-            shape = list(arrays[field].shape)
+    return checked_clip(
+        float(arrays["fps"].reshape(())),
+        arrays["root_pos"],
+        arrays["root_rot"],
+        arrays["dof_pos"],
+        where,
+        xyzw=True,
+        trim=trim,
+    )
+
+
+def checked_clip(
+    fps: float,
+    root_pos: np.ndarray,
+    root_rot: np.ndarray,
+    dof_pos: np.ndarray,
+    where: str,
+    *,
+    xyzw: bool = False,
+    trim: bool = True,
+) -> Clip:
+    """A clip of finite arrays.
+
+    Args:
+        fps: Frames a second.
+        root_pos: Root position [m].
+        root_rot: Root orientation.
+        dof_pos: Joint positions [rad], MuJoCo order, 29 or the 23 without wrists.
+        where: What errors name.
+        xyzw: The quaternions' scalar stands last.
+        trim: Cut a motion capture jump off the start.
+
+    Raises:
+        InputError: A frame rate outside 1 to 1000, a wrong shape, or a quaternion that is none.
+    """
+    if not 1.0 <= fps <= 1000.0:
+        raise InputError(f"{where}: field fps must be one number from 1 to 1000")
+    if dof_pos.ndim == 2 and dof_pos.shape[1] == len(JOINTS_23):
+        dof_pos = pad_joints(dof_pos)
+    if dof_pos.ndim == 2 and dof_pos.shape[1] != JOINTS:
+        raise InputError(f"{where}: dof_pos has {dof_pos.shape[1]} joints, expected {JOINTS} or {len(JOINTS_23)}")
+    frames = root_pos.shape[0] if root_pos.ndim == 2 else 0
+    for field, array, width in (("root_pos", root_pos, 3), ("root_rot", root_rot, 4), ("dof_pos", dof_pos, JOINTS)):
+        if array.shape != (frames, width) or frames < 2:
+            shape = list(array.shape)
             raise InputError(f"{where}: {field} has shape {shape}, expected [frames, {width}] with 2 or more frames")
-    norm = np.linalg.norm(arrays["root_rot"], axis=1, keepdims=True)
+    norm = np.linalg.norm(root_rot, axis=1, keepdims=True)
     if (np.abs(norm - 1.0) > 0.1).any():
         raise InputError(f"{where}: root_rot holds a quaternion that is not of length 1")
-    quat = (arrays["root_rot"] / norm)[:, [3, 0, 1, 2]]
-    rate = float(fps.reshape(()))
-    start = _start(arrays["root_pos"], arrays["dof_pos"], rate) if trim else 0
-    if frames - start < 2:
+    quat = root_rot / norm
+    clip = Clip(fps, root_pos, quat[:, [3, 0, 1, 2]] if xyzw else quat, dof_pos)
+    return trim_start(clip, where) if trim else clip
+
+
+def pad_joints(joint_pos: np.ndarray) -> np.ndarray:
+    """Joints of a 23-DoF clip with wrists at zero; shape [frames, 23] becomes [frames, 29]."""
+    padded = np.zeros((len(joint_pos), JOINTS), dtype=joint_pos.dtype)
+    padded[:, JOINTS_23] = joint_pos
+    return padded
+
+
+def trim_start(clip: Clip, where: str) -> Clip:
+    """The clip without a motion capture jump at its start; `trimmed` counts the frames.
+
+    Raises:
+        InputError: Nothing is left.
+    """
+    start = _start(clip.root_pos, clip.joint_pos, clip.fps)
+    if len(clip.root_pos) - start < 2:
         raise InputError(f"{where}: nothing is left after the jump at its start")
-    return Clip(rate, arrays["root_pos"][start:], quat[start:], arrays["dof_pos"][start:], start)
+    if not start:
+        return clip
+    hands = None if clip.hands is None else clip.hands[start:]
+    arrays = {name: getattr(clip, name)[start:] for name in ("root_pos", "root_quat", "joint_pos")}
+    return replace(clip, **arrays, hands=hands, trimmed=clip.trimmed + start)
 
 
 def _start(root_pos: np.ndarray, joint_pos: np.ndarray, fps: float) -> int:
