@@ -25,6 +25,7 @@ ENTRY_POINT_GROUP = "arena_newton.trackers"
 
 _BUILT_IN = {
     "pd": "arena_newton.trackers.pd:from_checkpoint",
+    "sonic": "arena_newton.trackers.sonic:from_checkpoint",
     "twist2": "arena_newton.trackers.twist2:from_checkpoint",
 }
 _registered: dict[str, Callable[[Path | None], Tracker]] = {}
@@ -104,7 +105,8 @@ def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
 
     Args:
         spec: Name of a built-in, registered or entry-point tracker.
-        checkpoint: Weights file (`--checkpoint`), for trackers that need one.
+        checkpoint: Weights (`--checkpoint`): a file, or whatever path the tracker documents, such as a folder. Without
+            it a tracker takes the weights it comes with.
 
     Raises:
         InputError: Unknown name, or a checkpoint that is absent or unfit.
@@ -112,7 +114,7 @@ def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
     path = None if checkpoint is None else Path(checkpoint)
     if spec not in names():
         raise InputError(f"--tracker {spec}: unknown tracker; known are {', '.join(names())}")
-    if path is not None and not path.is_file():
+    if path is not None and not all(Path(part).exists() for part in str(path).split(",")) and not path.exists():
         raise InputError(f"--checkpoint {path}: no such file")
     if spec in _registered:
         return _registered[spec](path)

@@ -10,9 +10,10 @@ Everything runs on any torch device without waiting for it, so a CUDA graph can 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -21,6 +22,9 @@ from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import MUJOCO_JOINTS, DriveGains
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.blocks import BlockRunner
+
+if TYPE_CHECKING:
+    from arena_newton.trackers.weights_file import Weights
 
 __all__ = ["ActionForm", "FrontEnd", "NetworkTracker", "residual_form"]
 
@@ -143,6 +147,9 @@ class FrontEnd:
 class NetworkTracker(Tracker):
     """A front end and the network behind it."""
 
+    card: Mapping[str, Any] = {}
+    """How our own weights came to be; empty for other checkpoints."""
+
     def __init__(
         self,
         front_end: FrontEnd,
@@ -162,6 +169,24 @@ class NetworkTracker(Tracker):
         self.front_end = front_end
         self.network = network
         self.checkpoint, self.checkpoint_hash = checkpoint, checkpoint_hash
+
+    def follow(self, weights: Weights, front_end: FrontEnd, checkpoint: str | Path) -> None:
+        """Become the tracker of a weights file: its network, its drive, its physics rate.
+
+        Args:
+            weights: The file's content.
+            front_end: Front end of its interface and action form.
+            checkpoint: The file.
+        """
+        NetworkTracker.__init__(
+            self,
+            front_end,
+            weights.network.deployed(),
+            checkpoint=str(checkpoint),
+            checkpoint_hash=weights.sha256[:12],
+        )
+        self.drive, self.card = weights.drive, weights.card
+        self.physics_rate = self.fast_physics_rate = weights.physics
 
     def bind(self, worlds: int, device: Any = "cpu", scene: Any = None) -> None:
         """Allocate observation buffers for `worlds` worlds on `device`."""

@@ -29,6 +29,8 @@ JOINTS = 29
 
 _STD_FLOOR = 1e-2
 """Added to the measured deviation, so that an input that never moved does not explode when it first does."""
+_WIDEST = 8192
+"""Widest layer that a file may ask for."""
 _LAST_LAYER_SCALE = 0.1
 """A network starts near zero, that is near the reference or the default pose."""
 
@@ -45,7 +47,7 @@ class InputNorm(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("std", torch.ones(width))
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64), persistent=False)
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Normalised inputs, shape [rows, width]."""
@@ -81,6 +83,19 @@ def _mlp(widths: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+def _folded(layer: nn.Module, norm: InputNorm, start: int = 0) -> nn.Linear:
+    """A linear layer that takes its inputs from `start` on as they were before `norm`."""
+    assert isinstance(layer, nn.Linear)
+    weight, bias = layer.weight.detach().double(), layer.bias.detach().double()
+    scaled = weight.clone()
+    scaled[:, start:] /= norm.std.double()
+    folded = nn.Linear(layer.in_features, layer.out_features, device=layer.weight.device)
+    with torch.no_grad():
+        folded.weight.copy_(scaled)
+        folded.bias.copy_(bias - scaled[:, start:] @ norm.mean.double())
+    return folded
+
+
 def _shrink_last(layers: nn.Sequential) -> None:
     last = layers[-1]
     assert isinstance(last, nn.Linear)
@@ -114,6 +129,10 @@ class Twist2Net(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Raw actions, shape [rows, 29]."""
         return self.actor(self.norm(obs))
+
+    def deployed(self) -> nn.Module:
+        """The same function with the normalisation inside the first layer."""
+        return nn.Sequential(_folded(self.actor[0], self.norm), *list(self.actor)[1:]).eval().requires_grad_(False)
 
     def update_norm(self, obs: torch.Tensor) -> None:
         """Take a batch of observations into the input statistics."""
@@ -174,6 +193,38 @@ class SonicNet(nn.Module):
         self.encoder_norm.update(obs.index_select(1, self.used))
         self.decoder_norm.update(obs[:, SONIC_ENCODER_WIDTH:])
 
+    def deployed(self) -> nn.Module:
+        """The same function with normalisation inside the first layers and one frame of the reference instead of ten.
+
+        It needs what `SonicFrontEnd` gives: ten equal frames.
+        """
+        return _DeployedSonic(self).eval().requires_grad_(False)
+
+
+class _DeployedSonic(nn.Module):
+    def __init__(self, network: SonicNet):
+        super().__init__()
+        assert isinstance(network.encoder, nn.Sequential)
+        first = _folded(network.encoder[0], network.encoder_norm)
+        # Of the used inputs: 10 x 29 positions, 10 x 29 velocities, the anchor, 10 x 6 anchors.
+        weight = first.weight.detach().double()
+        pos, vel, anchor, anchors = weight.split([290, 290, 6, 60], 1)
+        frames = [part.unflatten(1, (10, -1)).sum(1) for part in (pos, vel)]
+        merged = torch.cat([*frames, anchor + anchors.unflatten(1, (10, 6)).sum(1)], 1)
+        layer = nn.Linear(merged.shape[1], first.out_features, device=merged.device)
+        with torch.no_grad():
+            layer.weight.copy_(merged)
+            layer.bias.copy_(first.bias)
+        self.encoder = nn.Sequential(layer, *list(network.encoder)[1:])
+        self.decoder = nn.Sequential(
+            _folded(network.decoder[0], network.decoder_norm, network.widths[2]), *list(network.decoder)[1:]
+        )
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        pos, vel, anchor = obs[:, 4:33], obs[:, 294:323], obs[:, 595:601]
+        latent = self.encoder(torch.cat((pos, vel, anchor), 1))
+        return self.decoder(torch.cat((latent, obs[:, SONIC_ENCODER_WIDTH:]), 1))
+
 
 _NETWORKS: dict[str, type[Twist2Net] | type[SonicNet]] = {"twist2": Twist2Net, "sonic": SonicNet}
 
@@ -190,7 +241,11 @@ def make(interface: str, config: Mapping[str, Any] | None = None) -> Twist2Net |
     """
     if interface not in _NETWORKS:
         raise InputError(f"network interface {interface!r}: known are {', '.join(_NETWORKS)}")
+    config = dict(config or {})
+    widths = [w for value in config.values() for w in (value if isinstance(value, list | tuple) else [value])]
+    if not all(isinstance(w, int) and 0 < w <= _WIDEST for w in widths):
+        raise InputError(f"network of interface {interface!r}: widths must be whole numbers up to {_WIDEST}: {config}")
     try:
-        return _NETWORKS[interface](**dict(config or {}))
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"network of interface {interface!r}: unfit widths {dict(config or {})}: {error}") from error
+        return _NETWORKS[interface](**config)
+    except TypeError as error:
+        raise InputError(f"network of interface {interface!r}: unfit arguments {config}: {error}") from error

@@ -8,19 +8,23 @@ exactly rounded, so a world's bits do not depend on the other worlds.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from arena_newton.errors import InputError
 from arena_newton.robot import (
     CANONICAL_TO_MUJOCO,
     MUJOCO_TO_CANONICAL,
     SONIC_DRIVE,
     PhysicsRate,
 )
+from arena_newton.trackers import onnx_session, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
-from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker, column
+from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
 
 __all__ = [
     "ENCODER_INPUT",
@@ -30,6 +34,8 @@ __all__ = [
     "SONIC_FORM",
     "SonicFrontEnd",
     "SonicTracker",
+    "from_checkpoint",
+    "official_pair",
 ]
 
 FRAMES = 10
@@ -222,3 +228,70 @@ class SonicTracker(NetworkTracker):
     fast_physics_rate = PhysicsRate(dt=0.005, substeps=4)
     ignores = ("root xy", "root height")
     max_root_delta_deg = 26.0
+
+    def __init__(self, checkpoint: str | Path):
+        """Read the networks.
+
+        Args:
+            checkpoint: A `.safetensors` file of `trackers.weights_file`, or the official networks: the folder that
+                holds `model_encoder.onnx` and `model_decoder.onnx`, one of the two files, or both with a comma between.
+
+        Raises:
+            InputError: A file is absent or is no network of SONIC's widths.
+        """
+        if Path(checkpoint).suffix == ".safetensors":
+            weights = weights_file.load(checkpoint, "sonic")
+            self.follow(weights, SonicFrontEnd(weights.action_form), checkpoint)
+            return
+        encoder, decoder = official_pair(checkpoint)
+        networks = (
+            onnx_session.load_any(encoder, in_width=ENCODER_INPUT, out_width=LATENT),
+            onnx_session.load_any(decoder, in_width=DECODER_INPUT, out_width=JOINTS),
+        )
+        digest = hashlib.sha256(encoder.read_bytes() + decoder.read_bytes()).hexdigest()
+        super().__init__(
+            SonicFrontEnd(), EncoderDecoder(*networks), checkpoint=str(checkpoint), checkpoint_hash=digest[:12]
+        )
+
+
+def official_pair(checkpoint: str | Path) -> tuple[Path, Path]:
+    """Encoder and decoder that a `--checkpoint` names.
+
+    Args:
+        checkpoint: The folder with `model_encoder.onnx` and `model_decoder.onnx`, one of the two, or `a.onnx,b.onnx`.
+
+    Raises:
+        InputError: One of the two is absent.
+    """
+    path = Path(checkpoint)
+    if path.is_dir():
+        pair = path / "model_encoder.onnx", path / "model_decoder.onnx"
+    elif "," in str(checkpoint):
+        first, _, second = str(checkpoint).partition(",")
+        pair = Path(first), Path(second)
+    elif "encoder" in path.name:
+        pair = path, path.with_name(path.name.replace("encoder", "decoder"))
+    else:
+        pair = path.with_name(path.name.replace("decoder", "encoder")), path
+    absent = [p for p in pair if not p.is_file()]
+    if absent or pair[0] == pair[1]:
+        lacking = f"{absent[0]} is absent" if absent else "it names one network"
+        raise InputError(
+            f"--checkpoint {checkpoint}: --tracker sonic needs an encoder and a decoder, but {lacking}; pass the "
+            "folder that holds model_encoder.onnx and model_decoder.onnx"
+        )
+    return pair
+
+
+def from_checkpoint(checkpoint: Path | None) -> SonicTracker:
+    """Make the SONIC tracker: with the weights of this package, or with a checkpoint's.
+
+    Raises:
+        InputError: The checkpoint is unfit, or there is none and no weights came with the package.
+    """
+    checkpoint = checkpoint or weights_file.default("sonic", "--checkpoint with the folder of the official networks")
+    if not checkpoint.is_dir() and checkpoint.suffix not in (".onnx", ".safetensors"):
+        raise InputError(
+            f"--checkpoint {checkpoint}: --tracker sonic reads a .safetensors file or a folder with two .onnx files"
+        )
+    return SonicTracker(checkpoint)

@@ -1,4 +1,4 @@
-"""TWIST2: the official whole-body tracker, run from its ONNX file for all worlds at once.
+"""TWIST2: the whole-body tracker behind the mimic command, with our weights or the official ones.
 
 Facts of its observation are those of its own simulation script, as the original benchmark uses them: 127 numbers a
 frame, ten past frames, and the command once more, 1432 in all. All elementwise arithmetic on the observation is either
@@ -15,7 +15,7 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import onnx_mlp
+from arena_newton.trackers import onnx_mlp, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
 
@@ -136,29 +136,29 @@ class Twist2Tracker(NetworkTracker):
     ignores = ("absolute heading", "absolute position")
 
     def __init__(self, checkpoint: str | Path):
-        """Read the official network.
+        """Read the network.
 
         Args:
-            checkpoint: The official `.onnx` file.
+            checkpoint: The official `.onnx` file, or a `.safetensors` file of `trackers.weights_file`.
 
         Raises:
             InputError: The file is absent or is no network of TWIST2's widths.
         """
+        if Path(checkpoint).suffix == ".safetensors":
+            weights = weights_file.load(checkpoint, "twist2")
+            self.follow(weights, Twist2FrontEnd(weights.action_form), checkpoint)
+            return
         network = onnx_mlp.load(checkpoint, in_width=OBSERVATION, out_width=JOINTS)
         super().__init__(Twist2FrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
 
 
 def from_checkpoint(checkpoint: Path | None) -> Twist2Tracker:
-    """Make the TWIST2 tracker.
+    """Make the TWIST2 tracker: with the weights of this package, or with a checkpoint's.
 
     Raises:
-        InputError: No checkpoint was given, or it is unfit.
+        InputError: The checkpoint is unfit, or there is none and no weights came with the package.
     """
-    if checkpoint is None:
-        raise InputError(
-            "--tracker twist2: no weights come with this package; pass --checkpoint with the official "
-            "twist2_1017_20k.onnx, or use --tracker pd"
-        )
-    if checkpoint.suffix != ".onnx":
-        raise InputError(f"--checkpoint {checkpoint}: --tracker twist2 reads .onnx files")
+    checkpoint = checkpoint or weights_file.default("twist2", "--checkpoint with the official twist2_1017_20k.onnx")
+    if checkpoint.suffix not in (".onnx", ".safetensors"):
+        raise InputError(f"--checkpoint {checkpoint}: --tracker twist2 reads .onnx and .safetensors files")
     return Twist2Tracker(checkpoint)

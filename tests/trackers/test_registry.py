@@ -7,6 +7,7 @@ import torch
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
+from arena_newton.trackers import weights_file
 
 
 def message(spec: str, checkpoint=None) -> str:
@@ -19,7 +20,7 @@ def message(spec: str, checkpoint=None) -> str:
 
 def test_names():
     """The built-in trackers are listed."""
-    assert {"pd", "twist2"} <= set(trackers.names())
+    assert {"pd", "twist2", "sonic"} <= set(trackers.names())
 
 
 def test_unknown_name():
@@ -27,16 +28,23 @@ def test_unknown_name():
     assert "--tracker sonick" in message("sonick") and "pd" in message("sonick")
 
 
-def test_twist2_needs_checkpoint():
-    """TWIST2 without weights says what to do."""
-    text = message("twist2")
-    assert "--checkpoint" in text and "--tracker pd" in text
+@pytest.mark.parametrize("name", ["twist2", "sonic"])
+def test_needs_weights(name, monkeypatch, tmp_path):
+    """A tracker whose weights are not installed says what to do."""
+    monkeypatch.setattr(weights_file, "default_path", lambda interface: tmp_path / f"{interface}.safetensors")
+    text = message(name)
+    assert "--checkpoint" in text and "--tracker pd" in text and str(tmp_path) in text
 
 
 def test_missing_checkpoint(tmp_path):
     """A checkpoint that does not exist is named with its flag."""
     path = tmp_path / "none.onnx"
     assert message("twist2", path) == f"--checkpoint {path}: no such file"
+
+
+def test_folder_as_checkpoint(tmp_path):
+    """TWIST2 reads files: a folder is refused by its name."""
+    assert str(tmp_path) in message("twist2", tmp_path) and ".onnx" in message("twist2", tmp_path)
 
 
 def test_damaged_checkpoint(tmp_path):

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from arena_newton import trackers
+from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.networks import SonicNet
@@ -174,3 +176,97 @@ def test_declares():
     assert SonicTracker.ignores == ("root xy", "root height") and SonicTracker.drive is SONIC_DRIVE
     assert (SonicTracker.physics_rate.dt, SonicTracker.physics_rate.substeps) == (0.005, 4)
     assert SonicTracker.max_root_delta_deg == 26.0
+
+
+def onnx_file(path, layers: list[int], *, batch: int | str = "batch", levels: int = 0):
+    """An ELU network in ONNX, with its output rounded to `levels` if given, as the official encoder's latent is."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    rng = np.random.default_rng(layers[0])
+    nodes, weights, x = [], [], "obs"
+    for i, (a, b) in enumerate(zip(layers, layers[1:], strict=False)):
+        w = (rng.standard_normal((b, a)) / np.sqrt(a)).astype(np.float32)
+        weights += [numpy_helper.from_array(w, f"w{i}"), numpy_helper.from_array(np.zeros(b, np.float32), f"b{i}")]
+        nodes.append(helper.make_node("Gemm", [x, f"w{i}", f"b{i}"], [f"y{i}"], transB=1))
+        x = f"y{i}"
+        if i < len(layers) - 2:
+            nodes.append(helper.make_node("Elu", [x], [f"e{i}"]))
+            x = f"e{i}"
+    if levels:
+        weights.append(numpy_helper.from_array(np.float32(levels), "levels"))
+        for op, ins, out in (("Tanh", [x], "t"), ("Mul", ["t", "levels"], "m"), ("Round", ["m"], "r")):
+            nodes.append(helper.make_node(op, ins, [out]))
+        nodes.append(helper.make_node("Div", ["r", "levels"], ["latent"]))
+        x = "latent"
+    graph = helper.make_graph(
+        nodes,
+        "network",
+        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, [batch, layers[0]])],
+        [helper.make_tensor_value_info(x, TensorProto.FLOAT, [batch, layers[-1]])],
+        weights,
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), str(path))
+
+
+def official_like(folder, **encoder):
+    folder.mkdir(exist_ok=True)
+    onnx_file(folder / "model_encoder.onnx", [1762, 48, 64], **encoder)
+    onnx_file(folder / "model_decoder.onnx", [994, 48, 29], batch=encoder.get("batch", "batch"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "encoder", [{}, {"levels": 16}, {"levels": 16, "batch": 1}], ids=["plain", "rounded", "single"]
+)
+def test_official_networks(tmp_path, encoder):
+    """Encoder and decoder files of the official shapes run as onnxruntime runs them, with rounding and fixed batch."""
+    import onnxruntime
+
+    folder = official_like(tmp_path / "sonic", **encoder)
+    tracker = trackers.get("sonic", folder)
+    tracker.bind(3)
+    front = SonicFrontEnd()
+    front.bind(3)
+    front.reset()
+    sessions = [onnxruntime.InferenceSession(str(folder / f"model_{n}.onnx")) for n in ("encoder", "decoder")]
+    for tick in range(3):
+        command, state = inputs(tick, 3)
+        seen = front.observe(command, state).numpy()
+        raw = np.zeros((3, 29), np.float32)
+        for world in range(3):
+            latent = sessions[0].run(None, {"obs": seen[world : world + 1, :1762]})[0]
+            decoder_input = np.concatenate([latent, seen[world : world + 1, 1762:]], 1)
+            raw[world] = sessions[1].run(None, {"obs": decoder_input})[0]
+        expected = front.act(torch.from_numpy(raw))
+        torch.testing.assert_close(tracker.step(command, state), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_official_worlds_do_not_mix(tmp_path):
+    """Networks that run in onnxruntime give a world the same bits alone and among others."""
+    folder = official_like(tmp_path / "sonic", levels=16)
+    one, many = trackers.get("sonic", folder), trackers.get("sonic", folder)
+    one.bind(1)
+    many.bind(7)
+    for tick in range(3):
+        command, state = inputs(tick, 7)
+        assert torch.equal(many.step(command, state)[2:3], one.step(rows(command, [2]), rows(state, [2])))
+
+
+def test_ways_to_name_the_pair(tmp_path):
+    """A folder, either file, or both with a comma name the same networks; what is absent is named."""
+    folder = official_like(tmp_path / "sonic")
+    pair = [folder / f"model_{n}.onnx" for n in ("encoder", "decoder")]
+    hashes = {trackers.get("sonic", c).checkpoint_hash for c in (folder, *pair, f"{pair[0]},{pair[1]}")}
+    assert len(hashes) == 1
+    pair[1].unlink()
+    for checkpoint in (folder, pair[0]):
+        with pytest.raises(InputError, match="model_decoder.onnx is absent") as caught:
+            trackers.get("sonic", checkpoint)
+        assert "\n" not in str(caught.value)
+    onnx_file(pair[1], [500, 29])
+    with pytest.raises(InputError, match="takes 500 numbers, expected 994"):
+        trackers.get("sonic", folder)
+    pair[1].write_bytes(b"noise")
+    with pytest.raises(InputError, match="not a usable ONNX file"):
+        trackers.get("sonic", folder)

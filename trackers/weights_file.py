@@ -1,0 +1,224 @@
+"""Weights of our own trackers: one `.safetensors` file that says how it wants to be driven.
+
+The file holds the network's tensors and one metadata entry, `arena_newton`, a JSON object: format, interface, widths,
+action form, drive, physics rate and the card (how the weights came to be). Nothing in it is code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from arena_newton.errors import InputError
+from arena_newton.robot import TICK, DriveGains, PhysicsRate
+from arena_newton.trackers import networks
+from arena_newton.trackers.front_end import JOINTS, ActionForm
+
+__all__ = ["FORMAT", "METADATA_KEY", "Weights", "default", "default_path", "load", "save"]
+
+FORMAT = "arena-newton-tracker-1"
+"""Format that this module writes and reads."""
+METADATA_KEY = "arena_newton"
+"""Metadata entry of the safetensors header."""
+
+
+@dataclass
+class Weights:
+    """A network and everything a tracker must know about it."""
+
+    interface: str
+    """`twist2` or `sonic`."""
+    network: networks.Twist2Net | networks.SonicNet
+    """The network with its input normalisation."""
+    action_form: ActionForm
+    """How raw outputs become joint targets."""
+    drive: DriveGains
+    """Drive that the network was trained with."""
+    physics: PhysicsRate
+    """Physics rate that it was trained at."""
+    card: dict[str, Any] = field(default_factory=dict)
+    """How the weights came to be: `commit`, `command`, `samples`, `minutes`, `data`, `licences`, `metrics`, …"""
+    sha256: str = ""
+    """SHA-256 of the file, after loading."""
+
+    def metadata(self) -> dict[str, Any]:
+        """The JSON object of the file's header."""
+        form, drive, physics = (dataclasses.asdict(x) for x in (self.action_form, self.drive, self.physics))
+        return {
+            "format": FORMAT,
+            "interface": self.interface,
+            "hidden": self.network.config(),
+            "action_form": form,
+            "drive": drive,
+            "physics": physics,
+            "commit": self.card.get("commit"),
+            "card": self.card,
+        }
+
+
+def default_path(interface: str) -> Path:
+    """Where the weights that come with the package lie: `trackers/weights/<interface>.safetensors`."""
+    return Path(__file__).parent / "weights" / f"{interface}.safetensors"
+
+
+def default(interface: str, otherwise: str) -> Path:
+    """The weights that come with the package.
+
+    Args:
+        interface: `twist2` or `sonic`.
+        otherwise: What the user can pass instead, for the error.
+
+    Raises:
+        InputError: There are none.
+    """
+    path = default_path(interface)
+    if not path.is_file():
+        raise InputError(
+            f"--tracker {interface}: no weights come with this installation ({path} is absent); pass {otherwise}, "
+            "or use --tracker pd"
+        )
+    return path
+
+
+def save(path: str | Path, weights: Weights) -> None:
+    """Write a weights file (in one move: a reader never sees half of it).
+
+    Args:
+        path: The file, `.safetensors`.
+        weights: What to write.
+
+    Raises:
+        InputError: The path cannot be written, or a number of the network is not finite.
+    """
+    from safetensors.torch import save as encode
+
+    path = Path(path)
+    tensors = {name: t.detach().cpu().contiguous() for name, t in _tensors(weights.network).items()}
+    bad = [name for name, t in tensors.items() if not torch.isfinite(t).all()]
+    if bad:
+        raise InputError(f"{path}: not written, {bad[0]} holds numbers that are not finite")
+    data = encode(tensors, {METADATA_KEY: json.dumps(weights.metadata(), sort_keys=True)})
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def load(path: str | Path, interface: str | None = None, *, flag: str = "--checkpoint") -> Weights:
+    """Read a weights file.
+
+    Args:
+        path: The file.
+        interface: Interface that the caller needs; any by default.
+        flag: Command-line flag that errors name.
+
+    Raises:
+        InputError: The file is absent, damaged, of another kind or interface, or its tensors do not fit.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load as decode
+
+    where = f"{flag} {path}"
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+    try:
+        tensors = decode(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        text = header.get("__metadata__", {}).get(METADATA_KEY)
+    except (SafetensorError, ValueError, KeyError, AttributeError) as error:
+        raise InputError(f"{where}: not a readable safetensors file ({_line(error)})") from error
+    if text is None:
+        raise InputError(
+            f"{where}: safetensors without the metadata {METADATA_KEY!r}: not a tracker of this project "
+            "(python -m arena_newton.trackers.train export makes one)"
+        )
+    try:
+        meta = json.loads(text)
+        if meta["format"] != FORMAT:
+            raise InputError(f"{where}: format {meta['format']!r}, expected {FORMAT!r}")
+        if interface is not None and meta["interface"] != interface:
+            raise InputError(
+                f"{where}: weights of interface {meta['interface']!r}: use them with --tracker {meta['interface']}"
+            )
+        network = networks.make(meta["interface"], meta["hidden"])
+        weights = Weights(
+            interface=meta["interface"],
+            network=network,
+            action_form=_action_form(meta["action_form"]),
+            drive=_drive(meta["drive"]),
+            physics=_physics(meta["physics"]),
+            card=dict(meta.get("card") or {}),
+            sha256=hashlib.sha256(data).hexdigest(),
+        )
+    except InputError as error:
+        raise error if str(error).startswith(flag) else InputError(f"{where}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{where}: its metadata is incomplete or wrong ({_line(error)})") from error
+    _fill(network, tensors, where)
+    return weights
+
+
+def _tensors(network: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """What a file holds of a network: all but the counts behind its input statistics."""
+    return {name: t for name, t in network.state_dict().items() if not name.endswith(".count")}
+
+
+def _fill(network: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: str) -> None:
+    expected = _tensors(network)
+    missing, unknown = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    if missing or unknown:
+        names = f"misses {missing[0]}" if missing else f"holds an unknown {unknown[0]}"
+        raise InputError(f"{where}: it {names}; its tensors do not fit its widths")
+    for name, tensor in tensors.items():
+        if tensor.shape != expected[name].shape or not tensor.is_floating_point():
+            shape, wanted = list(tensor.shape), list(expected[name].shape)
+            raise InputError(f"{where}: {name} is {tensor.dtype} of shape {shape}, expected float32 of shape {wanted}")
+        if not torch.isfinite(tensor).all():
+            raise InputError(f"{where}: {name} holds numbers that are not finite")
+    network.load_state_dict(dict(tensors), strict=False)
+    network.eval()
+
+
+def _action_form(value: Mapping[str, Any]) -> ActionForm:
+    return ActionForm(str(value["kind"]), tuple(float(v) for v in value["scale"]), float(value["clip"]))
+
+
+def _drive(value: Mapping[str, Any]) -> DriveGains:
+    def vector(name: str) -> tuple[float, ...]:
+        numbers = tuple(float(v) for v in value[name])
+        if len(numbers) != JOINTS:
+            raise ValueError(f"drive {name} needs {JOINTS} numbers")
+        return numbers
+
+    return DriveGains(
+        name=str(value["name"]),
+        kp=vector("kp"),
+        kd=vector("kd"),
+        effort=vector("effort"),
+        finger_kp=float(value["finger_kp"]),
+        finger_kd=float(value["finger_kd"]),
+        finger_effort=float(value["finger_effort"]),
+        finger_armature=float(value["finger_armature"]),
+    )
+
+
+def _physics(value: Mapping[str, Any]) -> PhysicsRate:
+    rate = PhysicsRate(float(value["dt"]), int(value["substeps"]))
+    if rate.dt <= 0.0 or abs(rate.dt * rate.substeps - TICK) > 1e-9:
+        raise ValueError(f"physics {rate.dt} s x {rate.substeps} is not a tick of {TICK} s")
+    return rate
+
+
+def _line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
