@@ -444,6 +444,9 @@ class ArenaEnv:
             if on_finish is not None:
                 on_finish(result)
 
+        attach = getattr(policy, "attach", None)
+        if attach is not None:
+            attach(self)
         assign(list(range(self.worlds)))
         while self.active.any():
             asks = self.active & (self.tick >= 0) & (cursor >= length)

@@ -21,6 +21,7 @@ ENTRY_POINT_GROUP = "arena_newton.policies"
 """Other packages offer policies under this entry point group: a callable of the text after the colon (or None)."""
 
 _BUILT_IN = {
+    "expert": "arena_newton.policies.experts:from_spec",
     "remote": "arena_newton.policies.remote:from_spec",
     "replay": "arena_newton.policies.replay:from_spec",
     "stand": "arena_newton.policies.stand:from_spec",
@@ -55,6 +56,16 @@ class Policy:
 
         Raises:
             InputError: It cannot, for a reason that the user can mend.
+        """
+
+    def attach(self, env: Any) -> None:
+        """Get to know the environment before its first episode; only privileged policies (experts) look into it.
+
+        Args:
+            env: The `ArenaEnv` that the coming calls are about.
+
+        Raises:
+            InputError: The policy cannot work in this environment.
         """
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:

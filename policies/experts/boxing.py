@@ -1,0 +1,187 @@
+"""Boxing's expert: walk to the side of the right bag, crouch to the target's height, lead the nearer fist to it.
+
+The palm must come within 13 cm of a target that sits in the bag's skin, and the palm frame lies behind the fingers: a
+hand that comes straight at the bag stops too far out. So the robot stands where the target lies on the bag's flank, in
+front of a shoulder, and the hand passes beside the bag.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from arena_newton.policies.experts.base import Expert, Sight
+from arena_newton.policies.experts.planning import Floor, plan, signed_distance
+from arena_newton.tasks.boxing import PALMS, TARGET
+from arena_newton.trackers.motions.commands import MotionCommand
+from arena_newton.trackers.motions.kinematics import HAND_POINT
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate, wrap
+
+__all__ = ["BoxingExpert"]
+
+BAGS = ("/World/Bag_1", "/World/Bag_2")
+ROOM = ((-7.2, -6.5), (0.6, 5.2))
+"""Corners of the room [m]."""
+FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
+"""Bearing of the target from the bag's axis, against that of the robot [rad]: positive lies on the robot's right."""
+BEST_FLANK = math.radians(60)
+STAND = 0.50
+"""Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
+READY = 0.72
+"""The same where the robot turns to the bag before the last step [m]: its hands must not meet the bag."""
+PALM_FRAME = 0.0415
+"""The palm frame that the rule reads, so far before the wrist yaw frame [m]."""
+OFF = 0.06
+"""Distance of the palm from the target, away from the bag [m]: the hand is there before it touches."""
+BELOW = 0.12
+"""Pelvis under the target [m]: then the shoulder is 17 cm above it."""
+LOW, HIGH = 0.52, 0.74
+"""Range of pelvis heights [m]."""
+PATIENCE = 5.0
+"""Time given to one strike before the robot steps back and tries another stance [s]."""
+STEP_TIME = 8.0
+"""Time given to the last steps before the robot strikes from where it is [s]."""
+GAIN = 0.6
+"""Share of the palm's error that the command takes up in a second: trackers leave the hand 5-20 cm behind."""
+MOST = 0.15
+"""Largest correction [m]."""
+
+WALK, STEP, STRIKE = 0, 1, 2
+
+
+class BoxingExpert(Expert):
+    """Three phases a world: to the ready place, up to the bag, strike; after a miss back to the first."""
+
+    task = "boxing"
+
+    def __init__(self, sight: Sight):
+        """Find bags, target and palms."""
+        super().__init__(sight)
+        worlds, device = sight.worlds, sight.device
+        bags, boxes = [], []
+        for bag in BAGS:
+            _, place, half = sight.box(f"{bag}/Collider")
+            _, post, post_half = sight.box(f"{bag}/Post")
+            bags.append(place[:2])
+            zero = torch.zeros(1, device=device)
+            boxes.append(torch.cat([place[:2], zero, half[:1], half[:1]]))
+            boxes.append(torch.cat([post[:2], zero, post_half[:2]]))
+        self._bags = torch.stack(bags)
+        self._boxes = torch.stack(boxes).expand(worlds, -1, 5)
+        self._target = sight.frame(f"{TARGET}/Frame/Bounds")
+        self._palms = [sight.frame(name) for name in PALMS]
+        self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.45))
+        self.phase = torch.zeros(worlds, dtype=torch.long, device=device)
+        """`WALK`, `STEP` or `STRIKE`, shape [worlds]."""
+        self.right = torch.zeros(worlds, dtype=torch.bool, device=device)
+        """The right hand strikes, shape [worlds]."""
+        self.ready = torch.zeros(worlds, 3, device=device)
+        self.stand = torch.zeros(worlds, 3, device=device)
+        self._route: Tensor | None = None
+        self._tries = torch.zeros(worlds, dtype=torch.long, device=device)
+        self._clock = torch.zeros(worlds, device=device)
+        self._correction = torch.zeros(worlds, 3, device=device)
+
+    def begin(self, mask: Tensor) -> None:
+        """Choose bag, stance and hand."""
+        self._tries = self._tries.masked_fill(mask, 0)
+        self._approach(mask)
+
+    def _bag(self) -> tuple[Tensor, Tensor]:
+        """The target's bag [m], and the bearing of the target from its axis [rad]; [worlds, 2] and [worlds]."""
+        target = self._target()[:, :2]
+        gap = torch.linalg.vector_norm(target[:, None] - self._bags, dim=2)
+        bag = self._bags[gap.argmin(dim=1)]
+        return bag, torch.atan2(target[:, 1] - bag[:, 1], target[:, 0] - bag[:, 0])
+
+    def _approach(self, mask: Tensor) -> None:
+        """Plan the way to the best stance; after a miss to the next best one."""
+        pose = self.sight.pose
+        bag, bearing = self._bag()
+        flank = torch.tensor(FLANKS, device=pose.device)
+        side = bearing[:, None] - flank  # [W, C]: where the robot stands around the bag
+        out = torch.stack([torch.cos(side), torch.sin(side)], dim=2)
+        ready, stand = bag[:, None] + READY * out, bag[:, None] + STAND * out
+        room = signed_distance(torch.cat([ready, stand], dim=1), self._boxes[:, 1::2])
+        tight = (0.40 - room.view(len(pose), 2, -1).amin(dim=1)).clamp_min(0.0)
+        way = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
+        price = way + 20.0 * tight + 0.5 * (flank.abs() - BEST_FLANK).abs()
+        order = price.argsort(dim=1)
+        pick = torch.gather(order, 1, (self._tries % len(FLANKS))[:, None])
+
+        def chosen(points: Tensor) -> Tensor:
+            xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
+            return torch.cat([xy, wrap(torch.gather(side, 1, pick) + math.pi)], dim=1)
+
+        place = chosen(ready)
+        ways = plan(pose[:, :2], place[:, :2], Floor(self._boxes, *ROOM))
+        row = mask[:, None]
+        self.ready = torch.where(row, place, self.ready)
+        self.stand = torch.where(row, chosen(stand), self.stand)
+        self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
+        if self._route is None:
+            self._route = ways.points
+        self._route = torch.where(mask[:, None, None], ways.points, self._route)
+        self.phase = self.phase.masked_fill(mask, WALK)
+        self._clock = self._clock.masked_fill(mask, 0.0)
+        self._correction = self._correction.masked_fill(row, 0.0)
+        self.navigator.reset(mask)
+
+    def command(self, mask: Tensor, dt: float) -> MotionCommand:
+        """Walk, step up or strike."""
+        pose = self.sight.pose
+        stuck = mask & (self.phase == STRIKE) & (self._clock > PATIENCE)
+        if stuck.any():
+            self._tries = self._tries + stuck
+            self._approach(stuck)
+        walking, striking = self.phase == WALK, self.phase == STRIKE
+        goal = torch.where(walking[:, None], self.ready, self.stand)
+        route = torch.where(walking[:, None, None], self._route, pose[:, None, :2])
+        answer = self.navigator.command(pose, goal, dt, route=route, mask=mask)
+        self._clock = self._clock + dt * mask
+
+        command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
+        command.velocity = answer.velocity * (~striking)[:, None]
+        command.hands = torch.ones_like(command.hands)
+        self._strike(command, striking, mask, dt)
+
+        onward = mask & (
+            (walking & answer.arrived) | ((self.phase == STEP) & (answer.arrived | (self._clock > STEP_TIME)))
+        )
+        self.phase = self.phase + onward
+        self._clock = self._clock.masked_fill(onward, 0.0)
+        self.navigator.reset(onward)
+        return command
+
+    def _strike(self, command: MotionCommand, striking: Tensor, mask: Tensor, dt: float) -> None:
+        """Fill in height, waist and hand point."""
+        pose, target = self.sight.pose, self._target()
+        _, bearing = self._bag()
+        wanted = target.clone()
+        wanted[:, 0] += OFF * torch.cos(bearing)
+        wanted[:, 1] += OFF * torch.sin(bearing)
+        palms = torch.stack([palm() for palm in self._palms], dim=1)
+        hand = self.right.long()
+        palm = palms[torch.arange(len(palms), device=palms.device), hand]
+        error = self._local(wanted - palm, pose)
+        settled = striking & mask & (self._clock > 1.0)
+        correction = (self._correction + GAIN * dt * error).clamp(-MOST, MOST)
+        self._correction = torch.where(settled[:, None], correction, self._correction)
+
+        root = torch.cat([pose[:, :2], self.sight.height[:, None]], dim=1)
+        point = self._local(wanted - root, pose) + self._correction
+        point[:, 0] += HAND_POINT - PALM_FRAME
+        is_right = torch.stack([~self.right, self.right], dim=1)
+        command.hand_point = torch.where(is_right[..., None], point[:, None], command.hand_point)
+        command.reach = (is_right & striking[:, None]).to(command.reach.dtype)
+        height = (target[:, 2] - BELOW).clamp(LOW, HIGH)
+        command.height = torch.where(striking, height, command.height)
+        turn = torch.where(self.right, 0.35, -0.35)
+        waist = torch.stack([turn, torch.zeros_like(turn), torch.full_like(turn, 0.1)], dim=1)
+        command.waist = torch.where(striking[:, None], waist, command.waist)
+
+    @staticmethod
+    def _local(vector: Tensor, pose: Tensor) -> Tensor:
+        return torch.cat([rotate(vector[:, :2], -pose[:, 2]), vector[:, 2:]], dim=1)

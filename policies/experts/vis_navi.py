@@ -1,0 +1,109 @@
+"""VisNavi's expert: plan around the obstacles where they came to rest, walk, stand in the marked area."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from arena_newton.policies.experts.base import Expert, Sight
+from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
+from arena_newton.tasks.vis_navi import SIGN
+from arena_newton.trackers.motions.commands import MotionCommand
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, heading, rotate
+
+__all__ = ["VisNaviExpert"]
+
+OBSTACLES = ("Beam_a", "Beam_b", "Beam_c", "Block_a", "Block_b", "Block_c")
+ROOM = ((-7.2, -6.5), (0.6, 5.2))
+"""Corners of the warehouse room [m]."""
+FEET = 0.2
+"""Half of what both feet and the wander of a stop need of the area [m]."""
+APART = 0.42
+"""Distance that a place to stand should keep from obstacles and sign [m]."""
+MOVED = 0.06
+"""An obstacle that moved farther than this since the plan was made asks for a new one [m]."""
+STRAY = 0.35
+"""So does a robot that is farther off its way than this [m]."""
+
+
+class VisNaviExpert(Expert):
+    """Walks to the best place in the marked area on the shortest way with room to both sides."""
+
+    task = "vis_navi"
+
+    def __init__(self, sight: Sight):
+        """Find obstacles, sign and area."""
+        super().__init__(sight)
+        self._obstacles = [sight.box(f"/World/{name}") for name in OBSTACLES]
+        self._sign = sight.box(f"{SIGN}/Frame/Body")
+        self._zone = sight.scene.marker(f"{SIGN}/Frame/Zone")
+        worlds, device = sight.worlds, sight.device
+        self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.5))
+        self.goal = torch.zeros(worlds, 3, device=device)
+        """Where the robot wants to stand: x, y [m], yaw [rad], shape [worlds, 3]."""
+        self._route: Tensor | None = None
+        self._stray = torch.zeros(worlds, device=device)
+        self._seen = torch.zeros(worlds, len(OBSTACLES), 5, device=device)
+
+    def boxes(self) -> Tensor:
+        """Obstacles as they lie now, rectangles on the floor, shape [worlds, obstacles, 5]."""
+        return torch.stack([self._footprint(*box) for box in self._obstacles], dim=1)
+
+    def _footprint(self, body: int, place: Tensor, half: Tensor) -> Tensor:
+        _, quat = self.sight.body(body)
+        return footprint(self.sight.point(body, place.tolist()), quat, half.expand(len(quat), 3))
+
+    def begin(self, mask: Tensor) -> None:
+        """Plan from where the robot stands."""
+        self.navigator.reset(mask)
+        self._plan(mask, self.boxes())
+
+    def _plan(self, mask: Tensor, boxes: Tensor) -> None:
+        pose = self.sight.pose
+        zone, quat = self.sight.point(self._zone.body_id, self._zone.pos), self.sight.body(self._zone.body_id)[1]
+        every = torch.cat([boxes, self._footprint(*self._sign)[:, None]], dim=1)
+        spot = self._spot(zone[:, :2], heading(quat), every)
+        # The sign stands in the area itself: it only counts for the choice of the spot.
+        ways = plan(pose[:, :2], spot, Floor(boxes, *ROOM))
+        last = spot - torch.where((ways.length < BLOCKED)[:, None], _before_last(ways.points), pose[:, :2])
+        goal = torch.cat([spot, torch.atan2(last[:, 1], last[:, 0])[:, None]], dim=1)
+        route = ways.points
+        if self._route is None:
+            self._route = route
+        self._route = torch.where(mask[:, None, None], route, self._route)
+        self.goal = torch.where(mask[:, None], goal, self.goal)
+        self._seen = torch.where(mask[:, None, None], boxes, self._seen)
+        self._stray = self._stray.masked_fill(mask, 0.0)
+        self.navigator.reset(mask)
+
+    def _spot(self, centre: Tensor, yaw: Tensor, boxes: Tensor) -> Tensor:
+        """The place in the area that is best to stand on: clear of obstacles, near the middle; [worlds, 2]."""
+        half = torch.tensor(self._zone.half[:2], device=centre.device) - FEET
+        steps = torch.linspace(-1.0, 1.0, 9, device=centre.device)
+        grid = torch.cartesian_prod(steps, steps) * half
+        spots = centre[:, None] + rotate(grid.expand(len(centre), -1, 2), yaw[:, None].expand(-1, len(grid)))
+        lack = (APART - signed_distance(spots, boxes)).clamp_min(0.0)
+        price = 3.0 * lack + torch.linalg.vector_norm(grid, dim=1)
+        best = price.argmin(dim=1)
+        return spots[torch.arange(len(spots), device=spots.device), best]
+
+    def command(self, mask: Tensor, dt: float) -> MotionCommand:
+        """Follow the way; plan again where an obstacle was pushed or the robot strayed."""
+        boxes, pose = self.boxes(), self.sight.pose
+        stale = (boxes - self._seen)[..., :2].abs().amax(dim=(1, 2)) > MOVED
+        again = mask & (stale | (self._stray > STRAY))
+        if again.any():
+            self._plan(again, boxes)
+        answer = self.navigator.command(pose, self.goal, dt, route=self._route, mask=mask)
+        self._stray = torch.where(mask, answer.stray, self._stray)
+        command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
+        command.velocity = answer.velocity
+        return command
+
+
+def _before_last(points: Tensor) -> Tensor:
+    """The point from which each way reaches its last one; [W, K, 2] to [W, 2]."""
+    away = torch.linalg.vector_norm(points - points[:, -1:], dim=2) > 0.05
+    index = torch.arange(points.shape[1], device=points.device).expand_as(away)
+    pick = torch.where(away, index, 0).amax(dim=1)
+    return points[torch.arange(len(points), device=points.device), pick]
