@@ -60,7 +60,7 @@ def residual_form(drive: DriveGains, clip: float = 6.0) -> ActionForm:
 
 
 class FrontEnd:
-    """Base of all front ends; a subclass sets the widths and writes `reset`, `_write` and `_advance`."""
+    """Base of all front ends; a subclass sets the widths and writes `reset`, `write` and `advance`."""
 
     interface: str = ""
     """Name of the interface in weights files, such as `twist2`."""
@@ -75,6 +75,8 @@ class FrontEnd:
     """The observation's buffer, float32, shape [worlds, obs_width]."""
     last_action: torch.Tensor
     """Last raw output, unclipped, shape [worlds, action_width]."""
+    base: torch.Tensor
+    """What the scaled action is added to [rad], MuJoCo order, shape [worlds, 29]."""
 
     def __init__(self, action_form: ActionForm):
         """Keep the action form; `bind` allocates."""
@@ -93,7 +95,7 @@ class FrontEnd:
         self.last_action = torch.zeros(worlds, self.action_width, device=self.device)
         self._default = torch.tensor(self.default_pose, device=self.device)
         self._scale = torch.tensor(self.action_form.scale, device=self.device)
-        self._base = self._default.repeat(worlds, 1)
+        self.base = self._default.repeat(worlds, 1)
         self._targets = torch.zeros(worlds, JOINTS, device=self.device)
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
@@ -111,8 +113,8 @@ class FrontEnd:
         Calling it again before `act` replaces the tick's observation. Whoever keeps it must copy it.
         """
         if self.action_form.kind == "residual":
-            self._base.copy_(command.joints)
-        self._write(command, state)
+            self.base.copy_(command.joints)
+        self.write(command, state)
         return self.obs
 
     @torch.no_grad()
@@ -123,23 +125,23 @@ class FrontEnd:
             raw: The network's output, shape [worlds, action_width].
         """
         self.last_action.copy_(raw)
-        self._advance()
-        raw = self._to_mujoco(raw)
+        self.advance()
+        raw = self.to_mujoco(raw)
         if self.action_form.clip > 0.0:
             torch.clamp(raw, -self.action_form.clip, self.action_form.clip, out=self._targets)
         else:
             self._targets.copy_(raw)
-        return self._targets.mul_(self._scale).add_(self._base)
+        return self._targets.mul_(self._scale).add_(self.base)
 
-    def _write(self, command: TrackerCommand, state: RobotState) -> None:
+    def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write this tick's observation into `obs`."""
         raise NotImplementedError
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
         """Move histories on, after `last_action` took the raw output."""
         raise NotImplementedError
 
-    def _to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
+    def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
         """The raw output in MuJoCo order."""
         return raw
 

@@ -171,7 +171,7 @@ class SonicFrontEnd(FrontEnd):
     @torch.no_grad()
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the measured histories of the worlds in `mask` with the present; past actions stay."""
-        self._write(command, state)
+        self.write(command, state)
         for history in (self._ang_vel, self._joint_pos, self._joint_vel, self._gravity):
             present = history[:, -1:].expand_as(history)
             if mask is None:
@@ -179,7 +179,7 @@ class SonicFrontEnd(FrontEnd):
             else:
                 history.copy_(torch.where(column(mask, self.device)[:, None], present, history))
 
-    def _write(self, command: TrackerCommand, state: RobotState) -> None:
+    def write(self, command: TrackerCommand, state: RobotState) -> None:
         self._ref_pos.copy_(command.joints.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_pos))
         self._ref_vel.copy_(command.joint_vel.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_vel))
         relative = self._relative(_products(state.quat, command.quat))
@@ -195,13 +195,13 @@ class SonicFrontEnd(FrontEnd):
             history[:, -1] = present
             history.copy_(torch.where(self._fresh, present[:, None], history))
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
         torch.index_select(self._proprio, 1, self._source, out=self._shifted)
         self._proprio.copy_(self._shifted)
         self._actions[:, -1] = self.last_action
         self._fresh.fill_(False)
 
-    def _to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
+    def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
         return raw.index_select(1, self._from_canonical)
 
 

@@ -86,20 +86,20 @@ class Twist2FrontEnd(FrontEnd):
     @torch.no_grad()
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the history of the worlds in `mask` with the present frame: a start is then no jump for the network."""
-        self._write(command, state)
+        self.write(command, state)
         past = self._past.view(-1, HISTORY, FRAME)
         if mask is None:
             past.copy_(self._frame[:, None].expand_as(past))
         else:
             past.copy_(torch.where(column(mask, self.device)[:, None], self._frame[:, None], past))
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
         # History takes the present frame only after the network has seen it.
         self._shifted.copy_(self._past[:, FRAME:])
         self._past[:, :-FRAME].copy_(self._shifted)
         self._past[:, -FRAME:].copy_(self._frame)
 
-    def _write(self, command: TrackerCommand, state: RobotState) -> None:
+    def write(self, command: TrackerCommand, state: RobotState) -> None:
         frame = self._frame
         frame[:, :COMMAND] = command.mimic
         torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=frame[:, _ANG_VEL])

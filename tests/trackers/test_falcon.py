@@ -1,0 +1,92 @@
+"""A stranger's package brings a tracker with one class and an entry point: FALCON, whose weights are its own."""
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import trackers
+from arena_newton.errors import InputError
+
+PACKAGE = Path(__file__).parent / "falcon_package"
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """The package as an installer leaves it: importable, its entry points in a `.dist-info` beside it."""
+    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
+    info = tmp_path / "falcon_tracker-1.0.dist-info"
+    info.mkdir()
+    info.joinpath("METADATA").write_text("Metadata-Version: 2.1\nName: falcon-tracker\nVersion: 1.0\n")
+    lines = [f"[{g}]\n" + "".join(f"{k} = {v}\n" for k, v in e.items()) for g, e in project["entry-points"].items()]
+    info.joinpath("entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(PACKAGE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("falcon_tracker", None)
+
+
+@pytest.fixture
+def weights(shared):
+    return shared / "reference/falcon/falcon_g1_29dof.onnx"
+
+
+def test_package_uses_public_names():
+    """The stranger's source touches nothing of ours that begins with an underscore."""
+    source = (PACKAGE / "falcon_tracker/__init__.py").read_text()
+    assert not re.search(r"\._[a-z]|import _[a-z]", source)
+
+
+def test_registers(installed):
+    """Installed, it is listed beside our own trackers and says what it needs."""
+    assert "falcon" in trackers.names()
+    with pytest.raises(InputError, match="g1_29dof.onnx"):
+        trackers.get("falcon")
+
+
+def test_absent():
+    """Without the package the name is unknown."""
+    assert "falcon" not in trackers.names()
+
+
+def test_observation(installed, weights):
+    """575 numbers: five frames, oldest first, terms in the order of their names; arms ride on the reference."""
+    tracker = trackers.get("falcon", weights)
+    tracker.bind(2)
+    command = trackers.TrackerCommand(torch.randn(2, 35), torch.randn(2, 29), torch.randn(2, 29), torch.randn(2, 4))
+    quat = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.5**0.5, 0.5**0.5, 0.0, 0.0]])
+    state = trackers.RobotState(quat, torch.randn(2, 3), torch.randn(2, 29), torch.randn(2, 29))
+    tracker.prefill(command, state)
+    targets = tracker.step(command, state)
+    frames = tracker.observation().view(2, 5, 115)
+    assert torch.equal(frames[:, 0], frames[:, 3])
+    np.testing.assert_allclose(frames[:, 3, 98:101].numpy(), [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0]], atol=1e-6)
+    assert torch.equal(frames[:, 3, 101:], command.joints[:, 15:])
+    torch.testing.assert_close(targets[:, 15:], command.joints[:, 15:] + 0.25 * tracker.last_action[:, 15:])
+
+
+def test_stands_and_walks(installed, weights):
+    """FALCON keeps the robot up in our physics for 6 s and walks forward on command, through the usual environment."""
+    import dataclasses
+
+    from arena_newton.env import SETTLE_TICKS, STAND_ACTION, ArenaEnv
+
+    env = ArenaEnv("football", tracker=trackers.get("falcon", weights), worlds=2, engine="mujoco", device="cpu")
+    env.spec = dataclasses.replace(env.spec, spawn_position=(0.0, -15.0, 0.8))
+    env.reset([0, 0])
+    actions = torch.from_numpy(STAND_ACTION).repeat(2, 1)
+    for _ in range(SETTLE_TICKS):
+        env.step(actions)
+    start = env.physics.qpos.numpy()[:, :2].copy()
+    actions[1, 0] = 0.4 * 0.02
+    for _ in range(300):
+        env.step(actions)
+    root = env.scene.robot.root_qpos
+    qpos = env.physics.qpos.numpy()[:, root : root + 7]
+    assert (qpos[:, 2] > 0.65).all(), f"fell: pelvis heights {qpos[:, 2]}"
+    travelled = np.linalg.norm(qpos[:, :2] - start, axis=1)
+    assert travelled[0] < 0.5 and 1.2 < travelled[1] < 3.2, travelled
