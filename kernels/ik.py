@@ -76,8 +76,8 @@ LOST = wp.constant(0.01)
 RESTART_ROUNDS = wp.constant(16)
 STEP = wp.constant(0.4)
 """Largest change of a joint in one Gauss-Newton step [rad]."""
-ARM_SPEED = wp.constant(0.16)
-"""Largest change of an arm joint by IK in a tick [rad]: 8 rad/s."""
+ARM_SPEED = wp.constant(0.12)
+"""Largest change of an arm joint by IK in a tick [rad]: 6 rad/s."""
 SEAT_SOFTNESS = wp.constant(0.02)
 """Width of the change from balance to the seat [m]."""
 HAND_POINT = wp.constant(0.10)
@@ -187,7 +187,8 @@ def solve_leg(
     m: Model, w: int, first: int, target_p: wp.vec3, target_q: wp.quat, rounds: int, joints: wp.array2d[float]
 ) -> float:
     """Moves the six joints from link `first` towards an ankle pose in the pelvis frame; what was left before the last
-    step [m]."""
+    step [m].
+    """
     left = float(0.0)
     for _ in range(rounds):
         p = wp.vec3(0.0, 0.0, 0.0)

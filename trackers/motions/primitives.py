@@ -1,0 +1,316 @@
+"""Named motions as short command programs: stand, shift, step, walk, squat, reach, kick, punch, sit, rise, carry, push.
+
+A primitive is a `Script`, a row of timed segments; `+` joins scripts, `over` lays channels over all segments. A
+`Program` holds one script a world and turns a time into a `MotionCommand`. Nothing here limits a rate: the generator
+does, so a segment may jump, and one with `ramp` moves its channels evenly over its time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.robot import DEFAULT_POSE
+from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, MotionCommand, neutral_row
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = [
+    "CARRY_ARMS",
+    "GUARD_ARMS",
+    "PUSH_HANDS",
+    "Program",
+    "Script",
+    "Segment",
+    "carry",
+    "crouch_reach",
+    "kick",
+    "mirrored_arms",
+    "punch",
+    "push",
+    "reach",
+    "rise",
+    "shift",
+    "sit",
+    "squat",
+    "stand",
+    "step",
+    "step_over",
+    "walk",
+]
+
+SIDES = {"left": 0, "right": 1}
+SEAT_APPROACH, SEAT_DEPTH = (0.24, 0.14), (0.36, 0.09)
+"""Pelvis behind its standing place and above the seat [m], first until it touches, then pressed into it."""
+
+
+def mirrored_arms(left: Sequence[float]) -> tuple[float, ...]:
+    """Posture of both arms [rad] from the left one's seven joints: roll and yaw joints change their sign."""
+    signs = (1, -1, -1, 1, -1, 1, -1)
+    return (*left, *(s * v for s, v in zip(signs, left, strict=True)))
+
+
+DEFAULT_ARMS: tuple[float, ...] = tuple(DEFAULT_POSE[15:])
+GUARD_ARMS = mirrored_arms((-0.35, 0.25, 0.1, -0.45, 0.0, 0.0, 0.0))
+"""Fists before the chest [rad]."""
+CARRY_ARMS = mirrored_arms((-0.15, 0.12, 0.0, 0.05, 0.0, 0.0, 0.0))
+"""Forearms level, palms facing each other [rad]."""
+FORWARD_ARMS = mirrored_arms((-1.0, 0.2, 0.0, 0.9, 0.0, 0.0, 0.0))
+"""Arms stretched forward as a counterweight [rad]."""
+PUNCH_ARM = (-1.45, 0.12, 0.0, 1.25, 0.0, 0.0, 0.0)
+"""A stretched left arm [rad]."""
+PUSH_HANDS = ((0.36, 0.14, 0.20), (0.36, -0.14, 0.20))
+"""Palms before the chest [m]."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Commands for some time."""
+
+    seconds: float
+    """How long [s]."""
+    channels: Mapping[str, Any] = field(default_factory=dict)
+    """Channels that are not neutral."""
+    ramp: bool = False
+    """Whether channels move evenly from the last segment's values instead of jumping."""
+
+    def row(self) -> np.ndarray:
+        """The packed command; shape [`COMMAND_WIDTH`].
+
+        Raises:
+            InputError: No such channel, or numbers that do not fit it.
+        """
+        row = np.array(neutral_row(), dtype=np.float32)
+        for name, value in self.channels.items():
+            if name not in CHANNELS:
+                raise InputError(f"motion command: no channel {name!r}, expected one of {', '.join(CHANNELS)}")
+            part = CHANNELS[name]
+            numbers = np.asarray(value, dtype=np.float32).ravel()
+            if numbers.size not in (1, part.stop - part.start):
+                raise InputError(f"motion command: {name} takes {part.stop - part.start} numbers, got {numbers.size}")
+            row[part] = numbers
+        return row
+
+
+@dataclass(frozen=True)
+class Script:
+    """Segments one after the other."""
+
+    segments: tuple[Segment, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Length [s]."""
+        return sum(s.seconds for s in self.segments)
+
+    def __add__(self, other: Script) -> Script:
+        """One after the other."""
+        return Script(self.segments + other.segments)
+
+    def over(self, **channels: Any) -> Script:
+        """The same with these channels wherever a segment does not set them itself."""
+        return Script(tuple(Segment(s.seconds, {**channels, **s.channels}, s.ramp) for s in self.segments))
+
+
+class Program:
+    """One script a world; past its end a script holds its last segment."""
+
+    def __init__(self, scripts: Sequence[Script], device: Any = "cpu"):
+        """Packs the scripts.
+
+        Args:
+            scripts: One a world.
+            device: Torch device of the commands.
+        """
+        import torch
+
+        longest = max(len(s.segments) for s in scripts)
+        ends = np.full((len(scripts), longest), np.inf, dtype=np.float32)
+        rows = np.empty((len(scripts), longest + 1, COMMAND_WIDTH), dtype=np.float32)
+        lengths, ramps = np.ones_like(ends), np.zeros_like(ends)
+        for w, script in enumerate(scripts):
+            rows[w] = neutral_row()
+            total = 0.0
+            for k, segment in enumerate(script.segments):
+                total += segment.seconds
+                ends[w, k], lengths[w, k], ramps[w, k] = total, max(segment.seconds, 1e-3), segment.ramp
+                rows[w, k + 1 :] = segment.row()
+            ends[w, len(script.segments) - 1 :] = np.inf
+            lengths[w, len(script.segments) :] = 1.0
+        starts = np.concatenate([np.zeros((len(scripts), 1), np.float32), ends[:, :-1]], axis=1)
+        self._ends, self._starts = torch.tensor(ends, device=device), torch.tensor(starts, device=device)
+        self._lengths, self._ramps = torch.tensor(lengths, device=device), torch.tensor(ramps, device=device)
+        self._rows = torch.tensor(rows, device=device)
+        self._worlds = torch.arange(len(scripts), device=device)
+        self.worlds = len(scripts)
+        self.seconds = max(s.seconds for s in scripts)
+
+    def __call__(self, time: float | torch.Tensor) -> MotionCommand:
+        """Commands at a time [s] since the start, one number or one a world."""
+        import torch
+
+        if not isinstance(time, torch.Tensor):
+            time = torch.full((self.worlds,), float(time), device=self._ends.device)
+        w = self._worlds
+        k = (time[:, None] >= self._ends).sum(1)
+        share = ((time - self._starts[w, k]) / self._lengths[w, k]).clamp(0.0, 1.0)
+        share = torch.where(self._ramps[w, k] > 0.5, share, 1.0)[:, None]
+        before, row = self._rows[w, k], self._rows[w, k + 1]
+        return MotionCommand.unpack(before + share * (row - before))
+
+
+def _script(*segments: tuple[float, dict[str, Any]] | Segment) -> Script:
+    return Script(tuple(s if isinstance(s, Segment) else Segment(*s) for s in segments))
+
+
+def _sided(side: str) -> int:
+    if side not in SIDES:
+        raise InputError(f"motion primitive: no side {side!r}, expected left or right")
+    return SIDES[side]
+
+
+def stand(seconds: float = 2.0, **channels: Any) -> Script:
+    """Stand for a while, with any other channels."""
+    return _script((seconds, channels))
+
+
+def shift(forward: float = 0.0, left: float = 0.05, hold: float = 1.5) -> Script:
+    """Move the centre of mass over fixed feet [m], hold, and come back."""
+    return _script((hold + 0.8, {"shift": (forward, left)}), (1.0, {}))
+
+
+def step(seconds: float = 3.0, *, pause: float = 1.0) -> Script:
+    """Step in place."""
+    return _script((seconds, {"step_in_place": 1.0}), (pause, {}))
+
+
+def walk(
+    forward: float = 0.3, left: float = 0.0, turn: float = 0.0, seconds: float = 4.0, *, pause: float = 1.5
+) -> Script:
+    """Walk at a velocity [m/s, m/s, rad/s] of the heading frame and stop."""
+    return _script((seconds, {"velocity": (forward, left, turn)}), *([(pause, {})] if pause > 0.0 else []))
+
+
+def step_over(
+    speed: float = 0.35, seconds: float = 5.0, *, swing_height: float = 0.18, step_time: float = 0.6
+) -> Script:
+    """Walk with high steps, as over a sill."""
+    high = {"swing_height": swing_height, "step_time": step_time}
+    return _script((0.5, high), (seconds, {"velocity": (speed, 0.0, 0.0), **high}), (1.0, high), (1.0, {}))
+
+
+def squat(height: float = 0.45, *, pitch: float = 0.3, down: float = 1.5, hold: float = 1.0) -> Script:
+    """Lower the pelvis [m] over fixed feet, hold, and rise; `down` is the time of going down, and of going up [s]."""
+    low = {"height": height, "pitch": pitch}
+    return _script(Segment(down, low, ramp=True), (hold + 0.3, low), Segment(down, {}, ramp=True), (0.5, {}))
+
+
+def reach(side: str, point: Sequence[float], *, hold: float = 1.5, arms: Sequence[float] = DEFAULT_ARMS) -> Script:
+    """Reach with one palm to a point of the pelvis' heading frame [m], hold, and let go."""
+    k = _sided(side)
+    points, share = np.array(neutral_row()[CHANNELS["hand_point"]]).reshape(2, 3), [0.0, 0.0]
+    points[k], share[k] = point, 1.0
+    out = {"hand_point": points, "reach": share, "arms": arms}
+    return _script((hold + 1.2, out), (1.2, {"arms": arms}))
+
+
+def crouch_reach(
+    side: str,
+    point: Sequence[float],
+    height: float = 0.55,
+    *,
+    pitch: float = 0.35,
+    down: float = 1.5,
+    hold: float = 1.5,
+    arms: Sequence[float] = DEFAULT_ARMS,
+) -> Script:
+    """Squat, reach to a point of the pelvis' heading frame [m], let go, and rise."""
+    low = {"height": height, "pitch": pitch}
+    up = _script(Segment(down, {"arms": arms}, ramp=True), (0.5, {}))
+    return (
+        _script(Segment(down, {**low, "arms": arms}, ramp=True))
+        + reach(side, point, hold=hold, arms=arms).over(**low)
+        + up
+    )
+
+
+def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
+    """Shift to the other foot, wind up, swing at a foot speed [m/s], and recover."""
+    from arena_newton.trackers.motions.generator import KICK_BACK, KICK_FRONT
+    from arena_newton.trackers.motions.generator import KICK_RETURN, KICK_SETTLE, KICK_SHIFT, KICK_WIND
+
+    foot = _sided(side) + 1
+    length = KICK_SHIFT + KICK_WIND + 1.875 * (KICK_BACK + KICK_FRONT) / speed + KICK_RETURN + KICK_SETTLE
+    return _script((length, {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
+
+
+def punch(side: str = "right", *, height: float | None = None, speed: float = 10.0, times: int = 1) -> Script:
+    """Guard, stretch an arm in about 0.25 s at a joint speed [rad/s], and come back."""
+    k = _sided(side)
+    out = np.array(GUARD_ARMS).reshape(2, 7)
+    out[k] = np.array(mirrored_arms(PUNCH_ARM)).reshape(2, 7)[k]
+    both = {"hands": (1.0, 1.0), **({} if height is None else {"height": height, "pitch": 0.15})}
+    guard = {"arms": GUARD_ARMS, "arm_speed": 3.0, **both}
+    hit = ((0.35, {**guard, "arms": out.ravel(), "arm_speed": speed}), (0.7, {**guard, "arm_speed": 6.0}))
+    return _script((1.2, guard), *(hit * times), (1.2, {"arms": DEFAULT_ARMS}))
+
+
+def sit(seat: float = 0.42, *, hold: float = 3.0, depth: float = SEAT_DEPTH[0], press: float = SEAT_DEPTH[1]) -> Script:
+    """Sit down on a real seat of a height [m] whose edge is about 5 cm behind the standing pelvis, and stay.
+
+    Args:
+        seat: Height of the seat [m].
+        hold: Time on the seat [s].
+        depth: How far behind its standing place the pelvis ends [m].
+        press: Height of the pelvis above the seat at the end [m]; the robot's own touches it higher.
+    """
+    arms = {"arms": FORWARD_ARMS}
+    back, above = min(SEAT_APPROACH[0], depth), SEAT_APPROACH[1]
+    lean = {"pitch": 0.21, "waist": (0.0, 0.0, 0.14), **arms}
+    middle = 0.5 * (0.78 + seat + above)
+    return _script(
+        Segment(1.1, {"height": middle, "pelvis_back": 0.5 * back, **lean}, ramp=True),
+        Segment(1.1, {"height": seat + above, "pelvis_back": back, "pitch": 0.12, **arms}, ramp=True),
+        Segment(1.0, {"height": seat + press, "pelvis_back": depth, "pitch": 0.05, **arms}, ramp=True),
+        (hold, {"height": seat + press, "pelvis_back": depth, "pitch": 0.0, **arms}),
+    )
+
+
+def rise(seat: float = 0.42, *, depth: float = SEAT_DEPTH[0], press: float = SEAT_DEPTH[1]) -> Script:
+    """Stand up from a seat on which `sit` with the same numbers ended: lean forward, shift over the feet, rise."""
+    arms = {"arms": FORWARD_ARMS}
+    lean = {"pitch": 0.35, "waist": (0.0, 0.0, 0.25), **arms}
+    back, above = SEAT_APPROACH
+    return _script(
+        Segment(0.8, {"height": seat + press, "pelvis_back": depth, **lean}, ramp=True),
+        Segment(0.9, {"height": seat + above, "pelvis_back": min(back, depth), **lean}, ramp=True),
+        Segment(0.9, {"height": 0.5 * (0.78 + seat + above), "pelvis_back": 0.0, **lean}, ramp=True),
+        Segment(0.9, {**arms}, ramp=True),
+        (1.0, {}),
+    )
+
+
+def carry(
+    forward: float = 0.25, left: float = 0.0, turn: float = 0.0, seconds: float = 4.0, *, width: float = 0.24
+) -> Script:
+    """Walk with both palms at the sides of a box of a width [m] before the belly."""
+    points = ((0.30, 0.5 * width, 0.10), (0.30, -0.5 * width, 0.10))
+    held = {"hand_point": points, "reach": (1.0, 1.0), "arms": CARRY_ARMS}
+    return _script((1.5, held), (seconds, {**held, "velocity": (forward, left, turn)}), (1.0, held), (1.5, {}))
+
+
+def push(
+    forward: float = 0.35,
+    seconds: float = 5.0,
+    *,
+    foot_offset: float = 0.08,
+    hands: Sequence[Sequence[float]] = PUSH_HANDS,
+) -> Script:
+    """Walk against a resistance: palms forward, feet set behind the pelvis [m]."""
+    held = {"hand_point": hands, "reach": (1.0, 1.0), "arms": CARRY_ARMS, "foot_offset": foot_offset}
+    return _script((1.2, held), (seconds, {**held, "velocity": (forward, 0.0, 0.0)}), (1.0, held), (1.5, {}))
