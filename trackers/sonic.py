@@ -180,6 +180,7 @@ class SonicFrontEnd(FrontEnd):
                 history.copy_(torch.where(column(mask, self.device)[:, None], present, history))
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
+        """Write reference, anchor and the newest entry of each history but the actions'."""
         self._ref_pos.copy_(command.joints.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_pos))
         self._ref_vel.copy_(command.joint_vel.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_vel))
         relative = self._relative(_products(state.quat, command.quat))
@@ -196,12 +197,14 @@ class SonicFrontEnd(FrontEnd):
             history.copy_(torch.where(self._fresh, present[:, None], history))
 
     def advance(self) -> None:
+        """Shift the histories; the raw output becomes the newest action."""
         torch.index_select(self._proprio, 1, self._source, out=self._shifted)
         self._proprio.copy_(self._shifted)
         self._actions[:, -1] = self.last_action
         self._fresh.fill_(False)
 
     def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
+        """The raw output, which is in canonical order, in MuJoCo order."""
         return raw.index_select(1, self._from_canonical)
 
 

@@ -94,12 +94,14 @@ class Twist2FrontEnd(FrontEnd):
             past.copy_(torch.where(column(mask, self.device)[:, None], self._frame[:, None], past))
 
     def advance(self) -> None:
+        """Move the present frame into the history."""
         # History takes the present frame only after the network has seen it.
         self._shifted.copy_(self._past[:, FRAME:])
         self._past[:, :-FRAME].copy_(self._shifted)
         self._past[:, -FRAME:].copy_(self._frame)
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
+        """Write the present frame and the command's second place."""
         frame = self._frame
         frame[:, :COMMAND] = command.mimic
         torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=frame[:, _ANG_VEL])
