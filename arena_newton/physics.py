@@ -174,6 +174,10 @@ class MujocoPhysics(Physics):
         shared("xpos", m.nbody, 3)
         shared("xquat", m.nbody, 4)
         shared("xipos", m.nbody, 3)
+        # Views made once: a property of MjData costs about as much as the copy behind it.
+        names = ("qpos", "qvel", "xpos", "xquat", "xipos")
+        self._copies = [[(self._np[n][w], getattr(d, n)) for n in names] for w, d in enumerate(self._data)]
+        self._targets = [(d.ctrl, self._np["ctrl"][w]) for w, d in enumerate(self._data)]
         self._np["contact_force"] = self.contact_force.numpy()
         self._np["pair_force"] = self.pair_force.numpy()
         self._np["latch"] = self.latch_locked.numpy()
@@ -198,10 +202,11 @@ class MujocoPhysics(Physics):
 
     def _step_share(self, share: Iterator[int]) -> None:
         m, n, step = self._m, self.rate.substeps, self._mj.mj_step
-        ctrl, latch, equality = self._np["ctrl"], self._np["latch"], self.scene.latch_equality
+        latch, equality = self._np["latch"], self.scene.latch_equality
         for w in share:
             d = self._data[w]
-            d.ctrl[:] = ctrl[w]
+            target, source = self._targets[w]
+            target[:] = source
             if equality >= 0:
                 d.eq_active[equality] = latch[w]
             step(m, d, n)
@@ -209,12 +214,8 @@ class MujocoPhysics(Physics):
 
     def _publish(self, w: int, d: Any) -> None:
         self._mj.mj_kinematics(self._m, d)
-        out = self._np
-        out["qpos"][w] = d.qpos
-        out["qvel"][w] = d.qvel
-        out["xpos"][w] = d.xpos
-        out["xquat"][w] = d.xquat
-        out["xipos"][w] = d.xipos
+        for target, source in self._copies[w]:
+            target[:] = source
 
     def _bare_share(self, share: Iterator[int]) -> None:
         m, n, step, data = self._m, self.rate.substeps, self._mj.mj_step, self._data

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch_again
 from arena_newton.kernels.rotations import (
     heading_quat,
     heading_yaw,
@@ -172,7 +173,7 @@ def launch_state64(
         state: Output, shape [worlds, 64].
     """
     del root_qvel_adr
-    wp.launch(
+    launch_again(
         state64_kernel,
         dim=state.shape[0],
         inputs=[qpos, qvel, root_qpos_adr, joint_qpos, joint_qvel, heading0],
@@ -232,7 +233,7 @@ def launch_reset_reference(ref: ReferencePose, qpos: wp.array, root_qpos_adr: in
         root_qpos_adr: Address of the robot's free joint in `qpos`.
         mask: 1 = reset this world, int32, shape [worlds].
     """
-    wp.launch(
+    launch_again(
         reset_reference_kernel,
         dim=mask.shape[0],
         inputs=[qpos, root_qpos_adr, mask, ref.canonical_to_mujoco],
@@ -345,7 +346,7 @@ def launch_integrate(
         out: Where to write instead, for differentiation.
     """
     to = ref if out is None else out
-    wp.launch(
+    launch_again(
         integrate_kernel,
         dim=action.shape[0],
         inputs=[
@@ -399,4 +400,4 @@ def launch_validate_action(action: wp.array, bad: wp.array) -> None:
         action: Canonical actions, shape [worlds, 40].
         bad: Output: 0 good, `ACTION_NONFINITE`, or `ACTION_BAD_ROT6D` (|c0 x c1| < 1e-6), int32, shape [worlds].
     """
-    wp.launch(validate_action_kernel, dim=action.shape[0], inputs=[action], outputs=[bad], device=action.device)
+    launch_again(validate_action_kernel, dim=action.shape[0], inputs=[action], outputs=[bad], device=action.device)

@@ -6,6 +6,7 @@ import math
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch_again
 from arena_newton.kernels.rotations import load_quat2, up_of
 
 __all__ = ["launch_fall"]
@@ -81,7 +82,7 @@ def launch_fall(
         confirm_ticks: Ticks in a row that confirm, 5 in both rule sets.
         at_once: Which rule: True `paper`, False `released`.
     """
-    wp.launch(
+    launch_again(
         fall_kernel,
         dim=fallen.shape[0],
         inputs=[

@@ -4,6 +4,8 @@
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch_again
+
 __all__ = ["launch_clear", "launch_nonfinite", "launch_reset"]
 
 wp.set_module_options({"enable_backward": False})
@@ -81,7 +83,7 @@ def launch_reset(
         mocap_quat: Written, shape [worlds, nmocap, 4], or None.
     """
     worlds = mask.shape[0]
-    wp.launch(
+    launch_again(
         reset_state_kernel,
         dim=(worlds, max(qpos.shape[1], qvel.shape[1], ctrl.shape[1])),
         inputs=[mask, qpos0, qvel0, ctrl0],
@@ -89,7 +91,7 @@ def launch_reset(
         device=mask.device,
     )
     if mocap_pos is not None and mocap_pos.shape[1] > 0:
-        wp.launch(
+        launch_again(
             reset_mocap_kernel,
             dim=(worlds, mocap_pos.shape[1]),
             inputs=[mask, mocap_pos0, mocap_quat0],
@@ -113,7 +115,7 @@ def launch_clear(mask: wp.array, counter: wp.array) -> None:
         mask: 1 = clear, int32, shape [worlds].
         counter: Streak or counter, int32, shape [worlds].
     """
-    wp.launch(clear_kernel, dim=mask.shape[0], inputs=[mask], outputs=[counter], device=mask.device)
+    launch_again(clear_kernel, dim=mask.shape[0], inputs=[mask], outputs=[counter], device=mask.device)
 
 
 @wp.kernel
@@ -138,4 +140,4 @@ def launch_nonfinite(qpos: wp.array, qvel: wp.array, bad: wp.array) -> None:
         qvel: Velocities, shape [worlds, nv].
         bad: Output, 1 = broken, int32, shape [worlds].
     """
-    wp.launch(nonfinite_kernel, dim=bad.shape[0], inputs=[qpos, qvel], outputs=[bad], device=bad.device)
+    launch_again(nonfinite_kernel, dim=bad.shape[0], inputs=[qpos, qvel], outputs=[bad], device=bad.device)

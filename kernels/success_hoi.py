@@ -15,6 +15,7 @@ from arena_newton.kernels.boxes import (
     slack_xy,
     world_half,
 )
+from arena_newton.kernels.launching import launch_again
 from arena_newton.kernels.rotations import load_quat3, load_vec3
 
 __all__ = [
@@ -97,7 +98,7 @@ def launch_football(
         margin: Output [m], shape [worlds].
         event: Output, 1 = the ball left the field without a goal, int32, shape [worlds].
     """
-    wp.launch(
+    launch_again(
         football_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, ball_body, *goal.arrays, *pitch.arrays, int(rear_bound), int(judge_out), min_z],
@@ -156,7 +157,7 @@ def launch_double_desk_paper(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         double_desk_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, xipos, hammer_body, *inside.arrays, 0, 0.0],
@@ -180,7 +181,7 @@ def launch_double_desk_released(
 
     Other arguments as `launch_double_desk_paper`.
     """
-    wp.launch(
+    launch_again(
         double_desk_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, xipos, hammer_body, *inside.arrays, 1, min_z],
@@ -310,7 +311,7 @@ def launch_pp_box_paper(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         pp_box_paper_kernel,
         dim=success.shape[0],
         inputs=[
@@ -385,7 +386,7 @@ def launch_pp_box_released(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         pp_box_released_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, box_body, box_half, *decks.arrays, deck, plane_z, height_tolerance],

@@ -15,6 +15,7 @@ from arena_newton.kernels.boxes import (
     slack_xy,
     world_half,
 )
+from arena_newton.kernels.launching import launch_again
 from arena_newton.kernels.rotations import load_quat3, load_vec3
 
 __all__ = [
@@ -83,7 +84,7 @@ def launch_open_door_paper(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         open_door_paper_kernel,
         dim=success.shape[0],
         inputs=[
@@ -153,7 +154,7 @@ def launch_open_door_released(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         open_door_released_kernel,
         dim=success.shape[0],
         inputs=[qpos, root_qpos_adr, leaf_qpos_adr, latched, min_angle, stand_height, stand_up],
@@ -211,7 +212,7 @@ def launch_sit_sofa_paper(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         sit_sofa_paper_kernel,
         dim=success.shape[0],
         inputs=[qpos, root_qpos_adr, seat_force, min_force, max_root_z, stiffness, confirm_ticks],
@@ -359,7 +360,7 @@ def launch_sit_sofa_released(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         sit_sofa_released_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, contact_force, bodies, *seat.arrays, below, above, min_force, stiffness],
@@ -456,7 +457,7 @@ def launch_boxing(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         boxing_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, palm_body, palm_offset, *target.arrays, min_radius, pad],
@@ -542,7 +543,7 @@ def launch_vis_navi(
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
     """
-    wp.launch(
+    launch_again(
         vis_navi_kernel,
         dim=success.shape[0],
         inputs=[xpos, xquat, qpos, root_qpos_adr, feet, *zone.arrays, stand_height, stand_up],

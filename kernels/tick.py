@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch_again
+
 __all__ = [
     "ERROR_ACTION",
     "ERROR_STATE",
@@ -49,7 +51,7 @@ def launch_write_ctrl(targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_clo
     """Write joint targets [worlds, 29] and binary hands [worlds, 2] into actuator targets `ctrl` [worlds, nu]."""
     dim = (ctrl.shape[0], joint_ctrl.shape[0] + hand_ctrl.shape[0])
     inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close]
-    wp.launch(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
+    launch_again(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
 
 
 @wp.kernel
@@ -61,7 +63,7 @@ def _sanitize(bad: wp.array[wp.int32], neutral: wp.array[wp.float32], action: wp
 
 def launch_sanitize(bad: wp.array, neutral: wp.array, action: wp.array) -> None:
     """Replace the actions of worlds flagged `bad` [worlds] by `neutral` [40]."""
-    wp.launch(_sanitize, dim=action.shape, inputs=[bad, neutral], outputs=[action], device=action.device)
+    launch_again(_sanitize, dim=action.shape, inputs=[bad, neutral], outputs=[action], device=action.device)
 
 
 @wp.kernel
@@ -91,4 +93,4 @@ def _status(
 def launch_status(success, fallen, event, bad_state, bad_action, status) -> None:
     """One code a world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
     inputs = [success, fallen, event, bad_state, bad_action]
-    wp.launch(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)
+    launch_again(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)

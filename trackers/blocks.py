@@ -4,20 +4,17 @@ Matrix products and vectorised activations on a CPU give a row other last bits i
 and a walking robot amplifies that to another trajectory. Rows are therefore padded to a multiple of a fixed block size.
 Which size leaves a row's bits alone wherever it stands in a block depends on the network, the library and the
 processor, so it is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it
-replaces the separate ones, and such products are spread over a few threads. Each has one thread to itself: bits then do
-not depend on the number of threads. The network is traced, so that a product is one call without Python between its
-operations; the threads would wait for each other's interpreter lock otherwise. On other devices the batch runs whole,
-without that promise.
+replaces the separate ones. All of it runs on one thread: results then do not depend on the number of threads either,
+and a second thread loses more than it wins in an evaluation, where it has to fetch the weights anew each tick. The
+network is traced, which takes Python out from between its operations. On other devices the batch runs whole, without
+that promise.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
 
 import torch
 
@@ -27,8 +24,6 @@ BLOCK_SIZES = (8, 16, 32)
 """Block sizes tried, in this order; rows run one at a time where none keeps the bits."""
 
 _PROBE_SEED = 20240
-_THREADS = 4
-"""Threads that a batch is spread over at most."""
 _WARM_UP = 3
 """Calls within which a traced network settles on how it runs."""
 
@@ -43,12 +38,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    """Threads beside the caller's; torch gives each of them one core."""
-    return ThreadPoolExecutor(_THREADS - 1, "tracker", initializer=torch.set_num_threads, initargs=(1,))
 
 
 def _traced(network: Network, in_width: int, rows: int) -> Network | None:
@@ -102,36 +91,30 @@ class BlockRunner:
         self._buffer = torch.zeros(self._rows, in_width, device=self.device)
         self.input = self._buffer[:worlds]
         self._product: Network = network
-        self._plan: tuple[int, list[slice]] | None = None
+        self._plan: tuple[int, bool] | None = None
 
     @torch.inference_mode()
     def run(self) -> torch.Tensor:
         """Outputs of the rows in `input`, shape [worlds, out_width]; a new tensor."""
         if not self.fixed:
             return self.network(self.input)
-        _, products = self.plan()
-        others: list[Future[torch.Tensor]] = []
-        if self._product is not self.network and len(products) <= _THREADS:
-            others = [_pool().submit(self._run, rows) for rows in products[1:]]
+        block, merged = self.plan()
+        rows = -(-self.worlds // block) * block
         with _one_thread():
-            outputs = [self._run(rows) for rows in products[: len(products) - len(others)]]
-        outputs += [other.result() for other in others]
-        return (torch.cat(outputs) if len(outputs) > 1 else outputs[0])[: self.worlds]
+            if merged or rows == block:
+                return self._product(self._buffer[:rows])[: self.worlds]
+            blocks = [self._product(self._buffer[i : i + block].clone()) for i in range(0, rows, block)]
+        return torch.cat(blocks)[: self.worlds]
 
-    @torch.inference_mode()
-    def _run(self, rows: slice) -> torch.Tensor:
-        view = self._buffer[rows]
-        return self._product(view.clone() if rows.start else view)  # a copy starts at an aligned address, as the buffer
-
-    def plan(self) -> tuple[int, list[slice]]:
-        """Block size, and the rows of each product."""
+    def plan(self) -> tuple[int, bool]:
+        """Block size, and whether all blocks may run as one product."""
         if self._plan is None:
             with _one_thread():
                 self._plan = self._find_plan()
         return self._plan
 
     @torch.inference_mode()
-    def _find_plan(self) -> tuple[int, list[slice]]:
+    def _find_plan(self) -> tuple[int, bool]:
         generator = torch.Generator().manual_seed(_PROBE_SEED)
         width = self._buffer.shape[1]
         self._product = _traced(self.network, width, max(BLOCK_SIZES)) or self.network
@@ -145,20 +128,8 @@ class BlockRunner:
             ):
                 break
         else:
-            return 1, _split(self.worlds, 1, self.worlds)
-        blocks = -(-self.worlds // block)
-        rows = torch.randn(blocks * block, width, generator=generator)
-        alone = _split(blocks, block, blocks)
-        separate = torch.cat([self._product(rows[one].clone()) for one in alone])
-        cores = 1 if self._product is self.network else min(_THREADS, len(os.sched_getaffinity(0)))
-        for count in range(min(cores, blocks), 0, -1):
-            products = _split(blocks, block, count)
-            if torch.equal(torch.cat([self._product(rows[some].clone()) for some in products]), separate):
-                return block, products
-        return block, alone
-
-
-def _split(blocks: int, size: int, count: int) -> list[slice]:
-    """Rows of `blocks` blocks in `count` runs of nearly equal length."""
-    ends = [size * (blocks * i // count) for i in range(count + 1)]
-    return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+            return 1, False
+        count = -(-self.worlds // block) * block
+        rows = torch.randn(count, width, generator=generator)
+        separate = torch.cat([self._product(rows[i : i + block].clone()) for i in range(0, count, block)])
+        return block, torch.equal(self._product(rows), separate)
