@@ -1,0 +1,128 @@
+"""Film strips and videos of clips: a row of pictures a clip, the time under each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.robot import TICK
+from arena_newton.trackers.motions.library import MotionLibrary
+from arena_newton.video import GAP, LABEL_HEIGHT
+
+__all__ = ["film", "movie", "picked_frames"]
+
+VIDEO_FPS = 25.0
+"""Frame rate of videos [1/s]: every other tick."""
+
+
+def picked_frames(library: MotionLibrary, clip: int, count: int, start: float, end: float | None) -> np.ndarray:
+    """Evenly spaced frames of a clip between two times [s], first and last included.
+
+    Raises:
+        InputError: The clip is not that long, or fewer than 1 picture is asked for.
+    """
+    length = float(library.seconds[clip])
+    stop = length if end is None else min(end, length)
+    if count < 1:
+        raise InputError(f"--pictures {count}: expected 1 or more")
+    if not 0.0 <= start < stop:
+        name = library.clip_names[clip]
+        raise InputError(f"--start {start:g}: clip {name} has nothing between {start:g} s and {stop:g} s")
+    frames = np.linspace(start / TICK, stop / TICK, count).round().astype(int)
+    return np.unique(np.minimum(frames, library.clip_length[clip] - 1))
+
+
+def film(
+    library: MotionLibrary,
+    clips: Sequence[int],
+    out: str | Path,
+    *,
+    pictures: int = 10,
+    width: int = 180,
+    start: float = 0.0,
+    end: float | None = None,
+) -> Path:
+    """Write a PNG with one strip of pictures a clip.
+
+    Args:
+        library: The clips.
+        clips: Which of them.
+        out: The PNG.
+        pictures: Pictures a clip.
+        width: Width of a picture [px]; its height is a third more.
+        start: Time of the first picture [s].
+        end: Time of the last [s]; the clip's end by default.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: No clips, no time, or the file cannot be written.
+    """
+    from PIL import Image, ImageDraw
+
+    from arena_newton.trackers.motions.render import ClipRenderer
+
+    if not clips:
+        raise InputError("render: name at least one clip")
+    picked = [picked_frames(library, clip, pictures, start, end) for clip in clips]
+    renderer = ClipRenderer(library, width=width, height=width * 4 // 3)
+    high, row = renderer.height, renderer.height + LABEL_HEIGHT + GAP
+    columns = max(map(len, picked))
+    sheet = Image.new("RGB", (columns * (width + GAP) + GAP, row * len(clips)), "white")
+    text = ImageDraw.Draw(sheet)
+    for line, (clip, frames) in enumerate(zip(clips, picked, strict=True)):
+        y = line * row
+        name = f"{library.clip_names[clip]} ({library.family_names[library.family[clip]]})"
+        text.text((GAP, y + 3), name, fill="black")
+        for column, picture in enumerate(renderer.pictures(clip, frames)):
+            x = GAP + column * (width + GAP)
+            sheet.paste(Image.fromarray(picture), (x, y + LABEL_HEIGHT))
+            text.text((x + 3, y + LABEL_HEIGHT + high - 14), f"{frames[column] * TICK:.2f} s", fill="black")
+    out = Path(out)
+    part = out.with_name(out.name + ".part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        sheet.save(part, format="PNG")
+        os.replace(part, out)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+    return out
+
+
+def movie(
+    library: MotionLibrary,
+    clips: Sequence[int],
+    out: str | Path,
+    *,
+    width: int = 360,
+    start: float = 0.0,
+    end: float | None = None,
+) -> Path:
+    """Write an MP4 of clips one after the other, at 25 frames a second; arguments as of `film`.
+
+    Raises:
+        InputError: No clips, no time, or the file cannot be written.
+    """
+    from arena_newton.trackers.motions.render import ClipRenderer
+    from arena_newton.video import VideoWriter
+
+    if not clips:
+        raise InputError("render: name at least one clip")
+    picked = []
+    for clip in clips:
+        first, last = picked_frames(library, clip, 2, start, end)[[0, -1]]
+        picked.append(np.arange(first, last + 1, round(1.0 / (VIDEO_FPS * TICK))))
+    renderer = ClipRenderer(library, width=width, height=width * 4 // 3)
+    try:
+        with VideoWriter(out, renderer.width, renderer.height, VIDEO_FPS) as video:
+            for clip, frames in zip(clips, picked, strict=True):
+                for picture in renderer.pictures(clip, frames):
+                    video.write(picture)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+    return Path(out)

@@ -1,0 +1,323 @@
+"""Motion files that users have, read into one library: pickles, BeyondMimic's NPZ, tables, our own files.
+
+| file | what is in it |
+|---|---|
+| `.pkl` | TWIST2, GMR (29 joints), GMT (23), ASAP/PHC (23, several clips in a joblib file): `load` |
+| `.csv` | Unitree's LAFAN1 set, Kimodo: root x, y, z, quaternion, 29 or 23 joints (MuJoCo order); a line a frame |
+| `.npz` | BeyondMimic: fps, joint_pos, body_pos_w, body_quat_w (wxyz; body 0 is the pelvis) |
+| `.npz` | a motion library, or canonical actions (array action) |
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.robot import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
+from arena_newton.trackers.motions.library import FORMAT, UNKNOWN, MotionLibrary
+from arena_newton.trackers.motions.load import (
+    JOINTS_23,
+    Clip,
+    checked_clip,
+    clip_from_fields,
+    load_actions,
+    load_plain_pickle,
+    motions_of,
+)
+
+__all__ = ["FileReport", "ReadOptions", "Reading", "read_file", "read_library"]
+
+QuatOrder = Literal["auto", "wxyz", "xyzw"]
+JointOrder = Literal["auto", "isaac", "mujoco"]
+CSV_FPS = 30.0
+"""Frame rate of Unitree's LAFAN1 tables, which do not state it."""
+UPRIGHT_MARGIN = 0.2
+"""Difference of the mean uprightness (-1 to 1) from which the order of a table's quaternions is clear."""
+JOINT_ORDER_MARGIN = 0.01
+"""Mean distance of links [m] from which the order of an NPZ's joints is clear."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What files do not say about themselves."""
+
+    fps: float | None = None
+    """Frame rate of tables [1/s]; 30 by default."""
+    quat_order: QuatOrder = "auto"
+    """Order of a table's quaternions; by default the one in which the robot stands upright."""
+    joint_order: JointOrder = "auto"
+    """Order of the joints of BeyondMimic's NPZ: `isaac` (its own), `mujoco` (mjlab's); by default the one whose
+    kinematics give the file's body positions."""
+    trim: bool = True
+    """Cut motion capture jumps off the start."""
+
+
+@dataclass(frozen=True)
+class FileReport:
+    """What was found in one file."""
+
+    path: Path
+    """The file."""
+    kind: str
+    """Name of its format."""
+    clips: int
+    """Clips in it."""
+    seconds: float
+    """Their length together [s]."""
+    trimmed: int
+    """Frames cut off their starts."""
+    notes: tuple[str, ...] = ()
+    """What was assumed."""
+
+    def line(self) -> str:
+        """The report in one line."""
+        found = f"{self.path}: {self.kind}, {_count(self.clips, 'clip')}, {self.seconds:.1f} s"
+        cut = [f"{_count(self.trimmed, 'frame')} of a jump cut off the start"] if self.trimmed else []
+        return ", ".join([found, *cut, *self.notes])
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Clips of one file, or the library that it is."""
+
+    report: FileReport
+    """What was found."""
+    names: tuple[str, ...]
+    """Name of each clip."""
+    clips: tuple[Clip, ...] = ()
+    """The clips; none if the file is a library."""
+    library: MotionLibrary | None = None
+    """The library."""
+
+
+def read_library(
+    paths: Sequence[str | Path],
+    options: ReadOptions | None = None,
+    *,
+    family: str = "clips",
+    licence: str = UNKNOWN,
+    source: str = UNKNOWN,
+) -> tuple[MotionLibrary, list[FileReport]]:
+    """Read files of any known format into one library.
+
+    Args:
+        paths: The files; clips of libraries keep their family, licence and source.
+        options: What the files do not say.
+        family: Kind of motion of the clips.
+        licence: Their licence.
+        source: Where they are from; their file's name is put behind it.
+
+    Raises:
+        InputError: A file cannot be read, or none was given.
+    """
+    parts, reports, taken = [], [], set()
+    for path in paths:
+        reading = read_file(path, options)
+        reports.append(reading.report)
+        if reading.library is not None:
+            parts.append(reading.library)
+            taken.update(map(str, reading.library.clip_names))
+            continue
+        names = [_free_name(name, taken) for name in reading.names]
+        origin = f"{source}: {Path(path).name}" if source != UNKNOWN else Path(path).name
+        parts.append(MotionLibrary.from_clips(reading.clips, names, family=family, licence=licence, source=origin))
+    return MotionLibrary.concatenate(parts), reports
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    free, number = name, 2
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    taken.add(free)
+    return free
+
+
+def read_file(path: str | Path, options: ReadOptions | None = None) -> Reading:
+    """Read one file.
+
+    Raises:
+        InputError: The file is absent, damaged, or of no known format.
+    """
+    path, options = Path(path), options or ReadOptions()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    suffix = path.suffix.lower()
+    if suffix in (".pkl", ".pickle", ".joblib"):
+        return _pickle(path, options)
+    if suffix == ".csv":
+        return _table(path, options)
+    if suffix == ".npz":
+        return _npz(path, options)
+    raise InputError(f"{path}: unknown kind of motion file, expected .pkl, .csv or .npz")
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def _reading(path: Path, kind: str, clips: dict[str, Clip], notes: Sequence[str] = ()) -> Reading:
+    report = FileReport(
+        path,
+        kind,
+        len(clips),
+        sum(clip.duration for clip in clips.values()),
+        sum(clip.trimmed for clip in clips.values()),
+        tuple(notes),
+    )
+    return Reading(report, tuple(clips), tuple(clips.values()))
+
+
+def _pickle(path: Path, options: ReadOptions) -> Reading:
+    clips: dict[str, Clip] = {}
+    widths, kinds = set(), set()
+    for name, fields in motions_of(load_plain_pickle(path, flag=""), str(path)).items():
+        where = f"{path}: {name}" if name else str(path)
+        clips[name or path.stem] = clip_from_fields(fields, where, trim=options.trim)
+        kinds.add("ASAP pickle" if "root_trans_offset" in fields else "TWIST2/GMR pickle")
+        widths.add(np.asarray(fields.get("dof_pos", fields.get("dof"))).shape[1])
+    return _reading(path, " and ".join(sorted(kinds)), _short(clips, path), _padding(widths))
+
+
+def _short(clips: dict[str, Clip], path: Path) -> dict[str, Clip]:
+    """A single clip is named after its file."""
+    return {path.stem: next(iter(clips.values()))} if len(clips) == 1 else clips
+
+
+def _padding(widths: set[int]) -> list[str]:
+    return ["23 joints, wrists at zero"] if len(JOINTS_23) in widths else []
+
+
+def _table(path: Path, options: ReadOptions) -> Reading:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a readable table ({type(error).__name__})") from error
+    # A line of column names may stand above the numbers.
+    first = 1 if lines and not _is_number(lines[0].split(",")[0]) else 0
+    rows = [(number, line.split(",")) for number, line in enumerate(lines[first:], first + 1) if line.strip()]
+    if not rows:
+        raise InputError(f"{path}: holds no frame")
+    widths = (7 + len(MUJOCO_JOINTS), 7 + len(JOINTS_23))
+    width = len(rows[0][1])
+    if width not in widths:
+        raise InputError(
+            f"{path}: has {width} columns, expected {widths[0]} (root x, y, z, quaternion, 29 joints) or {widths[1]} "
+            "(23 joints)"
+        )
+    for number, row in rows:
+        if len(row) != width or not all(map(_is_number, row)):
+            raise InputError(f"{path}: line {number} does not hold {width} numbers")
+    table = np.array([[float(value) for value in row] for _, row in rows])
+    if not np.isfinite(table).all():
+        raise InputError(
+            f"{path}: line {rows[int(np.argmin(np.isfinite(table).all(axis=1)))][0]} holds NaN or infinity"
+        )
+    order = options.quat_order if options.quat_order != "auto" else _quat_order(table[:, 3:7], path)
+    fps = CSV_FPS if options.fps is None else options.fps
+    clip = checked_clip(
+        fps, table[:, :3], table[:, 3:7], table[:, 7:], str(path), xyzw=order == "xyzw", trim=options.trim
+    )
+    notes = [f"{fps:g} frames a second", f"quaternions {order}", *_padding({width - 7})]
+    return _reading(path, "table", {path.stem: clip}, notes)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _quat_order(quat: np.ndarray, path: Path) -> str:
+    """Unitree's tables say xyzw, others wxyz; a robot that stands upright tells which."""
+    square = quat**2 / np.maximum((quat**2).sum(axis=1, keepdims=True), 1e-12)
+    # Uprightness R22 = 1 - 2 (x² + y²).
+    wxyz, xyzw = (float((1 - 2 * square[:, list(at)].sum(axis=1)).mean()) for at in ((1, 2), (0, 1)))
+    if abs(wxyz - xyzw) < UPRIGHT_MARGIN:
+        raise InputError(f"{path}: the order of the quaternions is not clear; state --quat-order wxyz or xyzw")
+    return "wxyz" if wxyz > xyzw else "xyzw"
+
+
+def _npz(path: Path, options: ReadOptions) -> Reading:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            names = set(file.files)
+            wanted = ("fps", "joint_pos", "body_pos_w", "body_quat_w")
+            beyond = "body_pos_w" in names and "format" not in names
+            if beyond:
+                missing = [name for name in wanted if name not in names]
+                if missing:
+                    raise InputError(f"{path}: array {missing[0]} is missing")
+                arrays = {name: np.asarray(file[name], dtype=np.float64) for name in wanted}
+    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable NPZ file ({type(error).__name__})") from error
+    if beyond:
+        return _beyond_mimic(path, arrays, options)
+    if "format" in names:
+        library = MotionLibrary.load(path)
+        seconds = float(library.seconds.sum())
+        report = FileReport(path, "motion library", library.clips, seconds, 0)
+        return Reading(report, tuple(map(str, library.clip_names)), library=library)
+    if "action" in names:
+        return _reading(path, "canonical actions", {path.stem: _from_actions(path)})
+    raise InputError(
+        f"{path}: no known motion file; expected a motion library ({FORMAT}), BeyondMimic's arrays "
+        "(joint_pos, body_pos_w, body_quat_w, fps), or an array action"
+    )
+
+
+def _from_actions(path: Path) -> Clip:
+    import torch
+
+    from arena_newton.trackers.motions.frames import actions_to_motion
+
+    actions = load_actions(path, flag="")
+    if len(actions) < 2:
+        raise InputError(f"{path}: action has shape {list(actions.shape)}, expected 2 or more ticks")
+    motion = actions_to_motion(torch.from_numpy(actions.astype(np.float64)))
+    pos, quat, joints, hands = (part.numpy() for part in motion)
+    return Clip(1.0 / TICK, pos, quat, joints, hands=hands)
+
+
+def _beyond_mimic(path: Path, arrays: dict[str, np.ndarray], options: ReadOptions) -> Reading:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: array {name} holds NaN or infinity")
+    fps, joints, pos, quat = (arrays[name] for name in ("fps", "joint_pos", "body_pos_w", "body_quat_w"))
+    frames = len(joints) if joints.ndim else 0
+    for name, array, tail in (("body_pos_w", pos, 3), ("body_quat_w", quat, 4)):
+        if array.ndim != 3 or array.shape[0] != frames or array.shape[1] < 1 or array.shape[2] != tail:
+            raise InputError(f"{path}: {name} has shape {list(array.shape)}, expected [{frames}, bodies, {tail}]")
+    if fps.size != 1:
+        raise InputError(f"{path}: field fps must be one number from 1 to 1000")
+    if joints.shape != (frames, len(MUJOCO_JOINTS)):
+        raise InputError(f"{path}: joint_pos has shape {list(joints.shape)}, expected [frames, {len(MUJOCO_JOINTS)}]")
+    rate, where = float(fps.reshape(())), str(path)
+    candidates = {"isaac": joints[:, MUJOCO_TO_CANONICAL], "mujoco": joints}
+    order = options.joint_order
+    if order == "auto":
+        plain = checked_clip(rate, pos[:, 0], quat[:, 0], joints, where, trim=False)
+        far = {name: _link_distance(plain, mujoco, pos) for name, mujoco in candidates.items()}
+        # Where both fit (joints alike on both sides), the format's own order stands.
+        order = "mujoco" if far["mujoco"] < far["isaac"] - JOINT_ORDER_MARGIN else "isaac"
+    clip = checked_clip(rate, pos[:, 0], quat[:, 0], candidates[order], where, trim=options.trim)
+    note = "joints in Isaac Lab's order" if order == "isaac" else "joints in MuJoCo's order"
+    return _reading(path, "BeyondMimic NPZ", {path.stem: clip}, [note])
+
+
+def _link_distance(clip: Clip, joint_pos: np.ndarray, body_pos: np.ndarray) -> float:
+    """Mean distance [m] of a file's bodies to the nearest link, over some frames; whatever the bodies' order is."""
+    import torch
+
+    from arena_newton.trackers.motions.kinematics import forward
+
+    some: Any = np.unique(np.linspace(0, len(joint_pos) - 1, 20).astype(int))
+    links = forward(*(torch.from_numpy(x[some]) for x in (clip.root_pos, clip.root_quat, joint_pos))).position
+    return float(torch.cdist(torch.from_numpy(body_pos[some]), links).min(dim=-1).values.mean())
