@@ -1,0 +1,200 @@
+"""How well trackers follow references: `python -m arena_newton.trackers.evaluate --help`.
+
+One suite of references for any number of trackers, every rollout of a tracker in one batch of worlds; tables to
+Markdown, JSON and CSV. Figures that have a bar are printed with their verdict.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arena_newton.errors import ArenaError, InputError
+
+if TYPE_CHECKING:
+    from arena_newton.trackers.base import Tracker
+    from arena_newton.trackers.evaluation.suite import Cell
+
+__all__ = ["Entry", "main"]
+
+PROG = "python -m arena_newton.trackers.evaluate"
+ROLLOUTS = {"full": 64, "quick": 8}
+"""Rollouts a cell, unless --rollouts says otherwise."""
+
+
+class Entry:
+    """A tracker on the command line: its name, checkpoint and label."""
+
+    def __init__(self, name: str):
+        """With its default weights, called by its name."""
+        self.name = name
+        self.checkpoint: str | None = None
+        self.given_label: str | None = None
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        if self.given_label:
+            return self.given_label
+        return self.name if self.checkpoint is None else f"{self.name} {Path(self.checkpoint.split(',')[0]).stem}"
+
+    @property
+    def official(self) -> bool:
+        """Whether the weights are others': ours are safetensors."""
+        return self.checkpoint is not None and not self.checkpoint.endswith(".safetensors")
+
+    def make(self) -> Tracker:
+        """A new tracker, not bound yet."""
+        from arena_newton.trackers.base import get
+
+        return get(self.name, self.checkpoint)
+
+
+class _AddTracker(argparse.Action):
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        namespace.trackers = [*(namespace.trackers or []), Entry(values)]
+
+
+class _OfLastTracker(argparse.Action):
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        if not namespace.trackers:
+            raise InputError(f"{option} {values}: name its --tracker first")
+        setattr(namespace.trackers[-1], "checkpoint" if option == "--checkpoint" else "given_label", values)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> Any:
+        raise InputError(message)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog=PROG, description="Measure trackers on one suite of references.")
+    add = parser.add_argument
+    add("--tracker", dest="trackers", action=_AddTracker, metavar="NAME", help="tracker; repeat to compare several")
+    add("--checkpoint", action=_OfLastTracker, metavar="PATH", help="weights of the --tracker before it")
+    add("--label", action=_OfLastTracker, metavar="TEXT", help="what tables call the --tracker before it")
+    add(
+        "--import", dest="imports", action="append", default=[], metavar="MODULE", help="module that registers trackers"
+    )
+    add("--suite", choices=tuple(ROLLOUTS), default="full", help="full: every cell; quick: a few")
+    add("--only", nargs="+", default=[], metavar="CELL", help="only cells or groups whose names hold one of these")
+    add("--clips", nargs="+", default=[], type=Path, metavar="FILE", help="motion clips or libraries to add")
+    add("--rollouts", type=int, default=None, metavar="N", help="rollouts a cell (64 full, 8 quick)")
+    add("--goals", type=int, default=None, metavar="N", help="goals in closed loop (20 full, 4 quick)")
+    add("--seed", type=int, default=0, help="seed of goals and start perturbations")
+    add("--engine", choices=("auto", "mujoco", "warp"), default="auto", help="physics engine")
+    add("--device", default=None, help="cpu, cuda or cuda:N")
+    add("--threads", type=int, default=None, metavar="N", help="CPU threads of engine mujoco")
+    add("--fast-physics", action="store_true", help="each tracker's fast physics rate")
+    add("--film", action="store_true", help="write film strips of a walk, a kick, a squat and a sit")
+    add("--no-bench", dest="bench", action="store_false", help="leave out the inference times")
+    add("--list", dest="show", action="store_true", help="print the cells and stop")
+    add("--out", type=Path, default=None, metavar="DIR", help="write evaluation.{md,json,csv} and films here")
+    return parser
+
+
+def _cells(args: argparse.Namespace) -> list[Cell]:
+    from arena_newton.trackers.evaluation.cells import goals, suite
+    from arena_newton.trackers.evaluation.suite import clip_cells
+
+    cells = [cell for cell in suite(args.suite) if cell.goal is None or args.goals is None]
+    if args.goals is not None:
+        cells += goals(args.goals, args.seed)
+    elif args.seed:
+        count = sum(cell.goal is not None for cell in cells)
+        cells = [cell for cell in cells if cell.goal is None] + goals(count, args.seed)
+    cells += clip_cells(args.clips)
+    if args.only:
+        cells = [c for c in cells if any(word in c.name or word == c.group for word in args.only)]
+        if not cells:
+            raise InputError(f"--only {' '.join(args.only)}: no such cell; --list prints them")
+    return cells
+
+
+def _check(args: argparse.Namespace) -> int:
+    for name in ("rollouts", "goals", "threads"):
+        value = getattr(args, name)
+        if value is not None and value < (0 if name == "goals" else 1):
+            raise InputError(f"--{name} {value}: must be at least {0 if name == 'goals' else 1}")
+    if args.seed < 0:
+        raise InputError(f"--seed {args.seed}: must be at least 0")
+    if args.film and args.out is None:
+        raise InputError("--film: name a folder with --out")
+    for module in args.imports:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise InputError(f"--import {module}: {error}") from None
+    return args.rollouts or ROLLOUTS[args.suite]
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    rollouts = _check(args)
+    if args.show:
+        for cell in _cells(args):
+            print(f"{cell.group:14} {cell.name:36} {cell.seconds:5.1f} s")
+        return 0
+    if not args.trackers:
+        raise InputError("name at least one --tracker")
+    labels = [entry.label for entry in args.trackers]
+    if len(set(labels)) < len(labels):
+        raise InputError(f"two trackers are called {max(labels, key=labels.count)!r}: tell them apart with --label")
+    for entry in args.trackers:
+        entry.make()  # complains about files before anything is built
+
+    from arena_newton.trackers.evaluation import report
+    from arena_newton.trackers.evaluation.bench import inference
+    from arena_newton.trackers.evaluation.figures import Result
+    from arena_newton.trackers.evaluation.film import film
+    from arena_newton.trackers.evaluation.rollout import plan, run
+
+    played = plan(_cells(args), rollouts, args.seed)
+    options = {"engine": args.engine, "device": args.device, "fast_physics": args.fast_physics, "threads": args.threads}
+    results = []
+    for entry in args.trackers:
+        print(f"{entry.label}: {len(played.cells)} cells, {len(played.cell)} rollouts", file=sys.stderr, flush=True)
+        tracker = entry.make()
+        outcome = run(tracker, played, **options)
+        times = inference(entry.make) if args.bench else {}
+        result = Result(entry.label, tracker.name, entry.official, tracker.describe(), played, outcome, inference=times)
+        results.append(result)
+        print(f"{entry.label}: {outcome.rollout_s:.1f} s", file=sys.stderr, flush=True)
+    resolved = {
+        "suite": args.suite,
+        "rollouts": rollouts,
+        "seed": args.seed,
+        "engine": results[0].outcome.engine,
+        "device": results[0].outcome.device,
+        "fast physics": args.fast_physics,
+        "only": " ".join(args.only),
+        "clips": " ".join(path.name for path in args.clips),
+    }
+    print(report.figure_table(results))
+    if args.out is not None:
+        for path in report.write(results, resolved, args.out):
+            print(path, file=sys.stderr)
+        if args.film:
+            for entry in args.trackers:
+                for path in film(entry.make(), entry.label, args.out, seed=args.seed, **options):
+                    print(path, file=sys.stderr)
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; 0 done, 2 bad input."""
+    try:
+        return _evaluate(_parser().parse_args(argv))
+    except (InputError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except ArenaError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

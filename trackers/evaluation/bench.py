@@ -1,0 +1,59 @@
+"""How long a tracker takes for one tick, without physics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from arena_newton.trackers.base import Tracker
+
+__all__ = ["GPU_WORLDS", "inference"]
+
+GPU_WORLDS = 4096
+"""Worlds of the GPU's figure."""
+WARM_UP, CALLS = 30, 200
+
+
+def inference(make: Callable[[], Tracker]) -> dict[str, float]:
+    """Median time of a tick [ms]: `cpu` for one world and, where there is a GPU, `cuda` for `GPU_WORLDS`.
+
+    Args:
+        make: Makes a tracker that is not bound yet.
+    """
+    import torch
+
+    out = {"cpu": _median(make(), 1, torch.device("cpu"))}
+    if torch.cuda.is_available():
+        out["cuda"] = _median(make(), GPU_WORLDS, torch.device("cuda"))
+    return out
+
+
+def _median(tracker: Tracker, worlds: int, device: object) -> float:
+    import torch
+
+    from arena_newton.interfaces import RobotState, TrackerCommand
+    from arena_newton.robot import DEFAULT_POSE
+
+    quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(worlds, 1)  # type: ignore[call-overload]
+    joints = torch.tensor(DEFAULT_POSE, device=device).repeat(worlds, 1)  # type: ignore[call-overload]
+    zero = torch.zeros(worlds, 29, device=device)  # type: ignore[call-overload]
+    mimic = torch.zeros(worlds, 35, device=device)  # type: ignore[call-overload]
+    mimic[:, 2], mimic[:, 6:] = 0.78, joints
+    command = TrackerCommand(mimic=mimic, joints=joints, joint_vel=zero, quat=quat)
+    state = RobotState(quat=quat, ang_vel_body=zero[:, :3], joint_pos=joints, joint_vel=zero)
+    tracker.bind(worlds, device)
+    tracker.prefill(command, state)
+    cuda = torch.cuda.is_available() and worlds > 1
+    times = []
+    for call in range(WARM_UP + CALLS):
+        if cuda:
+            torch.cuda.synchronize()
+        began = time.perf_counter()
+        tracker.step(command, state)
+        if cuda:
+            torch.cuda.synchronize()
+        if call >= WARM_UP:
+            times.append(time.perf_counter() - began)
+    return 1000.0 * sorted(times)[len(times) // 2]

@@ -1,0 +1,78 @@
+"""Film strips of a few cells, seen by the lab's camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arena_newton.robot import TICK
+from arena_newton.trackers.evaluation.cells import suite
+from arena_newton.trackers.evaluation.rollout import plan, run
+
+if TYPE_CHECKING:
+    from arena_newton.trackers.base import Tracker
+
+__all__ = ["FILMED", "film"]
+
+FILMED = {"walk 0.6": "walk", "ball, standing kick": "kick", "squat 0.45": "squat", "sit 0.42": "sit"}
+"""Cell to file name."""
+PICTURES = 10
+"""Pictures a strip."""
+WIDTH, HEIGHT = 256, 256
+SHOWN = {"walk 0.6": (0.0, 5.0), "ball, standing kick": (0.5, 4.0), "squat 0.45": (0.0, 7.0), "sit 0.42": (0.0, 12.0)}
+"""Part of each rollout that is shown [s]."""
+
+
+class _Camera:
+    """Takes each strip's pictures at its own times."""
+
+    def __init__(self, names: list[str]):
+        self.names = names
+        self.frames: list[list[Any]] = [[] for _ in names]
+        self._wanted = []
+        for name in names:
+            first, last = SHOWN[name]
+            step = (last - first) / (PICTURES - 1)
+            self._wanted.append({round((first + k * step) / TICK) for k in range(PICTURES)})
+        self._camera: Any = None
+
+    def __call__(self, lab: Any, tick: int) -> None:
+        due = [w for w, ticks in enumerate(self._wanted) if tick in ticks]
+        if not due:
+            return
+        if self._camera is None:
+            from arena_newton.camera import Camera
+
+            self._camera = Camera.from_scene(
+                lab.scene, lab.physics, prim="world", width=WIDTH, height=HEIGHT, fit="native", samples=2
+            )
+            self._state = lab.scene.model.state()
+        lab.physics.write_newton_state(self._state)
+        pictures = self._camera.render(self._state)
+        for w in due:
+            self.frames[w].append(pictures[w].cpu().numpy().copy())
+
+
+def film(tracker: Tracker, label: str, out: Path, *, seed: int = 0, **options: Any) -> list[Path]:
+    """Play the filmed cells once and write a strip each; returns the files.
+
+    Args:
+        tracker: A tracker, not bound yet.
+        label: What the file names and the line above a strip call it.
+        out: Folder.
+        seed: Seed of the plan.
+        options: Engine, device and so on of `rollout.run`.
+    """
+    from arena_newton.video import film_strip
+
+    cells = [cell for cell in suite("full") if cell.name in FILMED]
+    names = [cell.name for cell in cells]
+    camera = _Camera(names)
+    run(tracker, plan(cells, 1, seed), observer=camera, **options)
+    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in label)
+    written = []
+    for name, frames in zip(names, camera.frames, strict=True):
+        path = out / f"film_{safe}_{FILMED[name]}.png"
+        first, last = SHOWN[name]
+        written.append(film_strip(frames, path, n=PICTURES, label=f"{label}: {name}, {first:g} to {last:g} s"))
+    return written

@@ -1,0 +1,173 @@
+"""Tables of an evaluation: figures with bars, groups, cells; as Markdown, JSON and CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arena_newton.trackers.evaluation.figures import Figure, Result, figures, wilson
+
+__all__ = ["COLUMNS", "cell_rows", "document", "figure_table", "markdown", "write"]
+
+COLUMNS: dict[str, tuple[str, str]] = {
+    "joint_rmse": ("joint RMSE [rad]", ".3f"),
+    "leg_rmse": ("legs", ".3f"),
+    "arm_rmse": ("arms", ".3f"),
+    "mpjpe": ("MPJPE [m]", ".3f"),
+    "velocity_error": ("root velocity error [m/s]", ".3f"),
+    "height_error": ("root height error [m]", ".3f"),
+    "drift_10s": ("drift per 10 s [m]", ".2f"),
+    "heading_error": ("heading error [deg]", ".1f"),
+    "foot_slip": ("foot slip [m/s]", ".3f"),
+    "action_rate": ("action rate [rad/s]", ".2f"),
+    "torque": ("torque [of limit]", ".3f"),
+}
+"""Measures of the printed tables: heading and format; JSON and CSV hold all of them."""
+
+
+def _means(result: Result, rows: np.ndarray) -> dict[str, float | None]:
+    out: dict[str, float | None] = {}
+    for name, values in result.outcome.measures.items():
+        kept = values[rows].astype(float)
+        kept = kept[np.isfinite(kept)]
+        if name != "fell":
+            out[name] = float(kept.mean()) if len(kept) else None
+    return out
+
+
+def _entry(result: Result, name: str, group: str, rows: np.ndarray) -> dict[str, Any]:
+    fell, count = int(result.outcome.measures["fell"][rows].sum()), int(rows.sum())
+    low, high = wilson(fell, count)
+    return {
+        "tracker": result.label,
+        "cell": name,
+        "group": group,
+        "rollouts": count,
+        "falls": fell,
+        "fall_rate": fell / count,
+        "fall_rate_low": low,
+        "fall_rate_high": high,
+        **_means(result, rows),
+    }
+
+
+def cell_rows(result: Result) -> list[dict[str, Any]]:
+    """Falls and means of every cell."""
+    return [_entry(result, cell.name, cell.group, result.plan.cell == i) for i, cell in enumerate(result.plan.cells)]
+
+
+def group_rows(result: Result) -> list[dict[str, Any]]:
+    """Falls and means of every group and of the whole suite."""
+    groups = dict.fromkeys(cell.group for cell in result.plan.cells)
+    rows = [_entry(result, "", group, result.group(group)) for group in groups]
+    return [*rows, _entry(result, "", "all", np.ones(len(result.plan.cell), dtype=bool))]
+
+
+def document(results: Sequence[Result], options: dict[str, Any]) -> dict[str, Any]:
+    """Content of the JSON file."""
+    return {
+        "options": options,
+        "trackers": [
+            {
+                "label": r.label,
+                **r.tracker,
+                "figures": [
+                    {"name": f.name, "value": f.value, "bar": f.bar, "verdict": f.verdict} for f in figures(r, results)
+                ],
+                "groups": group_rows(r),
+                "cells": cell_rows(r),
+                "inference_ms": r.inference,
+                "overflows": r.outcome.overflows,
+                "ticks": r.outcome.ticks,
+                "setup_s": r.outcome.setup_s,
+                "rollout_s": r.outcome.rollout_s,
+            }
+            for r in results
+        ],
+    }
+
+
+def figure_table(results: Sequence[Result]) -> str:
+    """Figures of all trackers side by side, Markdown."""
+    columns = [{f.name: f for f in figures(r, results)} for r in results]
+    names = list(dict.fromkeys(name for column in columns for name in column))
+    head = ["figure", "bar", *(r.label for r in results)]
+    lines = [_line(head), _line(["---"] * len(head))]
+    for name in names:
+        found = [column.get(name) for column in columns]
+        bars = list(dict.fromkeys(f.bar for f in found if f is not None and f.bar))
+        lines.append(_line([name, " / ".join(bars), *map(_shown, found)]))
+    return "\n".join(lines)
+
+
+def _shown(figure: Figure | None) -> str:
+    if figure is None:
+        return "–"
+    return f"{figure.value} **{figure.verdict}**" if figure.verdict else figure.value
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _table(entries: Sequence[dict[str, Any]], key: str) -> str:
+    head = [key, "tracker", "falls", "[95 %]", *(title for title, _ in COLUMNS.values())]
+    lines = [_line(head), _line(["---"] * len(head))]
+    for entry in entries:
+        numbers = [
+            "–" if entry.get(name) is None else format(entry[name], pattern) for name, (_, pattern) in COLUMNS.items()
+        ]
+        interval = f"[{100 * entry['fall_rate_low']:.1f}, {100 * entry['fall_rate_high']:.1f}] %"
+        lines.append(_line([entry[key], entry["tracker"], f"{entry['falls']}/{entry['rollouts']}", interval, *numbers]))
+    return "\n".join(lines)
+
+
+def _interleaved(tables: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Rows of all trackers, the same row of each next to one another."""
+    return [entry for rows in zip(*tables, strict=True) for entry in rows]
+
+
+def markdown(results: Sequence[Result], options: dict[str, Any]) -> str:
+    """The report."""
+    shown = ", ".join(f"{name} {value}" for name, value in options.items() if value not in (None, "", []))
+    worlds = len(results[0].plan.cell)
+    parts = [
+        "# Tracker evaluation",
+        f"{shown}; {len(results[0].plan.cells)} cells, {worlds} rollouts a tracker.",
+        "## Figures",
+        figure_table(results),
+        "## Groups",
+        _table(_interleaved([group_rows(r) for r in results]), "group"),
+        "## Cells",
+        _table(_interleaved([cell_rows(r) for r in results]), "cell"),
+        "## Trackers",
+        "\n".join(
+            f"- **{r.label}**: checkpoint {r.tracker['checkpoint_hash']}, drive {r.tracker['drive']}, physics "
+            f"{1000 * r.tracker['physics_dt']:g} ms x {r.tracker['substeps']}; does not see: "
+            f"{', '.join(r.tracker['ignores']) or 'nothing is ignored'}; {r.outcome.ticks} ticks in "
+            f"{r.outcome.rollout_s:.1f} s (set-up {r.outcome.setup_s:.1f} s), contact buffers overflowed in "
+            f"{r.outcome.overflows} worlds"
+            for r in results
+        ),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def write(results: Sequence[Result], options: dict[str, Any], out: Path) -> list[Path]:
+    """Write `evaluation.md`, `evaluation.json` and `evaluation.csv` (a row a tracker and cell) into `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / f"evaluation.{kind}" for kind in ("md", "json", "csv")]
+    paths[0].write_text(markdown(results, options), encoding="utf-8")
+    paths[1].write_text(json.dumps(document(results, options), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    entries = [entry for result in results for entry in cell_rows(result)]
+    names = list(dict.fromkeys(name for entry in entries for name in entry))
+    with paths[2].open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, restval="")
+        writer.writeheader()
+        writer.writerows(entries)
+    return paths

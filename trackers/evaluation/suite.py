@@ -1,0 +1,213 @@
+"""What is asked of a tracker: cells, each a reference, the world it happens in, and how many rollouts it gets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.robot import TICK
+
+if TYPE_CHECKING:
+    import torch
+
+    from arena_newton.trackers.motions.commands import MotionCommand
+
+    Program = Callable[[torch.Tensor], MotionCommand]
+    """Times since the anchor [s], shape [ticks], to a command whose rows are those times."""
+
+__all__ = ["Ball", "Cell", "Navigation", "Placed", "Push", "Tables", "clip_cells", "tabulate"]
+
+BLEND = 1.0
+"""Time from standing to a clip's first pose [s]."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A support in front of or behind the robot that stands at the origin and faces +x."""
+
+    name: str
+    """`Seat`, `Sill` or `Platform`."""
+    height: float
+    """Height of its top [m]."""
+    x: float | None = None
+    """Centre [m]; None finds the place of a sill that the reference's feet step over with the most clearance."""
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Where the ball lies, drawn per rollout."""
+
+    distance: tuple[float, float]
+    """Least and largest distance ahead of the ankles [m]."""
+    lateral: float
+    """To the left of the robot's middle [m]."""
+    spread: float = 0.01
+    """Uniform error of the lateral place [m]."""
+
+
+@dataclass(frozen=True)
+class Push:
+    """A force on the chest."""
+
+    newtons: float
+    """Size [N]."""
+    start: tuple[float, float]
+    """Earliest and latest begin [s], drawn per rollout."""
+    seconds: float
+    """Duration [s]."""
+    backward: bool = False
+    """Against the robot's heading; otherwise from any side, drawn per rollout."""
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """A goal reached in closed loop; the goals of a suite are drawn once, from the seed."""
+
+    x: float
+    """[m]"""
+    y: float
+    """[m]"""
+    yaw: float
+    """[rad]"""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One row of the tables."""
+
+    name: str
+    """What tables call it."""
+    group: str
+    """Primitive or condition that it belongs to."""
+    seconds: float
+    """Length after the start-up [s]."""
+    program: Program | None = None
+    """Commands of the reference generator."""
+    actions: np.ndarray | None = field(default=None, repr=False, compare=False)
+    """Canonical actions instead, shape [ticks, 40]."""
+    goal: Navigation | None = None
+    """A goal instead."""
+    friction: float = 1.0
+    payload: float = 0.0
+    """In each hand [kg]."""
+    support: Placed | None = None
+    ball: Ball | None = None
+    push: Push | None = None
+    window: float = 2.0
+    """Mean speeds are taken from here on [s]."""
+    rollouts: int | None = None
+    """Instead of the suite's number."""
+
+    @property
+    def ticks(self) -> int:
+        """Length [ticks]."""
+        return round(self.seconds / TICK)
+
+
+@dataclass
+class Tables:
+    """References of all cells by tick, on the device; cells that have ended hold their last frame."""
+
+    actions: torch.Tensor
+    """[ticks, cells, 40]."""
+    links: torch.Tensor
+    """Reference of `measure.LINKS` relative to the root in its heading frame [m], [ticks, cells, links, 3]."""
+    feet: torch.Tensor
+    """Ankle frames of the nominal reference in the world [m], [ticks, cells, 2, 3]."""
+
+
+def clip_cells(paths: list[Path]) -> list[Cell]:
+    """A cell a clip: single clips in any format that the loader knows, or motion libraries.
+
+    Raises:
+        InputError: A file is absent or unfit.
+    """
+    from arena_newton.policies.replay import ReplayPolicy, startup_actions
+
+    cells = []
+    for path in paths:
+        for name, actions in _clips(path, ReplayPolicy):
+            lead = startup_actions(actions[0], stand=0.2, blend=BLEND)
+            whole = np.concatenate([lead, actions])
+            cells.append(Cell(f"clip {name}", "clip", len(whole) * TICK, actions=whole, window=BLEND + 0.2))
+    return cells
+
+
+def _clips(path: Path, replay: Any) -> list[tuple[str, np.ndarray]]:
+    import torch
+
+    from arena_newton.trackers.motions.frames import motion_actions
+    from arena_newton.trackers.motions.library import MotionLibrary
+
+    if not path.is_file():
+        raise InputError(f"--clips {path}: no such file")
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as archive:
+            is_library = "clip_start" in archive.files
+        if is_library:
+            library = MotionLibrary.load(path)
+            out = []
+            for clip in range(library.clips):
+                rows = library.rows(clip)
+                arrays = (library.root_pos, library.root_quat, library.joint_pos, library.hands)
+                parts = [torch.as_tensor(a[rows], dtype=torch.float32) for a in arrays]
+                out.append((str(library.clip_names[clip]), motion_actions(*parts).numpy()))
+            return out
+    return [(path.stem, replay(path, startup_stand=0.0, startup_blend=0.0).actions)]
+
+
+def tabulate(cells: list[Cell], device: torch.device) -> Tables:
+    """Roll out every cell's reference; goals stand still here, their rows are made while they run."""
+    import torch
+
+    from arena_newton.canonical import ACTION, ACTION_WIDTH
+    from arena_newton.env import STAND_ACTION
+    from arena_newton.trackers.evaluation.measure import FEET, LINKS
+    from arena_newton.trackers.motions.frames import actions_to_motion, heading, quat_apply, quat_from_yaw
+    from arena_newton.trackers.motions.kinematics import forward, link_index
+
+    ticks = max(cell.ticks for cell in cells)
+    actions = torch.empty(ticks, len(cells), ACTION_WIDTH, device=device)
+    actions[:] = torch.as_tensor(STAND_ACTION, device=device)
+    programs = [i for i, cell in enumerate(cells) if cell.program is not None]
+    if programs:
+        actions[:, programs] = _generate([cells[i] for i in programs], ticks, device)
+    for i, cell in enumerate(cells):
+        if cell.actions is not None:
+            actions[: len(cell.actions), i] = torch.as_tensor(cell.actions, device=device)
+        if cell.goal is None:
+            # A finished cell holds its last frame without displacement.
+            actions[cell.ticks :, i] = actions[cell.ticks - 1, i].clone()
+            actions[cell.ticks :, i, ACTION["root_xy_delta"]] = 0.0
+    motion = actions_to_motion(actions.transpose(0, 1))
+    links, feet = [], []
+    for block in range(0, ticks, 256):
+        part = [a[:, block : block + 256] for a in (motion.root_pos, motion.root_quat, motion.joint_pos)]
+        poses = forward(*part).position
+        level = quat_from_yaw(-heading(part[1]))[..., None, :]
+        offset = poses[..., [link_index(n) for n in LINKS], :] - part[0][..., None, :]
+        links.append(quat_apply(level, offset).transpose(0, 1))
+        feet.append(poses[..., [link_index(n) for n in FEET], :].transpose(0, 1))
+    return Tables(actions, torch.cat(links), torch.cat(feet))
+
+
+def _generate(cells: list[Cell], ticks: int, device: torch.device) -> torch.Tensor:
+    import torch
+
+    from arena_newton.trackers.motions.commands import MotionCommand
+    from arena_newton.trackers.motions.generator import ReferenceGenerator
+
+    times = torch.arange(ticks, device=device) * TICK
+    # Only cells with a program come here.
+    channels = torch.stack([cell.program(times).pack() for cell in cells], dim=1)  # type: ignore[misc]
+    generator = ReferenceGenerator(len(cells), device)
+    out = []
+    for row in channels:
+        generator.step(MotionCommand.unpack(row))
+        out.append(generator.action().clone())
+    return torch.stack(out)
