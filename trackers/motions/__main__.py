@@ -32,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog=PROG, description="Motion clips and libraries of them.")
     commands = parser.add_subparsers(dest="command", required=True)
 
-    reading = argparse.ArgumentParser(add_help=False)
+    reading = _Parser(add_help=False)
     reading.add_argument("files", nargs="+", type=Path, metavar="FILE", help="clips or libraries: .pkl, .csv, .npz")
     reading.add_argument("--fps", type=float, default=None, help="frame rate of .csv tables (default: 30)")
     reading.add_argument(

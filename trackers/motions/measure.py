@@ -199,7 +199,7 @@ def _cells(m: ClipMeasures) -> tuple[str, ...]:
         limits if m.beyond_limits else "-",
         str(m.jumps or "-"),
         f"{1e3 * m.slip:.0f}",
-        f"{100 * m.floor:+.1f}",
+        f"{round(100 * m.floor, 1) + 0.0:+.1f}",
         m.support if m.support != "none" else "-",
         m.licence,
     )
