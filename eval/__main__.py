@@ -1,4 +1,4 @@
-"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|list] ...``."""
+"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|list] ...``."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 PROG = "python -m arena_newton.eval"
-COMMANDS = ("run", "resume", "report", "bench", "list")
+COMMANDS = ("run", "resume", "report", "bench", "engines", "list")
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
   {PROG} report <out>            write tables and report again from the journal
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} bench [--what ...]      measure this machine against the figures to reach
+  {PROG} engines [flags]         compare the rates of the two physics engines
 """
 
 
@@ -189,7 +190,20 @@ def _bench(arguments: list[str], factories: Factories | None) -> int:
     return bench.run(_parse(bench.BenchOptions, arguments, "bench"))
 
 
-_COMMANDS = {"run": _run, "resume": _resume, "report": _report, "list": _list, "bench": _bench}
+def _engines(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval import engines
+
+    return engines.run(_parse(engines.EngineOptions, arguments, "engines"))
+
+
+_COMMANDS = {
+    "run": _run,
+    "resume": _resume,
+    "report": _report,
+    "list": _list,
+    "bench": _bench,
+    "engines": _engines,
+}
 
 
 if __name__ == "__main__":

@@ -1,0 +1,193 @@
+"""``python -m arena_newton.eval engines``: do the two physics engines give the same rates?
+
+A replayed walk from one spawn pose is a single trajectory, and contacts make it chaotic: the least difference of two
+engines decides whether it stumbles. Rates are therefore compared over rollouts whose spawn positions differ by far less
+than any rule can see.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.eval.stats import wilson
+
+__all__ = ["EngineOptions", "Rates", "fisher", "measure", "run"]
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """Fall and success rates of one task on each engine, over rollouts with slightly moved spawn positions."""
+
+    policy: str = "stand"
+    """Policy, such as `replay:walk.pkl`."""
+    task: str = "double_desk"
+    """Task."""
+    tracker: str = "twist2"
+    """Tracker."""
+    checkpoint: str | None = None
+    """Its weights."""
+    engines: tuple[str, ...] = ("mujoco",)
+    """Engines: `mujoco` (CPU), `warp` (CUDA where there is one)."""
+    rollouts: int = 200
+    """Rollouts an engine."""
+    noise: float = 1e-3
+    """Standard deviation of the spawn position, x and y [m]."""
+    worlds: int = 20
+    """Worlds in a batch."""
+    max_steps: int | None = None
+    """Step budget instead of the rule set's [ticks]."""
+    fast_physics: bool = False
+    """Physics at 5 ms x 4."""
+    seed: int = 0
+    """Seed of the moved spawn positions; another range of it gives independent rollouts."""
+    against: str | None = None
+    """JSON file of an earlier call, possibly on another machine, to compare with."""
+    out: str | None = None
+    """Write the rates to this JSON file."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What one engine gave."""
+
+    engine: str
+    device: str
+    rollouts: int
+    falls: int
+    successes: int
+    errors: int
+    overflows: int
+    """Rollouts in which a contact or constraint buffer overflowed."""
+    wall_s: float
+    """Wall-clock time without building and compiling [s]."""
+
+
+@dataclass(frozen=True)
+class _Rollout:
+    episode_seed: int
+
+
+def fisher(a: int, n: int, b: int, m: int) -> float:
+    """Two-sided p-value of `a` of `n` against `b` of `m` under one common rate.
+
+    Fisher's exact test: the sum over all tables with the same margins that are no likelier than the observed one.
+    """
+
+    def weight(x: int) -> int:
+        return math.comb(n, x) * math.comb(m, a + b - x)
+
+    seen = weight(a)
+    possible = range(max(0, a + b - m), min(n, a + b) + 1)
+    return sum(weight(x) for x in possible if weight(x) <= seen) / math.comb(n + m, a + b)
+
+
+def measure(options: EngineOptions, engine: str) -> Rates:
+    """Run the rollouts on one engine."""
+    from tqdm import tqdm
+
+    from arena_newton import policies, trackers
+    from arena_newton.env import ArenaEnv
+
+    env: Any = ArenaEnv(
+        options.task,
+        worlds=min(options.worlds, options.rollouts),
+        tracker=trackers.get(options.tracker, options.checkpoint),
+        engine=engine,
+        fast_physics=options.fast_physics,
+    )
+    _move_spawns(env, options)
+    policy = policies.get(options.policy)
+    policy.check()
+    rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
+    began = time.perf_counter()
+    with tqdm(total=len(rollouts), desc=engine, unit="rollout") as bar:
+        results = env.run_episodes(policy, rollouts, on_finish=lambda _: bar.update(), max_steps=options.max_steps)
+    outcomes = [result.outcome for result in results]
+    return Rates(
+        engine=engine,
+        device=str(env.device),
+        rollouts=len(results),
+        falls=outcomes.count("fall"),
+        successes=outcomes.count("success"),
+        errors=outcomes.count("error"),
+        overflows=sum(result.overflow for result in results),
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def _move_spawns(env: Any, options: EngineOptions) -> None:
+    """Let every reset of `env` move the robot by noise that its episode seed alone decides."""
+    reset, place = env.reset, env.physics.reset_worlds
+    seeds_of: dict[int, int] = {}
+
+    def noted_reset(seeds: Any, worlds: Any = None) -> None:
+        rows = range(env.worlds) if worlds is None else worlds
+        seeds_of.update({int(w): int(s) for w, s in zip(rows, seeds, strict=True)})
+        reset(seeds, worlds)
+
+    def moved(rows: Any, qpos: Any, *fixtures: Any) -> None:
+        root = env.scene.robot.root_qpos
+        for k, w in enumerate(rows):
+            qpos[k, root : root + 2] += options.noise * np.random.default_rng(seeds_of[int(w)]).standard_normal(2)
+        place(rows, qpos, *fixtures)
+
+    env.reset, env.physics.reset_worlds = noted_reset, moved
+
+
+def _line(rates: Rates) -> str:
+    def share(count: int) -> str:
+        low, high = wilson(count, rates.rollouts) or (0.0, 1.0)
+        return f"{count}/{rates.rollouts} ({count / rates.rollouts:.1%}, 95 % {low:.1%} to {high:.1%})"
+
+    return (
+        f"{rates.engine:<7} {rates.device:<7} falls {share(rates.falls)}  successes {share(rates.successes)}  "
+        f"errors {rates.errors}  overflows {rates.overflows}  {rates.wall_s:.0f} s"
+    )
+
+
+def run(options: EngineOptions) -> int:
+    """Measure each engine, print rates and p-values.
+
+    Returns:
+        Exit code 0.
+
+    Raises:
+        InputError: Unfit numbers, or a file to compare with that cannot be read.
+    """
+    for flag, value, least in (("--rollouts", options.rollouts, 1), ("--worlds", options.worlds, 1)):
+        if value < least:
+            raise InputError(f"{flag} {value}: must be at least {least}")
+    if not (math.isfinite(options.noise) and options.noise >= 0.0):
+        raise InputError(f"--noise {options.noise}: must be a distance of 0 or more [m]")
+    earlier = _earlier(options.against)
+    rates = [*earlier]
+    for engine in options.engines:
+        rates.append(measure(options, engine))
+    for one in rates:
+        print(_line(one), flush=True)
+    for i, one in enumerate(rates):
+        for other in rates[:i]:
+            p = fisher(one.falls, one.rollouts, other.falls, other.rollouts)
+            q = fisher(one.successes, one.rollouts, other.successes, other.rollouts)
+            names = f"{other.engine} ({other.device}) against {one.engine} ({one.device})"
+            print(f"{names}: p = {p:.3f} falls, {q:.3f} successes")
+    if options.out is not None:
+        Path(options.out).write_text(json.dumps([asdict(one) for one in rates], indent=2) + "\n")
+    return 0
+
+
+def _earlier(path: str | None) -> list[Rates]:
+    if path is None:
+        return []
+    try:
+        return [Rates(**row) for row in json.loads(Path(path).read_text())]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"--against {path}: not a file that --out of this command wrote ({error})") from error
