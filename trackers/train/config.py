@@ -1,0 +1,156 @@
+"""Options of a training and rsl-rl's configuration made of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+__all__ = ["FAMILY_WEIGHTS", "TrainOptions", "runner_config"]
+
+FAMILY_WEIGHTS: dict[str, float] = {"clips": 8.0}
+"""Weights of families in the sampling, per second of motion: a few minutes of captured motion stand beside hours that
+were generated."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train a tracker with PPO in the lab world."""
+
+    tracker: Literal["twist2", "sonic"] = "twist2"
+    """Interface to train."""
+    worlds: int = 8192
+    """Parallel worlds of each process."""
+    device: str = "auto"
+    """cpu, cuda or cuda:N; with torchrun each process takes its own GPU."""
+    minutes: float = 0.0
+    """Most minutes to train, 0 = no limit."""
+    iterations: int = 100000
+    """Most iterations."""
+    seed: int = 0
+    """Seed; every process of torchrun adds its rank."""
+    resume: Path | None = None
+    """Checkpoint of a training to go on with."""
+    library: Path | None = None
+    """Motion library (NPZ); without it, references are generated."""
+    families: dict[str, int] = field(default_factory=dict)
+    """Generated clips of each family, e.g. `--families walk 900 squat 200`; the generator's mix by default."""
+    clips: tuple[Path, ...] = ()
+    """More motion files of any format that `motions convert` reads."""
+    clips_licence: str = "unknown"
+    """Licence of those files, for the card."""
+    clips_source: str = "unknown"
+    """Origin of those files, for the card."""
+    mirror: bool = True
+    """Add the mirror image of every clip."""
+    family_weights: dict[str, float] = field(default_factory=lambda: dict(FAMILY_WEIGHTS))
+    """Weights of families in the sampling, per second of motion, 1 where not named."""
+    log_dir: Path = Path("runs/tracker")
+    """Folder for checkpoints, progress.jsonl and TensorBoard."""
+    logger: Literal["tensorboard", "wandb"] = "tensorboard"
+    """Where curves go."""
+    action_form: Literal["auto", "residual", "default"] = "auto"
+    """Raw actions correct the reference (residual) or a default pose; auto: twist2 residual, sonic default."""
+    rewards: dict[str, float] = field(default_factory=dict)
+    """Other weights for reward terms, by name."""
+    randomise: bool = True
+    """Randomisation, noise and pushes."""
+    adaptive: float = 0.5
+    """Share of the episodes that start where the tracker fails."""
+    episode_s: float = 10.0
+    """Longest episode [s]."""
+    steps: int = 16
+    """Ticks of an iteration."""
+    epochs: int = 5
+    """Passes over an iteration's samples."""
+    minibatches: int = 4
+    """Minibatches of a pass."""
+    learning_rate: float = 3e-4
+    """Learning rate at the start."""
+    desired_kl: float = 0.02
+    """Divergence of an iteration that the learning rate aims at."""
+    entropy: float = 0.003
+    """Weight of the entropy."""
+    init_std: float = 0.6
+    """Standard deviation of the action noise at the start."""
+    symmetry: bool = False
+    """Train on the mirror image of every sample too."""
+    save_interval: int = 200
+    """Iterations between checkpoints."""
+    print_interval: int = 20
+    """Iterations between lines on the screen."""
+    log_interval: int = 5
+    """Iterations between points of the curves."""
+    contacts_per_world: int = 48
+    """Contact buffer."""
+    constraints_per_world: int = 160
+    """Constraint buffer."""
+    graph: bool = True
+    """Capture the physics tick on CUDA."""
+    bench: bool = False
+    """Only measure: train for `--minutes` (one by default), write nothing, print samples/s."""
+    commit: str = ""
+    """Commit for the card, where git is not at hand."""
+
+
+def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str, Any]) -> dict[str, Any]:
+    """rsl-rl's configuration.
+
+    Args:
+        options: The user's options.
+        network: Widths of the tracker's network.
+        card: What the weights' card will say about this training.
+    """
+    hidden = [512, 512, 256]
+    symmetry = None
+    if options.symmetry:
+        symmetry = {
+            "data_augmentation_func": "arena_newton.trackers.train.symmetry:augment",
+            "use_data_augmentation": True,
+            "use_mirror_loss": False,
+        }
+    logger: Any = options.logger
+    if options.logger == "wandb":
+        logger = {"class_name": "WandbLogWriter", "project_name": "arena-newton-trackers"}
+    return {
+        "seed": options.seed,
+        "num_steps_per_env": options.steps,
+        "save_interval": options.save_interval,
+        "print_interval": options.print_interval,
+        "log_interval": options.log_interval,
+        "logger": logger,
+        "card": card,
+        "options": {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(options).items()},
+        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
+        "actor": {
+            "class_name": "arena_newton.trackers.train.model:TrackerActor",
+            "interface": options.tracker,
+            "network": network,
+            "init_std": options.init_std,
+        },
+        "fit_steps": 300,
+        "critic": {
+            "class_name": "MLPModel",
+            "hidden_dims": hidden,
+            "activation": "elu",
+            "obs_normalization": True,
+        },
+        "algorithm": {
+            "class_name": "arena_newton.trackers.train.ppo:IterationPPO",
+            "num_learning_epochs": options.epochs,
+            "num_mini_batches": options.minibatches,
+            "learning_rate": options.learning_rate,
+            "schedule": "adaptive",
+            "desired_kl": options.desired_kl,
+            "gamma": 0.99,
+            "lam": 0.95,
+            "clip_param": 0.2,
+            "value_loss_coef": 1.0,
+            "entropy_coef": options.entropy,
+            "max_grad_norm": 1.0,
+            # Returns are about 16; clipping value steps to 0.2 would slow the critic down by that much.
+            "use_clipped_value_loss": False,
+            "symmetry_cfg": symmetry,
+        },
+    }

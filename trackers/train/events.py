@@ -1,0 +1,188 @@
+"""Randomisation: one function an event, all listed with their settings in `EVENTS`.
+
+`start` events draw properties that a world keeps for the whole training, `reset` events draw at the start of an
+episode, `interval` events strike at random ticks. All of them work on every world at once and write only the rows of a
+mask, so that nothing waits for the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+
+from arena_newton.robot import TICK
+
+if TYPE_CHECKING:
+    from arena_newton.trackers.train.simulation import Simulation
+
+__all__ = ["EVENTS", "OBSERVATION_NOISE", "START_NOISE", "Event", "apply", "uniform"]
+
+OBSERVATION_NOISE: dict[str, float] = {"ang_vel": 0.15, "tilt": 0.03, "joint_pos": 0.01, "joint_vel": 0.4}
+"""Half width of the uniform noise on what the tracker measures [rad/s, rad, rad, rad/s]."""
+START_NOISE: dict[str, float] = {
+    "xy": 0.03,
+    "z": 0.01,
+    "tilt": 0.05,
+    "heading": 0.1,
+    "lin_vel": 0.15,
+    "ang_vel": 0.3,
+    "joint_pos": 0.05,
+    "joint_vel": 0.3,
+}
+"""Half width of the uniform noise on the state in which an episode starts [m, m, rad, rad, m/s, rad/s, rad, rad/s];
+height is only ever added, so that no foot starts in the ground."""
+HANDS = ("left_wrist_yaw_link", "right_wrist_yaw_link")
+_PALM = 0.1
+"""A payload's place before the wrist yaw frame [m]."""
+_PAYLOAD_RADIUS = 0.05
+"""Radius of gyration of a payload [m]."""
+
+
+class World(Protocol):
+    """What events act on."""
+
+    sim: Simulation
+    """The physics."""
+    privileged: dict[str, torch.Tensor]
+    """What the critic is told, by name, each of shape [worlds, n]."""
+    delay: torch.Tensor
+    """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event and its settings."""
+
+    when: str
+    """`start`, `reset` or `interval`."""
+    run: Callable[..., None]
+    """Takes the environment, a mask of worlds [worlds] and the settings."""
+    settings: Mapping[str, float] = field(default_factory=dict)
+    """Keyword arguments of `run`."""
+
+
+def uniform(like: torch.Tensor, low: float, high: float, *shape: int) -> torch.Tensor:
+    """Uniform numbers on the device of `like`."""
+    return torch.rand(shape, device=like.device) * (high - low) + low
+
+
+def _chance(like: torch.Tensor, probability: float, worlds: int) -> torch.Tensor:
+    return torch.rand(worlds, device=like.device) < probability
+
+
+def friction(env: World, mask: torch.Tensor, low: float, high: float) -> None:
+    """Sliding friction of every geom of a world: of two geoms MuJoCo takes the larger."""
+    value = uniform(env.sim.qpos, low, high, env.sim.worlds)
+    env.sim.geom_friction[:, :, 0] = value[:, None]
+    env.privileged["friction"] = value[:, None] - 0.8
+
+
+def link_mass(env: World, mask: torch.Tensor, low: float, high: float) -> None:
+    """Mass and inertia of every link of the robot, by a factor each."""
+    sim = env.sim
+    links = list(sim.bodies.values())
+    factor = torch.ones_like(sim.body_mass)
+    factor[:, links] = uniform(sim.qpos, low, high, sim.worlds, len(links))
+    sim.body_mass.mul_(factor)
+    sim.body_inertia.mul_(factor[..., None])
+    env.privileged["trunk_mass"] = 10.0 * (factor[:, [sim.bodies["pelvis"], sim.bodies["torso_link"]]] - 1.0)
+
+
+def centre_of_mass(env: World, mask: torch.Tensor, reach: float) -> None:
+    """Centres of mass of pelvis and torso [m]."""
+    sim = env.sim
+    moved = []
+    for name in ("pelvis", "torso_link"):
+        shift = uniform(sim.qpos, -reach, reach, sim.worlds, 3)
+        sim.body_com[:, sim.bodies[name]] += shift
+        moved.append(shift)
+    env.privileged["centre_of_mass"] = 50.0 * torch.cat(moved, 1)
+
+
+def payload(env: World, mask: torch.Tensor, share: float, mass: float) -> None:
+    """Up to `mass` [kg] in either hand of a share of the worlds, each hand loaded with probability 2/3."""
+    sim = env.sim
+    loaded = _chance(sim.qpos, share, sim.worlds)
+    carried = []
+    for name in HANDS:
+        body = sim.bodies[name]
+        extra = uniform(sim.qpos, 0.0, mass, sim.worlds) * (loaded & _chance(sim.qpos, 2.0 / 3.0, sim.worlds))
+        before = sim.body_mass[:, body].clone()
+        palm = sim.body_com.new_tensor((_PALM, 0.0, 0.0))
+        apart = palm - sim.body_com[:, body]
+        reduced = before * extra / (before + extra)
+        sim.body_com[:, body] += apart * (extra / (before + extra))[:, None]
+        sim.body_inertia[:, body] += (extra * _PAYLOAD_RADIUS**2 + reduced * apart.square().sum(1))[:, None]
+        sim.body_mass[:, body] += extra
+        carried.append(extra)
+    env.privileged["payload"] = torch.stack(carried, 1)
+
+
+def motor_strength(env: World, mask: torch.Tensor, low: float, high: float) -> None:
+    """Stiffness, damping and torque limit of every joint, by one factor each."""
+    sim = env.sim
+    factor = uniform(sim.qpos, low, high, sim.worlds, 29)
+    sim.gain[:, :29, 0] *= factor
+    sim.bias[:, :29, 1:3] *= factor[..., None]
+    sim.effort_range.mul_(factor[..., None])
+    env.privileged["motor_strength"] = 10.0 * (factor - 1.0)
+
+
+def action_delay(env: World, mask: torch.Tensor, share: float) -> None:
+    """Targets of a share of the episodes arrive one tick late."""
+    env.delay.copy_(torch.where(mask, _chance(env.sim.qpos, share, env.sim.worlds), env.delay))
+
+
+def hand_force(env: World, mask: torch.Tensor, share: float, force: float) -> None:
+    """A constant force of up to `force` [N] in a random direction on each hand, in a share of the episodes."""
+    for name in HANDS:
+        direction = torch.nn.functional.normalize(torch.randn(env.sim.worlds, 3, device=mask.device), dim=1)
+        _write_force(env, mask, name, direction, share, force)
+
+
+def trunk_force(env: World, mask: torch.Tensor, share: float, force: float) -> None:
+    """A constant horizontal force of up to `force` [N] on the torso, in a share of the episodes."""
+    flat = torch.nn.functional.normalize(torch.randn(env.sim.worlds, 2, device=mask.device), dim=1)
+    _write_force(env, mask, "torso_link", torch.nn.functional.pad(flat, (0, 1)), share, force)
+
+
+def _write_force(
+    env: World, mask: torch.Tensor, link: str, direction: torch.Tensor, share: float, force: float
+) -> None:
+    worlds = env.sim.worlds
+    size = uniform(env.sim.qpos, 0.0, force, worlds) * _chance(mask, share, worlds)
+    applied = env.sim.body_force[:, env.sim.bodies[link], :3]
+    applied.copy_(torch.where(mask[:, None], direction * size[:, None], applied))
+
+
+def push(env: World, mask: torch.Tensor, every: float, planar: float, vertical: float, turn: float) -> None:
+    """A kick of the base: a jump of its velocity [m/s, rad/s], every `every` seconds on average."""
+    worlds = env.sim.worlds
+    struck = (_chance(env.sim.qpos, TICK / every, worlds) & mask).float()[:, None]
+    jump = uniform(env.sim.qpos, -1.0, 1.0, worlds, 6) * struck
+    env.sim.root_vel[:, :2].add_(jump[:, :2], alpha=planar)
+    env.sim.root_vel[:, 2:].add_(jump[:, 2:3], alpha=vertical)
+    env.sim.root_ang_vel.add_(jump[:, 3:], alpha=turn)
+
+
+EVENTS: dict[str, Event] = {
+    "friction": Event("start", friction, {"low": 0.4, "high": 1.2}),
+    "link_mass": Event("start", link_mass, {"low": 0.9, "high": 1.1}),
+    "centre_of_mass": Event("start", centre_of_mass, {"reach": 0.02}),
+    "payload": Event("start", payload, {"share": 0.3, "mass": 2.0}),
+    "motor_strength": Event("start", motor_strength, {"low": 0.9, "high": 1.1}),
+    "action_delay": Event("reset", action_delay, {"share": 0.3}),
+    "hand_force": Event("reset", hand_force, {"share": 0.2, "force": 10.0}),
+    "trunk_force": Event("reset", trunk_force, {"share": 0.2, "force": 15.0}),
+    "push": Event("interval", push, {"every": 4.0, "planar": 0.6, "vertical": 0.1, "turn": 0.4}),
+}
+
+
+def apply(env: World, when: str, mask: torch.Tensor, events: Mapping[str, Event]) -> None:
+    """Run the events of one kind on the worlds of a mask, in the table's order."""
+    for event in events.values():
+        if event.when == when:
+            event.run(env, mask, **event.settings)

@@ -1,0 +1,115 @@
+"""From a training checkpoint to the weights file of a tracker and its card."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.robot import DriveGains
+
+__all__ = ["ExportOptions", "export"]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write a tracker's weights file and its card."""
+
+    out: Path
+    """The file, `.safetensors`; the card goes beside it as .json and .md."""
+    metrics: Path | None = None
+    """JSON file of an evaluation, for the card."""
+    note: str = ""
+    """A sentence for the card."""
+
+
+def export(checkpoint: Path, options: ExportOptions) -> Path:
+    """Write the weights of a checkpoint.
+
+    Args:
+        checkpoint: File of the training.
+        options: Where to and with what.
+
+    Returns:
+        The weights file.
+
+    Raises:
+        InputError: The checkpoint is unfit, or a file cannot be written.
+    """
+    from arena_newton.robot import PhysicsRate
+    from arena_newton.trackers import networks, weights_file
+    from arena_newton.trackers.front_end import ActionForm
+    from arena_newton.trackers.train.runner import read_checkpoint
+
+    if options.out.suffix != ".safetensors":
+        raise InputError(f"--out {options.out}: expected a .safetensors file")
+    state = read_checkpoint(checkpoint)
+    card = dict(state["card"])
+    network = networks.make(card["tracker"], card.get("network"))
+    prefix = "net."
+    tensors = {k[len(prefix) :]: v for k, v in state["actor_state_dict"].items() if k.startswith(prefix)}
+    network.load_state_dict(tensors, strict=False)
+    form, drive, physics = card.pop("action_form"), card.pop("drive"), card.pop("physics")
+    card |= {
+        "iterations": state["iter"],
+        "samples": state["samples"],
+        "minutes": round(state["seconds"] / 60.0, 2),
+        "gpu_minutes": round(state["seconds"] / 60.0 * card.get("processes", 1), 2),
+        "training": {k: round(v, 5) for k, v in state["last"].items() if "/" in k},
+    }
+    if options.note:
+        card["note"] = options.note
+    if options.metrics is not None:
+        try:
+            card["metrics"] = json.loads(options.metrics.read_text())
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--metrics {options.metrics}: not a readable JSON file ({type(error).__name__})"
+            ) from error
+    weights = weights_file.Weights(
+        interface=card["tracker"],
+        network=network,
+        action_form=ActionForm(form["kind"], tuple(form["scale"]), form["clip"]),
+        drive=_drive(drive),
+        physics=PhysicsRate(**physics),
+        card=card,
+    )
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    weights_file.save(options.out, weights)
+    options.out.with_suffix(".json").write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
+    options.out.with_suffix(".md").write_text(_markdown(card))
+    return options.out
+
+
+def _drive(value: dict[str, Any]) -> DriveGains:
+    from arena_newton.robot import DriveGains
+
+    return DriveGains(**{k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in value.items()})
+
+
+def _markdown(card: dict[str, Any]) -> str:
+    """The card for people."""
+    lines = [f"# Tracker weights: {card['tracker']}", ""]
+    if card.get("note"):
+        lines += [card["note"], ""]
+    rows = {
+        "command": f"`{card['command']}`",
+        "commit": card["commit"],
+        "samples": f"{card['samples']:,}",
+        "GPU minutes": card["gpu_minutes"],
+        "iterations": card["iterations"],
+        "worlds": f"{card['worlds']} x {card['processes']} processes",
+        "seed": card["seed"],
+        "licences of the data": ", ".join(f"{name} ({count} clips)" for name, count in card["licences"].items()),
+        "sources of the data": "; ".join(card["data"]["sources"]),
+    }
+    lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
+    lines += ["## References", "", "| family | clips | minutes |", "|---|---|---|"]
+    lines += [f"| {name} | {f['clips']} | {f['minutes']} |" for name, f in card["data"]["families"].items()]
+    lines += ["", "## At the end of training", "", "| | |", "|---|---|"]
+    lines += [f"| {name} | {value} |" for name, value in card["training"].items()]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,80 @@
+"""The actor for rsl-rl: a tracker's own network, so that what was trained is what is shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import HiddenState
+from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
+from torch import nn
+
+from arena_newton.trackers import networks
+
+__all__ = ["TrackerActor"]
+
+
+class TrackerActor(MLPModel):
+    """rsl-rl's model interface around `networks.make(interface)`."""
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        interface: str = "twist2",
+        network: Mapping[str, Any] | None = None,
+        init_std: float = 0.6,
+        std_range: tuple[float, float] = (0.05, 2.0),
+    ):
+        """Make the network and the action noise.
+
+        Args:
+            obs: An observation, for the widths.
+            obs_groups: Groups of observations by set.
+            obs_set: The set that this model reads.
+            output_dim: Width of the action.
+            interface: `twist2` or `sonic`.
+            network: Widths (`networks.make`).
+            init_std: Standard deviation of the action noise at the start.
+            std_range: Bounds of the standard deviation.
+        """
+        nn.Module.__init__(self)
+        self.obs_groups, self.obs_dim = self._get_obs_dim(obs, obs_groups, obs_set)
+        self.obs_normalization = True
+        self.net = networks.make(interface, network)
+        if self.obs_dim != self.net.obs_width:
+            raise ValueError(
+                f"interface {interface}: {self.obs_dim} observations, the network takes {self.net.obs_width}"
+            )
+        self.distribution = GaussianDistribution(output_dim, init_std=init_std, std_range=std_range, std_type="log")
+
+    def forward(
+        self,
+        obs: TensorDict,
+        masks: torch.Tensor | None = None,
+        hidden_state: HiddenState = None,
+        stochastic_output: bool = False,
+    ) -> torch.Tensor:
+        """Raw actions, sampled or the mean, shape [rows, actions]."""
+        mean = self.net(self._pick(obs))
+        if not stochastic_output:
+            return mean
+        self.distribution.update(mean)
+        return self.distribution.sample()
+
+    def update_normalization(self, obs: TensorDict) -> None:
+        """Take a batch of observations into the network's input statistics."""
+        self.net.update_norm(self._pick(obs))
+
+    def counts(self) -> dict[str, torch.Tensor]:
+        """How many observations each input statistic has seen, by module; no part of the weights."""
+        return {n: m.count for n, m in self.net.named_modules() if isinstance(m, networks.InputNorm)}
+
+    def _pick(self, obs: TensorDict) -> torch.Tensor:
+        groups = [obs[name] for name in self.obs_groups]
+        return groups[0] if len(groups) == 1 else torch.cat(groups, -1)

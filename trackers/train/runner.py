@@ -1,0 +1,304 @@
+"""rsl-rl's runner with a time limit, a clean end on SIGTERM and complete checkpoints.
+
+Its log keeps statistics on the device and fetches them once an iteration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import statistics
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils.logger import Logger
+from tensordict import TensorDict
+
+from arena_newton.errors import InputError
+from arena_newton.trackers.train.env import TrackerEnv
+from arena_newton.trackers.train.model import TrackerActor
+
+__all__ = ["TrackerRunner"]
+
+
+class DeviceLogger(Logger):
+    """rsl-rl's log whose episode statistics stay on the device until an iteration ends."""
+
+    def __init__(self, **settings: Any):
+        """Take rsl-rl's settings; means are over the episodes of ten iterations."""
+        super().__init__(**settings)
+        self.rewbuffer, self.lenbuffer = deque(maxlen=10), deque(maxlen=10)
+        self._ended = torch.zeros(3, device=self.device)  # episodes, their rewards, their lengths
+
+    def process_env_step(self, rewards, dones, extras, intrinsic_rewards=None) -> None:
+        """Count one tick."""
+        if self.disable_logs:
+            return
+        self.cur_reward_sum += rewards
+        self.cur_episode_length += 1
+        done = (dones > 0).float()
+        self._ended += torch.stack(
+            (done.sum(), (self.cur_reward_sum * done).sum(), (self.cur_episode_length * done).sum())
+        )
+        keep = 1.0 - done
+        self.cur_reward_sum *= keep
+        self.cur_episode_length *= keep
+
+    def fetch(self) -> None:
+        """Bring the statistics over; once an iteration."""
+        count, reward, length = self._ended.tolist()
+        self._ended.zero_()
+        if count:
+            self.rewbuffer.append(reward / count)
+            self.lenbuffer.append(length / count)
+
+
+class TrackerRunner(OnPolicyRunner):
+    """Trains a tracker."""
+
+    env: TrackerEnv
+    current_learning_iteration: int
+
+    def __init__(self, env: TrackerEnv, train_cfg: dict, log_dir: str | None = None, device: str = "cpu"):
+        """See rsl-rl's runner."""
+        super().__init__(env, train_cfg, log_dir, device)
+        self.logger: DeviceLogger = DeviceLogger(
+            log_dir=log_dir,
+            cfg=self.cfg,
+            env_cfg=dataclasses.asdict(env.cfg),
+            num_envs=env.num_envs,
+            is_distributed=self.is_distributed,
+            gpu_world_size=self.gpu_world_size,
+            gpu_global_rank=self.gpu_global_rank,
+            device=device,
+        )
+        self.samples = 0
+        """Samples of all processes since the training began, before resuming included."""
+        self.seconds = 0.0
+        """Seconds of training, before resuming included."""
+        self.history: list[dict[str, float]] = []
+        """What each logged iteration measured."""
+        self._stop = False
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False, minutes: float = 0.0) -> None:
+        """Train.
+
+        Args:
+            num_learning_iterations: Most iterations to run.
+            init_at_random_ep_len: Unused; episodes start at random frames.
+            minutes: Most minutes to run, 0 = no limit. The last iteration is finished.
+        """
+        main = threading.current_thread() is threading.main_thread()
+        previous = signal.signal(signal.SIGTERM, self._on_terminate) if main else None
+        try:
+            self._learn(num_learning_iterations, minutes)
+        finally:
+            if previous is not None:
+                signal.signal(signal.SIGTERM, previous)
+
+    def _prepare(self) -> None:
+        """Before the first iteration: see what observations look like and ask for the reference.
+
+        A rollout fills the input statistics, which would otherwise jump after the first update. Where the raw action is
+        no correction of the reference, the network is fitted to ask for the reference itself, for a few hundred steps:
+        the start then is as good as that of a residual.
+        """
+        seen: list[TensorDict] = []
+        wanted: list[torch.Tensor] = []
+        with torch.no_grad():
+            for _ in range(self.cfg["num_steps_per_env"]):
+                seen.append(self.env.get_observations())
+                target = self.env.reference_action()
+                wanted.append(target)
+                self.env.step(target + 0.3 * torch.randn_like(target))
+            observations: TensorDict = torch.cat(seen)  # type: ignore[arg-type,assignment]
+            self.alg.actor.update_normalization(observations)
+            self.alg.critic.update_normalization(observations)
+        targets = torch.cat(wanted)
+        if self.env.front_end.action_form.kind == "residual":
+            return
+        actor = self.alg.actor
+        optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
+        size = min(len(targets), 8192)
+        for k in range(self.cfg.get("fit_steps", 300)):
+            for group in optimizer.param_groups:
+                group["lr"] = 1e-3 * (1.0 - k / self.cfg.get("fit_steps", 300))
+            rows = torch.randint(len(targets), (size,), device=targets.device)
+            loss = (actor(observations[rows]) - targets[rows]).square().mean()
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+        if not self.logger.disable_logs:
+            print(f"fitted to the reference: {float(loss.detach()) ** 0.5:.3f} RMS of raw action", flush=True)
+
+    def _on_terminate(self, *_: Any) -> None:
+        self._stop = True
+
+    def _learn(self, iterations: int, minutes: float) -> None:
+        self.alg.train_mode()
+        if self.current_learning_iteration == 0:
+            self._prepare()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        self.logger.init_logging_writer()
+        steps = self.cfg["num_steps_per_env"]
+        batch = steps * self.env.num_envs * self.gpu_world_size
+        obs = self.env.get_observations()
+        first = self.current_learning_iteration
+        began = mark = time.monotonic()
+        for it in range(first, first + iterations):
+            with torch.no_grad():
+                for _ in range(steps):
+                    obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
+                    self.alg.process_env_step(obs, rewards, dones, extras)
+                    self.logger.process_env_step(rewards, dones, extras)
+                # Everything so far was only queued: this reads the rollout's statistics and so ends its time.
+                metrics = self.env.collect()
+                self.logger.fetch()
+                collected = time.monotonic()
+                self.alg.compute_returns(obs)
+            losses = self.alg.update()
+            now = time.monotonic()
+            self.current_learning_iteration = it + 1
+            self.samples += batch
+            self.seconds += now - mark
+            self._report(it, first, iterations, collected - mark, now - collected, losses, metrics, batch)
+            mark = now
+            if self._should_stop(0.0 < 60.0 * minutes <= now - began):
+                break
+            if self._writes and (it + 1) % self.cfg["save_interval"] == 0:
+                self.save(str(Path(self.logger.log_dir or ".") / f"model_{it + 1}.pt"))
+                mark = time.monotonic()
+        if self._writes:
+            self.save(str(Path(self.logger.log_dir or ".") / "model_last.pt"))
+            self.logger.stop_logging_writer()
+
+    @property
+    def _writes(self) -> bool:
+        return self.logger.log_dir is not None and not self.logger.disable_logs
+
+    def _should_stop(self, out_of_time: bool) -> bool:
+        """Whether any process was told to stop or is out of time: all of them end after the same iteration."""
+        stop = bool(self._stop or out_of_time)
+        if not self.is_distributed:
+            return stop
+        flag = torch.tensor(float(stop), device=self.device)
+        torch.distributed.all_reduce(flag)
+        return bool(flag > 0)
+
+    def _report(
+        self,
+        it: int,
+        first: int,
+        iterations: int,
+        collect_time: float,
+        learn_time: float,
+        losses: dict[str, float],
+        metrics: dict[str, float],
+        batch: int,
+    ) -> None:
+        if self.logger.disable_logs:
+            return
+        std = self.alg.get_policy().distribution.log_std_param.detach().exp()
+        row = {
+            "iteration": it + 1,
+            "samples": self.samples,
+            "seconds": round(self.seconds, 2),
+            "samples_per_s": round(batch / (collect_time + learn_time)),
+            "collect_s": round(collect_time, 4),
+            "learn_s": round(learn_time, 4),
+            "learning_rate": self.alg.learning_rate,
+            "std": float(std.mean()),
+            "episode_reward": statistics.mean(self.logger.rewbuffer) if self.logger.rewbuffer else 0.0,
+            "episode_length": statistics.mean(self.logger.lenbuffer) if self.logger.lenbuffer else 0.0,
+            **{f"Loss/{k}": v for k, v in losses.items()},
+            **metrics,
+        }
+        self.history.append(row)
+        if it == first or (it + 1) % self.cfg["print_interval"] == 0:
+            print(
+                f"it {it + 1:5d}  {self.samples / 1e6:8.2f}M  {self.seconds:7.1f} s  {row['samples_per_s']:7d}/s "
+                f"({collect_time:.3f}+{learn_time:.3f})  reward/s {metrics['Train/reward_per_s']:6.3f}  "
+                f"mtbe {metrics['Train/seconds_between_ends']:7.2f} s  vel {metrics['Error/velocity_m_s']:.3f}  "
+                f"legs {metrics['Error/legs_rad']:.3f}  lr {self.alg.learning_rate:.1e}  kl {losses['kl']:.4f}  "
+                f"std {row['std']:.2f}  value {losses['value']:.3f}",
+                flush=True,
+            )
+        writer = self.logger.writer
+        if writer is None:
+            return
+        if it == first or (it + 1) % self.cfg["log_interval"] == 0:
+            with (Path(self.logger.log_dir) / "progress.jsonl").open("a") as file:
+                file.write(json.dumps(row) + "\n")
+            for name, value in row.items():
+                if name != "iteration":
+                    writer.add_scalar(name if "/" in name else f"Train/{name}", value, it + 1)
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Write everything that a resumed training needs."""
+        cuda = torch.cuda.get_rng_state(self.device) if str(self.device).startswith("cuda") else None
+        actor = self.alg.get_policy()
+        state = self.alg.save() | {
+            "iter": self.current_learning_iteration,
+            "infos": infos,
+            "norm_counts": actor.counts() if isinstance(actor, TrackerActor) else {},
+            "learning_rate": self.alg.learning_rate,
+            "samples": self.samples,
+            "seconds": self.seconds,
+            "sampler": self.env.sampler.state_dict(),
+            "rng": torch.get_rng_state(),
+            "cuda_rng": cuda,
+            "card": self.cfg.get("card", {}),
+            "last": self.history[-1] if self.history else {},
+        }
+        temporary = Path(path).with_suffix(".part")
+        torch.save(state, temporary)
+        temporary.replace(path)
+        self.logger.save_model(path, self.current_learning_iteration)
+
+    def load(
+        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
+    ) -> dict:
+        """Take up a checkpoint.
+
+        Raises:
+            InputError: The file is absent or no checkpoint of this training.
+        """
+        state = read_checkpoint(path, map_location or str(self.device))
+        self.alg.load(state, load_cfg, strict)
+        self.alg.learning_rate = state["learning_rate"]
+        for name, count in self.alg.get_policy().counts().items():
+            count.copy_(state["norm_counts"][name])
+        self.current_learning_iteration = state["iter"]
+        self.samples, self.seconds = state["samples"], state["seconds"]
+        self.env.sampler.load_state_dict(state["sampler"])
+        rank = getattr(self, "gpu_global_rank", 0)
+        if rank == 0:
+            torch.set_rng_state(state["rng"].cpu())
+            if state["cuda_rng"] is not None and str(self.device).startswith("cuda"):
+                torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
+        return state["infos"] or {}
+
+
+def read_checkpoint(path: str | Path, device: str = "cpu") -> dict[str, Any]:
+    """Read a training checkpoint: tensors and plain containers only.
+
+    Raises:
+        InputError: The file is absent or no checkpoint of this training.
+    """
+    try:
+        state = torch.load(path, weights_only=True, map_location=device)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such checkpoint") from None
+    except Exception as error:
+        raise InputError(f"{path}: not a training checkpoint ({type(error).__name__})") from error
+    missing = {"actor_state_dict", "norm_counts", "sampler", "card"} - set(state)
+    if missing:
+        raise InputError(f"{path}: not a checkpoint of this training, it lacks {', '.join(sorted(missing))}")
+    return state

@@ -1,0 +1,205 @@
+"""One training from options to checkpoint: references, environment, runner."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.trackers.train.config import TrainOptions, runner_config
+
+if TYPE_CHECKING:
+    from arena_newton.robot import DriveGains, PhysicsRate
+    from arena_newton.trackers.front_end import ActionForm, FrontEnd
+    from arena_newton.trackers.motions.library import MotionLibrary
+    from arena_newton.trackers.train.runner import TrackerRunner
+
+__all__ = ["build", "front_end", "make_library", "train"]
+
+
+def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveGains, PhysicsRate]:
+    """Front end, drive and physics rate of an interface.
+
+    Args:
+        tracker: `twist2` or `sonic`.
+        action_form: `auto`, `residual` or `default`.
+    """
+    from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
+    from arena_newton.trackers import sonic, twist2
+    from arena_newton.trackers.front_end import residual_form
+
+    kind: type[FrontEnd] = sonic.SonicFrontEnd if tracker == "sonic" else twist2.Twist2FrontEnd
+    drive = SONIC_DRIVE if tracker == "sonic" else TWIST2_DRIVE
+    default: ActionForm = sonic.SONIC_FORM if tracker == "sonic" else twist2.OFFICIAL_FORM
+    wanted = ("default" if tracker == "sonic" else "residual") if action_form == "auto" else action_form
+    form = residual_form(drive) if wanted == "residual" else dataclasses.replace(default, clip=10.0)
+    return kind(form), drive, PhysicsRate(dt=0.005, substeps=4)
+
+
+def make_library(options: TrainOptions, device: str) -> MotionLibrary:
+    """References of a training: a library or generated ones, more files, mirror images.
+
+    Raises:
+        InputError: A file cannot be read, or a family is unknown.
+    """
+    from arena_newton.trackers.motions.formats import read_library
+    from arena_newton.trackers.motions.library import MotionLibrary
+
+    if options.library is not None and options.families:
+        raise InputError("--families makes references, --library reads them: pass one of the two")
+    parts = []
+    if options.library is not None:
+        parts.append(MotionLibrary.load(options.library))
+    else:
+        from arena_newton.trackers.motions import programs
+
+        wanted: dict[str, Any] = {"families": options.families} if options.families else {}
+        parts.append(MotionLibrary.from_random(programs.random_clips(**wanted, seed=options.seed, device=device)))
+    if options.clips:
+        more, reports = read_library(
+            options.clips, family="clips", licence=options.clips_licence, source=options.clips_source
+        )
+        for report in reports:
+            print(report.line())
+        parts.append(more)
+    library = MotionLibrary.concatenate(parts) if len(parts) > 1 else parts[0]
+    return MotionLibrary.concatenate([library, library.mirrored()]) if options.mirror else library
+
+
+def _commit(given: str) -> str:
+    if given:
+        return given
+    try:
+        folder = Path(__file__).resolve().parent
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, timeout=10)
+        return done.stdout.strip()[:12] or "unknown"
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def _card(options: TrainOptions, library: MotionLibrary, processes: int) -> dict[str, Any]:
+    """What a training can say about itself before it starts."""
+    seconds = library.seconds
+    families = {
+        str(name): {
+            "clips": int((library.family == i).sum()),
+            "minutes": round(float(seconds[library.family == i].sum()) / 60.0, 2),
+        }
+        for i, name in enumerate(library.family_names)
+    }
+    licences = {str(n): int(c) for n, c in zip(*np.unique(library.licence, return_counts=True), strict=True)}
+    sources = sorted({str(s) for s in library.source})
+    return {
+        "tracker": options.tracker,
+        "command": "python -m arena_newton.trackers.train " + " ".join(sys.argv[1:]),
+        "commit": _commit(options.commit),
+        "processes": processes,
+        "worlds": options.worlds,
+        "seed": options.seed,
+        "data": {"clips": library.clips, "families": families, "mirrored": options.mirror, "sources": sources[:64]},
+        "licences": licences,
+    }
+
+
+def _device(name: str) -> str:
+    import torch
+
+    if "LOCAL_RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        name = f"cuda:{os.environ['LOCAL_RANK']}"
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
+        raise InputError(f"--device {name}: no such device here")
+    return "cuda:0" if name == "cuda" else name
+
+
+def build(options: TrainOptions) -> TrackerRunner:
+    """Make references, environment and runner; resume if asked to.
+
+    Raises:
+        InputError: An option does not fit.
+    """
+    import torch
+
+    from arena_newton.trackers import networks
+    from arena_newton.trackers.train.env import EnvConfig, TrackerEnv
+    from arena_newton.trackers.train.rewards import REWARDS
+    from arena_newton.trackers.train.runner import TrackerRunner
+    from arena_newton.trackers.train.simulation import share_stream
+
+    unknown = sorted(set(options.rewards) - set(REWARDS))
+    if unknown:
+        raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
+    device = _device(options.device)
+    rank, processes = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+    share_stream(device)
+    torch.set_float32_matmul_precision("high")
+    torch.manual_seed(options.seed + rank)
+    began = time.monotonic()
+    library = make_library(options, device)
+    told = time.monotonic()
+    front, drive, rate = front_end(options.tracker, options.action_form)
+    rewards = {n: dataclasses.replace(t, weight=options.rewards.get(n, t.weight)) for n, t in REWARDS.items()}
+    env = TrackerEnv(
+        front,
+        drive,
+        rate,
+        library.to(device),
+        EnvConfig(
+            worlds=options.worlds,
+            episode_s=options.episode_s,
+            adaptive=options.adaptive,
+            randomise=options.randomise,
+            contacts_per_world=options.contacts_per_world,
+            constraints_per_world=options.constraints_per_world,
+            graph=options.graph,
+        ),
+        device,
+        rewards=rewards,
+        family_weights=options.family_weights,
+    )
+    if rank == 0:
+        print(
+            f"{library.clips} clips, {library.seconds.sum() / 60.0:.1f} min of motion in {told - began:.1f} s; "
+            f"{options.worlds} worlds on {device} in {time.monotonic() - told:.1f} s",
+            flush=True,
+        )
+    card = _card(options, library, processes) | {
+        "action_form": dataclasses.asdict(front.action_form),
+        "drive": dataclasses.asdict(drive),
+        "physics": dataclasses.asdict(rate),
+        "rewards": {n: t.weight for n, t in rewards.items()},
+    }
+    config = runner_config(options, networks.make(options.tracker).config(), card)
+    log_dir = None if options.bench else str(options.log_dir)
+    runner = TrackerRunner(env, config, log_dir, device)
+    if options.resume is not None:
+        runner.load(str(options.resume), map_location=device)
+    return runner
+
+
+def train(options: TrainOptions) -> TrackerRunner:
+    """Train to the end of the limits."""
+    runner = build(options)
+    minutes = options.minutes or (1.0 if options.bench else 0.0)
+    runner.learn(options.iterations, minutes=minutes)
+    if options.bench and not runner.logger.disable_logs:
+        # The first iterations warm up allocators and libraries.
+        rows = runner.history[3:] or runner.history
+        total = sum(r["samples"] for r in rows[-1:]) - (rows[0]["samples"] if len(rows) > 1 else 0)
+        spent = rows[-1]["seconds"] - (rows[0]["seconds"] if len(rows) > 1 else 0.0)
+        collect = sum(r["collect_s"] for r in rows) / len(rows)
+        learn = sum(r["learn_s"] for r in rows) / len(rows)
+        print(
+            f"bench: {total / max(spent, 1e-9):.0f} samples/s, iteration {1e3 * (collect + learn):.1f} ms "
+            f"(collect {1e3 * collect:.1f}, update {1e3 * learn:.1f}), tick {1e3 * collect / options.steps:.2f} ms, "
+            f"{options.worlds} worlds x {options.steps} ticks, {options.tracker}"
+        )
+    return runner
