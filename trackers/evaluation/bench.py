@@ -7,6 +7,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import torch
+
     from arena_newton.trackers.base import Tracker
 
 __all__ = ["GPU_WORLDS", "inference"]
@@ -30,16 +32,16 @@ def inference(make: Callable[[], Tracker]) -> dict[str, float]:
     return out
 
 
-def _median(tracker: Tracker, worlds: int, device: object) -> float:
+def _median(tracker: Tracker, worlds: int, device: torch.device) -> float:
     import torch
 
     from arena_newton.interfaces import RobotState, TrackerCommand
     from arena_newton.robot import DEFAULT_POSE
 
-    quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(worlds, 1)  # type: ignore[call-overload]
-    joints = torch.tensor(DEFAULT_POSE, device=device).repeat(worlds, 1)  # type: ignore[call-overload]
-    zero = torch.zeros(worlds, 29, device=device)  # type: ignore[call-overload]
-    mimic = torch.zeros(worlds, 35, device=device)  # type: ignore[call-overload]
+    quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(worlds, 1)
+    joints = torch.tensor(DEFAULT_POSE, device=device).repeat(worlds, 1)
+    zero = torch.zeros(worlds, 29, device=device)
+    mimic = torch.zeros(worlds, 35, device=device)
     mimic[:, 2], mimic[:, 6:] = 0.78, joints
     command = TrackerCommand(mimic=mimic, joints=joints, joint_vel=zero, quat=quat)
     state = RobotState(quat=quat, ang_vel_body=zero[:, :3], joint_pos=joints, joint_vel=zero)

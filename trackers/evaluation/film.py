@@ -1,9 +1,11 @@
-"""Film strips of a few cells, seen by the lab's camera."""
+"""Film strips of a few cells, seen from the robot's right."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from arena_newton.robot import TICK
 from arena_newton.trackers.evaluation.cells import suite
@@ -21,6 +23,17 @@ PICTURES = 10
 WIDTH, HEIGHT = 256, 256
 SHOWN = {"walk 0.6": (0.0, 5.0), "ball, standing kick": (0.5, 4.0), "squat 0.45": (0.0, 7.0), "sit 0.42": (0.0, 12.0)}
 """Part of each rollout that is shown [s]."""
+VIEWS = {
+    "walk 0.6": (1.2, 4.6),
+    "ball, standing kick": (0.4, 2.6),
+    "squat 0.45": (0.1, 2.6),
+    "sit 0.42": (-0.1, 2.6),
+}
+"""Middle of the picture along the robot's way and distance of the camera to its right [m]."""
+EYE, GAZE = 1.05, 0.72
+"""Height of the camera and of what it looks at [m]."""
+FOCAL, APERTURE = 24.0, 20.0
+"""Horizontal field of view 45°."""
 
 
 class _Camera:
@@ -34,23 +47,42 @@ class _Camera:
             first, last = SHOWN[name]
             step = (last - first) / (PICTURES - 1)
             self._wanted.append({round((first + k * step) / TICK) for k in range(PICTURES)})
-        self._camera: Any = None
+        self._cameras: list[Any] = []
+
+    def _place(self, lab: Any) -> None:
+        from arena_newton.camera import Camera, WorldLights
+
+        lights = WorldLights.allocate(lab.worlds, lab.scene.device, lab.scene.stage)
+        for name in self.names:
+            x, distance = VIEWS[name]
+            # Looks along +y and down: the camera's -z turned about x.
+            tilt = 0.5 * (np.pi / 2 - np.arctan2(EYE - GAZE, distance))
+            self._cameras.append(
+                Camera(
+                    lab.scene.model,
+                    np.full(lab.worlds, -1),
+                    (x, -distance, EYE),
+                    (np.cos(tilt), np.sin(tilt), 0.0, 0.0),
+                    width=WIDTH,
+                    height=HEIGHT,
+                    focal_length=FOCAL,
+                    horizontal_aperture=APERTURE,
+                    lights=lights,
+                    samples=2,
+                )
+            )
+        self._state = lab.scene.model.state()
 
     def __call__(self, lab: Any, tick: int) -> None:
         due = [w for w, ticks in enumerate(self._wanted) if tick in ticks]
         if not due:
             return
-        if self._camera is None:
-            from arena_newton.camera import Camera
-
-            self._camera = Camera.from_scene(
-                lab.scene, lab.physics, prim="world", width=WIDTH, height=HEIGHT, fit="native", samples=2
-            )
-            self._state = lab.scene.model.state()
+        if not self._cameras:
+            self._place(lab)
         lab.physics.write_newton_state(self._state)
-        pictures = self._camera.render(self._state)
         for w in due:
-            self.frames[w].append(pictures[w].cpu().numpy().copy())
+            mask = np.arange(lab.worlds) == w
+            self.frames[w].append(self._cameras[w].render(self._state, mask)[w].cpu().numpy().copy())
 
 
 def film(tracker: Tracker, label: str, out: Path, *, seed: int = 0, **options: Any) -> list[Path]:

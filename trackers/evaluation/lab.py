@@ -131,13 +131,13 @@ def _add_point_mass(m: Any, body: int, mass: float, point: np.ndarray) -> None:
     """Fuse a point mass into a body: mass, centre, and principal moments by the parallel-axis theorem."""
     import mujoco
 
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, m.body_iquat[body])
-    axes = axes.reshape(3, 3)
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, m.body_iquat[body])
+    turn: Any = flat.reshape(3, 3)
     old, centre = float(m.body_mass[body]), m.body_ipos[body].copy()
     total = old + mass
     joint = (old * centre + mass * point) / total
-    inertia = axes @ np.diag(m.body_inertia[body]) @ axes.T
+    inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
     for part, at in ((old, centre), (mass, point)):
         r = at - joint
         inertia = inertia + part * (r @ r * np.eye(3) - np.outer(r, r))
@@ -209,7 +209,8 @@ class Lab:
         self.qpos, self.qvel = wp.to_torch(p.qpos), wp.to_torch(p.qvel)
         self.xpos, self.xquat = wp.to_torch(p.xpos), wp.to_torch(p.xquat)
         self.ctrl, self.pair_force = wp.to_torch(p.ctrl), wp.to_torch(p.pair_force)
-        self.force = torch.from_numpy(p.force) if native else p.force
+        force: Any = p.force
+        self.force: torch.Tensor = torch.from_numpy(force) if native else force
         """Force on the chest [N], world frame, [worlds, 3]; stays until changed."""
 
         def indices(values: Any) -> torch.Tensor:

@@ -42,7 +42,7 @@ SEAT_SMOOTHING = 0.1
 LEGS, ARMS = slice(0, 12), slice(15, 29)
 
 _POSTURE = ("joint", "legs", "arms", "link", "velocity", "height", "tilt", "slip", "contact", "rate", "torque", "limit")
-_WINDOW = ("vx", "vy", "wz", "ref_vx", "ref_vy", "ref_wz")
+_WINDOW = ("speed_x", "speed_y", "speed_yaw", "ref_x", "ref_y", "ref_yaw")
 
 
 @dataclass
@@ -223,9 +223,9 @@ class Meter:
         `drift`: planar distance from the reference at the end [m]; `drift_10s`: the same scaled to 10 s [m];
         `heading_error` at the end [deg]; `foot_slip`: mean planar speed of a foot on the floor [m/s]; `action_rate`:
         RMS of the targets' rate [rad/s]; `torque`: mean share of the torque limit; `saturation`: share of joint ticks
-        above 95 % of it; `speed_*`, `ref_*`: mean speeds in the heading frame [m/s], [rad/s]; `ball_peak`, `ball_end` [m/s]; `seat_time`: longest time at 100 N and more [s];
-        `touch`: largest force on a support [N]; `lowest` pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: the root at the
-        end.
+        above 95 % of it; `speed_*`, `ref_*`: mean speeds in the heading frame [m/s], [rad/s]; `ball_peak`, `ball_end`
+        [m/s]; `seat_time`: longest time at 100 N and more [s]; `touch`: largest force on a support [N]; `lowest`,
+        `lowest_ref`: lowest pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: the root at the end.
         """
         host: Callable[[torch.Tensor], np.ndarray] = lambda t: t.double().cpu().numpy()  # noqa: E731
         count = np.maximum(host(self._count), 1.0)
@@ -264,8 +264,4 @@ class Meter:
             "end_z": root[:, 2],
             "end_yaw": root[:, 3],
         }
-        for name, column in zip(
-            ("speed_x", "speed_y", "speed_yaw", "ref_x", "ref_y", "ref_yaw"), windowed.T, strict=True
-        ):
-            out[name] = column
-        return out
+        return out | dict(zip(_WINDOW, windowed.T, strict=True))
