@@ -9,7 +9,6 @@ exactly rounded, so a world's bits do not depend on the other worlds.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from arena_newton.robot import (
 from arena_newton.trackers import onnx_session, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
+from arena_newton.trackers.quadratic import Quadratic, products
 
 __all__ = [
     "ENCODER_INPUT",
@@ -78,7 +78,7 @@ _ARM_SCALE = (*(_SMALL,) * 5, _WRIST, _WRIST)
 SONIC_FORM = ActionForm("default", (*_LEG_SCALE, *_LEG_SCALE, _YAW, _SMALL, _SMALL, *_ARM_SCALE, *_ARM_SCALE))
 """SONIC's action form: default pose plus scaled output, not clipped."""
 
-# Both tables speak of the 16 products a_i b_j (index 4 i + j) of two wxyz quaternions, with their factors.
+# Tables of `Quadratic`: each entry names a product a_i b_j (4 i + j) of two wxyz quaternions and its factor.
 _RELATIVE = (
     ((0, 1), (5, 1), (10, 1), (15, 1)),
     ((1, 1), (4, -1), (11, -1), (14, 1)),
@@ -95,28 +95,6 @@ _DOWN = tuple(tuple((i, -f) for i, f in row) for row in (_R20, _R21, _R22))
 """Minus the last row of the rotation matrix, less the identity's: where down is, seen from the body."""
 
 
-class _Quadratic:
-    """Sums of products of two quaternions: three elementwise operations instead of dozens."""
-
-    def __init__(self, table: Sequence[Sequence[tuple[int, int]]], constant: Sequence[float], device: torch.device):
-        self.index = torch.tensor([i for row in table for i, _ in row], device=device)
-        self.factor = torch.tensor([float(f) for row in table for _, f in row], device=device)
-        self.constant = torch.tensor(constant, device=device)
-        self.shape = (-1, len(table), len(table[0]))
-
-    def __call__(self, products: torch.Tensor) -> torch.Tensor:
-        """Shape [rows, 16] → [rows, table rows]."""
-        terms = products.index_select(1, self.index).mul_(self.factor).view(self.shape)
-        total = terms[..., 0]
-        for k in range(1, self.shape[2]):  # in this order for every row: the bits stay
-            total = total + terms[..., k]
-        return total + self.constant
-
-
-def _products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    return (a[:, :, None] * b[:, None, :]).view(-1, 16)
-
-
 class SonicFrontEnd(FrontEnd):
     """Encoder input (1762) and proprioception (930) side by side."""
 
@@ -131,11 +109,12 @@ class SonicFrontEnd(FrontEnd):
     def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
         """Allocate buffers for `worlds` worlds on `device`."""
         super().bind(worlds, device, obs)
-        self._to_canonical = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)
+        four = [JOINTS * part + joint for part in range(4) for joint in CANONICAL_TO_MUJOCO]
+        self._four_to_canonical = torch.tensor(four, device=self.device)
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
-        self._relative = _Quadratic(_RELATIVE, (0.0,) * 4, self.device)
-        self._rot6d = _Quadratic(_ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
-        self._down = _Quadratic(_DOWN, (0.0, 0.0, -1.0), self.device)
+        self._relative = Quadratic(_RELATIVE, device=self.device)
+        self._rot6d = Quadratic(_ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
+        self._down = Quadratic(_DOWN, (0.0, 0.0, -1.0), self.device)
 
         def frames(part: slice) -> torch.Tensor:
             return self.obs[:, part].view(worlds, FRAMES, -1)
@@ -143,6 +122,10 @@ class SonicFrontEnd(FrontEnd):
         self._ref_pos, self._ref_vel, self._anchors = frames(_REF_POS), frames(_REF_VEL), frames(_ANCHORS)
         self._ang_vel, self._gravity = frames(_ANG_VEL), frames(_GRAVITY)
         self._joint_pos, self._joint_vel, self._actions = frames(_JOINT_POS), frames(_JOINT_VEL), frames(_ACTIONS)
+        self._anchor = self.obs[:, None, _ANCHOR]
+        self._now_ang_vel, self._now_gravity = self._ang_vel[:, -1], self._gravity[:, -1]
+        self._now_joint_pos, self._now_joint_vel = self._joint_pos[:, -1:], self._joint_vel[:, -1:]
+        self._now_action = self._actions[:, -1]
         self._proprio = self.obs[:, ENCODER_INPUT:]
         # Column from which each column of the histories takes its value when a tick ends; the newest stay.
         source = []
@@ -154,10 +137,13 @@ class SonicFrontEnd(FrontEnd):
         self._source = torch.tensor(source, device=self.device)
         self._shifted = torch.zeros(worlds, PROPRIOCEPTION, device=self.device)
         self._fresh = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
+        # Saves two operations a tick on the CPU; elsewhere a graph may be recorded now and replayed after a reset.
+        self._may_be_fresh = True
 
     @torch.no_grad()
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Histories of the worlds in `mask` become zero; those of the joints take the first values measured."""
+        self._may_be_fresh = True
         if mask is None:
             self.obs.zero_()
             self.last_action.zero_()
@@ -181,27 +167,31 @@ class SonicFrontEnd(FrontEnd):
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write reference, anchor and the newest entry of each history but the actions'."""
-        self._ref_pos.copy_(command.joints.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_pos))
-        self._ref_vel.copy_(command.joint_vel.index_select(1, self._to_canonical)[:, None].expand_as(self._ref_vel))
-        relative = self._relative(_products(state.quat, command.quat))
-        anchor = self._rot6d(_products(relative, relative))
-        self.obs[:, _ANCHOR] = anchor
-        self._anchors.copy_(anchor[:, None].expand_as(self._anchors))
+        joints = torch.cat((command.joints, command.joint_vel, state.joint_pos - self._default, state.joint_vel), 1)
+        ref_pos, ref_vel, pos, vel = joints.index_select(1, self._four_to_canonical).view(-1, 4, 1, JOINTS).unbind(1)
+        self._ref_pos.copy_(ref_pos.expand_as(self._ref_pos))
+        self._ref_vel.copy_(ref_vel.expand_as(self._ref_vel))
+        relative = self._relative(products(state.quat, command.quat))
+        anchor = self._rot6d(products(relative, relative))[:, None]
+        self._anchor.copy_(anchor)
+        self._anchors.copy_(anchor.expand_as(self._anchors))
 
-        self._ang_vel[:, -1] = state.ang_vel_body
-        self._gravity[:, -1] = self._down(_products(state.quat, state.quat))
-        joints = (state.joint_pos - self._default).index_select(1, self._to_canonical)
-        speeds = state.joint_vel.index_select(1, self._to_canonical)
-        for history, present in ((self._joint_pos, joints), (self._joint_vel, speeds)):
-            history[:, -1] = present
-            history.copy_(torch.where(self._fresh, present[:, None], history))
+        self._now_ang_vel.copy_(state.ang_vel_body)
+        self._now_gravity.copy_(self._down(products(state.quat, state.quat)))
+        self._now_joint_pos.copy_(pos)
+        self._now_joint_vel.copy_(vel)
+        if self._may_be_fresh:
+            self._joint_pos.copy_(torch.where(self._fresh, pos, self._joint_pos))
+            self._joint_vel.copy_(torch.where(self._fresh, vel, self._joint_vel))
 
     def advance(self) -> None:
         """Shift the histories; the raw output becomes the newest action."""
         torch.index_select(self._proprio, 1, self._source, out=self._shifted)
         self._proprio.copy_(self._shifted)
-        self._actions[:, -1] = self.last_action
-        self._fresh.fill_(False)
+        self._now_action.copy_(self.last_action)
+        if self._may_be_fresh:
+            self._fresh.fill_(False)
+            self._may_be_fresh = self.device.type != "cpu"
 
     def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
         """The raw output, which is in canonical order, in MuJoCo order."""

@@ -18,6 +18,7 @@ from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, Physic
 from arena_newton.trackers import onnx_mlp, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
+from arena_newton.trackers.quadratic import Quadratic, products
 
 __all__ = ["FRAME", "HISTORY", "OBSERVATION", "OFFICIAL_FORM", "Twist2FrontEnd", "Twist2Tracker", "from_checkpoint"]
 
@@ -43,6 +44,8 @@ JOINT_VEL_SCALE = 0.05
 OFFICIAL_FORM = ActionForm("default", (0.5,) * JOINTS, clip=10.0)
 """Action form of the official checkpoints."""
 OBSERVATION_CLIP = 100.0
+_TILT_TERMS = (((1, 2), (11, 2)), ((5, -2), (10, -2)), ((2, 2), (7, -2)))
+"""2(wx + yz), -2(x² + y²), 2(wy - zx) from the products of a quaternion with itself (`Quadratic`)."""
 _VECTOR = 64
 """Rows are padded to a multiple of this for `atan2` and `asin`: two AVX-512 vectors and room."""
 
@@ -66,9 +69,11 @@ class Twist2FrontEnd(FrontEnd):
         self._future = self.obs[:, _FUTURE]
         self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
-        self._quat = torch.zeros(4, padded, device=self.device)
-        self._tilt = torch.zeros(2, padded, device=self.device)
-        self._scratch = torch.zeros(4, padded, device=self.device)
+        self._tilt_terms = Quadratic(_TILT_TERMS, (0.0, 1.0, 0.0), self.device)
+        terms, angles = torch.zeros(3, padded, device=self.device), torch.zeros(2, padded, device=self.device)
+        self._roll_sine, self._roll_cosine, self._pitch_sine = terms
+        self._roll, self._pitch = angles
+        self._terms, self._angles = terms[:, :worlds].t(), angles[:, :worlds].t()
         self._joint_vel_scale = torch.full((JOINTS,), JOINT_VEL_SCALE, device=self.device)
         self._joint_vel_scale[[i for i, name in enumerate(MUJOCO_JOINTS) if "ankle" in name]] = 0.0
 
@@ -114,18 +119,10 @@ class Twist2FrontEnd(FrontEnd):
 
     def _roll_pitch(self, quat: torch.Tensor) -> torch.Tensor:
         """Roll atan2(2(wx + yz), 1 - 2(x² + y²)) and pitch asin(clamp(2(wy - zx))); shape [worlds, 2] [rad]."""
-        self._quat[:, : self.worlds] = quat.t()
-        w, x, y, z = self._quat
-        a, b, c, d = self._scratch
-        torch.mul(w, x, out=a)
-        a.add_(torch.mul(y, z, out=b)).mul_(2.0)
-        torch.mul(x, x, out=b)
-        b.add_(torch.mul(y, y, out=c)).mul_(-2.0).add_(1.0)
-        torch.mul(w, y, out=c)
-        c.sub_(torch.mul(z, x, out=d)).mul_(2.0).clamp_(-1.0, 1.0)
-        torch.atan2(a, b, out=self._tilt[0])
-        torch.asin(c, out=self._tilt[1])
-        return self._tilt[:, : self.worlds].t()
+        self._terms.copy_(self._tilt_terms(products(quat, quat)))
+        torch.atan2(self._roll_sine, self._roll_cosine, out=self._roll)
+        torch.asin(self._pitch_sine.clamp_(-1.0, 1.0), out=self._pitch)
+        return self._angles
 
 
 class Twist2Tracker(NetworkTracker):
