@@ -28,6 +28,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "shift": (2,),
     "foot_offset": (),
     "stance_width": (),
+    "stagger": (),
     "swing_height": (),
     "step_time": (),
     "pelvis_back": (),
@@ -99,6 +100,9 @@ class MotionCommand:
     """How far walking feet are set behind the pelvis [m], 0 to 0.10, shape [worlds]: leans the robot into a push."""
     stance_width: torch.Tensor
     """Distance between the feet [m], shape [worlds]."""
+    stagger: torch.Tensor
+    """How far a walking left foot is set before its place and the right one behind, together [m], shape [worlds]: by the
+    length of a step, the right foot lands beside the left one, which leaves room for a sill between two pairs of steps."""
     swing_height: torch.Tensor
     """Height of a step [m], shape [worlds]."""
     step_time: torch.Tensor
@@ -114,7 +118,7 @@ class MotionCommand:
     reach: torch.Tensor
     """Share of `hand_point` against `arms`, 0 to 1, shape [worlds, 2]."""
     arm_speed: torch.Tensor
-    """Largest speed of an arm joint [rad/s], shape [worlds]; a punch takes 10. Hand points move at 0.4 m of it a rad."""
+    """Largest speed of an arm joint [rad/s], shape [worlds]; a punch takes 10. Hand points move at 0.4 m a rad."""
     kick_speed: torch.Tensor
     """Speed of the swinging foot [m/s], shape [worlds]."""
     step_in_place: torch.Tensor

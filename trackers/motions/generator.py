@@ -21,7 +21,7 @@ from arena_newton.trackers.motions.kinematics import SOLE_CENTRE, SOLE_HEIGHT, c
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Frames", "ReferenceGenerator"]
+__all__ = ["Frames", "ReferenceGenerator", "kick_seconds"]
 
 DOUBLE_SUPPORT = 0.2
 """Share of a step with both feet on the ground."""
@@ -77,6 +77,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "shift": (0.12, 0.5),
     "foot_offset": (0.08, 0.4),
     "stance_width": (0.2, 1.0),
+    "stagger": (0.2, 1.0),
     "swing_height": (0.2, 1.0),
     "step_time": (0.3, 2.0),
     "pelvis_back": (0.25, 0.8),
@@ -87,6 +88,11 @@ _LIMITS: dict[str, tuple[float, float]] = {
 """Rate and acceleration [unit/s, unit/s²]; of arms and hand points in units of `arm_speed`."""
 _TURN_LIMITS = (1.5, 10.0)
 """Rate and acceleration of the yaw rate [rad/s², rad/s³]."""
+
+
+def kick_seconds(speed: Any) -> Any:
+    """Length of a kick [s] at a foot speed [m/s]."""
+    return KICK_SHIFT + KICK_WIND + 1.875 * (KICK_BACK + KICK_FRONT) / speed + KICK_RETURN + KICK_SETTLE
 
 
 @dataclass
@@ -218,6 +224,7 @@ class ReferenceGenerator:
             "shift": (-0.12, 0.12),
             "foot_offset": (0.0, 0.12),
             "stance_width": (0.16, 0.36),
+            "stagger": (-0.3, 0.3),
             "swing_height": (0.02, 0.22),
             "step_time": (SHORTEST_STEP, 0.8),
             "pelvis_back": (0.0, 0.45),
@@ -383,6 +390,7 @@ class ReferenceGenerator:
         height = torch.where(busy[:, None], height.clamp(max=KICK_HEIGHT), height)
         # Feet stay where they are until there is a reason to step: their offset waits for it.
         offset = torch.where(walking[:, None], row[:, at["foot_offset"]], now[:, at["foot_offset"]])
+        stagger = row[:, at["stagger"]] * (velocity != 0.0).any(1, keepdim=True)
         wanted, held = row[:, at["reach"]], now[:, at["reach"]]
         going = (wanted > 0.0).repeat_interleave(3, dim=1)
         resting = (held <= 0.0).repeat_interleave(3, dim=1)
@@ -396,7 +404,9 @@ class ReferenceGenerator:
                 height,
                 row[:, at["pitch"].start : at["foot_offset"].start],
                 offset,
-                row[:, at["stance_width"].start : at["hand_point"].start],
+                row[:, at["stance_width"]],
+                stagger,
+                row[:, at["swing_height"].start : at["hand_point"].start],
                 torch.where(going, row[:, at["hand_point"]], point),
                 wanted,
             ],
@@ -425,7 +435,8 @@ class ReferenceGenerator:
         yaw = body[:, 2] + v[:, 2] * ahead
         xy = body[:, :2] + _turn(body[:, 2] + 0.5 * v[:, 2] * ahead, v[:, :2] * ahead[:, None])
         width, offset = s["channels"][:, at["stance_width"]], s["channels"][:, at["foot_offset"]]
-        place = torch.stack([-offset.expand(-1, 2), 0.5 * width * self._sides], dim=-1)
+        stagger = s["channels"][:, at["stagger"]]
+        place = torch.stack([0.5 * stagger * self._sides - offset, 0.5 * width * self._sides], dim=-1)
         feet = xy[:, None] + _turn(yaw[:, None], place)
         return torch.cat([feet, yaw[:, None, None].expand(-1, 2, 1)], dim=2)
 
@@ -478,7 +489,9 @@ class ReferenceGenerator:
         gain = ((0.9 - swing) / 0.4).clamp(0.0, 1.0)
         gain = torch.where(begin, 1.0, gain)[:, None]
         s["landing"] = s["landing"] + gain * (planned - s["landing"])
-        course = _smooth(swing)[:, None]
+        # A high step rises before it goes on, so that the foot clears what lies before it.
+        early = ((s["channels"][:, at["swing_height"]].squeeze(1) - 0.08) * 1.6).clamp(0.0, 0.16)
+        course = _smooth((swing - early) / (1.0 - 2.0 * early))[:, None]
         flat = s["lifted"] + course * (s["landing"] - s["lifted"])
         rise = s["channels"][:, at["swing_height"]].squeeze(1) * torch.sin(math.pi * swing).square()
         moved = torch.stack([flat[:, 0], flat[:, 1], SOLE_HEIGHT + rise, flat[:, 2], torch.zeros_like(rise)], dim=1)
@@ -512,8 +525,7 @@ class ReferenceGenerator:
         start = (s["kick_asked"] > 0) & (s["kick_side"] == 0) & still
         swing = 1.875 * (KICK_BACK + KICK_FRONT) / row[:, at["kick_speed"]].squeeze(1)
         s["kick_swing"] = torch.where(start, swing, s["kick_swing"])
-        length = KICK_SHIFT + KICK_WIND + swing + KICK_RETURN + KICK_SETTLE
-        s["kick_length"] = torch.where(start, length, s["kick_length"])
+        s["kick_length"] = torch.where(start, kick_seconds(row[:, at["kick_speed"]].squeeze(1)), s["kick_length"])
         s["kick_side"] = torch.where(start, s["kick_asked"], s["kick_side"])
         s["kick_asked"] = torch.where(start, 0, s["kick_asked"])
         active = s["kick_side"] > 0

@@ -197,11 +197,20 @@ def walk(
 
 
 def step_over(
-    speed: float = 0.35, seconds: float = 5.0, *, swing_height: float = 0.18, step_time: float = 0.6
+    stride: float = 0.40, seconds: float = 6.0, *, swing_height: float = 0.18, step_time: float = 0.52
 ) -> Script:
-    """Walk with high steps, as over a sill."""
-    high = {"swing_height": swing_height, "step_time": step_time}
-    return _script((0.5, high), (seconds, {"velocity": (speed, 0.0, 0.0), **high}), (1.0, high), (1.0, {}))
+    """Walk with high steps, the right foot beside the left one, as over a sill.
+
+    Args:
+        stride: Way of a foot in one swing [m]; two steps.
+        seconds: Time of walking [s].
+        swing_height: Height of a step [m].
+        step_time: Time of a step [s].
+    """
+    high = {"swing_height": swing_height, "step_time": step_time, "height": 0.74}
+    speed = 0.5 * stride / step_time
+    stepping = {"velocity": (speed, 0.0, 0.0), "stagger": 0.5 * stride, **high}
+    return _script((0.5, high), (seconds, stepping), (1.5, high), (0.5, {}))
 
 
 def squat(height: float = 0.45, *, pitch: float = 0.3, down: float = 1.5, hold: float = 1.0) -> Script:
@@ -241,12 +250,10 @@ def crouch_reach(
 
 def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
     """Shift to the other foot, wind up, swing at a foot speed [m/s], and recover."""
-    from arena_newton.trackers.motions.generator import KICK_BACK, KICK_FRONT
-    from arena_newton.trackers.motions.generator import KICK_RETURN, KICK_SETTLE, KICK_SHIFT, KICK_WIND
+    from arena_newton.trackers.motions.generator import kick_seconds
 
     foot = _sided(side) + 1
-    length = KICK_SHIFT + KICK_WIND + 1.875 * (KICK_BACK + KICK_FRONT) / speed + KICK_RETURN + KICK_SETTLE
-    return _script((length, {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
+    return _script((kick_seconds(speed), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
 
 
 def punch(side: str = "right", *, height: float | None = None, speed: float = 10.0, times: int = 1) -> Script:

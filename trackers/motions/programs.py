@@ -1,0 +1,511 @@
+"""Random motion programs: clips for training that cover the primitives, their parameters and the ways between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.robot import DEFAULT_POSE, TICK
+from arena_newton.trackers.motions import primitives as p
+from arena_newton.trackers.motions.commands import CHANNELS, neutral_row
+from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
+from arena_newton.trackers.motions.primitives import Program, Script
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["FAMILIES", "SUPPORTS", "random_clips"]
+
+SUPPORTS = ("none", "seat", "sill", "platform")
+"""Names of `support_kind`."""
+SEAT_SIZE = (0.5, 0.6)
+"""Length and width of a seat [m]."""
+SILL_SIZE = (0.10, 1.4)
+"""Thickness and width of a sill [m]."""
+SILL_CLEARANCE = 0.05
+"""Least height of a sole above a sill [m]."""
+SILL_HEIGHTS = (0.05, 0.10)
+"""Lowest and highest sill [m]."""
+SOLE_BACK, SOLE_FRONT = 0.06, 0.14
+"""Ends of the foot behind and before the ankle [m], with a centimetre to spare."""
+LARGEST_ERROR = 0.02
+"""A clip with more IK error anywhere is replaced [m]."""
+FASTEST_JOINT = 25.0
+"""A clip with a faster joint anywhere is replaced [rad/s]."""
+ROUNDS = 6
+"""Times that refused clips are drawn anew."""
+
+FAMILIES: dict[str, int] = {
+    "stand": 128,
+    "squat": 224,
+    "shift": 128,
+    "step": 96,
+    "walk": 832,
+    "turn": 192,
+    "reach": 160,
+    "crouch_reach": 96,
+    "kick": 224,
+    "walk_kick": 96,
+    "punch": 64,
+    "carry": 96,
+    "push": 96,
+    "sit_air": 64,
+    "sit": 224,
+    "walk_sit": 96,
+    "sill": 128,
+    "mixed": 160,
+}
+"""Clips of each family in the default library."""
+
+
+@dataclass
+class _Plan:
+    """One clip before it is played."""
+
+    script: Script
+    support: str = "none"
+    start: float = 0.0
+    """When the robot begins to sit down [s]."""
+    height: float = 0.0
+    """Height of the seat, wanted height of the sill [m]."""
+    edge: float = 0.0
+    """Front edge of the seat behind the standing pelvis [m]."""
+
+
+class _Draw:
+    """Random parameters."""
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+
+    def __call__(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def chance(self, share: float) -> bool:
+        return bool(self.rng.random() < share)
+
+    def side(self) -> str:
+        return "left" if self.chance(0.5) else "right"
+
+    def arms(self) -> tuple[float, ...]:
+        """A random posture of both arms [rad]."""
+        limbs = [
+            (
+                self(-1.9, 0.6),
+                self(0.05, 0.9),
+                self(-0.7, 0.7),
+                self(-0.7, 1.5),
+                self(-0.6, 0.6),
+                self(-0.5, 0.5),
+                self(-0.5, 0.5),
+            )
+            for _ in range(2)
+        ]
+        return (*limbs[0], *p.mirrored_arms(limbs[1])[7:])
+
+    def hand(self, side: str) -> tuple[float, float, float]:
+        """A random hand point of a side [m]."""
+        y = self(-0.08, 0.45)
+        return self(0.12, 0.5), y if side == "left" else -y, self(-0.25, 0.6)
+
+    def gait(self) -> dict[str, float]:
+        """Random shape of steps."""
+        return {
+            "step_time": self(0.38, 0.52),
+            "stance_width": self(0.19, 0.27),
+            "swing_height": self(0.06, 0.10),
+            "height": self(0.70, 0.779),
+        }
+
+    def velocity(self) -> tuple[float, float, float]:
+        """A random walk [m/s, m/s, rad/s]: mostly forward, often curved."""
+        kind = self.rng.random()
+        if kind < 0.45:
+            return self(0.1, 0.8), 0.0, self(-0.5, 0.5) * self.chance(0.5)
+        if kind < 0.6:
+            return self(-0.4, -0.1), 0.0, self(-0.3, 0.3) * self.chance(0.3)
+        if kind < 0.75:
+            return 0.0, self(-0.3, 0.3), 0.0
+        return self(-0.3, 0.6), self(-0.25, 0.25), self(-0.8, 0.8)
+
+    def upper(self, script: Script, share: float = 0.5) -> Script:
+        """Random arms, waist and tilt on some scripts, another posture for every segment."""
+        if not self.chance(share):
+            return script
+        out = []
+        for s in script.segments:
+            more: dict[str, Any] = {"arms": self.arms(), "arm_speed": self(0.8, 4.0)}
+            if self.chance(0.4):
+                more["waist"] = (self(-0.6, 0.6), self(-0.15, 0.15), self(-0.15, 0.3))
+            if self.chance(0.2):
+                more["hands"] = (float(self.chance(0.5)), float(self.chance(0.5)))
+            out.append(p.Segment(s.seconds, {**more, **s.channels}, s.ramp))
+        return Script(tuple(out))
+
+
+def _stand(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.5, 1.5))
+    while parts.seconds < seconds:
+        channels: dict[str, Any] = {}
+        if d.chance(0.5):
+            channels["height"] = d(0.68, 0.785)
+        if d.chance(0.3):
+            channels["pitch"], channels["roll"] = d(-0.1, 0.3), d(-0.08, 0.08)
+        parts = parts + p.stand(d(0.8, 2.5), **channels)
+    return _Plan(d.upper(parts, 0.75))
+
+
+def _squat(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.3, 1.0))
+    while parts.seconds < seconds:
+        height = d(0.42, 0.72)
+        parts = parts + p.squat(height, pitch=d(0.0, 0.5), down=d(0.9, 2.2), hold=d(0.2, 2.0))
+    return _Plan(d.upper(parts))
+
+
+def _shift(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.3, 1.0))
+    while parts.seconds < seconds:
+        parts = parts + p.shift(d(-0.04, 0.05), d(-0.09, 0.09), d(0.5, 2.0))
+    return _Plan(d.upper(parts.over(height=d(0.66, 0.779), stance_width=d(0.19, 0.28))))
+
+
+def _step(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.2, 0.8))
+    while parts.seconds < seconds:
+        parts = parts + p.step(d(1.5, 4.0), pause=d(0.5, 1.5)).over(**d.gait())
+    return _Plan(d.upper(parts))
+
+
+def _walk(d: _Draw, seconds: float) -> _Plan:
+    gait, parts = d.gait(), p.stand(d(0.1, 0.6))
+    if d.chance(0.1):
+        gait["height"], gait["pitch"] = d(0.60, 0.70), d(0.0, 0.15)
+    while parts.seconds < seconds:
+        forward, left, turn = d.velocity()
+        pause = d(0.8, 2.0) if d.chance(0.35) else 0.0
+        parts = parts + p.walk(forward, left, turn, d(2.0, 4.5), pause=pause)
+    return _Plan(d.upper(parts.over(**gait)))
+
+
+def _turn(d: _Draw, seconds: float) -> _Plan:
+    gait, parts = d.gait(), p.stand(d(0.1, 0.6))
+    while parts.seconds < seconds:
+        parts = parts + p.walk(0.0, 0.0, d(0.2, 1.0) * d.rng.choice([-1, 1]), d(1.5, 4.0), pause=d(0.3, 1.5))
+    return _Plan(d.upper(parts.over(**gait)))
+
+
+def _reach(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.2, 0.8))
+    while parts.seconds < seconds:
+        side = d.side()
+        one = p.reach(side, d.hand(side), hold=d(0.3, 1.5)).over(
+            height=d(0.68, 0.779), pitch=d(-0.05, 0.3), arm_speed=d(1.0, 4.0), shift=(d(-0.01, 0.03), d(-0.03, 0.03))
+        )
+        if d.chance(0.3):
+            one = one.over(waist=(d(-0.6, 0.6), 0.0, d(0.0, 0.2)))
+        parts = parts + one
+    return _Plan(parts)
+
+
+def _crouch_reach(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.2, 0.8))
+    while parts.seconds < seconds:
+        side = d.side()
+        parts = parts + p.crouch_reach(
+            side, d.hand(side), d(0.42, 0.68), pitch=d(0.1, 0.55), down=d(1.0, 2.0), hold=d(0.3, 1.5)
+        )
+    return _Plan(parts)
+
+
+def _kick(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.3, 1.0))
+    while parts.seconds < seconds:
+        parts = parts + p.kick(d.side(), d(1.5, 3.5), pause=d(0.2, 1.2))
+    return _Plan(d.upper(parts, 0.3))
+
+
+def _walk_kick(d: _Draw, seconds: float) -> _Plan:
+    gait, parts = d.gait(), p.stand(d(0.1, 0.5))
+    while parts.seconds < seconds:
+        parts = parts + p.walk(d(0.15, 0.6), 0.0, d(-0.3, 0.3), d(1.2, 3.0), pause=0.0)
+        parts = parts + p.kick(d.side(), d(1.5, 3.5), pause=d(0.8, 1.5))
+    return _Plan(d.upper(parts.over(**gait), 0.3))
+
+
+def _punch(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.2, 0.8))
+    while parts.seconds < seconds:
+        height = d(0.55, 0.77) if d.chance(0.5) else None
+        parts = parts + p.punch(d.side(), height=height, speed=d(5.0, 11.0), times=int(d.rng.integers(1, 4)))
+        if d.chance(0.3):
+            parts = parts + p.walk(*d.velocity(), d(1.0, 2.0), pause=1.0).over(arms=p.GUARD_ARMS)
+    return _Plan(parts)
+
+
+def _carry(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.2, 0.6))
+    while parts.seconds < seconds:
+        forward, left, turn = d.velocity()
+        parts = parts + p.carry(0.6 * forward, 0.6 * left, 0.6 * turn, d(2.0, 5.0), width=d(0.16, 0.4))
+    return _Plan(parts)
+
+
+def _push(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.2, 0.6))
+    while parts.seconds < seconds:
+        hands = [(d(0.25, 0.42), s * d(0.05, 0.25), d(0.0, 0.35)) for s in (1, -1)]
+        parts = parts + p.push(d(0.15, 0.5), d(3.0, 6.0), foot_offset=d(0.03, 0.10), hands=hands)
+    return _Plan(parts)
+
+
+def _sit_air(d: _Draw, seconds: float) -> _Plan:
+    """The way down to a seat and back without one: the weight stays over the feet."""
+    parts = p.stand(d(0.2, 0.8))
+    while parts.seconds < seconds:
+        low = {"height": d(0.5, 0.6), "pitch": d(0.2, 0.45), "arms": p.FORWARD_ARMS}
+        parts = parts + p._script(
+            p.Segment(d(1.5, 2.5), low, ramp=True), (d(0.5, 1.5), low), p.Segment(d(1.5, 2.5), {}, ramp=True), (0.6, {})
+        )
+    return _Plan(parts)
+
+
+def _seated(d: _Draw, lead: Script, seconds: float) -> _Plan:
+    seat, edge = d(0.36, 0.48), d(0.03, 0.08)
+    depth, press = d(0.28, 0.36), d(0.09, 0.12)
+    left = seconds - lead.seconds - 3.2 - 5.0
+    script = lead + p.sit(seat, hold=max(left, 1.0), depth=depth, press=press)
+    script = script + p.rise(seat, depth=depth, press=press) + p.stand(1.0)
+    return _Plan(script, "seat", lead.seconds, seat, edge)
+
+
+def _sit(d: _Draw, seconds: float) -> _Plan:
+    return _seated(d, p.stand(d(0.3, 1.5)), seconds)
+
+
+def _walk_sit(d: _Draw, seconds: float) -> _Plan:
+    back = p.walk(-d(0.15, 0.3), 0.0, 0.0, d(1.0, 1.8), pause=1.2)
+    if d.chance(0.5):
+        back = p.walk(0.0, 0.0, d(0.5, 0.9) * d.rng.choice([-1, 1]), d(0.8, 1.6), pause=0.6) + back
+    return _seated(d, p.stand(0.2) + back, seconds)
+
+
+def _sill(d: _Draw, seconds: float) -> _Plan:
+    """A walk with high steps; where a sill fits under it is found afterwards."""
+    lead = p.stand(d(0.1, 0.5)) + p.walk(d(0.2, 0.5), 0.0, 0.0, d(0.5, 1.5), pause=0.0)
+    over = p.step_over(d(0.37, 0.44), d(4.0, 6.0), swing_height=d(0.15, 0.20), step_time=d(0.48, 0.6))
+    return _Plan(d.upper(lead + over + p.stand(1.0), 0.3), "sill", height=d(*SILL_HEIGHTS))
+
+
+def _mixed(d: _Draw, seconds: float) -> _Plan:
+    parts = p.stand(d(0.1, 0.6))
+    while parts.seconds < seconds:
+        kind = int(d.rng.integers(6))
+        if kind == 0:
+            parts = parts + p.walk(*d.velocity(), d(1.5, 3.0), pause=d(0.0, 1.0)).over(**d.gait())
+        elif kind == 1:
+            side = d.side()
+            parts = parts + p.crouch_reach(side, d.hand(side), d(0.45, 0.7), down=1.2, hold=d(0.3, 1.0))
+        elif kind == 2:
+            side = d.side()
+            parts = parts + p.reach(side, d.hand(side), hold=d(0.3, 1.0))
+        elif kind == 3:
+            parts = parts + p.kick(d.side(), d(1.5, 3.2), pause=0.3)
+        elif kind == 4:
+            parts = parts + p.punch(d.side(), height=d(0.6, 0.77))
+        else:
+            parts = parts + p.squat(d(0.45, 0.7), down=d(1.0, 1.6), hold=d(0.2, 1.0))
+    return _Plan(parts)
+
+
+_MAKERS: dict[str, Callable[[_Draw, float], _Plan]] = {
+    "stand": _stand,
+    "squat": _squat,
+    "shift": _shift,
+    "step": _step,
+    "walk": _walk,
+    "turn": _turn,
+    "reach": _reach,
+    "crouch_reach": _crouch_reach,
+    "kick": _kick,
+    "walk_kick": _walk_kick,
+    "punch": _punch,
+    "carry": _carry,
+    "push": _push,
+    "sit_air": _sit_air,
+    "sit": _sit,
+    "walk_sit": _walk_sit,
+    "sill": _sill,
+    "mixed": _mixed,
+}
+
+
+def _play(plans: list[_Plan], ticks: int, device: Any) -> dict[str, torch.Tensor]:
+    """Frames of all plans, and which of them are sound."""
+    import torch
+
+    from arena_newton.trackers.motions.generator import ReferenceGenerator
+
+    program = Program([plan.script for plan in plans], device)
+    generator = ReferenceGenerator(len(plans), device)
+    names = ("root_pos", "root_quat", "joint_pos", "hands")
+    frames: dict[str, list[torch.Tensor]] = {name: [] for name in (*names, "feet")}
+    worst = torch.zeros(len(plans), device=generator.device)
+    for tick in range(ticks):
+        one = generator.step(program(tick * TICK))
+        for name in names:
+            frames[name].append(getattr(one, name))
+        frames["feet"].append(torch.cat([generator.feet_pos, generator.feet_yaw[:, :, None]], dim=2))
+        worst = torch.maximum(worst, generator.ik_error)
+    out = {name: torch.stack(values, dim=1) for name, values in frames.items()}
+    speed = (out["joint_pos"][:, 1:] - out["joint_pos"][:, :-1]).abs().amax((1, 2)) / TICK
+    finite = torch.stack([v.flatten(1).isfinite().all(1) for v in out.values()]).all(0)
+    out["sound"] = finite & (worst <= LARGEST_ERROR) & (speed <= FASTEST_JOINT)
+    return out
+
+
+def _yaw(quat: torch.Tensor) -> torch.Tensor:
+    import torch
+
+    w, x, y, z = quat.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Boxes behind the standing pelvis, and which stay clear of feet and of the walk before."""
+    import torch
+
+    root = out["root_pos"]
+    at = torch.tensor([min(round(plan.start / TICK), root.shape[1] - 1) for plan in plans], device=root.device)
+    rows = torch.arange(len(plans), device=root.device)
+    place, yaw = root[rows, at], _yaw(out["root_quat"][rows, at])
+    edge = torch.tensor([plan.edge for plan in plans], device=root.device)
+    height = torch.tensor([plan.height for plan in plans], device=root.device)
+    ahead = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
+    centre = place[:, :2] - ahead * (edge + 0.5 * SEAT_SIZE[0])[:, None]
+    size = torch.tensor(SEAT_SIZE, device=root.device).expand(len(plans), 2)
+    box = torch.cat([centre, height[:, None], yaw[:, None], size, height[:, None]], dim=1)
+
+    def local(xy: torch.Tensor) -> torch.Tensor:
+        d = xy - centre[:, None]
+        c, s = torch.cos(yaw)[:, None], torch.sin(yaw)[:, None]
+        return torch.stack([c * d[..., 0] + s * d[..., 1], -s * d[..., 0] + c * d[..., 1]], dim=-1).abs()
+
+    half = 0.5 * torch.tensor(SEAT_SIZE, device=root.device)
+    feet = local(out["feet"][..., :2].flatten(1, 2))
+    stepped = (feet < half).all(-1).any(1)
+    early = torch.arange(root.shape[1], device=root.device)[None] < at[:, None]
+    crossed = ((local(root[..., :2]) < half).all(-1) & early).any(1)
+    return box, ~(stepped | crossed)
+
+
+def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where along the walk a sill is cleared best, and whether it is cleared by enough; lowers it where need be.
+
+    Each place along the line from start to end is tried; feet and their soles cross it in the air.
+    """
+    import torch
+
+    root, feet = out["root_pos"], out["feet"]
+    start, end = root[:, 0, :2], root[:, -1, :2]
+    way = end - start
+    length = way.square().sum(1).sqrt().clamp(min=1e-3)
+    ahead = way / length[:, None]
+    along = ((feet[..., :2] - start[:, None, None]) * ahead[:, None, None]).sum(-1).flatten(1)
+    height = (feet[..., 2] - SOLE_HEIGHT).flatten(1)
+    best = torch.full_like(length, -1.0)
+    where = torch.zeros_like(length)
+    half = 0.5 * SILL_SIZE[0]
+    for share in np.linspace(0.25, 0.85, 49):
+        spot = length * float(share)
+        over = (along - SOLE_BACK < (spot + half)[:, None]) & (along + SOLE_FRONT > (spot - half)[:, None])
+        clear = torch.where(over, height, 1.0).amin(1)
+        where = torch.where(clear > best, spot, where)
+        best = torch.maximum(best, clear)
+    wanted = torch.tensor([plan.height for plan in plans], device=root.device)
+    top = torch.minimum(best - SILL_CLEARANCE, wanted)
+    yaw = torch.atan2(ahead[:, 1], ahead[:, 0])
+    centre = start + ahead * where[:, None]
+    size = torch.tensor(SILL_SIZE, device=root.device).expand(len(top), 2)
+    box = torch.cat([centre, top[:, None], yaw[:, None], size, top[:, None]], dim=1)
+    return box, top >= SILL_HEIGHTS[0]
+
+
+def random_clips(
+    families: Mapping[str, int] | None = None, seconds: float = 12.0, seed: int = 0, device: Any = "cpu"
+) -> dict[str, Any]:
+    """Random clips of the named families, all of the same length.
+
+    A family is a way to draw scripts of primitives (`primitives`), joined until the clip is full; gait shape (step
+    0.38-0.52 s, width 0.19-0.27 m, swing 6-10 cm, pelvis 0.70-0.78 m) is drawn once a clip, and on about half the clips
+    every segment has random arms, waist and hands.
+
+    - `stand`: heights, tilts, arms. `shift`: weight shifts. `squat`: 0.42-0.72 m, repeated. `step`: in place.
+    - `walk`: pieces of 2-4.5 s: forward 0.1-0.8, back to -0.4, sideways 0.3 m/s, arcs to 0.8 rad/s, stops between a
+      third of them; a tenth walks crouched at 0.60-0.70 m. `turn`: on the spot.
+    - `reach`, `crouch_reach`: either palm to random points. `kick`: 1.5-3.5 m/s, either foot. `walk_kick`: a kick out
+      of a walk. `punch`: some crouched, some after steps.
+    - `carry`: palms at a box of 16-40 cm. `push`: feet 3-10 cm behind the pelvis.
+    - `sit_air`: down to 0.5-0.6 m and up in balance, no seat. `sit`, `walk_sit`: seats of 0.36-0.48 m with the front
+      edge 3-8 cm behind the standing pelvis, really loaded (the pelvis ends 28-36 cm back and at seat + 0.09-0.12 m);
+      after standing, or after turning and walking backwards to it.
+    - `sill`: steps of 15-20 cm, the feet beside each other; a sill of 5-10 cm lies where every sole clears it by 5 cm or more.
+    - `mixed`: walk, reach, crouch, kick, punch, squat in any order.
+
+    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support that feet run into is drawn anew.
+
+    Args:
+        families: Clips of each family; `FAMILIES` without it.
+        seconds: Length of every clip [s].
+        seed: The same seed gives the same clips.
+        device: Torch device; a GPU makes 2400 clips in seconds.
+
+    Returns:
+        Torch tensors on `device`: root_pos [m], shape [clips, ticks, 3]; root_quat, wxyz, [clips, ticks, 4]; joint_pos
+        [rad], MuJoCo order, [clips, ticks, 29]; hands [clips, ticks, 2]; family, int64 [clips], into family_names;
+        support_kind, int64 [clips], into `SUPPORTS`; support_box [clips, 7]: centre of the top face x, y, z [m], yaw
+        [rad], length along the heading, width, height of the top [m] (zeros without one).
+
+    Raises:
+        InputError: An unknown family, or one whose clips are refused again and again.
+    """
+    import torch
+
+    counts = dict(FAMILIES if families is None else families)
+    for name in counts:
+        if name not in _MAKERS:
+            raise InputError(f"random clips: no family {name!r}, expected one of {', '.join(_MAKERS)}")
+    names = list(counts)
+    family = np.repeat(np.arange(len(names)), [counts[n] for n in names])
+    ticks = round(seconds / TICK)
+    draw = _Draw(np.random.default_rng(seed))
+    result: dict[str, torch.Tensor] = {}
+    missing = np.arange(len(family))
+    for _ in range(ROUNDS):
+        if not len(missing):
+            break
+        plans = [_MAKERS[names[family[i]]](draw, seconds) for i in missing]
+        out = _play(plans, ticks, device)
+        sound = out.pop("sound")
+        kind = torch.tensor([SUPPORTS.index(plan.support) for plan in plans], device=sound.device)
+        seat, clear = _seat(plans, out)
+        sill, cleared = _place_sill(plans, out)
+        sound &= torch.where(kind == 1, clear, True) & torch.where(kind == 2, cleared, True)
+        box = torch.where((kind == 1)[:, None], seat, torch.where((kind == 2)[:, None], sill, 0.0))
+        out = {**out, "support_kind": kind, "support_box": box}
+        good = sound.cpu().numpy()
+        to = torch.tensor(missing[good], device=sound.device)
+        for name, values in out.items():
+            if name not in result:
+                result[name] = torch.zeros(len(family), *values.shape[1:], dtype=values.dtype, device=values.device)
+            result[name][to] = values[sound]
+        missing = missing[~good]
+    if len(missing):
+        bad = sorted({names[family[i]] for i in missing})
+        raise InputError(f"random clips: {len(missing)} clips of {', '.join(bad)} were refused {ROUNDS} times")
+    del result["feet"]
+    return {**result, "family": torch.tensor(family, device=device), "family_names": names}
