@@ -26,7 +26,7 @@ from arena_newton.trackers.blocks import BlockRunner
 if TYPE_CHECKING:
     from arena_newton.trackers.weights_file import Weights
 
-__all__ = ["ActionForm", "FrontEnd", "NetworkTracker", "residual_form"]
+__all__ = ["ActionForm", "FrontEnd", "Mirror", "NetworkTracker", "residual_form"]
 
 JOINTS = len(MUJOCO_JOINTS)
 
@@ -57,6 +57,33 @@ def residual_form(drive: DriveGains, clip: float = 6.0) -> ActionForm:
         clip: Largest magnitude of the raw output that counts.
     """
     return ActionForm("residual", tuple(0.25 * e / k for e, k in zip(drive.effort, drive.kp, strict=True)), clip)
+
+
+class Mirror:
+    """The mirror image (left for right) of rows of numbers: `mirror(x)[:, i] = sign[i] * x[:, index[i]]`."""
+
+    def __init__(self, parts: Sequence[tuple[Sequence[int], Sequence[float]]], device: torch.device | str = "cpu"):
+        """Put parts side by side.
+
+        Args:
+            parts: For each part the index within it and the sign of every number.
+            device: Torch device of the rows.
+        """
+        index: list[int] = []
+        for places, _ in parts:
+            start = len(index)
+            index += [start + i for i in places]
+        self.index = torch.tensor(index, device=device)
+        self.sign = torch.tensor([float(s) for _, signs in parts for s in signs], device=device)
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """Mirror image of rows, shape [rows, width]."""
+        return x.index_select(1, self.index) * self.sign
+
+
+def plain(*signs: float) -> tuple[Sequence[int], Sequence[float]]:
+    """A part of a `Mirror` whose numbers stay in their places."""
+    return range(len(signs)), signs
 
 
 class FrontEnd:
@@ -132,6 +159,14 @@ class FrontEnd:
         else:
             self._targets.copy_(raw)
         return self._targets.mul_(self._scale).add_(self.base)
+
+    def mirror_obs(self) -> Mirror:
+        """Mirror image of an observation; for training."""
+        raise NotImplementedError
+
+    def mirror_action(self) -> Mirror:
+        """Mirror image of a raw action; for training."""
+        raise NotImplementedError
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write this tick's observation into `obs`."""

@@ -23,7 +23,8 @@ from arena_newton.robot import (
 )
 from arena_newton.trackers import onnx_session, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
-from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
+from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
+from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
 from arena_newton.trackers.quadratic import Quadratic, products
 
 __all__ = [
@@ -95,6 +96,13 @@ _DOWN = tuple(tuple((i, -f) for i, f in row) for row in (_R20, _R21, _R22))
 """Minus the last row of the rotation matrix, less the identity's: where down is, seen from the body."""
 
 
+_MIRROR = (
+    [MUJOCO_TO_CANONICAL[MIRROR_JOINTS[joint]] for joint in CANONICAL_TO_MUJOCO],
+    [MIRROR_SIGNS[joint] for joint in CANONICAL_TO_MUJOCO],
+)
+"""Mirror image of joints in canonical order."""
+
+
 class SonicFrontEnd(FrontEnd):
     """Encoder input (1762) and proprioception (930) side by side."""
 
@@ -164,6 +172,18 @@ class SonicFrontEnd(FrontEnd):
                 history.copy_(present.clone())
             else:
                 history.copy_(torch.where(column(mask, self.device)[:, None], present, history))
+
+    def mirror_obs(self) -> Mirror:
+        """Mirror image of an observation; the zeros of the other modes stay where they are."""
+        anchor = plain(1, -1, -1, 1, 1, -1)
+        reference = [plain(*[1] * 4), *[_MIRROR] * (2 * FRAMES), plain(*[1] * 11), anchor, *[anchor] * FRAMES]
+        rest = plain(*[1] * (ENCODER_INPUT - _ANCHORS.stop))
+        past = [*[plain(-1, 1, -1)] * FRAMES, *[_MIRROR] * (3 * FRAMES), *[plain(1, -1, 1)] * FRAMES]
+        return Mirror([*reference, rest, *past], self.device)
+
+    def mirror_action(self) -> Mirror:
+        """Mirror image of a raw action: limbs change sides."""
+        return Mirror([_MIRROR], self.device)
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write reference, anchor and the newest entry of each history but the actions'."""

@@ -17,7 +17,8 @@ from arena_newton.errors import InputError
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, PhysicsRate
 from arena_newton.trackers import onnx_mlp, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
-from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, NetworkTracker, column
+from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
+from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
 from arena_newton.trackers.quadratic import Quadratic, products
 
 __all__ = ["FRAME", "HISTORY", "OBSERVATION", "OFFICIAL_FORM", "Twist2FrontEnd", "Twist2Tracker", "from_checkpoint"]
@@ -104,6 +105,17 @@ class Twist2FrontEnd(FrontEnd):
         self._shifted.copy_(self._past[:, FRAME:])
         self._past[:, :-FRAME].copy_(self._shifted)
         self._past[:, -FRAME:].copy_(self._frame)
+
+    def mirror_obs(self) -> Mirror:
+        """Mirror image of an observation: vy, roll and yaw rate change sign, limbs change sides."""
+        joints = MIRROR_JOINTS, MIRROR_SIGNS
+        command = [plain(1, -1, 1, -1, 1, -1), joints]
+        frame = [*command, plain(-1, 1, -1), plain(-1, 1), joints, joints, joints]
+        return Mirror([*frame * (1 + HISTORY), *command], self.device)
+
+    def mirror_action(self) -> Mirror:
+        """Mirror image of a raw action: limbs change sides."""
+        return Mirror([(MIRROR_JOINTS, MIRROR_SIGNS)], self.device)
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write the present frame and the command's second place."""
