@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from arena_newton.errors import InputError
-from arena_newton.trackers.motions import load_actions, load_clip
-from arena_newton.trackers.motions.load import JOINTS_23
+from arena_newton.trackers.motions import load, load_actions, load_clip
+from arena_newton.trackers.motions.load import JOINTS_23, load_plain_pickle
 
 CLIPS = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2" / "example_motions"
 
@@ -69,6 +69,16 @@ def test_other_callables(tmp_path, name):
     path.write_bytes(name + b"(S'echo'\ntR.")
     with pytest.raises(InputError, match="refused"):
         load_clip(path)
+
+
+def test_state_of_functions(tmp_path):
+    """A pickle cannot set attributes on the functions and classes that it may name."""
+    for name in (b"c_codecs\nencode\n", b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n"):
+        path = tmp_path / "state.pkl"
+        path.write_bytes(b"\x80\x02" + name + b"N}(S'marked'\nS'x'\nu\x86b.")
+        with pytest.raises(InputError, match=r"a state for .*refused"):
+            load_plain_pickle(path)
+        assert not any(hasattr(admitted, "marked") for admitted in load._admitted().values())
 
 
 class JoblibPickler(pickle._Pickler):

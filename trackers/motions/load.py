@@ -139,10 +139,13 @@ class _PlainUnpickler(pickle._Unpickler):
         raise _RefusedError("a persistent id")
 
     def load_build(self) -> None:
-        super().load_build()  # type: ignore[misc]
         stack: list[Any] = self.stack  # type: ignore[attr-defined]
+        # A state is set on arrays and their types only: set on a function it would change the function.
+        if not isinstance(stack[-2], np.ndarray | np.dtype | _JoblibArray):
+            raise _RefusedError(f"a state for {stack[-2]!r}")
+        super().load_build()  # type: ignore[misc]
         if isinstance(stack[-1], _JoblibArray):
-            stack[-1] = stack[-1].read(self._file)
+            stack[-1] = _JoblibArray.read(stack[-1], self._file)
 
     dispatch = dict(pickle._Unpickler.dispatch)
     dispatch[pickle.BUILD[0]] = load_build  # type: ignore[assignment]

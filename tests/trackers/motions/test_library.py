@@ -7,6 +7,7 @@ import warp as wp
 
 from arena_newton.errors import InputError
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate, launch_reset_reference
+from arena_newton.policies.replay import clip_actions
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS, MotionLibrary
@@ -201,6 +202,16 @@ def test_resampling():
     np.testing.assert_allclose(library.root_pos, fast.root_pos, atol=1e-3)
     same_rotation(library.root_quat, fast.root_quat, 1e-5)
     np.testing.assert_allclose(library.joint_pos, fast.joint_pos, atol=1e-3)
+
+
+def test_replay_plays_the_same():
+    """A clip's actions from a library are those that the replay policy plays from its file."""
+    clip = wave(61, fps=29.9)
+    library = MotionLibrary.from_clips([clip], ["a"])
+    arrays = (torch.from_numpy(x.astype(float)) for x in (library.root_pos, library.root_quat, library.joint_pos))
+    actions, played = frames.motion_actions(*arrays).numpy(), clip_actions(clip)
+    assert len(actions) == len(played)
+    np.testing.assert_allclose(actions, played, atol=2e-6)
 
 
 def test_bad_files(library, tmp_path):
