@@ -74,8 +74,6 @@ class TrainOptions:
     """Weight of the entropy."""
     init_std: float = 0.6
     """Standard deviation of the action noise at the start."""
-    symmetry: bool = False
-    """Train on the mirror image of every sample too."""
     save_interval: int = 200
     """Iterations between checkpoints."""
     print_interval: int = 20
@@ -103,13 +101,6 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
         card: What the weights' card will say about this training.
     """
     hidden = [512, 512, 256]
-    symmetry = None
-    if options.symmetry:
-        symmetry = {
-            "data_augmentation_func": "arena_newton.trackers.train.symmetry:augment",
-            "use_data_augmentation": True,
-            "use_mirror_loss": False,
-        }
     logger: Any = options.logger
     if options.logger == "wandb":
         logger = {"class_name": "WandbLogWriter", "project_name": "arena-newton-trackers"}
@@ -151,6 +142,5 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "max_grad_norm": 1.0,
             # Returns are about 16; clipping value steps to 0.2 would slow the critic down by that much.
             "use_clipped_value_loss": False,
-            "symmetry_cfg": symmetry,
         },
     }

@@ -9,6 +9,7 @@ waits for the device.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,6 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from arena_newton.errors import ArenaError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
 from arena_newton.trackers.motions import frames
@@ -26,13 +26,14 @@ from arena_newton.trackers.train.references import FEET, KEY_LINKS, Frame, Refer
 from arena_newton.trackers.train.rewards import REWARDS, TERMINATION_REWARD, Term
 from arena_newton.trackers.train.sampling import ClipSampler
 from arena_newton.trackers.train.simulation import Simulation
+from arena_newton.trackers.train.tally import Tally
 from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
 
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
     from arena_newton.trackers.motions.library import DeviceLibrary
 
-__all__ = ["ERRORS", "EnvConfig", "TrackerEnv", "TrainingError"]
+__all__ = ["EnvConfig", "TrackerEnv"]
 
 _PREFILL = 0.5
 """Share of the episodes that start with a history of the present frame; the others start with an empty one."""
@@ -59,27 +60,7 @@ class EnvConfig:
     constraints_per_world: int = 160
     """Constraint buffer."""
     graph: bool = True
-    """Capture the physics tick on CUDA."""
-
-
-class TrainingError(ArenaError):
-    """Training cannot go on."""
-
-
-def _rms(difference: torch.Tensor) -> torch.Tensor:
-    return difference.square().mean(1).sqrt()
-
-
-ERRORS: dict[str, Callable[[Motion], torch.Tensor]] = {
-    "velocity_m_s": lambda m: m.velocity_error[:, :2].norm(dim=1),
-    "legs_rad": lambda m: _rms((m.joint_pos - m.reference.joint_pos)[:, :12]),
-    "arms_rad": lambda m: _rms((m.joint_pos - m.reference.joint_pos)[:, 15:]),
-    "links_m": lambda m: (m.keys - m.reference.keys).norm(dim=2).mean(1),
-    "height_m": lambda m: m.position_error[:, 2].abs(),
-    "position_m": lambda m: m.position_error[:, :2].norm(dim=1),
-    "heading_rad": lambda m: m.heading_error.abs(),
-}
-"""Tracking errors that are logged beside the rewards."""
+    """Capture the tick on CUDA."""
 
 
 class TrackerEnv(VecEnv):
@@ -156,41 +137,73 @@ class TrackerEnv(VecEnv):
         self._scale = torch.tensor(front_end.action_form.scale, device=device)
         numbers = torch.arange(self.num_actions, device=device)[None]
         self._raw_order = torch.argsort(front_end.to_mujoco(numbers)[0])
-        self.episode_length_buf = torch.zeros(worlds, dtype=torch.long, device=device)
-        self.frame = torch.zeros(worlds, dtype=torch.long, device=device)
-        self._action = torch.zeros(worlds, self.num_actions, device=device)
-        self._targets = torch.zeros(worlds, 29, device=device)
-        self._feet = torch.zeros(worlds, 2, 3, device=device)
-        self._foot_vel = torch.zeros(worlds, 2, 3, device=device)
-        self._make_counters()
+        self._allocate()
         with torch.no_grad():
             self._restart(self._every)
             self._observe(self._every)
+        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+        if config.graph and device.startswith("cuda"):
+            self._capture()
 
-    def _make_counters(self) -> None:
-        terms, ends = len(self.rewards), len(self.terminations)
-        zeros = lambda *shape: torch.zeros(shape, device=self.device)  # noqa: E731
-        self._sums = {
-            "reward": zeros(terms),
-            "ended": zeros(ends),
-            "error": zeros(len(ERRORS)),
-            "family_seconds": zeros(len(self.bank.family_names)),
-            "family_falls": zeros(len(self.bank.family_names)),
-            "ticks": zeros(1),
-            "falls": zeros(1),
-            "overflow": zeros(1),
-        }
-        self._weights = torch.tensor([t.weight for t in self.rewards.values()], device=self.device)
-        self._limits = torch.tensor([b.limit for b in self.terminations.values()], device=self.device)
-        # The guard's names: reward terms, then observations, then the policy's actions.
-        self.guarded = [*(f"reward {n}" for n in self.rewards), "observation actor", "observation critic", "action"]
-        self._bad_world = torch.full((len(self.guarded),), -1, dtype=torch.long, device=self.device)
+    def _allocate(self) -> None:
+        """Buffers that keep their place, so that a CUDA graph can hold a tick."""
+        worlds, device = self.num_envs, self.device
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(shape, dtype=dtype, device=device)
+
+        self.episode_length_buf, self.frame = zeros(worlds, dtype=torch.long), zeros(worlds, dtype=torch.long)
+        self._action, self._last_action = zeros(worlds, self.num_actions), zeros(worlds, self.num_actions)
+        self._targets = zeros(worlds, 29)
+        self._feet, self._foot_vel = zeros(worlds, 2, 3), zeros(worlds, 2, 3)
+        self._next_rows = zeros(worlds, self.bank.data.shape[1])
+        self._next = self.bank.split(self._next_rows)
+        self._reward, self._done = zeros(worlds), zeros(worlds, dtype=torch.long)
+        self._time_out = zeros(worlds, dtype=torch.bool)
+        self._critic_obs: torch.Tensor | None = None
+        self._weights = torch.tensor([t.weight for t in self.rewards.values()], device=device)
+        self._limits = torch.tensor([b.limit for b in self.terminations.values()], device=device)
+        self.tally = Tally(list(self.rewards), list(self.terminations), self.bank.family_names, device)
+
+    @torch.no_grad()
+    def _capture(self) -> None:
+        """Hold what a tick does around the physics in two CUDA graphs; without them it runs as it is, more slowly."""
+        for _ in range(3):
+            self.step(self.reference_action())
+        torch.cuda.synchronize(self.device)
+        graphs = {}
+        try:
+            for name, work in (("before", self._before), ("after", self._after)):
+                graphs[name] = torch.cuda.CUDAGraph()
+                # Other threads (a process group's watchdog) may use the device meanwhile.
+                with torch.cuda.graph(graphs[name], capture_error_mode="thread_local"):
+                    work()
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:200]
+            warnings.warn(f"the training tick is not captured, it runs more slowly: {reason}", stacklevel=2)
+            graphs = {}
+        torch.cuda.synchronize(self.device)
+        self._graphs = graphs
+        self._restart(self._every)
+        self._observe(self._every)
+        self.sampler.clear()
+        self.tally.clear()
+
+    def _run(self, name: str, work: Callable[[], None]) -> None:
+        graph = self._graphs.get(name)
+        if graph is None:
+            work()
+        else:
+            graph.replay()
 
     # -- rsl-rl's interface -----------------------------------------------------------------------------------------
 
     def get_observations(self) -> TensorDict:
         """Observations of the present state: groups `actor` and `critic`."""
-        return TensorDict({"actor": self.front_end.obs.clone(), "critic": self._critic_obs}, batch_size=[self.num_envs])
+        assert self._critic_obs is not None
+        return TensorDict(
+            {"actor": self.front_end.obs.clone(), "critic": self._critic_obs.clone()}, batch_size=[self.num_envs]
+        )
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
@@ -202,27 +215,36 @@ class TrackerEnv(VecEnv):
         Returns:
             Observations, rewards [worlds], dones [worlds] (int64) and extras with `time_outs`.
         """
-        last_action, self._action = self._action, actions.detach()
+        self._last_action.copy_(self._action)
+        self._action.copy_(actions)
+        self._run("before", self._before)
+        self.sim.step()
+        self._run("after", self._after)
+        return self.get_observations(), self._reward, self._done, {"time_outs": self._time_out}
+
+    def _before(self) -> None:
+        """Raw actions become targets, some of them a tick late."""
         targets = self.front_end.act(self._action)
         self.sim.targets.copy_(torch.where(self.delay[:, None], self._targets, targets))
         self._targets.copy_(targets)
-        self.sim.step()
-        self.frame += 1
-        self.episode_length_buf += 1
 
-        motion = self._measure(self._next, last_action)
+    def _after(self) -> None:
+        """The new state is judged, ended worlds start again, the next observations are made."""
+        self.frame.add_(1)
+        self.episode_length_buf.add_(1)
+        motion = self._measure(self._next)
         reward, failed = self._judge(motion)
         over = (self.frame >= self.bank.last.index_select(0, self.frame)) | (
             self.episode_length_buf >= self.max_episode_length
         )
-        time_out = over & ~failed
         done = failed | over
+        self._reward.copy_(reward)
+        self._done.copy_(done)
+        self._time_out.copy_(over & ~failed)
         self.sampler.record(self.frame, failed, TICK)
-
         self._restart(done)
         events.apply(self, "interval", ~done, self.events)
         self._observe(done)
-        return self.get_observations(), reward, done.long(), {"time_outs": time_out}
 
     def reference_action(self) -> torch.Tensor:
         """The raw action that asks for the next reference frame's joints, shape [worlds, actions]."""
@@ -239,32 +261,11 @@ class TrackerEnv(VecEnv):
             TrainingError: A reward term, an observation or an action was not finite.
         """
         self.sampler.renew()
-        packed = torch.cat([*(v.reshape(-1) for v in self._sums.values()), self._bad_world.float()]).tolist()
-        values: dict[str, list[float]] = {}
-        for name, sums in self._sums.items():
-            values[name], packed = packed[: sums.numel()], packed[sums.numel() :]
-            sums.zero_()
-        for what, world in zip(self.guarded, packed, strict=True):
-            if world >= 0:
-                raise TrainingError(f"world {int(world)}: {what} is not finite")
-        ticks = max(values["ticks"][0], 1.0)
-        seconds = ticks * TICK
-        out = {f"Reward/{n}": v / seconds for n, v in zip(self.rewards, values["reward"], strict=True)}
-        out |= {f"Ends_per_s/{n}": v / seconds for n, v in zip(self.terminations, values["ended"], strict=True)}
-        out |= {f"Error/{n}": v / ticks for n, v in zip(ERRORS, values["error"], strict=True)}
-        for name, lived, falls in zip(
-            self.bank.family_names, values["family_seconds"], values["family_falls"], strict=True
-        ):
-            if lived > 0.0:
-                out[f"Seconds_between_ends/{name}"] = lived / max(falls, 1.0)
-        out["Train/reward_per_s"] = sum(values["reward"]) / seconds
-        out["Train/seconds_between_ends"] = seconds / max(values["falls"][0], 1.0)
-        out["Train/overflow_share"] = values["overflow"][0] / ticks
-        return out
+        return self.tally.collect()
 
     # -- parts of a tick --------------------------------------------------------------------------------------------
 
-    def _measure(self, reference: Frame, last_action: torch.Tensor) -> Motion:
+    def _measure(self, reference: Frame) -> Motion:
         """Compare the measured state with a reference frame."""
         sim = self.sim
         finite = torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
@@ -277,7 +278,7 @@ class TrackerEnv(VecEnv):
         first = self.episode_length_buf <= 1
         moved = torch.where(first[:, None, None], 0.0, (key_pos[:, FEET] - self._feet) / TICK).clamp(-10.0, 10.0)
         self._feet.copy_(key_pos[:, FEET])
-        self._foot_vel = moved
+        self._foot_vel.copy_(moved)
         return Motion(
             reference=reference,
             root_pos=sim.root_pos,
@@ -298,7 +299,7 @@ class TrackerEnv(VecEnv):
             keys=rotations.turn(-heading[:, None], key_pos - below[:, None]),
             foot_vel=moved,
             action=self._action,
-            last_action=last_action,
+            last_action=self._last_action,
             finite=finite,
             first=first,
         )
@@ -308,35 +309,19 @@ class TrackerEnv(VecEnv):
         values = torch.stack([term.value(motion) for term in self.rewards.values()], 1)
         # What a broken physics state spoils is no fault of a term: the world ends and earns nothing.
         values = torch.where(motion.finite[:, None], values, 0.0)
-        self._guard(values)
+        assert self._critic_obs is not None
+        self.tally.guard(values, self.front_end.obs, self._critic_obs, self._action)
         ends = torch.stack([bound.value(motion) for bound in self.terminations.values()], 1) > self._limits
         failed = ends.any(1) | ~motion.finite
         earned = values * (self._weights * TICK)
-        reward = earned.sum(1) + TERMINATION_REWARD * failed
-        sums = self._sums
-        sums["reward"] += earned.sum(0)
-        sums["ended"] += ends.float().sum(0)
-        errors = torch.stack([error(motion) for error in ERRORS.values()], 1)
-        sums["error"] += torch.where(motion.finite[:, None], errors, 0.0).clamp_max(100.0).sum(0)
         family = self.bank.family.index_select(0, self.bank.clip_of.index_select(0, self.frame))
-        sums["family_seconds"].index_add_(0, family, torch.full_like(reward, TICK))
-        sums["family_falls"].index_add_(0, family, failed.float())
-        sums["ticks"] += self.num_envs
-        sums["falls"] += failed.sum()
-        sums["overflow"] += (self.sim.overflow != 0).sum()
-        return reward, failed
-
-    def _guard(self, values: torch.Tensor) -> None:
-        """Remember a world for each guarded term that is not finite, without waiting for the device."""
-        checked = (self.front_end.obs, self._critic_obs, self._action)
-        bad = [~torch.isfinite(values), *(~torch.isfinite(v).all(1, keepdim=True) for v in checked)]
-        bad_terms = torch.cat(bad, 1)
-        self._bad_world = torch.where(bad_terms.any(0), bad_terms.int().argmax(0), self._bad_world)
+        self.tally.add(motion, earned, ends, failed, family, self.sim.overflow)
+        return earned.sum(1) + TERMINATION_REWARD * failed, failed
 
     def _restart(self, mask: torch.Tensor) -> None:
         """Put the masked worlds into a random frame of a sampled clip, at the reference's state with a little noise."""
         sim, worlds, row = self.sim, self.num_envs, mask[:, None]
-        self.frame = torch.where(mask, self.sampler.sample(worlds), self.frame)
+        self.frame.copy_(torch.where(mask, self.sampler.sample(worlds), self.frame))
         start = self.bank.gather(self.frame)
         noise = events.START_NOISE if self.cfg.randomise else dict.fromkeys(events.START_NOISE, 0.0)
 
@@ -361,8 +346,8 @@ class TrackerEnv(VecEnv):
         put(sim.joint_vel, around(start.joint_vel, "joint_vel"))
         put(sim.warmstart, 0.0)
         put(self._targets, start.joint_pos)
-        self._action = torch.where(row, 0.0, self._action)
-        self._foot_vel = torch.where(row[:, None], 0.0, self._foot_vel)
+        self._action.masked_fill_(row, 0.0)
+        self._foot_vel.masked_fill_(row[:, None], 0.0)
         sim.overflow.masked_fill_(mask, 0)
         self.episode_length_buf.masked_fill_(mask, 0)
         clip = self.bank.clip_of.index_select(0, self.frame)
@@ -382,7 +367,7 @@ class TrackerEnv(VecEnv):
             fresh: Worlds whose episode starts, bool, shape [worlds].
         """
         now = self.bank.gather(self.frame)
-        self._next = self.bank.gather(torch.minimum(self.frame + 1, self.bank.last.index_select(0, self.frame)))
+        self._next_rows.copy_(self.bank.rows(torch.minimum(self.frame + 1, self.bank.last.index_select(0, self.frame))))
         ahead = self._next
         command = TrackerCommand(
             mimic=ahead.mimic, joints=ahead.joint_pos, joint_vel=ahead.joint_vel, quat=ahead.root_quat
@@ -393,7 +378,11 @@ class TrackerEnv(VecEnv):
             fresh = fresh & (torch.rand(self.num_envs, device=self.device) < _PREFILL)
         self.front_end.prefill(command, state, fresh)
         self.front_end.observe(command, state)
-        self._critic_obs = self._critic(now)
+        critic = self._critic(now)
+        if self._critic_obs is None:
+            self._critic_obs = critic.clone()
+        else:
+            self._critic_obs.copy_(critic)
 
     def _noisy_state(self) -> RobotState:
         sim = self.sim

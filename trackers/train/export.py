@@ -88,7 +88,8 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
 def _drive(value: dict[str, Any]) -> DriveGains:
     from arena_newton.robot import DriveGains
 
-    return DriveGains(**{k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in value.items()})
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in value.items()}
+    return DriveGains(**fields)
 
 
 def _markdown(card: dict[str, Any]) -> str:

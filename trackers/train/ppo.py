@@ -34,22 +34,19 @@ class IterationPPO(PPO):
 
     def update(self) -> dict[str, float]:
         """Optimise over the stored rollout; mean losses by name."""
-        if self.rnd or self.actor.is_recurrent or self.critic.is_recurrent:
+        if self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent:
             return super().update()
         batches = self.num_learning_epochs * self.num_mini_batches
         last_epoch = batches - self.num_mini_batches
-        totals = torch.zeros(4, device=self.device)
+        totals = torch.zeros(3, device=self.device)
         divergence = torch.zeros((), device=self.device)
         generator = self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs)
         for k, batch in enumerate(generator):
-            size = batch.observations.batch_size[0]
-            if self.symmetry:
-                self.symmetry.augment_batch(batch, size)
             self.actor(batch.observations, stochastic_output=True)
             log_prob = self.actor.get_output_log_prob(batch.actions)
             values = self.critic(batch.observations)
-            parameters = tuple(p[:size] for p in self.actor.output_distribution_params)
-            entropy = self.actor.output_entropy[:size].mean()
+            parameters = self.actor.output_distribution_params
+            entropy = self.actor.output_entropy.mean()
             if k >= last_epoch:
                 with torch.no_grad():
                     divergence += self.actor.get_kl_divergence(batch.old_distribution_params, parameters).mean()
@@ -63,11 +60,6 @@ class IterationPPO(PPO):
             else:
                 value = (values - batch.returns).square().mean()
             loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
-            mirror = torch.zeros((), device=self.device)
-            if self.symmetry:
-                mirror = self.symmetry.compute_loss(self.actor, batch, size)
-                if self.symmetry.use_mirror_loss:
-                    loss = loss + self.symmetry.mirror_loss_coeff * mirror
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             if self.is_multi_gpu:
@@ -75,7 +67,7 @@ class IterationPPO(PPO):
             nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
             nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
             self.optimizer.step()
-            totals += torch.stack((value.detach(), surrogate.detach(), entropy.detach(), mirror.detach()))
+            totals += torch.stack((value.detach(), surrogate.detach(), entropy.detach()))
         observations = self.storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
@@ -87,9 +79,7 @@ class IterationPPO(PPO):
         losses = (totals / batches).tolist()
         self.last_kl = float(divergence)
         self._set_rate(self.last_kl)
-        named = dict(zip(("value", "surrogate", "entropy", "symmetry"), losses, strict=True))
-        if not self.symmetry:
-            del named["symmetry"]
+        named = dict(zip(("value", "surrogate", "entropy"), losses, strict=True))
         return named | {"kl": self.last_kl}
 
     def _set_rate(self, divergence: float) -> None:

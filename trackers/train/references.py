@@ -98,12 +98,19 @@ class ReferenceBank:
         self.last = (self.start + self.length - 1)[self.clip_of]
         """Last frame of each frame's clip, shape [frames]."""
 
-    def gather(self, frame: torch.Tensor) -> Frame:
-        """The frames of an index tensor, shape [worlds]."""
-        rows = self.data.index_select(0, frame)
+    def rows(self, frame: torch.Tensor) -> torch.Tensor:
+        """Packed frames of an index tensor, shape [worlds] to [worlds, width]."""
+        return self.data.index_select(0, frame)
+
+    def split(self, rows: torch.Tensor) -> Frame:
+        """Views of packed frames."""
         parts = dict(zip(_FIELDS, rows.split(list(_FIELDS.values()), dim=1), strict=True))
         parts["keys"] = parts["keys"].unflatten(1, (len(KEY_LINKS), 3))
         return Frame(**parts)
+
+    def gather(self, frame: torch.Tensor) -> Frame:
+        """The frames of an index tensor, shape [worlds]."""
+        return self.split(self.rows(frame))
 
 
 def _key_links(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:

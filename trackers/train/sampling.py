@@ -24,8 +24,8 @@ PRIOR = 10.0
 """Seconds of evidence of the family that stand beside a bin's own."""
 FORGET = 0.99
 """What is kept of the evidence each iteration."""
-CEILING = 20.0
-"""Largest factor of a bin over the mean."""
+CEILING = 5.0
+"""Largest factor of a bin over the mean: what no tracker can follow shall not take all the time."""
 
 
 class ClipSampler:
@@ -91,9 +91,15 @@ class ClipSampler:
         by_bin = (self.failures + PRIOR * by_family[self.family]) / (self.seconds + PRIOR)
         factor = (by_bin / (self.base * by_bin).sum()).clamp_max(CEILING)
         factor /= (self.base * factor).sum()
-        self.cumulative = torch.cumsum(self.base * (1.0 - self.adaptive + self.adaptive * factor), 0)
+        torch.cumsum(self.base * (1.0 - self.adaptive + self.adaptive * factor), 0, out=self.cumulative)
         self.seconds *= FORGET
         self.failures *= FORGET
+
+    def clear(self) -> None:
+        """Forget the evidence."""
+        self.seconds.zero_()
+        self.failures.zero_()
+        self.renew()
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed training needs."""
@@ -104,4 +110,4 @@ class ClipSampler:
         if state["seconds"].shape == self.seconds.shape:
             self.seconds.copy_(state["seconds"])
             self.failures.copy_(state["failures"])
-            self.cumulative = state["cumulative"].to(self.base.device)
+            self.cumulative.copy_(state["cumulative"])

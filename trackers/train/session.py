@@ -43,7 +43,7 @@ def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveG
     return kind(form), drive, PhysicsRate(dt=0.005, substeps=4)
 
 
-def make_library(options: TrainOptions, device: str) -> MotionLibrary:
+def make_library(options: TrainOptions, device: str, seed: int = 0) -> MotionLibrary:
     """References of a training: a library or generated ones, more files, mirror images.
 
     Raises:
@@ -61,7 +61,7 @@ def make_library(options: TrainOptions, device: str) -> MotionLibrary:
         from arena_newton.trackers.motions import programs
 
         wanted: dict[str, Any] = {"families": options.families} if options.families else {}
-        parts.append(MotionLibrary.from_random(programs.random_clips(**wanted, seed=options.seed, device=device)))
+        parts.append(MotionLibrary.from_random(programs.random_clips(**wanted, seed=seed, device=device)))
     if options.clips:
         more, reports = read_library(
             options.clips, family="clips", licence=options.clips_licence, source=options.clips_source
@@ -143,7 +143,7 @@ def build(options: TrainOptions) -> TrackerRunner:
     torch.set_float32_matmul_precision("high")
     torch.manual_seed(options.seed + rank)
     began = time.monotonic()
-    library = make_library(options, device)
+    library = make_library(options, device, options.seed + 1000 * rank)
     told = time.monotonic()
     front, drive, rate = front_end(options.tracker, options.action_form)
     rewards = {n: dataclasses.replace(t, weight=options.rewards.get(n, t.weight)) for n, t in REWARDS.items()}

@@ -1,0 +1,143 @@
+"""Parts of the training that need no physics."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from arena_newton.trackers.motions import frames, kinematics
+from arena_newton.trackers.train import rotations
+from arena_newton.trackers.train.motion import Motion
+from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
+from arena_newton.trackers.train.rewards import REWARDS
+from arena_newton.trackers.train.sampling import ClipSampler
+from arena_newton.trackers.train.tally import Tally, TrainingError
+from arena_newton.trackers.train.terminations import TERMINATIONS
+
+
+@pytest.fixture(scope="module")
+def bank(library):
+    return ReferenceBank(library.to("cpu"), "cpu")
+
+
+def perfect(bank: ReferenceBank, frame: torch.Tensor) -> Motion:
+    """A tick in which the robot does what it was asked for."""
+    reference = bank.gather(frame)
+    n = len(frame)
+    zero = torch.zeros(n)
+    return Motion(
+        reference=reference,
+        root_pos=reference.root_pos,
+        heading=zero,
+        heading_error=zero,
+        position_error=torch.zeros(n, 3),
+        velocity=reference.lin_vel,
+        velocity_error=torch.zeros(n, 3),
+        yaw_rate_error=zero,
+        tilt_error=zero,
+        gravity=torch.tensor([[0.0, 0.0, -1.0]]).repeat(n, 1),
+        ang_vel=torch.zeros(n, 3),
+        joint_pos=reference.joint_pos,
+        joint_vel=reference.joint_vel,
+        joint_acc=torch.zeros(n, 29),
+        torque=torch.zeros(n, 29),
+        joint_range=torch.tensor([[-3.0, 3.0]]).repeat(29, 1),
+        keys=reference.keys,
+        foot_vel=torch.zeros(n, 2, 3),
+        action=torch.zeros(n, 29),
+        last_action=torch.zeros(n, 29),
+        finite=torch.ones(n, dtype=torch.bool),
+        first=torch.zeros(n, dtype=torch.bool),
+    )
+
+
+def test_perfect_tracking_earns_every_positive_weight(bank):
+    """Each positive weight is what perfect tracking earns a second, penalties are zero, and nothing ends."""
+    motion = perfect(bank, torch.tensor([10, 200, 250]))
+    for name, term in REWARDS.items():
+        expected = 1.0 if term.weight > 0.0 else 0.0
+        assert torch.allclose(term.value(motion), torch.full((3,), expected)), name
+    assert not any((bound.value(motion) > bound.limit).any() for bound in TERMINATIONS.values())
+
+
+@pytest.mark.parametrize(
+    ("field", "error", "lost"),
+    [
+        ("joint_pos", 0.2, {"joint_position"}),
+        ("velocity_error", 0.25, {"velocity"}),
+        ("heading_error", 0.35, {"heading"}),
+        ("tilt_error", 0.15, {"tilt"}),
+        ("yaw_rate_error", 0.5, {"yaw_rate"}),
+    ],
+)
+def test_an_error_costs_its_own_term(bank, field, error, lost):
+    """An error of one quantity lowers the term of that quantity and no other tracking term."""
+    motion = perfect(bank, torch.tensor([10, 200]))
+    worse = dataclasses.replace(motion, **{field: getattr(motion, field) + error})
+    fallen = {n for n, t in REWARDS.items() if t.weight > 0.0 and (t.value(worse) < 0.99).any()}
+    assert fallen == lost
+
+
+def test_key_links_are_seen_from_the_heading_frame(library):
+    """Key links do not change when a clip is moved and turned on the floor."""
+    turned = dataclasses.replace(
+        library,
+        root_pos=frames.quat_apply(
+            frames.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4), torch.tensor(library.root_pos)
+        ).numpy()
+        + [3.0, -2.0, 0.0],
+        root_quat=frames.quat_multiply(
+            frames.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4), torch.tensor(library.root_quat)
+        ).numpy(),
+    )
+    here, there = (
+        ReferenceBank(lib.to("cpu"), "cpu").gather(torch.tensor([70, 220])).keys for lib in (library, turned)
+    )
+    assert torch.allclose(here, there, atol=1e-5)
+    assert torch.allclose(here[:, :2, 2], torch.full((2, 2), kinematics.SOLE_HEIGHT), atol=1e-5)
+    assert here.shape == (2, len(KEY_LINKS), 3)
+
+
+def test_turning_a_quaternion_by_a_small_vector():
+    """`turned_by` turns in the body's frame, so that gravity seen from the body moves by the vector's length."""
+    quat = frames.quat_from_yaw(torch.tensor([0.7]))
+    turned = rotations.turned_by(quat, torch.tensor([[0.02, 0.0, 0.0]]))
+    assert torch.allclose(frames.roll_pitch(turned), torch.tensor([[0.02, 0.0]]), atol=1e-5)
+    assert torch.allclose(frames.heading(turned), torch.tensor([0.7]), atol=1e-5)
+    assert torch.allclose(
+        rotations.gravity_in_body(turned),
+        frames.quat_apply(frames.quat_conjugate(turned), torch.tensor([[0.0, 0.0, -1.0]])),
+        atol=1e-6,
+    )
+
+
+def test_failures_draw_episodes(bank):
+    """A bin in which the tracker fails is drawn more often, and no start lies outside a clip or at its very end."""
+    torch.manual_seed(0)
+    sampler = ClipSampler(bank, adaptive=0.5)
+    before = sampler.bin_of[sampler.sample(20000)]
+    worst = int(sampler.bin_of[220])
+    for _ in range(200):
+        sampler.record(torch.arange(bank.frames), sampler.bin_of == worst, 0.02)
+    sampler.renew()
+    drawn = sampler.sample(20000)
+    share = lambda bins: float(((bins == worst) | (bins == worst - 1)).float().mean())  # noqa: E731
+    assert share(sampler.bin_of[drawn]) > 1.3 * share(before)
+    assert (bank.last[drawn] - drawn >= 25).all()
+    assert (drawn >= bank.start[bank.clip_of[drawn]]).all()
+
+
+def test_guard_names_term_and_world(bank):
+    """A term that is not finite stops the training with its name and its world."""
+    tally = Tally(list(REWARDS), list(TERMINATIONS), bank.family_names, "cpu")
+    values, seen, action = torch.zeros(4, len(REWARDS)), torch.zeros(4, 7), torch.zeros(4, 29)
+    tally.guard(values, seen, seen, action)
+    tally.collect()
+    values[2, list(REWARDS).index("tilt")] = float("nan")
+    tally.guard(values, seen, seen, action)
+    with pytest.raises(TrainingError, match="world 2: reward tilt is not finite"):
+        tally.collect()
+    action[3, 5] = float("inf")
+    tally.guard(torch.zeros_like(values), seen, seen, action)
+    with pytest.raises(TrainingError, match="world 3: action is not finite"):
+        tally.collect()
