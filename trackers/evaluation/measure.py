@@ -212,7 +212,9 @@ class Meter:
         share = TICK / (SEAT_SMOOTHING + TICK)
         self._force = self._force + share * (lab.pair_force - self._force)
         self._touch = torch.where(live, torch.maximum(self._touch, lab.pair_force), self._touch)
-        self._streak = (self._streak + TICK) * (live & (self._force >= SEAT_LOAD))
+        # A leaky count: every tick below the load takes one back.
+        step = torch.where(self._force >= SEAT_LOAD, TICK, -TICK)
+        self._streak = torch.where(live, (self._streak + step).clamp_min(0.0), self._streak)
         self._loaded = torch.maximum(self._loaded, self._streak)
 
     def results(self) -> dict[str, np.ndarray]:
@@ -224,7 +226,7 @@ class Meter:
         `heading_error` at the end [deg]; `foot_slip`: mean planar speed of a foot on the floor [m/s]; `action_rate`:
         RMS of the targets' rate [rad/s]; `torque`: mean share of the torque limit; `saturation`: share of joint ticks
         above 95 % of it; `speed_*`, `ref_*`: mean speeds in the heading frame [m/s], [rad/s]; `ball_peak`, `ball_end`
-        [m/s]; `seat_time`: longest time at 100 N and more [s]; `touch`: largest force on a support [N]; `lowest`,
+        [m/s]; `seat_time`: time at 100 N and more, less the gaps [s]; `touch`: largest force on a support [N]; `lowest`,
         `lowest_ref`: lowest pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: the root at the end.
         """
         host: Callable[[torch.Tensor], np.ndarray] = lambda t: t.double().cpu().numpy()  # noqa: E731

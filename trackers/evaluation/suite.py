@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +14,7 @@ from arena_newton.robot import TICK
 if TYPE_CHECKING:
     import torch
 
-    from arena_newton.trackers.motions.commands import MotionCommand
-
-    Program = Callable[[torch.Tensor], MotionCommand]
-    """Times since the anchor [s], shape [ticks], to a command whose rows are those times."""
+    from arena_newton.trackers.motions.primitives import Script
 
 __all__ = ["Ball", "Cell", "Navigation", "Placed", "Push", "Tables", "clip_cells", "tabulate"]
 
@@ -86,7 +82,7 @@ class Cell:
     """Primitive or condition that it belongs to."""
     seconds: float
     """Length after the start-up [s]."""
-    program: Program | None = None
+    script: Script | None = None
     """Commands of the reference generator."""
     actions: np.ndarray | None = field(default=None, repr=False, compare=False)
     """Canonical actions instead, shape [ticks, 40]."""
@@ -174,7 +170,7 @@ def tabulate(cells: list[Cell], device: torch.device) -> Tables:
     ticks = max(cell.ticks for cell in cells)
     actions = torch.empty(ticks, len(cells), ACTION_WIDTH, device=device)
     actions[:] = torch.as_tensor(STAND_ACTION, device=device)
-    programs = [i for i, cell in enumerate(cells) if cell.program is not None]
+    programs = [i for i, cell in enumerate(cells) if cell.script is not None]
     if programs:
         actions[:, programs] = _generate([cells[i] for i in programs], ticks, device)
     for i, cell in enumerate(cells):
@@ -199,15 +195,13 @@ def tabulate(cells: list[Cell], device: torch.device) -> Tables:
 def _generate(cells: list[Cell], ticks: int, device: torch.device) -> torch.Tensor:
     import torch
 
-    from arena_newton.trackers.motions.commands import MotionCommand
     from arena_newton.trackers.motions.generator import ReferenceGenerator
+    from arena_newton.trackers.motions.primitives import Program
 
-    times = torch.arange(ticks, device=device) * TICK
-    # Only cells with a program come here.
-    channels = torch.stack([cell.program(times).pack() for cell in cells], dim=1)  # type: ignore[misc]
+    program = Program([cell.script for cell in cells if cell.script is not None], device)
     generator = ReferenceGenerator(len(cells), device)
     out = []
-    for row in channels:
-        generator.step(MotionCommand.unpack(row))
+    for tick in range(ticks):
+        generator.step(program(tick * TICK))
         out.append(generator.action().clone())
     return torch.stack(out)
