@@ -66,7 +66,13 @@ class Twist2FrontEnd(FrontEnd):
         """Allocate buffers for `worlds` worlds on `device`."""
         super().bind(worlds, device, obs)
         self._frame = self.obs[:, :FRAME]
+        # Views are made once: a tick of one world is mostly the cost of calls.
+        self._mimic, self._ang_vel, self._tilt = self._frame[:, :COMMAND], self.obs[:, _ANG_VEL], self.obs[:, _TILT]
+        self._joints, self._joint_vel = self.obs[:, _JOINTS], self.obs[:, _JOINT_VEL]
+        self._past_action = self.obs[:, _LAST_ACTION]
         self._past = self.obs[:, _PAST]
+        self._later, self._earlier = self._past[:, FRAME:], self._past[:, :-FRAME]
+        self._newest = self._past[:, -FRAME:]
         self._future = self.obs[:, _FUTURE]
         self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
@@ -102,9 +108,9 @@ class Twist2FrontEnd(FrontEnd):
     def advance(self) -> None:
         """Move the present frame into the history."""
         # History takes the present frame only after the network has seen it.
-        self._shifted.copy_(self._past[:, FRAME:])
-        self._past[:, :-FRAME].copy_(self._shifted)
-        self._past[:, -FRAME:].copy_(self._frame)
+        self._shifted.copy_(self._later)
+        self._earlier.copy_(self._shifted)
+        self._newest.copy_(self._frame)
 
     def mirror_obs(self) -> Mirror:
         """Mirror image of an observation: vy, roll and yaw rate change sign, limbs change sides."""
@@ -119,15 +125,14 @@ class Twist2FrontEnd(FrontEnd):
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write the present frame and the command's second place."""
-        frame = self._frame
-        frame[:, :COMMAND] = command.mimic
-        torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=frame[:, _ANG_VEL])
-        frame[:, _TILT] = self._roll_pitch(state.quat)
-        torch.sub(state.joint_pos, self._default, out=frame[:, _JOINTS])
-        torch.mul(state.joint_vel, self._joint_vel_scale, out=frame[:, _JOINT_VEL])
-        frame[:, _LAST_ACTION] = self.last_action
-        frame.clamp_(-OBSERVATION_CLIP, OBSERVATION_CLIP)
-        self._future.copy_(frame[:, :COMMAND])
+        self._mimic.copy_(command.mimic)
+        torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=self._ang_vel)
+        self._tilt.copy_(self._roll_pitch(state.quat))
+        torch.sub(state.joint_pos, self._default, out=self._joints)
+        torch.mul(state.joint_vel, self._joint_vel_scale, out=self._joint_vel)
+        self._past_action.copy_(self.last_action)
+        self._frame.clamp_(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+        self._future.copy_(self._mimic)
 
     def _roll_pitch(self, quat: torch.Tensor) -> torch.Tensor:
         """Roll atan2(2(wx + yz), 1 - 2(x² + y²)) and pitch asin(clamp(2(wy - zx))); shape [worlds, 2] [rad]."""
