@@ -14,12 +14,12 @@ __all__ = ["Quadratic", "products"]
 
 
 def products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """All products a_i b_j at index 4 i + j, shapes [rows, 4] → [rows, 16]."""
-    return (a[:, :, None] * b[:, None, :]).view(-1, 16)
+    """All products a_i b_j at index (width of b) i + j, shape [rows, width of a x width of b]."""
+    return (a[:, :, None] * b[:, None, :]).flatten(1)
 
 
 class Quadratic:
-    """Sums of a few of the 16 products: `quadratic(products(a, b))`."""
+    """Sums of a few products: `quadratic(products(a, b))`."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class Quadratic:
         self._shape = (-1, len(table[0]), len(table))
 
     def __call__(self, products: torch.Tensor) -> torch.Tensor:
-        """Shape [rows, 16] → [rows, results]."""
+        """Shape [rows, products] → [rows, results]."""
         total, *rest = products.index_select(1, self._index).mul_(self._factor).view(self._shape).unbind(1)
         for term in rest:
             total = total + term

@@ -79,21 +79,23 @@ _ARM_SCALE = (*(_SMALL,) * 5, _WRIST, _WRIST)
 SONIC_FORM = ActionForm("default", (*_LEG_SCALE, *_LEG_SCALE, _YAW, _SMALL, _SMALL, *_ARM_SCALE, *_ARM_SCALE))
 """SONIC's action form: default pose plus scaled output, not clipped."""
 
-# Tables of `Quadratic`: each entry names a product a_i b_j (4 i + j) of two wxyz quaternions and its factor.
-_RELATIVE = (
-    ((0, 1), (5, 1), (10, 1), (15, 1)),
-    ((1, 1), (4, -1), (11, -1), (14, 1)),
-    ((2, 1), (7, 1), (8, -1), (13, -1)),
-    ((3, 1), (6, -1), (9, 1), (12, -1)),
-)
-"""conj(a) b, from the products of a and b."""
+# Tables of `Quadratic`: each entry names a product of wxyz quaternions and its factor.
 _R00, _R01 = ((10, -2), (15, -2)), ((6, 2), (3, -2))
 _R10, _R11 = ((6, 2), (3, 2)), ((5, -2), (15, -2))
-_R20, _R21, _R22 = ((7, 2), (2, -2)), ((11, 2), (1, 2)), ((5, -2), (10, -2))
+_R20, _R21 = ((7, 2), (2, -2)), ((11, 2), (1, 2))
 _ROT6D = (_R00, _R01, _R10, _R11, _R20, _R21)
-"""Two columns of the rotation matrix, row by row, less the identity's; from a quaternion's products with itself."""
-_DOWN = tuple(tuple((i, -f) for i, f in row) for row in (_R20, _R21, _R22))
-"""Minus the last row of the rotation matrix, less the identity's: where down is, seen from the body."""
+"""Two columns of the rotation matrix, row by row, less the identity's: from a_i a_j (index 4 i + j)."""
+_RELATIVE_AND_DOWN = (
+    ((4, 1), (13, 1), (22, 1), (31, 1)),
+    ((5, 1), (12, -1), (23, -1), (30, 1)),
+    ((6, 1), (15, 1), (20, -1), (29, -1)),
+    ((7, 1), (14, -1), (21, 1), (28, -1)),
+    ((11, -2), (2, 2), (0, 0), (0, 0)),
+    ((19, -2), (1, -2), (0, 0), (0, 0)),
+    ((9, 2), (18, 2), (0, 0), (0, 0)),
+)
+"""conj(a) b, then minus the last row of a's rotation matrix, less the identity's: where down is, seen from the body.
+From a_i (a, b)_j (index 8 i + j)."""
 
 
 _MIRROR = (
@@ -120,9 +122,8 @@ class SonicFrontEnd(FrontEnd):
         four = [JOINTS * part + joint for part in range(4) for joint in CANONICAL_TO_MUJOCO]
         self._four_to_canonical = torch.tensor(four, device=self.device)
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
-        self._relative = Quadratic(_RELATIVE, device=self.device)
+        self._relative_and_down = Quadratic(_RELATIVE_AND_DOWN, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), self.device)
         self._rot6d = Quadratic(_ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
-        self._down = Quadratic(_DOWN, (0.0, 0.0, -1.0), self.device)
 
         def frames(part: slice) -> torch.Tensor:
             return self.obs[:, part].view(worlds, FRAMES, -1)
@@ -191,13 +192,13 @@ class SonicFrontEnd(FrontEnd):
         ref_pos, ref_vel, pos, vel = joints.index_select(1, self._four_to_canonical).view(-1, 4, 1, JOINTS).unbind(1)
         self._ref_pos.copy_(ref_pos.expand_as(self._ref_pos))
         self._ref_vel.copy_(ref_vel.expand_as(self._ref_vel))
-        relative = self._relative(products(state.quat, command.quat))
+        quats = products(state.quat, torch.cat((state.quat, command.quat), 1))
+        relative, down = self._relative_and_down(quats).split((4, 3), 1)
         anchor = self._rot6d(products(relative, relative))[:, None]
         self._anchor.copy_(anchor)
         self._anchors.copy_(anchor.expand_as(self._anchors))
-
+        self._now_gravity.copy_(down)
         self._now_ang_vel.copy_(state.ang_vel_body)
-        self._now_gravity.copy_(self._down(products(state.quat, state.quat)))
         self._now_joint_pos.copy_(pos)
         self._now_joint_vel.copy_(vel)
         if self._may_be_fresh:
