@@ -146,12 +146,14 @@ def _evaluate(args: argparse.Namespace) -> int:
     for entry in args.trackers:
         entry.make()  # complains about files before anything is built
 
+    from arena_newton.physics import resolve_engine
     from arena_newton.trackers.evaluation import report
     from arena_newton.trackers.evaluation.bench import inference
     from arena_newton.trackers.evaluation.figures import Result
     from arena_newton.trackers.evaluation.film import film
     from arena_newton.trackers.evaluation.rollout import plan, run
 
+    resolve_engine(args.engine, args.device)
     played = plan(_cells(args), rollouts, args.seed)
     options = {"engine": args.engine, "device": args.device, "fast_physics": args.fast_physics, "threads": args.threads}
     results = []

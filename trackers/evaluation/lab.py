@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from arena_newton.robot import DriveGains, PhysicsRate
 
-__all__ = ["Lab", "Start", "WorldKind"]
+__all__ = ["Lab", "Start", "WorldKind", "variant"]
 
 CHEST = "torso_link"
 """Link that forces act on, at its centre of mass."""
@@ -63,7 +63,7 @@ class _LabMujoco(MujocoPhysics):
     """Native MuJoCo with a model a kind of world, forces on the chest, and pair forces of chosen worlds only."""
 
     def prepare(self, kinds: list[WorldKind], watched: np.ndarray) -> None:
-        models = {kind: _variant(self.scene, kind) for kind in set(kinds)}
+        models = {kind: variant(self.scene, kind) for kind in set(kinds)}
         self._models = [models[kind] for kind in kinds]
         self._watched = watched
         self._chest = self.scene.link(CHEST)
@@ -97,7 +97,7 @@ class _LabWarp(WarpPhysics):
     def prepare(self, kinds: list[WorldKind], watched: np.ndarray) -> None:
         import warp as wp
 
-        models = {kind: _variant(self.scene, kind) for kind in set(kinds)}
+        models = {kind: variant(self.scene, kind) for kind in set(kinds)}
         for name in (*_FIELDS, "geom_friction", "dof_invweight0"):
             array = getattr(self._m, name)
             rows = np.stack([getattr(models[kind], name) for kind in kinds]).astype(np.float32)
@@ -112,7 +112,7 @@ class _LabWarp(WarpPhysics):
         self._d.qvel.assign(qvel)
 
 
-def _variant(scene: Any, kind: WorldKind) -> Any:
+def variant(scene: Any, kind: WorldKind) -> Any:
     """The scene's MuJoCo model with another friction and a payload in each hand."""
     import mujoco
 

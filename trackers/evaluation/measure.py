@@ -226,8 +226,8 @@ class Meter:
         `heading_error` at the end [deg]; `foot_slip`: mean planar speed of a foot on the floor [m/s]; `action_rate`:
         RMS of the targets' rate [rad/s]; `torque`: mean share of the torque limit; `saturation`: share of joint ticks
         above 95 % of it; `speed_*`, `ref_*`: mean speeds in the heading frame [m/s], [rad/s]; `ball_peak`, `ball_end`
-        [m/s]; `seat_time`: time at 100 N and more, less the gaps [s]; `touch`: largest force on a support [N]; `lowest`,
-        `lowest_ref`: lowest pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: the root at the end.
+        [m/s]; `seat_time`: time at 100 N and more, less the gaps [s]; `touch`: largest force on a support [N];
+        `lowest`, `lowest_ref`: lowest pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: the root at the end.
         """
         host: Callable[[torch.Tensor], np.ndarray] = lambda t: t.double().cpu().numpy()  # noqa: E731
         count = np.maximum(host(self._count), 1.0)

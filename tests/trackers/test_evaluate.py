@@ -1,0 +1,303 @@
+"""The evaluation of trackers: its worlds, its measures, its suite and its tables."""
+
+import csv
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import robot as g1
+from arena_newton.trackers.evaluate import main
+from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
+from arena_newton.trackers.evaluation.figures import Result, figures, wilson
+from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
+from arena_newton.trackers.evaluation.measure import FEET, LINKS, Meter, Reference
+from arena_newton.trackers.evaluation.rollout import Outcome, plan, run, sill_place
+from arena_newton.trackers.evaluation.suite import Cell
+from arena_newton.trackers.motions import primitives
+
+RATE = g1.PhysicsRate(dt=0.005, substeps=4)
+PRIMITIVES = (
+    "stand",
+    "shift",
+    "step",
+    "walk",
+    "squat",
+    "reach",
+    "crouch_reach",
+    "kick",
+    "punch",
+    "sit",
+    "carry",
+    "push",
+)
+
+
+def test_every_primitive_has_three_settings():
+    """The full suite holds three cells or more of every primitive, 20 goals, and no name twice."""
+    cells = suite("full")
+    names = [cell.name for cell in cells]
+    assert len(set(names)) == len(names)
+    assert set(QUICK) <= set(names)
+    for group in PRIMITIVES:
+        assert sum(cell.group == group for cell in cells) >= 3, group
+    assert sum(cell.goal is not None for cell in cells) == 20
+    assert {cell.payload for cell in cells} >= {1.0, 2.0}
+    assert {cell.friction for cell in cells} >= {0.4, 1.2}
+
+
+def test_goals_depend_on_the_seed_alone():
+    """The same seed draws the same goals within 3 m, another seed others."""
+    drawn = [(c.goal.x, c.goal.y, c.goal.yaw) for c in goals(20, seed=3)]
+    assert drawn == [(c.goal.x, c.goal.y, c.goal.yaw) for c in goals(20, seed=3)]
+    assert drawn != [(c.goal.x, c.goal.y, c.goal.yaw) for c in goals(20, seed=4)]
+    assert np.abs(np.array(drawn)[:, :2]).max() <= 3.0
+
+
+def test_draws_of_a_cell_do_not_depend_on_the_others():
+    """A cell alone gets the draws that it gets within the suite."""
+    cells = suite("quick")
+    whole, alone = plan(cells, 3, 7), plan([cells[2]], 3, 7)
+    for name, values in alone.noise.items():
+        assert np.array_equal(values, whole.noise[name][whole.cell == 2])
+    assert not np.array_equal(alone.noise["joints"], plan([cells[2]], 3, 8).noise["joints"])
+
+
+def test_wilson_is_the_interval_of_the_benchmark():
+    """Rates get the interval that the benchmark's own tables use."""
+    from arena_newton.eval import stats
+
+    for successes, trials in ((0, 64), (1, 64), (40, 64), (64, 64)):
+        assert wilson(successes, trials) == pytest.approx(stats.wilson(successes, trials))
+
+
+def test_a_sill_stands_where_the_feet_clear_it():
+    """The sill goes under the swing, and a foot that stands on its place counts as no clearance."""
+    x = np.linspace(0.0, 2.0, 201)
+    feet = np.zeros((201, 2, 3))
+    feet[..., 0] = x[:, None]
+    feet[..., 2] = 0.035
+    feet[(x > 0.6) & (x < 1.1), :, 2] = 0.20
+    place, clearance = sill_place(feet)
+    assert 0.6 + 0.17 <= place <= 1.1 - 0.10 + 0.01
+    assert clearance == pytest.approx(0.165)
+    feet[(x > 0.6) & (x < 1.1), 1, 2] = 0.035
+    assert sill_place(feet)[1] == pytest.approx(0.0)
+
+
+class _FakeLab:
+    """Two worlds whose robot is moved by hand."""
+
+    worlds, root_q, root_v, ball_v = 2, 0, 0, 35
+    device = torch.device("cpu")
+
+    def __init__(self):
+        self.scene = SimpleNamespace(link=LINKS.index, drive=g1.TWIST2_DRIVE)
+        self.feet = [LINKS.index(name) for name in FEET]
+        self.qpos, self.qvel = torch.zeros(2, 36), torch.zeros(2, 41)
+        self.qpos[:, 2], self.qpos[:, 3] = 0.75, 1.0
+        self.xpos = torch.zeros(2, len(LINKS), 3)
+        self.xpos[..., 2] = 0.75
+        self.xpos[:, self.feet, 2] = 0.035
+        self.pair_force = torch.zeros(2)
+        self.joint_q, self.joint_v = torch.arange(7, 36), torch.arange(6, 35)
+
+    def move(self, x: float) -> None:
+        self.qpos[:, 0] = x
+        feet = self.xpos[:, self.feet, 0].clone()
+        self.xpos[..., 0] = x
+        self.xpos[:, self.feet, 0] = feet
+
+
+def _reference(x: float) -> Reference:
+    quat = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1)
+    return Reference(torch.tensor([[x, 0.0, 0.75]] * 2), quat, torch.zeros(2, 29), torch.zeros(2, len(LINKS), 3))
+
+
+def test_measures_are_what_they_say():
+    """A robot 0.1 rad off in the legs, slower by 0.1 m/s, with a sliding foot, is measured as that."""
+    lab = _FakeLab()
+    meter = Meter(lab, np.array([100, 100]), np.array([50, 0]))
+    targets = torch.zeros(2, 29)
+    meter.anchor(targets, _reference(0.0).position)
+    lab.qpos[:, 7:19] = 0.1
+    for tick in range(100):
+        lab.move(0.5 * 0.02 * (tick + 1))
+        lab.xpos[:, lab.feet, 0] += 0.001  # both feet slide 5 cm/s
+        lab.pair_force[:] = 150.0 if tick >= 40 else 0.0
+        meter.update(tick, _reference(0.6 * 0.02 * (tick + 1)), targets)
+    m = meter.results()
+    assert not m["fell"].any()
+    assert m["leg_rmse"] == pytest.approx([0.1, 0.1], rel=1e-5)
+    assert m["arm_rmse"] == pytest.approx([0.0, 0.0])
+    assert m["velocity_error"] == pytest.approx([0.1, 0.1], rel=1e-3)
+    assert m["speed_x"] == pytest.approx([0.5, 0.5], rel=1e-4) and m["ref_x"] == pytest.approx([0.6, 0.6], rel=1e-4)
+    assert m["drift"] == pytest.approx([0.2, 0.2], rel=1e-3) and m["drift_10s"] == pytest.approx([1.0, 1.0], rel=1e-3)
+    assert m["foot_slip"] == pytest.approx([0.05, 0.05], rel=1e-3)
+    assert m["seat_time"] == pytest.approx([1.08, 1.08], abs=0.08)
+    torque = (12 * 0.1 * np.array(g1.TWIST2_DRIVE.kp[:12]) / np.array(g1.TWIST2_DRIVE.effort[:12])).mean() / 29
+    assert m["torque"] == pytest.approx([torque, torque], rel=1e-4)
+
+
+def test_falls_end_a_rollout():
+    """Tilt, height and NaN are falls; what comes after a fall does not count."""
+    lab = _FakeLab()
+    meter = Meter(lab, np.array([10, 10]), np.zeros(2))
+    targets = torch.zeros(2, 29)
+    meter.anchor(targets, _reference(0.0).position)
+    meter.update(0, _reference(0.0), targets)
+    lab.qpos[0, 2] = 0.39
+    lab.qpos[:, 7:36] = 1.0
+    live = meter.update(1, _reference(0.0), targets)
+    assert live.tolist() == [False, True]
+    lab.qpos[1, 2] = float("nan")
+    assert meter.update(2, _reference(0.0), targets).tolist() == [False, False]
+    m = meter.results()
+    assert m["fell"].all() and m["fall_time"] == pytest.approx([0.02, 0.04])
+    assert m["joint_rmse"] == pytest.approx([0.0, np.sqrt(0.5)])
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_worlds_of_a_batch_differ_as_asked(engine):
+    """Payload, friction and chest force act in their own world only, by the amount that is asked."""
+    kinds = [WorldKind(), WorldKind(friction=0.05, payload=2.0)]
+    lab = Lab(kinds, np.zeros(2, bool), drive=g1.TWIST2_DRIVE, rate=RATE, engine=engine, device="cpu", threads=1)
+    root = np.tile([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], (2, 1))
+    joints = np.tile(g1.DEFAULT_POSE, (2, 1))
+    away = {"Seat": np.array([[np.nan] * 4, [1.0, 0.0, 0.42, 0.0]])}
+    lab.start(Start(root, joints, away, np.full((2, 3), np.nan)))
+    lab.force[0, 0], lab.force[1, 0] = 100.0, 100.0
+    masses = [float(lab.scene.mj_model.body_subtreemass[lab.scene.link("pelvis")]) + extra for extra in (0.0, 4.0)]
+    held = torch.tensor(g1.DEFAULT_POSE).repeat(2, 1)
+    for _ in range(5):
+        lab.step(held)
+    momentum = [mass * float(v) for mass, v in zip(masses, _mean_velocity(lab), strict=True)]
+    # 100 N for 0.1 s, in free fall.
+    assert momentum == pytest.approx([10.0, 10.0], rel=0.03)
+    lab.force.zero_()
+    lab.start(Start(root * [1, 1, 0.8 / 3.0, 1, 1, 1, 1], joints, {}, np.full((2, 3), np.nan)))
+    lab.add_velocity(np.tile([1.5, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1)))
+    for _ in range(8):
+        lab.step(held)
+    foot = lab.xpos[:, lab.scene.link("left_ankle_roll_link"), 0]
+    assert float(foot[1]) > float(foot[0]) + 0.005  # less friction slides farther
+    assert lab.overflows() == 0
+
+
+def _mean_velocity(lab: Lab) -> list[float]:
+    """Forward velocity of the robots' centres of mass [m/s]."""
+    import mujoco
+
+    robot = lab.scene.link("pelvis")
+    out = []
+    for w, extra in enumerate((0.0, 2.0)):
+        model = variant(lab.scene, WorldKind(payload=extra))
+        d = mujoco.MjData(model)
+        d.qpos[:], d.qvel[:] = lab.qpos[w].numpy(), lab.qvel[w].numpy()
+        mujoco.mj_forward(model, d)
+        mujoco.mj_subtreeVel(model, d)
+        out.append(float(d.subtree_linvel[robot, 0]))
+    return out
+
+
+def test_a_tracker_that_cannot_balance_falls_when_pushed():
+    """Under bare joint drives the robot stands, falls from a 40 N·s push, and no cell disturbs another."""
+    from arena_newton.trackers.base import get
+
+    push = next(cell for cell in suite("full") if cell.name == "push 40 N·s, stand")
+    cells = [Cell("short stand", "stand", 1.0, primitives.stand(1.0)), push]
+    played = plan(cells, 2, 0)
+    outcome = run(get("pd"), played, engine="mujoco", threads=1)
+    fell = outcome.measures["fell"]
+    assert fell.tolist() == [False, False, True, True]
+    assert np.all(outcome.measures["fall_time"][2:] > 3.0)
+    assert np.all(outcome.measures["drift"][:2] < 0.1)
+
+
+def test_official_twist2_walks_the_reference(shared):
+    """The official checkpoint reaches 90 % of 0.3 m/s on the generator's walk and goes to a goal."""
+    from arena_newton.trackers.base import get
+
+    cells = [cell for cell in suite("full") if cell.name in ("walk 0.3", "goal 1")]
+    tracker = get("twist2", shared / "reference/twist2/twist2_1017_20k.onnx")
+    outcome = run(tracker, plan(cells, 2, 0), engine="mujoco", fast_physics=True, threads=1)
+    m = outcome.measures
+    assert not m["fell"].any()
+    assert np.mean(m["speed_x"][:2] / m["ref_x"][:2]) >= 0.9
+    assert m["goal_distance"][2] <= 0.08 and m["goal_turn"][2] <= 5.0
+    assert np.isnan(m["drift"][2]) and np.isfinite(m["drift"][:2]).all()
+
+
+def _result(label: str, interface: str, official: bool, fell: list[bool]) -> Result:
+    cells = [cell for cell in suite("full") if cell.name in ("walk 0.3", "squat 0.45")]
+    played = plan(cells, 2, 0)
+    measures = {name: np.full(4, 0.05) for name in ("leg_rmse", "drift_10s", "lowest")}
+    measures |= {"speed_x": np.full(4, 0.3), "ref_x": np.full(4, 0.3), "fell": np.array(fell)}
+    outcome = Outcome(measures, 0, 1, "mujoco", "cpu", 0.0, 0.0)
+    return Result(label, interface, official, {}, played, outcome)
+
+
+def test_figures_have_the_verdict_of_their_bar():
+    """A figure above its bar is a MISS, one within it a pass, one without bar neither."""
+    ours, theirs = (
+        _result("ours", "twist2", False, [False] * 4),
+        _result("official", "twist2", True, [True] + [False] * 3),
+    )
+    verdicts = {f.name: f.verdict for f in figures(ours, [ours, theirs])}
+    assert verdicts["fall rate, whole suite"] == "pass"
+    assert verdicts["fall rate, against official TWIST2"] == "pass"
+    assert verdicts["leg joint RMSE, walk 0.3 m/s"] == "MISS"
+    assert verdicts["drift per 10 s, walk 0.3 m/s, open loop"] == "pass"
+    assert verdicts["squat to 0.45 m and back"] == "pass"
+    assert {f.name: f.verdict for f in figures(theirs)}["fall rate, whole suite"] == "MISS"
+    sonic = {f.name: f.verdict for f in figures(_result("s", "sonic", False, [False] * 4))}
+    assert sonic["drift per 10 s, walk 0.3 m/s, open loop"] == ""
+
+
+def test_command_line_writes_tables_side_by_side(tmp_path, capsys):
+    """Two trackers stand in one table; Markdown, JSON and CSV hold every cell."""
+    arguments = "--tracker pd --label a --tracker pd --label b --suite quick --only stand --rollouts 2".split()
+    arguments += ["--engine", "mujoco", "--threads", "1", "--no-bench", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "| figure | bar | a | b |" in printed and "fall rate, whole suite" in printed
+    document = json.loads((tmp_path / "evaluation.json").read_text())
+    assert [t["label"] for t in document["trackers"]] == ["a", "b"]
+    assert document["trackers"][0]["cells"] == [
+        {**cell, "tracker": "a"} for cell in document["trackers"][1]["cells"]
+    ], "the same tracker on the same plan gives the same numbers"
+    with (tmp_path / "evaluation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["tracker"], r["cell"], r["rollouts"]) for r in rows] == [("a", "stand", "2"), ("b", "stand", "2")]
+    text = (tmp_path / "evaluation.md").read_text()
+    assert "## Figures" in text and "MPJPE" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "at least one --tracker"),
+        (["--checkpoint", "x.onnx"], "name its --tracker first"),
+        (["--tracker", "nobody"], "unknown tracker"),
+        (["--tracker", "pd", "--tracker", "pd"], "--label"),
+        (["--tracker", "pd", "--only", "nothing"], "no such cell"),
+        (["--tracker", "pd", "--rollouts", "0"], "--rollouts 0"),
+        (["--tracker", "pd", "--clips", "absent.pkl"], "absent.pkl"),
+        (["--tracker", "pd", "--film"], "--out"),
+        (["--tracker", "pd", "--device", "cuda:99"], "cuda"),
+    ],
+)
+def test_bad_arguments_end_in_one_line(arguments, message, capsys):
+    """A mistyped command is answered by one line that names what is wrong."""
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_list_prints_the_cells(capsys):
+    """--list names every cell without a tracker."""
+    assert main(["--list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(cell.name in printed for cell in suite("full"))
