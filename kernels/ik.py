@@ -31,11 +31,11 @@ GOAL: dict[str, slice] = {
     "reach": slice(45, 47),
     "seat_weight": slice(47, 48),
 }
-"""One row of goals: centre of mass [m]; pelvis of the gait [m] and its share of the pelvis' place, 0 = the centre of mass
-decides, 1 = the gait; pelvis height [m]; how far before `anchor` along the heading the pelvis may be [m]; orientation of
-the pelvis [rad]; left and right ankle x, y, z [m], yaw, pitch [rad]; waist and arm posture [rad]; left and right hand
-points in the pelvis' heading frame [m] and the share of the arm that goes there instead of the posture; share of the
-seat's bound on the pelvis."""
+"""One row of goals: centre of mass [m]; pelvis of the gait [m] and its share of the pelvis' place (0 = the centre of
+mass decides, 1 = the gait); pelvis height [m]; how far before `anchor` along the heading the pelvis may be [m];
+orientation of the pelvis [rad]; left and right ankle x, y, z [m], yaw, pitch [rad]; waist and arm posture [rad]; left
+and right hand points in the pelvis' heading frame [m] and the share of the arm that goes there instead of the posture;
+share of the seat's bound on the pelvis."""
 GOAL_WIDTH = 48
 
 _COM = wp.constant(0)
@@ -54,7 +54,7 @@ _REACH = wp.constant(45)
 _SEAT_WEIGHT = wp.constant(47)
 
 PELVIS_ROUNDS = wp.constant(4)
-"""Corrections of the pelvis' place a tick; each leaves about a tenth of the error, and the last tick's place starts it."""
+"""Corrections of the pelvis' place a tick, from the last tick's; each leaves about a tenth of the error."""
 LEG_ROUNDS = wp.constant(2)
 """Gauss-Newton steps of a leg a correction."""
 LAST_ROUNDS = wp.constant(4)
@@ -186,9 +186,7 @@ def settle_joint(m: Model, link: int, angle: float) -> float:
 def solve_leg(
     m: Model, w: int, first: int, target_p: wp.vec3, target_q: wp.quat, rounds: int, joints: wp.array2d[float]
 ) -> float:
-    """Moves the six joints from link `first` towards an ankle pose in the pelvis frame; what was left before the last
-    step [m].
-    """
+    """Moves the joints from link `first` on towards an ankle pose of the pelvis frame; distance at the last step."""
     left = float(0.0)
     for _ in range(rounds):
         p = wp.vec3(0.0, 0.0, 0.0)

@@ -101,8 +101,8 @@ class MotionCommand:
     stance_width: torch.Tensor
     """Distance between the feet [m], shape [worlds]."""
     stagger: torch.Tensor
-    """How far a walking left foot is set before its place and the right one behind, together [m], shape [worlds]: by the
-    length of a step, the right foot lands beside the left one, which leaves room for a sill between two pairs of steps."""
+    """How far a walking left foot is set before the right one, beyond the gait's own steps [m], shape [worlds]: by the
+    length of a step, the right foot lands beside the left one, which leaves room for a sill between two pairs."""
     swing_height: torch.Tensor
     """Height of a step [m], shape [worlds]."""
     step_time: torch.Tensor

@@ -9,61 +9,48 @@ feasible reference. Torch plans, one Warp kernel solves the joints (`kernels.ik`
 from __future__ import annotations
 
 import contextlib
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
 from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, MotionCommand, neutral_row
+from arena_newton.trackers.motions.footwork import (
+    SHORTEST_STEP,
+    State,
+    approach,
+    kick,
+    rotate,
+    smooth,
+    sway,
+    walk,
+    wrap,
+)
 from arena_newton.trackers.motions.kinematics import SOLE_CENTRE, SOLE_HEIGHT, chain, neutral_stance
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Frames", "ReferenceGenerator", "kick_seconds"]
+__all__ = ["Frames", "ReferenceGenerator"]
 
-DOUBLE_SUPPORT = 0.2
-"""Share of a step with both feet on the ground."""
-SWAY = 0.05
-"""Sway of the pelvis towards the stance foot [m] at a stance width of 0.22 m."""
 WALK_HEIGHT = 0.75
 """Highest pelvis of a walk [m]: higher, the legs do not reach their footsteps."""
 STAND_HEIGHT = 0.785
 """Highest pelvis of all [m]: the knees are nearly straight."""
 LOWEST = 0.38
 DEEP, DEEP_LEAN = 0.55, 2.6
-"""Below this pelvis height [m] the pelvis leans so much per metre [rad/m]: upright, the ankles would not bend enough."""
+"""Below this pelvis height [m] the pelvis leans so much per metre [rad/m]: upright, ankles would not bend enough."""
 WALK_PITCH = 0.05
 """Forward lean of the pelvis in a walk [rad]."""
-LEAD_IN = 0.4
-"""Weight shift before the first lift and after the last touchdown, in steps."""
-STRIDE = 0.28
-"""Longest step [m]: faster walks take shorter time."""
-SIDE_STRIDE = 0.11
-"""Longest step sideways [m]: the feet keep off each other."""
-SHORTEST_STEP = 0.32
-"""Shortest time of a step [s]."""
 STILL = 0.02
 """Commanded speeds below this are standing [m/s, rad/s]."""
-MISPLACED = (0.02, 0.07)
-"""A standing robot steps when a foot is so far from its place [m, rad]."""
-PLACED = (0.004, 0.02)
-"""A walk ends when both feet are so near to their places [m, rad]."""
 SUPPORT = 0.0214
 """Centre of mass before the ankles in a relaxed stand [m]: where the default pose has it."""
 CAREFUL_SUPPORT = SOLE_CENTRE
 """The same in a squat or on one foot [m]: the middle of the soles."""
-
-KICK_SHIFT, KICK_WIND, KICK_RETURN, KICK_SETTLE = 0.8, 0.4, 0.6, 0.8
-"""Times of a kick's phases around the swing [s]."""
-KICK_BACK, KICK_FRONT = 0.18, 0.24
-"""Ends of the swing behind and before the stance [m]."""
-KICK_TOE = (0.45, -0.25)
-"""Pitch of the foot there [rad], toes down positive: within the ankle's range."""
-KICK_LIFT, KICK_LOW = 0.08, 0.05
-"""Height of the foot at the end of the wind-up and of the swing [m]."""
-KICK_HEIGHT = 0.73
+KICK_SUPPORT = 0.055
+"""Centre of mass before the ankle of the standing foot in a kick [m]."""
+KICK_HEIGHT = 0.75
 """Highest pelvis of a kick [m]."""
 
 _FILTERED = CHANNELS["reach"].stop
@@ -83,16 +70,11 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "pelvis_back": (0.25, 0.8),
     "arms": (1.0, 8.0),
     "hand_point": (0.4, 3.2),
-    "reach": (2.5, 12.0),
+    "reach": (1.6, 8.0),
 }
 """Rate and acceleration [unit/s, unit/s²]; of arms and hand points in units of `arm_speed`."""
 _TURN_LIMITS = (1.5, 10.0)
 """Rate and acceleration of the yaw rate [rad/s², rad/s³]."""
-
-
-def kick_seconds(speed: Any) -> Any:
-    """Length of a kick [s] at a foot speed [m/s]."""
-    return KICK_SHIFT + KICK_WIND + 1.875 * (KICK_BACK + KICK_FRONT) / speed + KICK_RETURN + KICK_SETTLE
 
 
 @dataclass
@@ -107,42 +89,6 @@ class Frames:
     """Joint positions [rad], MuJoCo order, shape [worlds, 29]."""
     hands: torch.Tensor
     """Left and right hand, 1 closed, 0 open, shape [worlds, 2]."""
-
-
-def _smooth(share: torch.Tensor) -> torch.Tensor:
-    """Minimum-jerk course from 0 to 1."""
-    t = share.clamp(0.0, 1.0)
-    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
-
-
-def _approach(
-    x: torch.Tensor, rate: torch.Tensor, target: torch.Tensor, top: torch.Tensor, slope: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """One tick towards `target` with bounded rate and acceleration; returns value and rate."""
-    import torch
-
-    away = target - x
-    size = away.abs()
-    brake = 0.5 * TICK * slope
-    speed = torch.minimum(torch.sqrt(1.8 * slope * size + brake * brake) - brake, size / TICK)
-    wanted = torch.sign(away) * torch.minimum(speed, top)
-    change = slope * TICK
-    rate = rate + torch.maximum(torch.minimum(wanted - rate, change), -change)
-    return x + rate * TICK, rate
-
-
-def _turn(yaw: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """Vectors of a heading frame in the world; yaw, shape [...], xy, shape [..., 2]."""
-    import torch
-
-    c, s = torch.cos(yaw), torch.sin(yaw)
-    return torch.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], dim=-1)
-
-
-def _wrap(angle: torch.Tensor) -> torch.Tensor:
-    import torch
-
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
 
 
 class ReferenceGenerator:
@@ -167,6 +113,8 @@ class ReferenceGenerator:
         if seed_pose != "stand":
             raise InputError(f"reference generator: no start pose {seed_pose!r}, expected 'stand'")
         self.worlds, self.device = worlds, torch.device(device)
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", torch.cuda.current_device())
         self._ik = ik
         wp.init()
         name = str(wp.device_from_torch(self.device))
@@ -209,7 +157,7 @@ class ReferenceGenerator:
         self._to_mujoco = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)
         self._low, self._high = self._bounds(constant)
 
-        self._s: dict[str, torch.Tensor] = {}
+        self._s: State = {}
         self.reset()
 
     def _bounds(self, constant: Any) -> tuple[torch.Tensor, torch.Tensor]:
@@ -260,7 +208,7 @@ class ReferenceGenerator:
         offset[:, :, 0] = self._stance.ankle
         offset[:, :, 1] = 0.5 * self._stance.width * self._sides
         feet = zeros(2, 5)
-        feet[:, :, :2] = root[:, None] + _turn(yaw[:, None], offset)
+        feet[:, :, :2] = root[:, None] + rotate(yaw[:, None], offset)
         feet[:, :, 2], feet[:, :, 3] = SOLE_HEIGHT, yaw[:, None]
         body = torch.cat([feet[:, :, :2].mean(1), yaw[:, None]], dim=1)
         height = torch.full_like(yaw, self._stance.height)
@@ -296,7 +244,7 @@ class ReferenceGenerator:
             "_joints": self._default.expand(w, 29),
             "_arms": self._default_arms.expand(w, 8),
             "_palms": self._default_palms.expand(w, 6),
-            "_com": torch.cat([root + _turn(yaw, offset[:, 0] * 0.0 + self._com_offset()), height[:, None]], dim=1),
+            "_com": torch.cat([root + rotate(yaw, offset[:, 0] * 0.0 + self._com_offset()), height[:, None]], dim=1),
             "_error": zeros(),
         }
         if mask is None:
@@ -353,7 +301,7 @@ class ReferenceGenerator:
             return contextlib.nullcontext()
         return wp.ScopedStream(wp.stream_from_torch(self.device))
 
-    def _plan(self, s: dict[str, torch.Tensor], row: torch.Tensor) -> None:
+    def _plan(self, s: State, row: torch.Tensor) -> None:
         """Advances the state of all worlds by one tick and writes the goals of the solver."""
         import torch
 
@@ -372,14 +320,12 @@ class ReferenceGenerator:
 
         self._limit(s, row, velocity, moving | s["stepping"], busy)
         self._advance_body(s)
-        self._walk(s, moving, free)
-        self._kick(s, row)
+        walk(s, moving, free)
+        kick(s, row)
         self._aim(s)
         s["hands"] = (row[:, at["hands"]] >= 0.5).float()
 
-    def _limit(
-        self, s: dict[str, torch.Tensor], row: torch.Tensor, velocity: torch.Tensor, walking: torch.Tensor, busy: Any
-    ) -> None:
+    def _limit(self, s: State, row: torch.Tensor, velocity: torch.Tensor, walking: torch.Tensor, busy: Any) -> None:
         """Moves every channel towards its command."""
         import torch
 
@@ -417,146 +363,16 @@ class ReferenceGenerator:
         top, slope = self._top.expand_as(now).clone(), self._slope.expand_as(now).clone()
         top[:, arms] *= speed
         slope[:, arms] *= speed
-        s["channels"], s["rates"] = _approach(now, s["rates"], target, top, slope)
+        s["channels"], s["rates"] = approach(now, s["rates"], target, top, slope)
 
-    def _advance_body(self, s: dict[str, torch.Tensor]) -> None:
+    def _advance_body(self, s: State) -> None:
         import torch
 
         v, body = s["channels"][:, CHANNELS["velocity"]], s["body"]
-        xy = body[:, :2] + TICK * _turn(body[:, 2] + 0.5 * TICK * v[:, 2], v[:, :2])
+        xy = body[:, :2] + TICK * rotate(body[:, 2] + 0.5 * TICK * v[:, 2], v[:, :2])
         s["body"] = torch.cat([xy, body[:, 2:] + TICK * v[:, 2:]], dim=1)
 
-    def _nominal(self, s: dict[str, torch.Tensor], ahead: torch.Tensor) -> torch.Tensor:
-        """Places of both feet when the body has gone on for `ahead` seconds: x, y [m], yaw [rad], shape [worlds, 2, 3]."""
-        import torch
-
-        at, body = CHANNELS, s["body"]
-        v = s["channels"][:, at["velocity"]]
-        yaw = body[:, 2] + v[:, 2] * ahead
-        xy = body[:, :2] + _turn(body[:, 2] + 0.5 * v[:, 2] * ahead, v[:, :2] * ahead[:, None])
-        width, offset = s["channels"][:, at["stance_width"]], s["channels"][:, at["foot_offset"]]
-        stagger = s["channels"][:, at["stagger"]]
-        place = torch.stack([0.5 * stagger * self._sides - offset, 0.5 * width * self._sides], dim=-1)
-        feet = xy[:, None] + _turn(yaw[:, None], place)
-        return torch.cat([feet, yaw[:, None, None].expand(-1, 2, 1)], dim=2)
-
-    def _walk(self, s: dict[str, torch.Tensor], moving: torch.Tensor, free: torch.Tensor) -> None:
-        """Starts, advances and ends steps; moves the swing foot."""
-        import torch
-
-        at, feet = CHANNELS, s["feet"]
-        v = s["channels"][:, at["velocity"]]
-        still = ~moving & (v.abs() < 1e-3).all(1)
-        pace = s["channels"][:, at["step_time"]].squeeze(1)
-        speed = v[:, :2].square().sum(1).sqrt().clamp(min=0.05)
-        pace = torch.minimum(pace, torch.minimum(STRIDE / speed, SIDE_STRIDE / v[:, 1].abs().clamp(min=0.05)))
-        pace = pace.clamp(min=SHORTEST_STEP)
-
-        nominal = self._nominal(s, torch.zeros_like(pace))
-        away = (feet[:, :, :2] - nominal[:, :, :2]).square().sum(2).sqrt()
-        twist = _wrap(feet[:, :, 3] - nominal[:, :, 2]).abs()
-        misplaced = (away > MISPLACED[0]) | (twist > MISPLACED[1])
-        unplaced = (away > PLACED[0]) | (twist > PLACED[1])
-
-        stepping, side = s["stepping"], s["side"]
-        share = s["share"] + torch.where(stepping, TICK / pace, 0.0)
-        over = stepping & (share >= 1.0 + LEAD_IN * s["final"])
-        other = 1 - side
-        rows = torch.arange(self.worlds, device=self.device)
-        go_on = over & (~still | unplaced.any(1))
-        next_side = torch.where(still & ~unplaced[rows, other], side, other)
-        start = ~stepping & free & (moving | misplaced.any(1))
-        turn = v[:, 1] + 0.3 * v[:, 2]
-        first_side = torch.where(turn > 0.01, 0, torch.where(turn < -0.01, 1, other))
-        first_side = torch.where(still & ~misplaced[rows, first_side], 1 - first_side, first_side)
-        begin = go_on | start
-        side = torch.where(start, first_side, torch.where(go_on, next_side, side))
-        stance = 1 - side
-        final_now = still & ~unplaced[rows, stance]
-        s["stepping"] = (stepping & ~over) | begin
-        s["side"] = side
-        s["first"] = torch.where(begin, start, s["first"])
-        s["final"] = torch.where(begin, final_now, s["final"])
-        share = torch.where(start, -LEAD_IN, torch.where(go_on, share - 1.0 - LEAD_IN * (share > 1.0 + LEAD_IN), share))
-        s["share"] = torch.where(s["stepping"], share, 0.0)
-
-        own = feet[rows, side][:, [0, 1, 3]]
-        s["lifted"] = torch.where(begin[:, None], own, s["lifted"])
-        swing = ((s["share"] - 0.5 * DOUBLE_SUPPORT) / (1.0 - DOUBLE_SUPPORT)).clamp(0.0, 1.0)
-        left = (1.0 - s["share"]).clamp(min=0.0) * pace + 0.5 * pace
-        planned = self._nominal(s, left)[rows, side]
-        # The end of a swing no longer follows the plan, so that a foot comes down without sliding.
-        gain = ((0.9 - swing) / 0.4).clamp(0.0, 1.0)
-        gain = torch.where(begin, 1.0, gain)[:, None]
-        s["landing"] = s["landing"] + gain * (planned - s["landing"])
-        # A high step rises before it goes on, so that the foot clears what lies before it.
-        early = ((s["channels"][:, at["swing_height"]].squeeze(1) - 0.08) * 1.6).clamp(0.0, 0.16)
-        course = _smooth((swing - early) / (1.0 - 2.0 * early))[:, None]
-        flat = s["lifted"] + course * (s["landing"] - s["lifted"])
-        rise = s["channels"][:, at["swing_height"]].squeeze(1) * torch.sin(math.pi * swing).square()
-        moved = torch.stack([flat[:, 0], flat[:, 1], SOLE_HEIGHT + rise, flat[:, 2], torch.zeros_like(rise)], dim=1)
-        swings = torch.stack([side == 0, side == 1], dim=1) & s["stepping"][:, None]
-        s["feet"] = torch.where(swings[:, :, None], moved[:, None], feet)
-        s["support"] = ~(swings & ((swing > 0.0) & (swing < 1.0))[:, None])
-        gait, rate = s["gait"].unbind(1)
-        on = s["stepping"].float()
-        top, slope = torch.full_like(gait, 3.0), torch.full_like(gait, 15.0)
-        s["gait"] = torch.stack(_approach(gait, rate, on, top, slope), dim=1)
-
-    def _sway(self, s: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Sideways place of the pelvis [m], left positive."""
-        import torch
-
-        share = s["share"]
-        shape = torch.sin(math.pi * share.clamp(0.0, 1.0))
-        lead = _smooth((share + LEAD_IN) / (0.5 + LEAD_IN))
-        tail = _smooth((1.0 + LEAD_IN - share) / (0.5 + LEAD_IN))
-        shape = torch.where(s["first"] & (share < 0.5), lead, shape)
-        shape = torch.where(s["final"] & (share >= 0.5), tail, shape)
-        size = SWAY * s["channels"][:, CHANNELS["stance_width"]].squeeze(1) / 0.22
-        return torch.where(s["stepping"], (2.0 * s["side"] - 1.0) * size * shape, 0.0)
-
-    def _kick(self, s: dict[str, torch.Tensor], row: torch.Tensor) -> None:
-        """Starts, advances and ends kicks; moves the kicking foot."""
-        import torch
-
-        at = CHANNELS
-        still = ~s["stepping"] & (s["channels"][:, at["velocity"]].abs() < 1e-3).all(1) & (s["gait"][:, 0] < 0.02)
-        start = (s["kick_asked"] > 0) & (s["kick_side"] == 0) & still
-        swing = 1.875 * (KICK_BACK + KICK_FRONT) / row[:, at["kick_speed"]].squeeze(1)
-        s["kick_swing"] = torch.where(start, swing, s["kick_swing"])
-        s["kick_length"] = torch.where(start, kick_seconds(row[:, at["kick_speed"]].squeeze(1)), s["kick_length"])
-        s["kick_side"] = torch.where(start, s["kick_asked"], s["kick_side"])
-        s["kick_asked"] = torch.where(start, 0, s["kick_asked"])
-        active = s["kick_side"] > 0
-        time = torch.where(active, s["kick_time"] + TICK, 0.0)
-        over = time >= s["kick_length"]
-        s["kick_side"] = torch.where(over, 0, s["kick_side"])
-        active = active & ~over
-        s["kick_time"] = time = torch.where(over, 0.0, time)
-        foot = (s["kick_side"] - 1).clamp(min=0)
-        rows = torch.arange(self.worlds, device=self.device)
-        own = s["feet"][rows, foot]
-        s["lifted"] = torch.where(start[:, None], own[:, [0, 1, 3]], s["lifted"])
-
-        t1 = KICK_SHIFT + KICK_WIND
-        t2 = t1 + s["kick_swing"]
-        wind = _smooth((time - KICK_SHIFT) / KICK_WIND)
-        swing = _smooth((time - t1) / s["kick_swing"])
-        home = _smooth((time - t2) / (0.75 * KICK_RETURN))
-        down = _smooth((time - t2 - 0.25 * KICK_RETURN) / (0.75 * KICK_RETURN))
-        x = -KICK_BACK * wind + (KICK_BACK + KICK_FRONT) * swing - KICK_FRONT * home
-        z = KICK_LIFT * wind - (KICK_LIFT - KICK_LOW) * swing - KICK_LOW * down
-        base = s["lifted"]
-        xy = base[:, :2] + _turn(base[:, 2], torch.stack([x, torch.zeros_like(x)], dim=1))
-        toe = KICK_TOE[0] * wind + (KICK_TOE[1] - KICK_TOE[0]) * swing - KICK_TOE[1] * home
-        pose = torch.cat([xy, (SOLE_HEIGHT + z)[:, None], base[:, 2:], toe[:, None]], dim=1)
-        kicks = torch.stack([s["kick_side"] == 1, s["kick_side"] == 2], dim=1)
-        s["feet"] = torch.where(kicks[:, :, None], pose[:, None], s["feet"])
-        s["support"] = s["support"] & ~(kicks & (z > 1e-4)[:, None])
-        s["kick_share"] = active * (_smooth(time / KICK_SHIFT) - _smooth((time - t2 - KICK_RETURN) / KICK_SETTLE))
-
-    def _aim(self, s: dict[str, torch.Tensor]) -> None:
+    def _aim(self, s: State) -> None:
         """Writes the goals of the solver."""
         import torch
 
@@ -565,14 +381,14 @@ class ReferenceGenerator:
         height = c[:, at["height"]]
         careful = ((self._stance.height - height) / 0.2).clamp(0.0, 1.0)
         ahead = SUPPORT + (CAREFUL_SUPPORT - SUPPORT) * careful - c[:, at["foot_offset"]] * (1.0 - gait)
-        sway = self._sway(s)[:, None]
+        aside = sway(s)[:, None]
         shift = c[:, at["shift"]] * (1.0 - gait)
-        com = body[:, :2] + _turn(yaw, torch.cat([ahead + shift[:, :1], sway + shift[:, 1:]], dim=1))
+        com = body[:, :2] + rotate(yaw, torch.cat([ahead + shift[:, :1], aside + shift[:, 1:]], dim=1))
         stance = torch.where((s["kick_side"] == 1)[:, None], feet[:, 1], feet[:, 0])
         sole = torch.zeros_like(com)
-        sole[:, 0] = CAREFUL_SUPPORT
-        com = com + s["kick_share"][:, None] * (stance[:, :2] + _turn(stance[:, 3], sole) - com)
-        pelvis = body[:, :2] + _turn(yaw, torch.cat([torch.zeros_like(sway), sway], dim=1))
+        sole[:, 0] = KICK_SUPPORT
+        com = com + s["kick_share"][:, None] * (stance[:, :2] + rotate(stance[:, 3], sole) - com)
+        pelvis = body[:, :2] + rotate(yaw, torch.cat([torch.zeros_like(aside), aside], dim=1))
         pitch, roll = c[:, at["pitch"]] + WALK_PITCH * gait, c[:, at["roll"]]
         pitch = torch.maximum(pitch, (DEEP_LEAN * (DEEP - height)).clamp(min=0.0))
         back = c[:, at["pelvis_back"]]
@@ -592,8 +408,8 @@ class ReferenceGenerator:
                 c[:, at["waist"]],
                 c[:, at["arms"]],
                 c[:, at["hand_point"]],
-                _smooth(c[:, at["reach"]]),
-                _smooth(back / 0.05),
+                smooth(c[:, at["reach"]]),
+                smooth(back / 0.05),
             ],
             dim=1,
             out=self._goal,
@@ -693,12 +509,12 @@ class ReferenceGenerator:
         import torch
 
         s = dict(self._s)
-        turn = weight * _wrap(yaw.to(self.device) - s["body"][:, 2])
+        turn = weight * wrap(yaw.to(self.device) - s["body"][:, 2])
         centre = s["root"][:, :2]
 
         def about(xy: torch.Tensor) -> torch.Tensor:
             dims = (slice(None), *([None] * (xy.ndim - 2)))
-            return centre[dims] + _turn(turn[dims], xy - centre[dims])
+            return centre[dims] + rotate(turn[dims], xy - centre[dims])
 
         s["body"] = torch.cat([about(s["body"][:, :2]), (s["body"][:, 2] + turn)[:, None]], dim=1)
         feet = s["feet"]
@@ -728,7 +544,7 @@ class ReferenceGenerator:
         self._publish()
 
 
-def _merge(mask: torch.Tensor, new: dict[str, torch.Tensor], old: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def _merge(mask: torch.Tensor, new: State, old: State) -> State:
     """Rows of `new` where the mask is set, of `old` elsewhere."""
     import torch
 

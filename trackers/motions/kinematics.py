@@ -126,7 +126,7 @@ def forward(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch.Te
 
 @dataclass(frozen=True)
 class Chain:
-    """Pelvis and the 29 links that body joints carry, fingers lumped into the wrists; row 0 the pelvis, row 1 + j joint j."""
+    """Pelvis and the 29 links that body joints carry, fingers lumped into the wrists; row 1 + j hangs on joint j."""
 
     offset: np.ndarray
     """Origin in the parent's frame [m], shape [30, 3]."""

@@ -16,6 +16,7 @@ import numpy as np
 from arena_newton.errors import InputError
 from arena_newton.robot import DEFAULT_POSE
 from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, MotionCommand, neutral_row
+from arena_newton.trackers.motions.footwork import kick_seconds
 
 if TYPE_CHECKING:
     import torch
@@ -250,8 +251,6 @@ def crouch_reach(
 
 def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
     """Shift to the other foot, wind up, swing at a foot speed [m/s], and recover."""
-    from arena_newton.trackers.motions.generator import kick_seconds
-
     foot = _sided(side) + 1
     return _script((kick_seconds(speed), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
 

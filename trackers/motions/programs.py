@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.robot import DEFAULT_POSE, TICK
+from arena_newton.robot import TICK
 from arena_newton.trackers.motions import primitives as p
-from arena_newton.trackers.motions.commands import CHANNELS, neutral_row
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 from arena_newton.trackers.motions.primitives import Program, Script
 
@@ -453,7 +452,7 @@ def random_clips(
     - `sit_air`: down to 0.5-0.6 m and up in balance, no seat. `sit`, `walk_sit`: seats of 0.36-0.48 m with the front
       edge 3-8 cm behind the standing pelvis, really loaded (the pelvis ends 28-36 cm back and at seat + 0.09-0.12 m);
       after standing, or after turning and walking backwards to it.
-    - `sill`: steps of 15-20 cm, the feet beside each other; a sill of 5-10 cm lies where every sole clears it by 5 cm or more.
+    - `sill`: steps of 15-20 cm, the feet beside each other; a sill of 5-10 cm lies where every sole clears it by 5 cm.
     - `mixed`: walk, reach, crouch, kick, punch, squat in any order.
 
     A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support that feet run into is drawn anew.
