@@ -70,7 +70,7 @@ def test_observation(installed, weights):
 
 
 def test_stands_and_walks(installed, weights):
-    """FALCON keeps the robot up in our physics for 6 s and walks forward on command, through the usual environment."""
+    """FALCON keeps the robot up in our physics for 4 s and walks forward on command, through the usual environment."""
     import dataclasses
 
     from arena_newton.env import SETTLE_TICKS, STAND_ACTION, ArenaEnv
@@ -83,10 +83,10 @@ def test_stands_and_walks(installed, weights):
         env.step(actions)
     start = env.physics.qpos.numpy()[:, :2].copy()
     actions[1, 0] = 0.4 * 0.02
-    for _ in range(300):
+    for _ in range(200):
         env.step(actions)
     root = env.scene.robot.root_qpos
     qpos = env.physics.qpos.numpy()[:, root : root + 7]
     assert (qpos[:, 2] > 0.65).all(), f"fell: pelvis heights {qpos[:, 2]}"
     travelled = np.linalg.norm(qpos[:, :2] - start, axis=1)
-    assert travelled[0] < 0.5 and 1.2 < travelled[1] < 3.2, travelled
+    assert travelled[0] < 0.5 and 0.7 < travelled[1] < 2.2, travelled
