@@ -149,7 +149,7 @@ def _actions(
 
 
 def _with_start(name: str, actions: np.ndarray) -> Reference:
-    from arena_newton.policies.replay import startup_actions
+    from arena_newton.trackers.motions.playback import startup_actions
 
     return Reference(name, np.concatenate([startup_actions(actions[0], stand=0.0, blend=BLEND), actions]))
 

@@ -9,122 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from arena_newton.canonical import ACTION, ACTION_WIDTH
+from arena_newton.canonical import ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Observation, Policy, world_mask
-from arena_newton.policies.stand import stand_action
-from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
-from arena_newton.trackers.motions import Clip, load_actions, load_clip
+from arena_newton.trackers.motions import load_actions, load_clip
+from arena_newton.trackers.motions.playback import clip_actions, startup_actions
 
-__all__ = ["ReplayPolicy", "clip_actions", "from_spec", "startup_actions"]
+__all__ = ["ReplayPolicy", "from_spec"]
 
 _XY = ACTION["root_xy_delta"]
-_ROT = ACTION["root_rot6d"]
-
-
-def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Quaternion product, wxyz."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    """Rotation matrices of unit quaternions wxyz, shape [..., 3, 3]."""
-    w, x, y, z = np.moveaxis(quat, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _slerp(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Spherical interpolation of unit quaternions along the shorter arc; shapes [n, 4], [n, 4], [n]."""
-    dot = (a * b).sum(axis=-1, keepdims=True)
-    b, dot = np.where(dot < 0, -b, b), np.abs(dot)
-    angle = np.arccos(np.clip(dot, 0.0, 1.0))
-    t = t[:, None]
-    near = angle < 1e-6
-    sine = np.where(near, 1.0, np.sin(angle))
-    quat = np.where(near, a + t * (b - a), (np.sin((1 - t) * angle) * a + np.sin(t * angle) * b) / sine)
-    return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-
-
-def _inverse_heading(quat: np.ndarray) -> np.ndarray:
-    """The rotation about z that removes a quaternion's heading (yaw = atan2(2(wz + xy), 1 - 2(y² + z²)))."""
-    w, x, y, z = quat
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.array([np.cos(-yaw / 2), 0.0, 0.0, np.sin(-yaw / 2)])
-
-
-def clip_actions(clip: Clip) -> np.ndarray:
-    """Canonical actions of a clip at 50 Hz, float32, shape [ticks, 40].
-
-    The displacement of a tick is given in the reference root frame of that tick (full orientation), the orientation
-    without the clip's first heading, so that integrating the actions rebuilds the clip's path (schema v3.1 of the
-    original). The first action holds no displacement; hands are open.
-    """
-    ticks = int(np.floor(clip.duration / TICK + 1e-9)) + 1
-    at = np.minimum(np.arange(ticks) * TICK * clip.fps, len(clip.root_pos) - 1)
-    low = np.minimum(at.astype(int), len(clip.root_pos) - 2)
-    t = at - low
-    pos = (1 - t)[:, None] * clip.root_pos[low] + t[:, None] * clip.root_pos[low + 1]
-    joints = (1 - t)[:, None] * clip.joint_pos[low] + t[:, None] * clip.joint_pos[low + 1]
-    quat = _slerp(clip.root_quat[low], clip.root_quat[low + 1], t)
-
-    anchor = _inverse_heading(quat[0])
-    quat = _multiply(np.broadcast_to(anchor, quat.shape), quat)
-    moved = np.zeros_like(pos)
-    moved[1:] = np.diff(pos, axis=0) @ _matrix(anchor).T
-    rotation = _matrix(quat)
-
-    actions = np.zeros((ticks, ACTION_WIDTH))
-    actions[:, _XY] = np.einsum("tji,tj->ti", rotation, moved)[:, :2]
-    actions[:, ACTION["root_z"]] = pos[:, 2:]
-    actions[:, _ROT] = rotation[:, :, :2].reshape(ticks, 6)
-    actions[:, ACTION["joint_pos"]] = joints[:, list(CANONICAL_TO_MUJOCO)]
-    return actions.astype(np.float32)
-
-
-def startup_actions(first: np.ndarray, *, stand: float, blend: float) -> np.ndarray:
-    """Actions that lead from standing to a recording's first action without displacement.
-
-    Args:
-        first: The first action, shape [40].
-        stand: Time that the robot stands [s].
-        blend: Time in which height, orientation and joints move over linearly [s].
-
-    Returns:
-        float32, shape [ticks, 40].
-    """
-    standing = stand_action()
-    waiting = np.repeat(standing[None], round(stand / TICK), axis=0)
-    ticks = round(blend / TICK)
-    share = (np.arange(1, ticks + 1) / (ticks + 1))[:, None].astype(np.float32)
-    moving = (1 - share) * standing + share * first
-    moving[:, _XY] = 0.0
-    moving[:, _ROT] = _orthonormal(moving[:, _ROT])
-    moving[:, ACTION["hands"]] = first[ACTION["hands"]]
-    return np.concatenate([waiting, moving]).astype(np.float32)
-
-
-def _orthonormal(rot6d: np.ndarray) -> np.ndarray:
-    """The rotation next to each row-layout rot6d (first two columns, flattened by rows), shape [ticks, 6]."""
-    columns = rot6d.reshape(-1, 3, 2)
-    x = columns[:, :, 0] / np.linalg.norm(columns[:, :, 0], axis=1, keepdims=True)
-    y = columns[:, :, 1] - (x * columns[:, :, 1]).sum(axis=1, keepdims=True) * x
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    return np.stack([x, y], axis=-1).reshape(-1, 6)
 
 
 class ReplayPolicy(Policy):

@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from arena_newton.canonical import ACTION, ACTION_WIDTH, IDENTITY_ROT6D
+from arena_newton.canonical import ACTION_WIDTH
+from arena_newton.env import STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Observation, Policy
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE
 
-__all__ = ["STAND_HEIGHT", "StandPolicy", "from_spec", "stand_action"]
-
-STAND_HEIGHT = 0.8
-"""Reference root height [m] of TWIST2's command when nobody steers it."""
-
-
-def stand_action() -> np.ndarray:
-    """The action that stands: no displacement, identity orientation, default pose, hands open; float32, shape [40]."""
-    action = np.zeros(ACTION_WIDTH, dtype=np.float32)
-    action[ACTION["root_z"]] = STAND_HEIGHT
-    action[ACTION["root_rot6d"]] = IDENTITY_ROT6D
-    action[ACTION["joint_pos"]] = np.asarray(DEFAULT_POSE)[list(CANONICAL_TO_MUJOCO)]
-    return action
+__all__ = ["StandPolicy", "from_spec"]
 
 
 class StandPolicy(Policy):
@@ -33,7 +21,7 @@ class StandPolicy(Policy):
     def act(self, observation: Observation) -> Chunk:
         """One second of standing for every world."""
         shape = (len(observation.state), self.chunk_size, ACTION_WIDTH)
-        return Chunk(np.broadcast_to(stand_action(), shape).copy())
+        return Chunk(np.broadcast_to(STAND_ACTION, shape).copy())
 
 
 def from_spec(argument: str | None) -> StandPolicy:

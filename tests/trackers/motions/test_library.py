@@ -7,11 +7,11 @@ import warp as wp
 
 from arena_newton.errors import InputError
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate, launch_reset_reference
-from arena_newton.policies.replay import clip_actions
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS, MotionLibrary
 from arena_newton.trackers.motions.load import Clip
+from arena_newton.trackers.motions.playback import clip_actions
 
 
 def wave(ticks: int = 90, seed: int = 0, fps: float = 50.0) -> Clip:
@@ -208,7 +208,8 @@ def test_replay_plays_the_same():
     """A clip's actions from a library are those that the replay policy plays from its file."""
     clip = wave(61, fps=29.9)
     library = MotionLibrary.from_clips([clip], ["a"])
-    arrays = (torch.from_numpy(x.astype(float)) for x in (library.root_pos, library.root_quat, library.joint_pos))
+    parts = (library.root_pos, library.root_quat, library.joint_pos, library.hands)
+    arrays = (torch.from_numpy(x.astype(float)) for x in parts)
     actions, played = frames.motion_actions(*arrays).numpy(), clip_actions(clip)
     assert len(actions) == len(played)
     np.testing.assert_allclose(actions, played, atol=2e-6)
