@@ -49,8 +49,14 @@ class Entry:
 
     def make(self) -> Tracker:
         """A new tracker, not bound yet."""
-        from arena_newton.trackers.base import get
+        from arena_newton.trackers.base import get, register
 
+        module, _, factory = self.name.partition(":")
+        if factory:
+            try:
+                register(self.name, getattr(importlib.import_module(module), factory))
+            except (ImportError, AttributeError) as error:
+                raise InputError(f"--tracker {self.name}: {error}") from None
         return get(self.name, self.checkpoint)
 
 
@@ -74,12 +80,15 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog=PROG, description="Measure trackers on one suite of references.")
     add = parser.add_argument
-    add("--tracker", dest="trackers", action=_AddTracker, metavar="NAME", help="tracker; repeat to compare several")
+    add(
+        "--tracker",
+        dest="trackers",
+        action=_AddTracker,
+        metavar="NAME",
+        help="registered tracker, or module:factory of one that is not; repeat to compare several",
+    )
     add("--checkpoint", action=_OfLastTracker, metavar="PATH", help="weights of the --tracker before it")
     add("--label", action=_OfLastTracker, metavar="TEXT", help="what tables call the --tracker before it")
-    add(
-        "--import", dest="imports", action="append", default=[], metavar="MODULE", help="module that registers trackers"
-    )
     add("--suite", choices=tuple(ROLLOUTS), default="full", help="full: every cell; quick: a few")
     add("--only", nargs="+", default=[], metavar="CELL", help="only cells or groups whose names hold one of these")
     add("--clips", nargs="+", default=[], type=Path, metavar="FILE", help="motion clips or libraries to add")
@@ -124,11 +133,6 @@ def _check(args: argparse.Namespace) -> int:
         raise InputError(f"--seed {args.seed}: must be at least 0")
     if args.film and args.out is None:
         raise InputError("--film: name a folder with --out")
-    for module in args.imports:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise InputError(f"--import {module}: {error}") from None
     return args.rollouts or ROLLOUTS[args.suite]
 
 

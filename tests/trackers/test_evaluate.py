@@ -15,7 +15,7 @@ from arena_newton.trackers.evaluation.figures import Result, figures, wilson
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
 from arena_newton.trackers.evaluation.measure import FEET, LINKS, Meter, Reference
 from arena_newton.trackers.evaluation.rollout import Outcome, plan, run, sill_place
-from arena_newton.trackers.evaluation.suite import Cell
+from arena_newton.trackers.evaluation.suite import Cell, Navigation
 from arena_newton.trackers.motions import primitives
 
 RATE = g1.PhysicsRate(dt=0.005, substeps=4)
@@ -220,7 +220,8 @@ def test_official_twist2_walks_the_reference(shared):
     """The official checkpoint reaches 90 % of 0.3 m/s on the generator's walk and goes to a goal."""
     from arena_newton.trackers.base import get
 
-    cells = [cell for cell in suite("full") if cell.name in ("walk 0.3", "goal 1")]
+    goal = Cell("near goal", "goal", 13.0, goal=Navigation(1.0, 0.3, 0.5), rollouts=1)
+    cells = [Cell("short walk", "walk", 5.0, primitives.walk(0.3, seconds=5.0)), goal]
     tracker = get("twist2", shared / "reference/twist2/twist2_1017_20k.onnx")
     outcome = run(tracker, plan(cells, 2, 0), engine="mujoco", fast_physics=True, threads=1)
     m = outcome.measures
@@ -281,6 +282,7 @@ def test_command_line_writes_tables_side_by_side(tmp_path, capsys):
         ([], "at least one --tracker"),
         (["--checkpoint", "x.onnx"], "name its --tracker first"),
         (["--tracker", "nobody"], "unknown tracker"),
+        (["--tracker", "nowhere:factory"], "nowhere"),
         (["--tracker", "pd", "--tracker", "pd"], "--label"),
         (["--tracker", "pd", "--only", "nothing"], "no such cell"),
         (["--tracker", "pd", "--rollouts", "0"], "--rollouts 0"),

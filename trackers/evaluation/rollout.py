@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +44,13 @@ class Plan:
     """Cell of each world, [worlds]."""
     noise: dict[str, np.ndarray]
     """Draws of each world."""
+    _tables: dict[torch.device, Tables] = field(default_factory=dict, repr=False)
+
+    def tables(self, device: torch.device) -> Tables:
+        """References of all cells, rolled out once a device."""
+        if device not in self._tables:
+            self._tables[device] = tabulate(self.cells, device)
+        return self._tables[device]
 
 
 @dataclass
@@ -243,7 +250,7 @@ def run(
     watched = np.array([cells[i].support is not None for i in plan.cell])
     rate = tracker.rate(fast=fast_physics)
     lab = Lab(kinds, watched, drive=tracker.drive, rate=rate, engine=engine, device=device, threads=threads)
-    tables = tabulate(cells, lab.device)
+    tables = plan.tables(lab.device)
     lab.start(_start(plan, tables, neutral_stance().ankle))
     end = np.array([c.ticks for c in cells])[plan.cell]
     meter = Meter(lab, end, np.array([round(c.window / g1.TICK) for c in cells])[plan.cell])
