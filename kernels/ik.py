@@ -60,6 +60,9 @@ LEG_ROUNDS = wp.constant(2)
 LAST_ROUNDS = wp.constant(4)
 """Gauss-Newton steps of a leg after the pelvis stands."""
 ARM_ROUNDS = wp.constant(6)
+ARM_RESTART = wp.constant(16)
+ARM_LOST = wp.constant(0.03)
+"""An arm farther than this from its point starts anew [m]."""
 LEG_DAMPING = wp.constant(1.0e-6)
 """Square of the damping of `trackers_measured`'s solver."""
 LEG_CARE = wp.constant(0.5)
@@ -292,31 +295,19 @@ def palm(m: Model, w: int, first: int, base_p: wp.vec3, base_q: wp.quat, joints:
 
 
 @wp.func
-def solve_arm(
+def step_arm(
     m: Model,
     w: int,
     first: int,
-    slot: int,
-    target: wp.vec3,
+    goal: wp.vec3,
     base_p: wp.vec3,
     base_q: wp.quat,
     posture: wp.array2d[float],
-    arms: wp.array2d[float],
+    rounds: int,
     joints: wp.array2d[float],
-):
-    """Moves shoulder and elbow of `arms` towards a hand point; the wrist keeps the posture. Works in `joints`."""
-    start = vec6f()
-    for i in range(4):
-        start[i] = arms[w, slot + i]
-    shoulder = base_p + wp.quat_rotate(base_q, m.offset[first])
-    reach = target - shoulder
-    size = wp.length(reach)
-    goal = shoulder + reach * (wp.clamp(size, REACH_MIN, REACH_MAX) / wp.max(size, 1.0e-4))
-    for i in range(4):
-        joints[w, first + i - 1] = arms[w, slot + i]
-    for i in range(4, 7):
-        joints[w, first + i - 1] = settle_joint(m, first + i, posture[w, _UPPER + first - 13 + i])
-    for _ in range(ARM_ROUNDS):
+) -> float:
+    """Moves shoulder and elbow in `joints` towards a hand point; what is left [m]."""
+    for _ in range(rounds):
         p = base_p
         q = base_q
         axes = mat63()
@@ -355,9 +346,51 @@ def solve_arm(
             link = first + i
             angle = joints[w, link - 1] + wp.clamp(step[i], -STEP, STEP)
             joints[w, link - 1] = settle_joint(m, link, angle)
+    return wp.length(goal - palm(m, w, first, base_p, base_q, joints))
+
+
+@wp.func
+def solve_arm(
+    m: Model,
+    w: int,
+    first: int,
+    slot: int,
+    target: wp.vec3,
+    base_p: wp.vec3,
+    base_q: wp.quat,
+    posture: wp.array2d[float],
+    arms: wp.array2d[float],
+    joints: wp.array2d[float],
+):
+    """Moves `arms` towards a hand point; the wrist keeps the posture. Works in `joints`.
+
+    An arm that is folded against its limits starts anew from one held forward.
+    """
+    shoulder = base_p + wp.quat_rotate(base_q, m.offset[first])
+    reach = target - shoulder
+    size = wp.length(reach)
+    goal = shoulder + reach * (wp.clamp(size, REACH_MIN, REACH_MAX) / wp.max(size, 1.0e-4))
     for i in range(4):
-        change = wp.clamp(joints[w, first + i - 1] - start[i], -ARM_SPEED, ARM_SPEED)
-        arms[w, slot + i] = start[i] + change
+        joints[w, first + i - 1] = arms[w, slot + i]
+    for i in range(4, 7):
+        joints[w, first + i - 1] = settle_joint(m, first + i, posture[w, _UPPER + first - 13 + i])
+    left = step_arm(m, w, first, goal, base_p, base_q, posture, ARM_ROUNDS, joints)
+    if left > ARM_LOST:
+        found = vec6f()
+        for i in range(4):
+            found[i] = joints[w, first + i - 1]
+        side = wp.where(slot == 0, 1.0, -1.0)
+        joints[w, first - 1] = -0.6
+        joints[w, first] = 0.3 * side
+        joints[w, first + 1] = 0.0
+        joints[w, first + 2] = 0.2
+        again = step_arm(m, w, first, goal, base_p, base_q, posture, ARM_RESTART, joints)
+        if again > 0.7 * left:
+            for i in range(4):
+                joints[w, first + i - 1] = found[i]
+    for i in range(4):
+        change = wp.clamp(joints[w, first + i - 1] - arms[w, slot + i], -ARM_SPEED, ARM_SPEED)
+        arms[w, slot + i] = arms[w, slot + i] + change
 
 
 @wp.func
