@@ -85,7 +85,8 @@ class MotionCommand:
     """One command a world; rows are worlds."""
 
     velocity: torch.Tensor
-    """Forward and left [m/s] and yaw rate [rad/s] in the heading frame, shape [worlds, 3]; up to 0.8 m/s."""
+    """Forward and left [m/s] and yaw rate [rad/s] in the heading frame, shape [worlds, 3]; up to 0.8 m/s
+    forward and 0.35 m/s sideways."""
     height: torch.Tensor
     """Pelvis above the ground [m], 0.40 to 0.785, shape [worlds]; walking lowers it to 0.75."""
     pitch: torch.Tensor

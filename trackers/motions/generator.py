@@ -167,7 +167,7 @@ class ReferenceGenerator:
             "velocity": (-0.9, 0.9),
             "height": (LOWEST, STAND_HEIGHT),
             "pitch": (-0.3, 1.0),
-            "roll": (-0.3, 0.3),
+            "roll": (-0.2, 0.2),
             "waist": (-2.5, 2.5),
             "shift": (-0.12, 0.12),
             "foot_offset": (0.0, 0.12),
@@ -182,7 +182,7 @@ class ReferenceGenerator:
         }.items():
             part = CHANNELS[name]
             low[part], high[part] = [a] * (part.stop - part.start), [b] * (part.stop - part.start)
-        low[2], high[2] = -1.2, 1.2
+        low[1:3], high[1:3] = [-0.35, -1.2], [0.35, 1.2]
         return constant(low), constant(high)
 
     def reset(
