@@ -6,7 +6,7 @@ over the canonical actions that the generator makes of them. It never learns whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -115,7 +115,7 @@ class ExpertPolicy(Policy):
 
     name = "expert"
 
-    def __init__(self, experts: dict[str, Callable[[Sight], Expert]], chunk_size: int = 5):
+    def __init__(self, experts: Mapping[str, Callable[[Sight], Expert]], chunk_size: int = 5):
         """Take the table of experts.
 
         Args:

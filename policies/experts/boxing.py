@@ -79,7 +79,7 @@ class BoxingExpert(Expert):
         """The right hand strikes, shape [worlds]."""
         self.ready = torch.zeros(worlds, 3, device=device)
         self.stand = torch.zeros(worlds, 3, device=device)
-        self._route: Tensor | None = None
+        self._route = torch.zeros(0, device=device)
         self._tries = torch.zeros(worlds, dtype=torch.long, device=device)
         self._clock = torch.zeros(worlds, device=device)
         self._correction = torch.zeros(worlds, 3, device=device)
@@ -87,6 +87,7 @@ class BoxingExpert(Expert):
     def begin(self, mask: Tensor) -> None:
         """Choose bag, stance and hand."""
         self._tries = self._tries.masked_fill(mask, 0)
+        self.navigator.reset(mask)
         self._approach(mask)
 
     def _bag(self) -> tuple[Tensor, Tensor]:
@@ -121,13 +122,12 @@ class BoxingExpert(Expert):
         self.ready = torch.where(row, place, self.ready)
         self.stand = torch.where(row, chosen(stand), self.stand)
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
-        if self._route is None:
-            self._route = ways.points
-        self._route = torch.where(mask[:, None, None], ways.points, self._route)
+        old = self._route if len(self._route) else ways.points
+        self._route = torch.where(mask[:, None, None], ways.points, old)
         self.phase = self.phase.masked_fill(mask, WALK)
         self._clock = self._clock.masked_fill(mask, 0.0)
         self._correction = self._correction.masked_fill(row, 0.0)
-        self.navigator.reset(mask)
+        self.navigator.retarget(mask)
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """Walk, step up or strike."""
@@ -152,7 +152,7 @@ class BoxingExpert(Expert):
         )
         self.phase = self.phase + onward
         self._clock = self._clock.masked_fill(onward, 0.0)
-        self.navigator.reset(onward)
+        self.navigator.retarget(onward)
         return command
 
     def _strike(self, command: MotionCommand, striking: Tensor, mask: Tensor, dt: float) -> None:

@@ -41,7 +41,7 @@ class VisNaviExpert(Expert):
         self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.5))
         self.goal = torch.zeros(worlds, 3, device=device)
         """Where the robot wants to stand: x, y [m], yaw [rad], shape [worlds, 3]."""
-        self._route: Tensor | None = None
+        self._route = torch.zeros(0, device=device)
         self._stray = torch.zeros(worlds, device=device)
         self._seen = torch.zeros(worlds, len(OBSTACLES), 5, device=device)
 
@@ -67,14 +67,12 @@ class VisNaviExpert(Expert):
         ways = plan(pose[:, :2], spot, Floor(boxes, *ROOM))
         last = spot - torch.where((ways.length < BLOCKED)[:, None], _before_last(ways.points), pose[:, :2])
         goal = torch.cat([spot, torch.atan2(last[:, 1], last[:, 0])[:, None]], dim=1)
-        route = ways.points
-        if self._route is None:
-            self._route = route
-        self._route = torch.where(mask[:, None, None], route, self._route)
+        old = self._route if len(self._route) else ways.points
+        self._route = torch.where(mask[:, None, None], ways.points, old)
         self.goal = torch.where(mask[:, None], goal, self.goal)
         self._seen = torch.where(mask[:, None, None], boxes, self._seen)
         self._stray = self._stray.masked_fill(mask, 0.0)
-        self.navigator.reset(mask)
+        self.navigator.retarget(mask)
 
     def _spot(self, centre: Tensor, yaw: Tensor, boxes: Tensor) -> Tensor:
         """The place in the area that is best to stand on: clear of obstacles, near the middle; [worlds, 2]."""
