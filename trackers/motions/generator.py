@@ -17,6 +17,7 @@ from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
 from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, MotionCommand, neutral_row
 from arena_newton.trackers.motions.footwork import (
     SHORTEST_STEP,
+    STRIDE,
     State,
     approach,
     kick,
@@ -35,6 +36,8 @@ __all__ = ["Frames", "ReferenceGenerator"]
 
 WALK_HEIGHT = 0.75
 """Highest pelvis of a walk [m]: higher, the legs do not reach their footsteps."""
+LONGEST_BEHIND = 0.22
+"""A foot farther behind the pelvis at the end of its stance lowers the walk [m]."""
 STAND_HEIGHT = 0.785
 """Highest pelvis of all [m]: the knees are nearly straight."""
 LOWEST = 0.38
@@ -332,7 +335,10 @@ class ReferenceGenerator:
         at = CHANNELS
         now = s["channels"]
         height = row[:, at["height"]]
-        height = torch.where(walking[:, None], height.clamp(max=WALK_HEIGHT), height)
+        speed = torch.maximum(velocity[:, :2].norm(dim=1), now[:, :2].norm(dim=1))[:, None]
+        behind = 0.75 * (speed * now[:, at["step_time"]]).clamp(max=STRIDE) + now[:, at["foot_offset"]]
+        top = WALK_HEIGHT - 0.8 * (behind - LONGEST_BEHIND).clamp(min=0.0)
+        height = torch.where(walking[:, None], torch.minimum(height, top), height)
         height = torch.where(busy[:, None], height.clamp(max=KICK_HEIGHT), height)
         # Feet stay where they are until there is a reason to step: their offset waits for it.
         offset = torch.where(walking[:, None], row[:, at["foot_offset"]], now[:, at["foot_offset"]])
@@ -358,11 +364,10 @@ class ReferenceGenerator:
             ],
             dim=1,
         )
-        speed = row[:, at["arm_speed"]]
         arms = slice(at["arms"].start, at["hand_point"].stop)
         top, slope = self._top.expand_as(now).clone(), self._slope.expand_as(now).clone()
-        top[:, arms] *= speed
-        slope[:, arms] *= speed
+        top[:, arms] *= row[:, at["arm_speed"]]
+        slope[:, arms] *= row[:, at["arm_speed"]]
         s["channels"], s["rates"] = approach(now, s["rates"], target, top, slope)
 
     def _advance_body(self, s: State) -> None:
