@@ -421,6 +421,8 @@ def load_scene(
             kinematic_switchable_roots=False,
             use_mujoco_cpu=native,
         )
+    if not native:
+        _collide_boxes_as_mujoco(solver.mjw_model)
     m = solver.mj_model
     map_body = solver.mjc_body_to_newton.numpy()
     if native and worlds > 1:
@@ -453,6 +455,17 @@ def load_scene(
     if rules is not None and scene.has_body("/World/Ball"):
         _set_restitution(scene, rules.ball_restitution)
     return scene
+
+
+def _collide_boxes_as_mujoco(warp_model: Any) -> None:
+    """Let mujoco_warp collide boxes by its port of MuJoCo's own routine.
+
+    By default it treats them as any convex shapes, and the normal of a foot that grazes an edge at a few degrees is
+    then the foot's instead of the obstacle's: with it a walk along a sill fell in 10 % of the rollouts, against 3 %.
+    """
+    import mujoco
+
+    warp_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
 
 
 def _set_restitution(scene: Scene, restitution: float) -> None:
