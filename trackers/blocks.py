@@ -20,7 +20,7 @@ import torch
 
 __all__ = ["BLOCK_SIZES", "BlockRunner"]
 
-BLOCK_SIZES = (8, 16, 32)
+BLOCK_SIZES = (4, 8, 16, 32)
 """Block sizes tried, in this order; rows run one at a time where none keeps the bits."""
 
 _PROBE_SEED = 20240

@@ -57,9 +57,9 @@ def test_separate_blocks_where_merging_changes_bits():
     """Blocks run separately where one larger product would give other bits."""
 
     def network(x):
-        return x + (1e-3 if len(x) > 8 else 0.0)
+        return x + (1e-3 if len(x) > 4 else 0.0)
 
     runner = BlockRunner(network, 4, 20)
-    assert runner.plan() == (8, False)
+    assert runner.plan() == (4, False)
     rows = torch.randn(20, 4)
     assert torch.equal(outputs(network, rows), rows)
