@@ -49,7 +49,7 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         raise InputError(f"--out {options.out}: expected a .safetensors file")
     state = read_checkpoint(checkpoint)
     card = dict(state["card"])
-    network = networks.make(card["tracker"], card.get("network"))
+    network = networks.make(card["tracker"], state["network"])
     prefix = "net."
     tensors = {k[len(prefix) :]: v for k, v in state["actor_state_dict"].items() if k.startswith(prefix)}
     network.load_state_dict(tensors, strict=False)

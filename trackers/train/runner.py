@@ -120,16 +120,16 @@ class TrackerRunner(OnPolicyRunner):
             observations: TensorDict = torch.cat(seen)  # type: ignore[arg-type,assignment]
             self.alg.actor.update_normalization(observations)
             self.alg.critic.update_normalization(observations)
-        targets = torch.cat(wanted)
-        if self.env.front_end.action_form.kind == "residual":
+        steps = self.cfg["fit_steps"]
+        if self.env.front_end.action_form.kind == "residual" or not steps:
             return
+        targets = torch.cat(wanted)
         actor = self.alg.actor
         optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-        size = min(len(targets), 8192)
-        for k in range(self.cfg.get("fit_steps", 300)):
-            for group in optimizer.param_groups:
-                group["lr"] = 1e-3 * (1.0 - k / self.cfg.get("fit_steps", 300))
-            rows = torch.randint(len(targets), (size,), device=targets.device)
+        loss = torch.zeros(())
+        for k in range(steps):
+            optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - k / steps)
+            rows = torch.randint(len(targets), (min(len(targets), 8192),), device=targets.device)
             loss = (actor(observations[rows]) - targets[rows]).square().mean()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -247,6 +247,7 @@ class TrackerRunner(OnPolicyRunner):
         state = self.alg.save() | {
             "iter": self.current_learning_iteration,
             "infos": infos,
+            "network": actor.net.config() if isinstance(actor, TrackerActor) else {},
             "norm_counts": actor.counts() if isinstance(actor, TrackerActor) else {},
             "learning_rate": self.alg.learning_rate,
             "samples": self.samples,
@@ -298,7 +299,7 @@ def read_checkpoint(path: str | Path, device: str = "cpu") -> dict[str, Any]:
         raise InputError(f"{path}: no such checkpoint") from None
     except Exception as error:
         raise InputError(f"{path}: not a training checkpoint ({type(error).__name__})") from error
-    missing = {"actor_state_dict", "norm_counts", "sampler", "card"} - set(state)
+    missing = {"actor_state_dict", "network", "norm_counts", "sampler", "card"} - set(state)
     if missing:
         raise InputError(f"{path}: not a checkpoint of this training, it lacks {', '.join(sorted(missing))}")
     return state

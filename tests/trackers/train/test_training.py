@@ -1,0 +1,201 @@
+"""Training end to end on the CPU: 8 worlds, engine `warp`."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from arena_newton.errors import InputError
+from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
+from arena_newton.trackers import weights_file
+from arena_newton.trackers.motions import frames
+from arena_newton.trackers.train import __main__ as command_line
+from arena_newton.trackers.train import events, session
+from arena_newton.trackers.train.config import TrainOptions, runner_config
+from arena_newton.trackers.train.env import EnvConfig, TrackerEnv
+from arena_newton.trackers.train.export import ExportOptions, export
+from arena_newton.trackers.train.rewards import Term
+from arena_newton.trackers.train.runner import TrackerRunner, read_checkpoint
+
+WORLDS = 8
+
+
+@pytest.fixture(scope="module")
+def env(library):
+    """Eight worlds with all of the randomisation."""
+    torch.manual_seed(0)
+    front, drive, rate = session.front_end("twist2")
+    made = TrackerEnv(front, drive, rate, library.to("cpu"), EnvConfig(worlds=WORLDS), "cpu")
+    made.library = library.to("cpu")
+    return made
+
+
+def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
+    options = TrainOptions(worlds=WORLDS, device="cpu", steps=8, print_interval=1000, **changes)
+    card = {
+        "tracker": "twist2",
+        "command": "test",
+        "commit": "none",
+        "worlds": WORLDS,
+        "processes": 1,
+        "seed": 0,
+        "data": {"clips": 2, "families": {"stand": {"clips": 1, "minutes": 0.1}}, "sources": ["test"]},
+        "licences": {"Apache-2.0": 2},
+        "action_form": dataclasses.asdict(env.front_end.action_form),
+        "drive": dataclasses.asdict(TWIST2_DRIVE),
+        "physics": dataclasses.asdict(PhysicsRate(0.005, 4)),
+    }
+    return TrackerRunner(env, runner_config(options, {"hidden": [64, 64]}, card), log_dir, "cpu")
+
+
+def test_worlds_differ_and_the_critic_knows(env):
+    """Start events give every world its own friction, masses and motors, and the critic sees them."""
+    sim = env.sim
+    friction = sim.geom_friction[:, :, 0]
+    assert (friction == friction[:, :1]).all() and friction[:, 0].unique().numel() == WORLDS
+    assert torch.allclose(env.privileged["friction"][:, 0] + 0.8, friction[:, 0])
+    robot = sim.body_mass[:, list(sim.bodies.values())].sum(1)
+    assert robot.unique().numel() == WORLDS and ((robot > 33.0) & (robot < 46.0)).all()
+    strength = 1.0 + 0.1 * env.privileged["motor_strength"]
+    assert torch.allclose(sim.gain[:, :29, 0], strength * torch.tensor(TWIST2_DRIVE.kp), rtol=1e-5)
+    assert torch.allclose(sim.effort_range[:, :, 1], strength * torch.tensor(TWIST2_DRIVE.effort), rtol=1e-5)
+
+
+def test_episodes_start_on_the_reference_beside_its_support(env, library):
+    """A restarted world stands in its frame within the noise; the seat stands where its clip says, or out of reach."""
+    env._restart(env._every)
+    now = env.bank.gather(env.frame)
+    noise = events.START_NOISE
+    assert ((env.sim.joint_pos - now.joint_pos).abs() <= noise["joint_pos"] + 1e-6).all()
+    assert ((env.sim.root_pos - now.root_pos)[:, :2].abs() <= noise["xy"] + 1e-6).all()
+    assert (frames.wrap_angle(frames.heading(env.sim.root_quat)).abs() < 0.2).all()
+    seat = env.sim.mocap_pos[:, env.sim.scene.mocap_id("/World/Seat")]
+    sits = env.bank.support_kind[env.bank.clip_of[env.frame]] == 1
+    assert torch.allclose(seat[sits], torch.tensor([-0.6, 0.0, 0.4])) and (seat[~sits, 2] < -1.0).all()
+    assert 0 < sits.sum() < WORLDS
+
+
+def test_a_broken_world_ends_and_starts_again(env):
+    """A world whose state is not finite ends its episode, starts again finite, and does not stop the training."""
+    env.step(torch.zeros(WORLDS, 29))
+    env.collect()
+    env.sim.qpos[3, 9] = float("nan")
+    observations, reward, done, extras = env.step(torch.zeros(WORLDS, 29))
+    assert done[3] == 1 and not extras["time_outs"][3]
+    assert torch.isfinite(reward).all() and reward[3] < -2.0
+    assert all(torch.isfinite(v).all() for v in observations.values())
+    for _ in range(3):
+        observations, reward, done, _ = env.step(torch.zeros(WORLDS, 29))
+    assert torch.isfinite(observations["critic"]).all() and torch.isfinite(env.sim.qpos).all()
+    assert env.collect()["Ends_per_s/nonfinite"] > 0.0
+
+
+def test_time_outs_are_no_falls(env):
+    """An episode that reaches its clip's end ends without the penalty of a fall."""
+    env._restart(env._every)
+    env._observe(env._every)
+    env.frame.copy_(env.bank.last[env.frame] - 1)
+    env._next_rows.copy_(env.bank.rows(env.frame + 1))
+    now = env.bank.gather(env.frame)
+    env.sim.root_pos.copy_(now.root_pos)
+    env.sim.joint_pos.copy_(now.joint_pos)
+    env.sim.root_quat.copy_(now.root_quat)
+    _, reward, done, extras = env.step(torch.zeros(WORLDS, 29))
+    assert done.all() and extras["time_outs"].all() and (reward > 0.0).all()
+    assert (env.episode_length_buf == 0).all()
+
+
+def pointers(thing: object, depth: int = 2) -> dict[str, int]:
+    """Addresses of all tensors that an object holds, directly or within its parts."""
+    found: dict[str, int] = {}
+    for name, value in vars(thing).items():
+        if isinstance(value, torch.Tensor):
+            found[name] = value.data_ptr()
+        elif isinstance(value, dict):
+            found |= {f"{name}.{k}": v.data_ptr() for k, v in value.items() if isinstance(v, torch.Tensor)}
+        elif depth and hasattr(value, "__dict__") and not callable(value):
+            found |= {f"{name}.{k}": v for k, v in pointers(value, depth - 1).items()}
+    return found
+
+
+def test_a_tick_keeps_its_buffers(env):
+    """No tensor of the environment moves in a tick: a CUDA graph holds addresses."""
+    parts = (env, env.front_end, env.sampler, env.tally, env.bank, env.sim)
+    before = [pointers(part, 0) for part in parts]
+    env.step(torch.zeros(WORLDS, 29))
+    env.collect()
+    env.step(torch.ones(WORLDS, 29))
+    assert [pointers(part, 0) for part in parts] == before
+
+
+def test_reward_improves(env):
+    """A few iterations of PPO move the policy to where a reward term wants it."""
+    torch.manual_seed(0)
+    wanted = Term(lambda motion: (motion.action[:, 0] - 1.0).square(), -5.0)
+    easy = TrackerEnv(
+        session.front_end("twist2")[0],
+        TWIST2_DRIVE,
+        PhysicsRate(0.005, 4),
+        env.library,
+        EnvConfig(worlds=WORLDS, randomise=False),
+        "cpu",
+        rewards={"wanted": wanted},
+    )
+    runner = make_runner(easy, learning_rate=1e-3, desired_kl=10.0, entropy=0.0)
+    runner.alg.gamma = 0.0
+    runner.learn(10)
+    earned = [row["Train/reward_per_s"] for row in runner.history]
+    assert sum(earned[-3:]) > 0.85 * sum(earned[:3])
+    assert runner.samples == 10 * 8 * WORLDS
+
+
+def test_resume_goes_on_as_before(env, tmp_path):
+    """A checkpoint brings back networks, input statistics, sampling, learning rate and random numbers."""
+    first = make_runner(env, str(tmp_path / "a"), minutes=0.0)
+    first.learn(2)
+    path = tmp_path / "a" / "model_last.pt"
+    second = make_runner(env, None)
+    state = torch.get_rng_state()
+    second.load(str(path))
+    expected = read_checkpoint(path)
+    assert torch.equal(torch.get_rng_state(), expected["rng"]) and not torch.equal(torch.get_rng_state(), state)
+    observations = env.get_observations()
+    assert torch.equal(first.alg.actor(observations), second.alg.actor(observations))
+    assert torch.equal(first.alg.critic(observations), second.alg.critic(observations))
+    assert second.alg.learning_rate == first.alg.learning_rate and second.samples == first.samples
+    assert first.alg.actor.counts().keys() == second.alg.actor.counts().keys()
+    for name, count in first.alg.actor.counts().items():
+        assert count == second.alg.actor.counts()[name] > 0
+    assert torch.equal(env.sampler.cumulative, expected["sampler"]["cumulative"])
+    second.learn(1)
+    assert second.current_learning_iteration == 3 and second.history[-1]["iteration"] == 3
+
+
+def test_export_is_what_was_trained(env, tmp_path):
+    """The weights file makes the actions of the trained actor, and its card says how it came to be."""
+    runner = make_runner(env, str(tmp_path))
+    runner.learn(1)
+    out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w" / "twist2.safetensors", note="A test."))
+    weights = weights_file.load(out, "twist2")
+    observations = env.get_observations()
+    assert torch.equal(weights.network(observations["actor"]), runner.alg.actor(observations))
+    assert weights.action_form == env.front_end.action_form and weights.drive == TWIST2_DRIVE
+    assert weights.card["samples"] == 8 * WORLDS and weights.card["licences"] == {"Apache-2.0": 2}
+    card = out.with_suffix(".md").read_text()
+    assert "A test." in card and "| stand | 1 | 0.1 |" in card
+
+
+def test_mistakes_answer_in_one_line(tmp_path, capsys):
+    """Wrong flags and files exit with 2 and name what is wrong."""
+    (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
+    for arguments, words in (
+        (["--library", str(tmp_path / "none.npz"), "--device", "cpu"], "no such file"),
+        (["--rewards", "nonsense", "1.0"], "nonsense"),
+        (["export", str(tmp_path / "bad.pt"), "--out", str(tmp_path / "x.safetensors")], "not a training checkpoint"),
+        (["export", str(tmp_path / "none.pt"), "--out", str(tmp_path / "x.safetensors")], "no such checkpoint"),
+    ):
+        assert command_line.main(arguments) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
+    with pytest.raises(InputError, match="pass one of the two"):
+        session.make_library(TrainOptions(library=tmp_path / "a.npz", families={"walk": 1}), "cpu")
