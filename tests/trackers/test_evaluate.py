@@ -303,3 +303,20 @@ def test_list_prints_the_cells(capsys):
     assert main(["--list"]) == 0
     printed = capsys.readouterr().out
     assert all(cell.name in printed for cell in suite("full"))
+
+
+def test_film_shows_the_robot(tmp_path, monkeypatch):
+    """A strip is written for every filmed cell, and its pictures differ where the robot moves."""
+    from PIL import Image
+
+    from arena_newton.trackers.base import get
+    from arena_newton.trackers.evaluation import film
+
+    for name, value in (("FILMED", {"squat 0.45": "squat"}), ("PICTURES", 2), ("WIDTH", 48), ("HEIGHT", 48)):
+        monkeypatch.setattr(film, name, value)
+    monkeypatch.setitem(film.SHOWN, "squat 0.45", (0.0, 2.0))
+    (path,) = film.film(get("pd"), "pd", tmp_path, engine="mujoco", threads=1)
+    assert path.name == "film_pd_squat.png"
+    strip = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    first, second = strip[-48:, :48], strip[-48:, -48:]
+    assert np.abs(first - second).max() > 60

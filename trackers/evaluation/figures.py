@@ -19,6 +19,8 @@ GOAL_PLACE, GOAL_TURN = 0.08, 5.0
 """A goal counts as reached within this [m], [deg]."""
 SEAT_TIME = 2.0
 """Time at 100 N and more that counts as sitting [s]."""
+BEHIND = 0.2
+"""A pelvis this far behind the middle of a sill is over it [m]."""
 RISEN = 0.65
 """A pelvis above this stands again [m]."""
 
@@ -192,7 +194,7 @@ def _sill(result: Result) -> Figure | None:
     if not rows.any():
         return None
     fell, count, _ = _falls(result, rows)
-    over = result.of("end_x", rows) > 1.2
+    over = (result.of("end_x", rows) > result.of("support_x", rows) + BEHIND) & ~result.of("fell", rows)
     text = f"falls {fell}/{count}, over {int(over.sum())}, touched {int((result.of('touch', rows) > 5).sum())}"
     return Figure("step over a 9 cm sill", text, "no fall, all over", bool(fell == 0 and over.all()))
 

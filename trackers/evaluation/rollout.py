@@ -58,7 +58,7 @@ class Outcome:
     """What one tracker did."""
 
     measures: dict[str, np.ndarray]
-    """`Meter.results`, rows are worlds, with `goal_distance` [m] and `goal_turn` [deg] of the goals."""
+    """`Meter.results` and, of worlds that have one, `support_x` [m], `goal_distance` [m] and `goal_turn` [deg]."""
     overflows: int
     """Worlds whose contact buffers overflowed."""
     ticks: int
@@ -251,7 +251,8 @@ def run(
     rate = tracker.rate(fast=fast_physics)
     lab = Lab(kinds, watched, drive=tracker.drive, rate=rate, engine=engine, device=device, threads=threads)
     tables = plan.tables(lab.device)
-    lab.start(_start(plan, tables, neutral_stance().ankle))
+    start = _start(plan, tables, neutral_stance().ankle)
+    lab.start(start)
     end = np.array([c.ticks for c in cells])[plan.cell]
     meter = Meter(lab, end, np.array([round(c.window / g1.TICK) for c in cells])[plan.cell])
     tracker.bind(worlds, lab.device)
@@ -322,12 +323,21 @@ def run(
         if observer is not None:
             observer(lab, tick)
     measures = meter.results()
+    measures["support_x"] = _support_x(start)
     if goals is not None:
         _add_goals(measures, plan)
     done = time.perf_counter()
     return Outcome(
         measures, lab.overflows(), ticks + SETTLE_TICKS, lab.engine, str(lab.device), setup, done - began - setup
     )
+
+
+def _support_x(start: Start) -> np.ndarray:
+    """Place of each world's support along the way [m], NaN without one, [worlds]."""
+    out: np.ndarray = np.full(len(start.root), np.nan)
+    for pose in start.supports.values():
+        out = np.where(np.isfinite(pose[:, 0]), pose[:, 0], out)
+    return out
 
 
 def _add_goals(measures: dict[str, np.ndarray], plan: Plan) -> None:

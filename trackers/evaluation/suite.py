@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arena_newton.errors import InputError
 from arena_newton.robot import TICK
 
 if TYPE_CHECKING:
@@ -118,43 +117,30 @@ class Tables:
 
 
 def clip_cells(paths: list[Path]) -> list[Cell]:
-    """A cell a clip: single clips in any format that the loader knows, or motion libraries.
+    """A cell a clip: files in any format that `motions.formats` reads, or motion libraries.
 
     Raises:
         InputError: A file is absent or unfit.
     """
-    from arena_newton.policies.replay import ReplayPolicy, startup_actions
-
-    cells = []
-    for path in paths:
-        for name, actions in _clips(path, ReplayPolicy):
-            lead = startup_actions(actions[0], stand=0.2, blend=BLEND)
-            whole = np.concatenate([lead, actions])
-            cells.append(Cell(f"clip {name}", "clip", len(whole) * TICK, actions=whole, window=BLEND + 0.2))
-    return cells
-
-
-def _clips(path: Path, replay: Any) -> list[tuple[str, np.ndarray]]:
     import torch
 
+    from arena_newton.trackers.motions.formats import read_library
     from arena_newton.trackers.motions.frames import motion_actions
-    from arena_newton.trackers.motions.library import MotionLibrary
+    from arena_newton.trackers.motions.playback import startup_actions
 
-    if not path.is_file():
-        raise InputError(f"--clips {path}: no such file")
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as archive:
-            is_library = "clip_start" in archive.files
-        if is_library:
-            library = MotionLibrary.load(path)
-            out = []
-            for clip in range(library.clips):
-                rows = library.rows(clip)
-                arrays = (library.root_pos, library.root_quat, library.joint_pos, library.hands)
-                parts = [torch.as_tensor(a[rows], dtype=torch.float32) for a in arrays]
-                out.append((str(library.clip_names[clip]), motion_actions(*parts).numpy()))
-            return out
-    return [(path.stem, replay(path, startup_stand=0.0, startup_blend=0.0).actions)]
+    if not paths:
+        return []
+    library, _ = read_library(paths)
+    cells = []
+    for clip in range(library.clips):
+        rows = library.rows(clip)
+        arrays = (library.root_pos, library.root_quat, library.joint_pos, library.hands)
+        parts = (torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays)
+        actions = motion_actions(*parts).numpy()
+        whole = np.concatenate([startup_actions(actions[0], stand=0.2, blend=BLEND), actions])
+        name = f"clip {library.clip_names[clip]}"
+        cells.append(Cell(name, "clip", len(whole) * TICK, actions=whole, window=BLEND + 0.2))
+    return cells
 
 
 def tabulate(cells: list[Cell], device: torch.device) -> Tables:
