@@ -5,7 +5,6 @@ Its log keeps statistics on the device and fetches them once an iteration.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import signal
 import statistics
@@ -71,7 +70,7 @@ class TrackerRunner(OnPolicyRunner):
         self.logger: DeviceLogger = DeviceLogger(
             log_dir=log_dir,
             cfg=self.cfg,
-            env_cfg=dataclasses.asdict(env.cfg),
+            env_cfg=env.cfg,
             num_envs=env.num_envs,
             is_distributed=self.is_distributed,
             gpu_world_size=self.gpu_world_size,
@@ -177,6 +176,7 @@ class TrackerRunner(OnPolicyRunner):
                 mark = time.monotonic()
         if self._writes:
             self.save(str(Path(self.logger.log_dir or ".") / "model_last.pt"))
+            self.save(str(Path(self.logger.log_dir or ".") / "model_slim.pt"), slim=True)
             self.logger.stop_logging_writer()
 
     @property
@@ -240,8 +240,14 @@ class TrackerRunner(OnPolicyRunner):
                 if name != "iteration":
                     writer.add_scalar(name if "/" in name else f"Train/{name}", value, it + 1)
 
-    def save(self, path: str, infos: dict | None = None) -> None:
-        """Write everything that a resumed training needs."""
+    def save(self, path: str, infos: dict | None = None, *, slim: bool = False) -> None:
+        """Write everything that a resumed training needs.
+
+        Args:
+            path: The file.
+            infos: Anything the caller wants back from `load`.
+            slim: Leave out the optimiser's moments, two thirds of the file; a resumed training builds them anew.
+        """
         cuda = torch.cuda.get_rng_state(self.device) if str(self.device).startswith("cuda") else None
         actor = self.alg.get_policy()
         state = self.alg.save() | {
@@ -258,6 +264,8 @@ class TrackerRunner(OnPolicyRunner):
             "card": self.cfg.get("card", {}),
             "last": self.history[-1] if self.history else {},
         }
+        if slim:
+            del state["optimizer_state_dict"]
         temporary = Path(path).with_suffix(".part")
         torch.save(state, temporary)
         temporary.replace(path)
@@ -272,8 +280,11 @@ class TrackerRunner(OnPolicyRunner):
             InputError: The file is absent or no checkpoint of this training.
         """
         state = read_checkpoint(path, map_location or str(self.device))
-        self.alg.load(state, load_cfg, strict)
+        parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
+        self.alg.load(state, load_cfg or parts, strict)
         self.alg.learning_rate = state["learning_rate"]
+        for group in self.alg.optimizer.param_groups:
+            group["lr"] = self.alg.learning_rate
         for name, count in self.alg.get_policy().counts().items():
             count.copy_(state["norm_counts"][name])
         self.current_learning_iteration = state["iter"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import os
 import subprocess
 import sys
@@ -134,6 +135,8 @@ def build(options: TrainOptions) -> TrackerRunner:
     from arena_newton.trackers.train.runner import TrackerRunner
     from arena_newton.trackers.train.simulation import share_stream
 
+    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
+        raise InputError("--logger wandb: the package wandb is not installed")
     unknown = sorted(set(options.rewards) - set(REWARDS))
     if unknown:
         raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
@@ -190,6 +193,16 @@ def train(options: TrainOptions) -> TrackerRunner:
     runner = build(options)
     minutes = options.minutes or (1.0 if options.bench else 0.0)
     runner.learn(options.iterations, minutes=minutes)
+    if runner.is_distributed:
+        import torch
+
+        torch.distributed.destroy_process_group()
+    if not options.bench and not runner.logger.disable_logs:
+        from arena_newton.trackers.train.export import ExportOptions, export
+
+        out = options.log_dir / f"{options.tracker}.safetensors"
+        export(options.log_dir / "model_last.pt", ExportOptions(out))
+        print(f"wrote {out} and its card")
     if options.bench and not runner.logger.disable_logs:
         # The first iterations warm up allocators and libraries.
         rows = runner.history[3:] or runner.history
