@@ -46,7 +46,7 @@ __all__ = [
 ]
 
 SIDES = {"left": 0, "right": 1}
-SEAT_APPROACH, SEAT_DEPTH = (0.24, 0.14), (0.36, 0.09)
+SEAT_APPROACH, SEAT_DEPTH = (0.24, 0.14), (0.25, 0.12)
 """Pelvis behind its standing place and above the seat [m], first until it touches, then pressed into it."""
 
 

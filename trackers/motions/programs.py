@@ -275,7 +275,7 @@ def _sit_air(d: _Draw, seconds: float) -> _Plan:
 
 def _seated(d: _Draw, lead: Script, seconds: float) -> _Plan:
     seat, edge = d(0.36, 0.48), d(0.03, 0.08)
-    depth, press = d(0.28, 0.36), d(0.09, 0.12)
+    depth, press = d(0.24, 0.36), d(0.09, 0.14)
     left = seconds - lead.seconds - 3.2 - 5.0
     script = lead + p.sit(seat, hold=max(left, 1.0), depth=depth, press=press)
     script = script + p.rise(seat, depth=depth, press=press) + p.stand(1.0)
@@ -450,7 +450,7 @@ def random_clips(
       of a walk. `punch`: some crouched, some after steps.
     - `carry`: palms at a box of 16-40 cm. `push`: feet 3-10 cm behind the pelvis.
     - `sit_air`: down to 0.5-0.6 m and up in balance, no seat. `sit`, `walk_sit`: seats of 0.36-0.48 m with the front
-      edge 3-8 cm behind the standing pelvis, really loaded (the pelvis ends 28-36 cm back and at seat + 0.09-0.12 m);
+      edge 3-8 cm behind the standing pelvis, really loaded (the pelvis ends 24-36 cm back and at seat + 0.09-0.14 m);
       after standing, or after turning and walking backwards to it.
     - `sill`: steps of 15-20 cm, the feet beside each other; a sill of 5-10 cm lies where every sole clears it by 5 cm.
     - `mixed`: walk, reach, crouch, kick, punch, squat in any order.
