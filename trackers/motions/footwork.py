@@ -219,5 +219,5 @@ def kick(s: State, row: torch.Tensor) -> None:
     pose = torch.cat([xy, (SOLE_HEIGHT + z)[:, None], base[:, 2:], toe[:, None]], dim=1)
     kicks = torch.stack([s["kick_side"] == 1, s["kick_side"] == 2], dim=1)
     s["feet"] = torch.where(kicks[:, :, None], pose[:, None], s["feet"])
-    s["support"] = s["support"] & ~(kicks & (z > 1e-4)[:, None])
+    s["support"] = s["support"] & ~(kicks & (z > 1e-6)[:, None])
     s["kick_share"] = active * (smooth(time / KICK_SHIFT) - smooth((time - t2 - KICK_RETURN) / KICK_SETTLE))
