@@ -74,6 +74,8 @@ class TrainOptions:
     """Weight of the entropy."""
     init_std: float = 0.6
     """Standard deviation of the action noise at the start."""
+    mirror_loss: float = 0.0
+    """Weight of the difference between the action of a mirrored observation and the mirrored action."""
     save_interval: int = 200
     """Iterations between checkpoints."""
     print_interval: int = 20
@@ -140,6 +142,7 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "value_loss_coef": 1.0,
             "entropy_coef": options.entropy,
             "max_grad_norm": 1.0,
+            "mirror_loss": options.mirror_loss,
             # Returns are about 16; clipping value steps to 0.2 would slow the critic down by that much.
             "use_clipped_value_loss": False,
         },

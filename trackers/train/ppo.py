@@ -7,11 +7,15 @@ minibatch.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
 from torch import nn
+
+if TYPE_CHECKING:
+    from arena_newton.trackers.front_end import Mirror
 
 __all__ = ["IterationPPO"]
 
@@ -27,7 +31,16 @@ class IterationPPO(PPO):
     """Upper bound of the learning rate."""
 
     def __init__(self, *args: Any, **kwargs: Any):
-        """Take rsl-rl's arguments; `schedule` is `adaptive` or `fixed`, `desired_kl` the divergence aimed at."""
+        """Take rsl-rl's arguments and `mirror_loss`.
+
+        Args:
+            args: rsl-rl's.
+            kwargs: rsl-rl's; `schedule` is `adaptive` or `fixed`, `desired_kl` the divergence aimed at. `mirror_loss`
+                weighs the squared difference between the action of a mirrored observation and the mirrored action.
+        """
+        self.mirror_loss: float = kwargs.pop("mirror_loss", 0.0)
+        self.mirrors: tuple[Mirror, Mirror] | None = None
+        """Mirror images of the actor's observation and of the action."""
         super().__init__(*args, **kwargs)
         self.last_kl = 0.0
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
@@ -60,6 +73,8 @@ class IterationPPO(PPO):
             else:
                 value = (values - batch.returns).square().mean()
             loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+            if self.mirror_loss > 0.0 and self.mirrors is not None:
+                loss = loss + self.mirror_loss * self._asymmetry(batch.observations)
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             if self.is_multi_gpu:
@@ -81,6 +96,15 @@ class IterationPPO(PPO):
         self._set_rate(self.last_kl)
         named = dict(zip(("value", "surrogate", "entropy"), losses, strict=True))
         return named | {"kl": self.last_kl}
+
+    def _asymmetry(self, observations: TensorDict) -> torch.Tensor:
+        """Mean squared difference between both ways to a mirrored action, on a quarter of the rows."""
+        assert self.mirrors is not None
+        rows = len(observations) // 4
+        mirror_obs, mirror_action = self.mirrors
+        straight = self.actor.output_mean[:rows]
+        mirrored = self.actor(TensorDict({"actor": mirror_obs(observations["actor"][:rows])}, batch_size=[rows]))
+        return (mirrored - mirror_action(straight.detach())).square().mean()
 
     def _set_rate(self, divergence: float) -> None:
         """Every process computes the same rate, for the divergence is the mean of all."""

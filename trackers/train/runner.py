@@ -22,6 +22,7 @@ from tensordict import TensorDict
 from arena_newton.errors import InputError
 from arena_newton.trackers.train.env import TrackerEnv
 from arena_newton.trackers.train.model import TrackerActor
+from arena_newton.trackers.train.ppo import IterationPPO
 
 __all__ = ["TrackerRunner"]
 
@@ -63,6 +64,7 @@ class TrackerRunner(OnPolicyRunner):
 
     env: TrackerEnv
     current_learning_iteration: int
+    alg: IterationPPO
 
     def __init__(self, env: TrackerEnv, train_cfg: dict, log_dir: str | None = None, device: str = "cpu"):
         """See rsl-rl's runner."""
@@ -77,6 +79,8 @@ class TrackerRunner(OnPolicyRunner):
             gpu_global_rank=self.gpu_global_rank,
             device=device,
         )
+        if self.alg.mirror_loss > 0.0:
+            self.alg.mirrors = (env.front_end.mirror_obs(), env.front_end.mirror_action())
         self.samples = 0
         """Samples of all processes since the training began, before resuming included."""
         self.seconds = 0.0
