@@ -44,8 +44,8 @@ class TrainOptions:
     """Origin of those files, for the card."""
     mirror: bool = True
     """Add the mirror image of every clip."""
-    family_weights: dict[str, float] = field(default_factory=lambda: dict(FAMILY_WEIGHTS))
-    """Weights of families in the sampling, per second of motion, 1 where not named."""
+    family_weights: dict[str, float] = field(default_factory=dict)
+    """Weights of families in the sampling, per second of motion; 8 for clips and 1 for the others where not named."""
     log_dir: Path = Path("runs/tracker")
     """Folder for checkpoints, progress.jsonl and TensorBoard."""
     logger: Literal["tensorboard", "wandb"] = "tensorboard"

@@ -18,6 +18,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from arena_newton.interfaces import RobotState, TrackerCommand
+from arena_newton.kernels.newton_state import LOST_CONTACTS
 from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.train import events, rotations
@@ -315,7 +316,7 @@ class TrackerEnv(VecEnv):
         failed = ends.any(1) | ~motion.finite
         earned = values * (self._weights * TICK)
         family = self.bank.family.index_select(0, self.bank.clip_of.index_select(0, self.frame))
-        self.tally.add(motion, earned, ends, failed, family, self.sim.overflow)
+        self.tally.add(motion, earned, ends, failed, family, self.sim.overflow & LOST_CONTACTS)
         return earned.sum(1) + TERMINATION_REWARD * failed, failed
 
     def _restart(self, mask: torch.Tensor) -> None:

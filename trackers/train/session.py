@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.trackers.train.config import TrainOptions, runner_config
+from arena_newton.trackers.train.config import FAMILY_WEIGHTS, TrainOptions, runner_config
 
 if TYPE_CHECKING:
     from arena_newton.robot import DriveGains, PhysicsRate
@@ -166,7 +166,7 @@ def build(options: TrainOptions) -> TrackerRunner:
         ),
         device,
         rewards=rewards,
-        family_weights=options.family_weights,
+        family_weights=FAMILY_WEIGHTS | options.family_weights,
     )
     if rank == 0:
         print(
