@@ -237,7 +237,7 @@ def _result(label: str, interface: str, official: bool, falls: int, cells: list[
     names = "leg_rmse drift_10s lowest speed_x ref_x goal_distance goal_turn seat_time end_z end_x support_x touch"
     measures = {name: np.full(worlds, 0.05) for name in [*names.split(), "ball_peak", "ball_end"]}
     measures["fell"] = np.arange(worlds) < falls
-    return Result(label, interface, official, {}, played, Outcome(measures, 0, 1, "mujoco", "cpu", 0.0, 0.0))
+    return Result(label, interface, official, {}, played, Outcome(measures, 0, 1, "mujoco", "cpu", RATE, 0.0, 0.0))
 
 
 def test_figures_have_the_verdict_of_their_bar():

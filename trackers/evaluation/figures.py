@@ -150,7 +150,9 @@ def _walks(result: Result) -> list[Figure]:
         rows = result.rows(f"walk {speed:g}")
         if not rows.any():
             continue
-        share = float(np.mean(result.of("speed_x", rows)) / np.mean(result.of("ref_x", rows)))
+        asked = float(np.mean(result.of("ref_x", rows)))
+        # Nobody was still up when the mean speed began to count: nothing was reached.
+        share = float(np.mean(result.of("speed_x", rows))) / asked if asked else 0.0
         out.append(Figure(f"speed reached, walk {speed:g} m/s", f"{100 * share:.0f} %", "≥ 90 %", share >= 0.9))
         rmse = float(result.of("leg_rmse", rows).mean())
         out.append(Figure(f"leg joint RMSE, walk {speed:g} m/s", f"{rmse:.3f} rad", f"≤ {error:g} rad", rmse <= error))

@@ -84,6 +84,7 @@ def document(results: Sequence[Result], options: dict[str, Any]) -> dict[str, An
                 "inference_ms": r.inference,
                 "overflows": r.outcome.overflows,
                 "ticks": r.outcome.ticks,
+                "rollout_physics": {"dt": r.outcome.rate.dt, "substeps": r.outcome.rate.substeps},
                 "setup_s": r.outcome.setup_s,
                 "rollout_s": r.outcome.rollout_s,
             }
@@ -148,7 +149,7 @@ def markdown(results: Sequence[Result], options: dict[str, Any]) -> str:
         "## Trackers",
         "\n".join(
             f"- **{r.label}**: checkpoint {r.tracker['checkpoint_hash']}, drive {r.tracker['drive']}, physics "
-            f"{1000 * r.tracker['physics_dt']:g} ms x {r.tracker['substeps']}; does not see: "
+            f"{1000 * r.outcome.rate.dt:g} ms x {r.outcome.rate.substeps}; does not see: "
             f"{', '.join(r.tracker['ignores']) or 'nothing is ignored'}; {r.outcome.ticks} ticks in "
             f"{r.outcome.rollout_s:.1f} s (set-up {r.outcome.setup_s:.1f} s), contact buffers overflowed in "
             f"{r.outcome.overflows} worlds"

@@ -64,6 +64,8 @@ class Outcome:
     ticks: int
     engine: str
     device: str
+    rate: g1.PhysicsRate
+    """Physics rate of the rollouts."""
     setup_s: float
     """Wall-clock time of building worlds and references [s]."""
     rollout_s: float
