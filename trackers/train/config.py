@@ -87,7 +87,9 @@ class TrainOptions:
     constraints_per_world: int = 160
     """Constraint buffer."""
     graph: bool = True
-    """Capture the physics tick on CUDA."""
+    """Capture the physics of a tick on CUDA."""
+    tick_graph: bool = True
+    """Capture what a tick does around the physics on CUDA."""
     bench: bool = False
     """Only measure: train for `--minutes` (one by default), write nothing, print samples/s."""
     commit: str = ""

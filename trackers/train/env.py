@@ -61,7 +61,9 @@ class EnvConfig:
     constraints_per_world: int = 160
     """Constraint buffer."""
     graph: bool = True
-    """Capture the tick on CUDA."""
+    """Capture the physics of a tick on CUDA."""
+    tick_graph: bool = True
+    """Capture the rest of a tick on CUDA."""
 
 
 class TrackerEnv(VecEnv):
@@ -143,7 +145,7 @@ class TrackerEnv(VecEnv):
             self._restart(self._every)
             self._observe(self._every)
         self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
-        if config.graph and device.startswith("cuda"):
+        if config.tick_graph and device.startswith("cuda"):
             self._capture()
 
     def _allocate(self) -> None:

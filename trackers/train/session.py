@@ -163,6 +163,7 @@ def build(options: TrainOptions) -> TrackerRunner:
             contacts_per_world=options.contacts_per_world,
             constraints_per_world=options.constraints_per_world,
             graph=options.graph,
+            tick_graph=options.tick_graph,
         ),
         device,
         rewards=rewards,
