@@ -330,7 +330,14 @@ def run(
         _add_goals(measures, plan)
     done = time.perf_counter()
     return Outcome(
-        measures, lab.overflows(), ticks + SETTLE_TICKS, lab.engine, str(lab.device), setup, done - began - setup
+        measures=measures,
+        overflows=lab.overflows(),
+        ticks=ticks + SETTLE_TICKS,
+        engine=lab.engine,
+        device=str(lab.device),
+        rate=rate,
+        setup_s=setup,
+        rollout_s=done - began - setup,
     )
 
 
