@@ -16,17 +16,17 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Policy, world_mask
 from arena_newton.robot import TICK
-from arena_newton.trackers.motions.navigate import heading, wrap
+from arena_newton.trackers.motions.navigate import heading
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.commands import MotionCommand
 
 __all__ = ["Expert", "ExpertPolicy", "Sight"]
 
-REALIGN = 0.02
-"""Share of the heading error between reference and robot that a tick takes out of the reference beyond `SLACK`."""
-SLACK = 0.35
-"""Heading error that a tracker may keep [rad]: a lag of its own. More of it means that the robot cannot follow."""
+REALIGN = TICK / 10.0
+"""Share of the heading error between reference and robot that a tick of a walk takes out of the reference. Slow: a
+tracker that does not see its heading takes the correction for a yaw rate; one that sees it must not be left far behind.
+"""
 
 
 class Sight:
@@ -167,10 +167,9 @@ class ExpertPolicy(Policy):
             self._fresh &= ~begins
         command = self.expert.command(mask, self.chunk_size * TICK)
         actions = torch.empty(worlds, self.chunk_size, 40, device=mask.device)
-        yaw = self.sight.pose[:, 2]
+        yaw, share = self.sight.pose[:, 2], REALIGN * (mask & (command.velocity != 0).any(dim=1))
         for tick in range(self.chunk_size):
-            lag = wrap(yaw - heading(self.generator.frames.root_quat))
-            self.generator.realign(yaw, REALIGN * (1.0 - SLACK / lag.abs().clamp_min(SLACK)) * mask)
+            self.generator.realign(yaw, share)
             self.generator.step(command, mask)
             actions[:, tick] = self.generator.action()
         return Chunk(actions)

@@ -41,7 +41,11 @@ LOW, HIGH = 0.52, 0.74
 """Range of pelvis heights [m]."""
 PATIENCE = 5.0
 """Time given to one strike before the robot steps back and tries another stance [s]."""
-STEP_TIME = 8.0
+READY_WITHIN = (0.10, 0.15)
+"""Errors at the ready place that do not matter [m, rad]."""
+STAND_WITHIN = (0.05, 0.10)
+"""Errors in front of the bag that the arm makes up for [m, rad]."""
+STEP_TIME = 6.0
 """Time given to the last steps before the robot strikes from where it is [s]."""
 GAIN = 0.6
 """Share of the palm's error that the command takes up in a second: trackers leave the hand 5-20 cm behind."""
@@ -147,9 +151,11 @@ class BoxingExpert(Expert):
         command.hands = torch.ones_like(command.hands)
         self._strike(command, striking, mask, dt)
 
-        onward = mask & (
-            (walking & answer.arrived) | ((self.phase == STEP) & (answer.arrived | (self._clock > STEP_TIME)))
-        )
+        place = torch.where(walking, READY_WITHIN[0], STAND_WITHIN[0])
+        turn = torch.where(walking, READY_WITHIN[1], STAND_WITHIN[1])
+        there = (answer.distance < place) & (answer.heading_error.abs() < turn)
+        late = (self.phase == STEP) & (self._clock > STEP_TIME)
+        onward = mask & ~striking & (there | answer.arrived | late)
         self.phase = self.phase + onward
         self._clock = self._clock.masked_fill(onward, 0.0)
         self.navigator.retarget(onward)
