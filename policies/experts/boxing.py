@@ -27,9 +27,9 @@ ROOM = ((-7.2, -6.5), (0.6, 5.2))
 FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
 """Bearing of the target from the bag's axis, against that of the robot [rad]: positive lies on the robot's right."""
 BEST_FLANK = math.radians(60)
-STAND = 0.50
+STAND = 0.45
 """Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
-READY = 0.72
+READY = 0.70
 """The same where the robot turns to the bag before the last step [m]: its hands must not meet the bag."""
 PALM_FRAME = 0.0415
 """The palm frame that the rule reads, so far before the wrist yaw frame [m]."""
@@ -39,8 +39,14 @@ BELOW = 0.12
 """Pelvis under the target [m]: then the shoulder is 17 cm above it."""
 LOW, HIGH = 0.52, 0.74
 """Range of pelvis heights [m]."""
-PATIENCE = 5.0
-"""Time given to one strike before the robot steps back and tries another stance [s]."""
+PATIENCE = 3.5
+"""Time given to one strike before the robot moves by what its palm is off [s]."""
+SHIFTS = 2
+"""Moves of that kind before it goes to another side of the target."""
+CLOSER = 0.12
+"""Longest of them [m]."""
+LEAN = 0.25
+"""Waist pitch of a strike [rad]."""
 READY_WITHIN = (0.10, 0.15)
 """Errors at the ready place that do not matter [m, rad]."""
 STAND_WITHIN = (0.05, 0.10)
@@ -114,7 +120,7 @@ class BoxingExpert(Expert):
         way = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
         price = way + 20.0 * tight + 0.5 * (flank.abs() - BEST_FLANK).abs()
         order = price.argsort(dim=1)
-        pick = torch.gather(order, 1, (self._tries % len(FLANKS))[:, None])
+        pick = torch.gather(order, 1, (self._tries // (SHIFTS + 1) % len(FLANKS))[:, None])
 
         def chosen(points: Tensor) -> Tensor:
             xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
@@ -128,10 +134,7 @@ class BoxingExpert(Expert):
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
         old = self._route if len(self._route) else ways.points
         self._route = torch.where(mask[:, None, None], ways.points, old)
-        self.phase = self.phase.masked_fill(mask, WALK)
-        self._clock = self._clock.masked_fill(mask, 0.0)
-        self._correction = self._correction.masked_fill(row, 0.0)
-        self.navigator.retarget(mask)
+        self._begin_phase(mask, WALK)
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """Walk, step up or strike."""
@@ -139,7 +142,9 @@ class BoxingExpert(Expert):
         stuck = mask & (self.phase == STRIKE) & (self._clock > PATIENCE)
         if stuck.any():
             self._tries = self._tries + stuck
-            self._approach(stuck)
+            again = stuck & (self._tries % (SHIFTS + 1) == 0)
+            self._shift(stuck & ~again)
+            self._approach(again)
         walking, striking = self.phase == WALK, self.phase == STRIKE
         goal = torch.where(walking[:, None], self.ready, self.stand)
         route = torch.where(walking[:, None, None], self._route, pose[:, None, :2])
@@ -161,17 +166,37 @@ class BoxingExpert(Expert):
         self.navigator.retarget(onward)
         return command
 
+    def _shift(self, mask: Tensor) -> None:
+        """Move the stance by what the palm missed: a crouch and a stretched arm push the robot back by centimetres."""
+        miss = (self._wanted() - self._palm())[:, :2]
+        size = torch.linalg.vector_norm(miss, dim=1, keepdim=True).clamp_min(1e-6)
+        moved = self.sight.pose[:, :2] + miss * (CLOSER / size).clamp_max(1.0)
+        stand = torch.cat([moved, self.stand[:, 2:]], dim=1)
+        self.stand = torch.where(mask[:, None], stand, self.stand)
+        self._begin_phase(mask, STEP)
+
+    def _begin_phase(self, mask: Tensor, phase: int) -> None:
+        self.phase = self.phase.masked_fill(mask, phase)
+        self._clock = self._clock.masked_fill(mask, 0.0)
+        self._correction = self._correction.masked_fill(mask[:, None], 0.0)
+        self.navigator.retarget(mask)
+
+    def _wanted(self) -> Tensor:
+        """Where the palm shall be [m]: beside the target, [worlds, 3]."""
+        target = self._target()
+        _, bearing = self._bag()
+        away = torch.stack([torch.cos(bearing), torch.sin(bearing), torch.zeros_like(bearing)], dim=1)
+        return target + OFF * away
+
+    def _palm(self) -> Tensor:
+        """The striking palm [m], [worlds, 3]."""
+        left, right = (palm() for palm in self._palms)
+        return torch.where(self.right[:, None], right, left)
+
     def _strike(self, command: MotionCommand, striking: Tensor, mask: Tensor, dt: float) -> None:
         """Fill in height, waist and hand point."""
-        pose, target = self.sight.pose, self._target()
-        _, bearing = self._bag()
-        wanted = target.clone()
-        wanted[:, 0] += OFF * torch.cos(bearing)
-        wanted[:, 1] += OFF * torch.sin(bearing)
-        palms = torch.stack([palm() for palm in self._palms], dim=1)
-        hand = self.right.long()
-        palm = palms[torch.arange(len(palms), device=palms.device), hand]
-        error = self._local(wanted - palm, pose)
+        pose, wanted = self.sight.pose, self._wanted()
+        error = self._local(wanted - self._palm(), pose)
         settled = striking & mask & (self._clock > 1.0)
         correction = (self._correction + GAIN * dt * error).clamp(-MOST, MOST)
         self._correction = torch.where(settled[:, None], correction, self._correction)
@@ -182,10 +207,10 @@ class BoxingExpert(Expert):
         is_right = torch.stack([~self.right, self.right], dim=1)
         command.hand_point = torch.where(is_right[..., None], point[:, None], command.hand_point)
         command.reach = (is_right & striking[:, None]).to(command.reach.dtype)
-        height = (target[:, 2] - BELOW).clamp(LOW, HIGH)
+        height = (wanted[:, 2] - BELOW).clamp(LOW, HIGH)
         command.height = torch.where(striking, height, command.height)
         turn = torch.where(self.right, 0.35, -0.35)
-        waist = torch.stack([turn, torch.zeros_like(turn), torch.full_like(turn, 0.1)], dim=1)
+        waist = torch.stack([turn, torch.zeros_like(turn), torch.full_like(turn, LEAN)], dim=1)
         command.waist = torch.where(striking[:, None], waist, command.waist)
 
     @staticmethod
