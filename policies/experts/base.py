@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Policy, world_mask
@@ -59,18 +61,18 @@ class Sight:
         """Position [m] and orientation wxyz of a body, shapes [worlds, 3] and [worlds, 4]."""
         return self._xpos[:, body], self._xquat[:, body]
 
-    def point(self, body: int, offset: Sequence[float]) -> Tensor:
-        """A point fixed to a body, given in its frame [m]; shape [worlds, 3]."""
+    def point(self, body: int, offset: Tensor) -> Tensor:
+        """A point fixed to a body, given in its frame [m], shape [3]; shape [worlds, 3]."""
         pos, quat = self.body(body)
-        v = torch.tensor([float(x) for x in offset], device=self.device).expand_as(pos)
-        axis = quat[:, 1:]
+        v, axis = offset.expand_as(pos), quat[:, 1:]
         twice = 2.0 * torch.linalg.cross(axis, v)
         return pos + v + quat[:, :1] * twice + torch.linalg.cross(axis, twice)
 
     def frame(self, name: str) -> Callable[[], Tensor]:
         """Position [m] of a frame prim of the robot or scene, to be read again each time; shape [worlds, 3]."""
         frame = self.scene.frame(name)
-        return lambda: self.point(frame.body_id, frame.pos)
+        offset = torch.tensor(frame.pos, dtype=torch.float32, device=self.device)
+        return lambda: self.point(frame.body_id, offset)
 
     def box(self, prim: str) -> tuple[int, Tensor, Tensor]:
         """Body of a prim's first box collider, the collider's place in it [m] and its half sizes [m]."""
@@ -141,12 +143,12 @@ class ExpertPolicy(Policy):
         self.sight = Sight(env)
         self.expert = self.experts[task](self.sight)
         self.generator = ReferenceGenerator(env.worlds, env.torch_device)
-        self._fresh = torch.ones(env.worlds, dtype=torch.bool, device=env.torch_device)
+        self._fresh = np.ones(env.worlds, dtype=bool)
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
         """New episodes in the worlds of `mask`; the expert looks at them when they ask first."""
         if self.expert is not None:
-            self._fresh |= torch.from_numpy(world_mask(mask, len(seeds))).to(self._fresh.device)
+            self._fresh |= world_mask(mask, len(seeds))
 
     @torch.inference_mode()
     def act(self, observation: Observation) -> Chunk:
@@ -157,16 +159,17 @@ class ExpertPolicy(Policy):
         """
         if self.expert is None:
             raise InputError("--policy expert: sees the world itself; run it in this process, with attach(env)")
-        worlds = len(observation.state)
-        mask = torch.from_numpy(world_mask(observation.mask, worlds)).to(self._fresh.device)
-        begins = mask & self._fresh
-        if begins.any():
-            pose = self.sight.pose
+        worlds, device = len(observation.state), self.sight.device
+        asking = world_mask(observation.mask, worlds)
+        mask = torch.from_numpy(asking).to(device)
+        fresh = asking & self._fresh
+        if fresh.any():
+            begins, pose = torch.from_numpy(fresh).to(device), self.sight.pose
             self.generator.reset(begins, root_xy=pose[:, :2], yaw=pose[:, 2])
             self.expert.begin(begins)
-            self._fresh &= ~begins
+            self._fresh &= ~fresh
         command = self.expert.command(mask, self.chunk_size * TICK)
-        actions = torch.empty(worlds, self.chunk_size, 40, device=mask.device)
+        actions = torch.empty(worlds, self.chunk_size, ACTION_WIDTH, device=device)
         yaw, share = self.sight.pose[:, 2], REALIGN * (mask & (command.velocity != 0).any(dim=1))
         for tick in range(self.chunk_size):
             self.generator.realign(yaw, share)

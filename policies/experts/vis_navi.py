@@ -37,6 +37,7 @@ class VisNaviExpert(Expert):
         self._obstacles = [sight.box(f"/World/{name}") for name in OBSTACLES]
         self._sign = sight.box(f"{SIGN}/Frame/Body")
         self._zone = sight.scene.marker(f"{SIGN}/Frame/Zone")
+        self._centre = sight.frame(f"{SIGN}/Frame/Zone")
         worlds, device = sight.worlds, sight.device
         self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.5))
         self.goal = torch.zeros(worlds, 3, device=device)
@@ -51,7 +52,7 @@ class VisNaviExpert(Expert):
 
     def _footprint(self, body: int, place: Tensor, half: Tensor) -> Tensor:
         _, quat = self.sight.body(body)
-        return footprint(self.sight.point(body, place.tolist()), quat, half.expand(len(quat), 3))
+        return footprint(self.sight.point(body, place), quat, half.expand(len(quat), 3))
 
     def begin(self, mask: Tensor) -> None:
         """Plan from where the robot stands."""
@@ -60,7 +61,7 @@ class VisNaviExpert(Expert):
 
     def _plan(self, mask: Tensor, boxes: Tensor) -> None:
         pose = self.sight.pose
-        zone, quat = self.sight.point(self._zone.body_id, self._zone.pos), self.sight.body(self._zone.body_id)[1]
+        zone, quat = self._centre(), self.sight.body(self._zone.body_id)[1]
         every = torch.cat([boxes, self._footprint(*self._sign)[:, None]], dim=1)
         spot = self._spot(zone[:, :2], heading(quat), every)
         # The sign stands in the area itself: it only counts for the choice of the spot.

@@ -192,8 +192,9 @@ class Navigator:
         stays = (off < k.leave_position) & (error.abs() < k.leave_heading)
         missed = every & self.holding & ~stays
         miss = torch.cat([rotate(smooth - goal[:, :2], -yaw), -error[:, None]], dim=1)
-        most = miss.new_tensor([k.most_learned[0], k.most_learned[0], k.most_learned[1]])
-        learned = torch.minimum(torch.maximum(self._bias + k.learning * miss, -most), most)
+        learned = self._bias + k.learning * miss
+        most, most_turn = k.most_learned
+        learned = torch.cat([learned[:, :2].clamp(-most, most), learned[:, 2:].clamp(-most_turn, most_turn)], dim=1)
         self._bias = torch.where(missed[:, None], learned, self._bias)
 
         shift, turned = -rotate(self._bias[:, :2], yaw), goal[:, 2] - self._bias[:, 2]
