@@ -298,9 +298,13 @@ class ReferenceGenerator:
 
     def _stream(self) -> contextlib.AbstractContextManager:
         """Warp works on torch's current stream, so that the two need not wait for each other."""
+        import torch
         import warp as wp
 
         if self.device.type != "cuda":
+            return contextlib.nullcontext()
+        # Where torch already works on Warp's own stream, a second handle of it would end the first one with its life.
+        if torch.cuda.current_stream(self.device).cuda_stream == wp.get_stream(str(self.device)).cuda_stream:
             return contextlib.nullcontext()
         return wp.ScopedStream(wp.stream_from_torch(self.device))
 

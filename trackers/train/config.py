@@ -56,7 +56,7 @@ class TrainOptions:
     """Other weights for reward terms, by name."""
     randomise: bool = True
     """Randomisation, noise and pushes."""
-    adaptive: float = 0.5
+    adaptive: float = 0.25
     """Share of the episodes that start where the tracker fails."""
     episode_s: float = 10.0
     """Longest episode [s]."""
@@ -70,9 +70,9 @@ class TrainOptions:
     """Learning rate at the start."""
     desired_kl: float = 0.02
     """Divergence of an iteration that the learning rate aims at."""
-    entropy: float = 0.003
+    entropy: float = 0.0015
     """Weight of the entropy."""
-    init_std: float = 0.6
+    init_std: float = 0.5
     """Standard deviation of the action noise at the start."""
     mirror_loss: float = 0.0
     """Weight of the difference between the action of a mirrored observation and the mirrored action."""

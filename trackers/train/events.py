@@ -16,6 +16,7 @@ import torch
 from arena_newton.robot import TICK
 
 if TYPE_CHECKING:
+    from arena_newton.trackers.train.references import ReferenceBank
     from arena_newton.trackers.train.simulation import Simulation
 
 __all__ = ["EVENTS", "OBSERVATION_NOISE", "START_NOISE", "Event", "apply", "uniform"]
@@ -50,6 +51,10 @@ class World(Protocol):
     """What the critic is told, by name, each of shape [worlds, n]."""
     delay: torch.Tensor
     """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
+    bank: ReferenceBank
+    """The references."""
+    frame: torch.Tensor
+    """Reference frame of each world, shape [worlds]."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +148,22 @@ def hand_force(env: World, mask: torch.Tensor, share: float, force: float) -> No
         _write_force(env, mask, name, direction, share, force)
 
 
-def trunk_force(env: World, mask: torch.Tensor, share: float, force: float) -> None:
-    """A constant horizontal force of up to `force` [N] on the torso, in a share of the episodes."""
+def trunk_force(env: World, mask: torch.Tensor, share: float, force: float, resistance: float) -> None:
+    """A constant horizontal force of up to `force` [N] on the torso, in a share of the episodes.
+
+    References of the family `push` lean into something: nothing but a force against their heading makes them feasible,
+    so their torso always meets one of up to `resistance` [N].
+    """
     flat = torch.nn.functional.normalize(torch.randn(env.sim.worlds, 2, device=mask.device), dim=1)
     _write_force(env, mask, "torso_link", torch.nn.functional.pad(flat, (0, 1)), share, force)
+    bank = env.bank
+    if "push" not in bank.family_names:
+        return
+    family = bank.family.index_select(0, bank.clip_of.index_select(0, env.frame))
+    pushing = mask & (family == bank.family_names.index("push"))
+    w, z = env.sim.root_quat[:, 0], env.sim.root_quat[:, 3]
+    against = -torch.stack((w * w - z * z, 2.0 * w * z, torch.zeros_like(w)), 1)
+    _write_force(env, pushing, "torso_link", torch.nn.functional.normalize(against, dim=1), 1.0, resistance)
 
 
 def _write_force(
@@ -170,14 +187,14 @@ def push(env: World, mask: torch.Tensor, every: float, planar: float, vertical: 
 
 EVENTS: dict[str, Event] = {
     "friction": Event("start", friction, {"low": 0.4, "high": 1.2}),
-    "link_mass": Event("start", link_mass, {"low": 0.9, "high": 1.1}),
-    "centre_of_mass": Event("start", centre_of_mass, {"reach": 0.02}),
-    "payload": Event("start", payload, {"share": 0.3, "mass": 2.0}),
-    "motor_strength": Event("start", motor_strength, {"low": 0.9, "high": 1.1}),
-    "action_delay": Event("reset", action_delay, {"share": 0.3}),
-    "hand_force": Event("reset", hand_force, {"share": 0.2, "force": 10.0}),
-    "trunk_force": Event("reset", trunk_force, {"share": 0.2, "force": 15.0}),
-    "push": Event("interval", push, {"every": 4.0, "planar": 0.6, "vertical": 0.1, "turn": 0.4}),
+    "link_mass": Event("start", link_mass, {"low": 0.95, "high": 1.05}),
+    "centre_of_mass": Event("start", centre_of_mass, {"reach": 0.01}),
+    "payload": Event("start", payload, {"share": 0.25, "mass": 2.0}),
+    "motor_strength": Event("start", motor_strength, {"low": 0.95, "high": 1.05}),
+    "action_delay": Event("reset", action_delay, {"share": 0.2}),
+    "hand_force": Event("reset", hand_force, {"share": 0.1, "force": 5.0}),
+    "trunk_force": Event("reset", trunk_force, {"share": 0.1, "force": 10.0, "resistance": 12.0}),
+    "push": Event("interval", push, {"every": 4.0, "planar": 0.5, "vertical": 0.05, "turn": 0.4}),
 }
 
 
