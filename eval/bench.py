@@ -223,7 +223,7 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
         for _ in range(count):
             env.physics.mj_step_only()
 
-    def timed(work: Callable[[int], None], count: int = 5) -> float:
+    def timed(work: Callable[[int], None], count: int = 25) -> float:
         _sync(env)
         began = time.perf_counter()
         work(count)
