@@ -32,6 +32,8 @@ class TrainOptions:
     """Seed; every process of torchrun adds its rank."""
     resume: Path | None = None
     """Checkpoint of a training to go on with."""
+    start_from: Path | None = None
+    """Weights file (.safetensors) whose network a new training begins with."""
     library: Path | None = None
     """Motion library (NPZ); without it, references are generated."""
     families: dict[str, int] = field(default_factory=dict)
@@ -125,6 +127,7 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "init_std": options.init_std,
         },
         "fit_steps": 300,
+        "critic_iterations": 20,
         "critic": {
             "class_name": "MLPModel",
             "hidden_dims": hidden,

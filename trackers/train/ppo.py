@@ -112,6 +112,10 @@ class IterationPPO(PPO):
             return
         # Divergence grows with the square of the rate; one iteration's is a noisy measure, so changes are bounded.
         factor = min(max((self.desired_kl / max(divergence, 1e-8)) ** 0.5, 0.6), 1.15)
-        self.learning_rate = min(max(self.learning_rate * factor, self.lowest_rate), self.highest_rate)
+        self.set_learning_rate(min(max(self.learning_rate * factor, self.lowest_rate), self.highest_rate))
+
+    def set_learning_rate(self, rate: float) -> None:
+        """Use this rate from now on."""
+        self.learning_rate = rate
         for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+            group["lr"] = rate

@@ -26,6 +26,9 @@ from arena_newton.trackers.train.ppo import IterationPPO
 
 __all__ = ["TrackerRunner"]
 
+_SEEN = 1e9
+"""Observations that the input statistics of a weights file stand for: a training that starts from it leaves them."""
+
 
 class DeviceLogger(Logger):
     """rsl-rl's log whose episode statistics stay on the device until an iteration ends."""
@@ -88,6 +91,29 @@ class TrackerRunner(OnPolicyRunner):
         self.history: list[dict[str, float]] = []
         """What each logged iteration measured."""
         self._stop = False
+        self._started = False
+
+    def start_from(self, path: Path) -> None:
+        """Begin with the network of a weights file; its critic is learnt anew before the network changes.
+
+        Raises:
+            InputError: The file is absent, of another interface or of other widths.
+        """
+        from arena_newton.trackers import weights_file
+
+        actor = self.alg.get_policy()
+        interface = str(self.cfg["card"]["tracker"])
+        weights = weights_file.load(path, interface, flag="--start-from")
+        if weights.network.config() != actor.net.config():
+            raise InputError(f"--start-from {path}: a network of other widths than this training's")
+        form = self.cfg["card"]["action_form"]
+        if weights.action_form.kind != form["kind"]:
+            raise InputError(f"--start-from {path}: its action form is {weights.action_form.kind}, not {form['kind']}")
+        actor.net.load_state_dict(weights.network.state_dict())
+        for count in actor.counts().values():
+            count.fill_(_SEEN)
+        self.cfg["card"]["started_from"] = weights.card.get("commit", path.name)
+        self._started = True
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False, minutes: float = 0.0) -> None:
         """Train.
@@ -117,14 +143,14 @@ class TrackerRunner(OnPolicyRunner):
         with torch.no_grad():
             for _ in range(self.cfg["num_steps_per_env"]):
                 seen.append(self.env.get_observations())
-                target = self.env.reference_action()
+                target = self.alg.actor(seen[-1]) if self._started else self.env.reference_action()
                 wanted.append(target)
                 self.env.step(target + 0.3 * torch.randn_like(target))
             observations: TensorDict = torch.cat(seen)  # type: ignore[arg-type,assignment]
             self.alg.actor.update_normalization(observations)
             self.alg.critic.update_normalization(observations)
         steps = self.cfg["fit_steps"]
-        if self.env.front_end.action_form.kind == "residual" or not steps:
+        if self._started or self.env.front_end.action_form.kind == "residual" or not steps:
             return
         targets = torch.cat(wanted)
         actor = self.alg.actor
@@ -154,8 +180,17 @@ class TrackerRunner(OnPolicyRunner):
         batch = steps * self.env.num_envs * self.gpu_world_size
         obs = self.env.get_observations()
         first = self.current_learning_iteration
+        rate = self.alg.learning_rate
+        learning = list(self.alg.get_policy().parameters())
+        alone = self.cfg["critic_iterations"] if self._started else 0
+        for parameter in learning:
+            parameter.requires_grad_(first >= alone)
         began = mark = time.monotonic()
         for it in range(first, first + iterations):
+            if it == alone > 0:  # the critic knows the network by now
+                for parameter in learning:
+                    parameter.requires_grad_(True)
+                self.alg.set_learning_rate(rate)
             with torch.no_grad():
                 for _ in range(steps):
                     obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
@@ -286,9 +321,7 @@ class TrackerRunner(OnPolicyRunner):
         state = read_checkpoint(path, map_location or str(self.device))
         parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
         self.alg.load(state, load_cfg or parts, strict)
-        self.alg.learning_rate = state["learning_rate"]
-        for group in self.alg.optimizer.param_groups:
-            group["lr"] = self.alg.learning_rate
+        self.alg.set_learning_rate(state["learning_rate"])
         for name, count in self.alg.get_policy().counts().items():
             count.copy_(state["norm_counts"][name])
         self.current_learning_iteration = state["iter"]

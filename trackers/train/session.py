@@ -53,6 +53,8 @@ def make_library(options: TrainOptions, device: str, seed: int = 0) -> MotionLib
     from arena_newton.trackers.motions.formats import read_library
     from arena_newton.trackers.motions.library import MotionLibrary
 
+    if options.resume is not None and options.start_from is not None:
+        raise InputError("--resume goes on with a training, --start-from begins one: pass one of the two")
     if options.library is not None and options.families:
         raise InputError("--families makes references, --library reads them: pass one of the two")
     parts = []
@@ -186,6 +188,8 @@ def build(options: TrainOptions) -> TrackerRunner:
     runner = TrackerRunner(env, config, log_dir, device)
     if options.resume is not None:
         runner.load(str(options.resume), map_location=device)
+    elif options.start_from is not None:
+        runner.start_from(options.start_from)
     return runner
 
 

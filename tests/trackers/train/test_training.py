@@ -185,6 +185,36 @@ def test_export_is_what_was_trained(env, tmp_path):
     assert "A test." in card and "| stand | 1 | 0.1 |" in card
 
 
+def test_start_from_weights(env, tmp_path):
+    """A new training begins with the network of a weights file, and keeps it while the critic learns."""
+    first = make_runner(env, str(tmp_path))
+    first.learn(1)
+    file = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "weights.safetensors"))
+    weights = {k: v.clone() for k, v in first.alg.get_policy().net.state_dict().items() if not k.endswith("count")}
+
+    second = make_runner(env)
+    second.start_from(file)
+    critic = [p.detach().clone() for p in second.alg.critic.parameters()]
+    second.cfg["critic_iterations"] = 2
+    second.learn(2)
+    for name, value in second.alg.get_policy().net.state_dict().items():
+        if name in weights:
+            torch.testing.assert_close(value, weights[name], atol=1e-4, rtol=1e-3)
+    assert any(not torch.equal(a, b) for a, b in zip(critic, second.alg.critic.parameters(), strict=True))
+    second.learn(1)
+    moved = [k for k, v in second.alg.get_policy().net.state_dict().items() if k in weights and (v != weights[k]).any()]
+    assert any(k.endswith("weight") for k in moved), "afterwards the network learns"
+
+
+def test_start_from_unfit_weights(env, tmp_path):
+    """Weights of another width are refused by the flag's name."""
+    with pytest.raises(InputError, match="--start-from .*: no such|--start-from .*absent"):
+        make_runner(env).start_from(tmp_path / "absent.safetensors")
+    if weights_file.default_path("twist2").is_file():
+        with pytest.raises(InputError, match="other widths"):
+            make_runner(env).start_from(weights_file.default_path("twist2"))
+
+
 def test_mistakes_answer_in_one_line(tmp_path, capsys):
     """Wrong flags and files exit with 2 and name what is wrong."""
     (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
