@@ -55,12 +55,13 @@ class RunOptions:
 
     task: tuple[str, ...] = ()
     """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
-    tracker: str = "pd"
-    """Tracker that executes the 40D action: pd, twist2, ..."""
+    tracker: str = "twist2"
+    """Tracker that executes the 40D action: twist2, sonic, pd, ..."""
     checkpoint: str | None = None
-    """File with the tracker's weights."""
+    """The tracker's weights: a .safetensors or official .onnx file (SONIC: a folder or two files with a comma between);
+    those that come with the package when none is named."""
     policy: str = "stand"
-    """Policy that decides it: stand, replay:<clip or episode>, remote:<url>."""
+    """Policy that decides it: stand, expert, replay:<clip or episode>, remote:<url>."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
@@ -202,7 +203,7 @@ def resolve(options: RunOptions) -> RunConfig:
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
     repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else PROTOCOL_REPEATS)
-    checkpoint = _existing("--checkpoint", options.checkpoint)
+    checkpoint, checkpoint_hash = _checkpoint(options)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
     variant = _existing("--variant", options.variant)
@@ -216,7 +217,7 @@ def resolve(options: RunOptions) -> RunConfig:
         modes=tuple(options.mode) or ("base",),
         tracker=options.tracker,
         checkpoint=checkpoint,
-        checkpoint_hash=hash_path(checkpoint) if checkpoint else None,
+        checkpoint_hash=checkpoint_hash,
         policy=options.policy,
         policy_hash=hash_path(policy_path) if policy_path else None,
         rules=options.rules,
@@ -319,13 +320,30 @@ def _hash_package(tasks: tuple[str, ...]) -> tuple[str, str]:
     root = root if root.is_dir() else Path(__file__).resolve().parent.parent
     scenes = root / "usd_scenes"
     layers = [f for part in ("g1", "textures", *tasks) for f in sorted((scenes / part).rglob("*")) if f.suffix != ".py"]
-    parts = [root, root / "tasks", root / "kernels", root / "trackers", root / "policies"]
-    code = [f for part in parts for f in sorted(part.glob("*.py"))]
+    parts = ("", "tasks", "kernels", "trackers", "trackers/motions", "policies", "policies/experts")
+    code = [f for part in parts for f in sorted((root / part).glob("*.py"))]
 
     def digest(files: list[Path]) -> str:
         return config_hash([[f.relative_to(root).as_posix(), hash_path(f)] for f in files if f.is_file()])
 
     return digest(layers), digest(code)
+
+
+def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:
+    """The weights' path, and what they hash to: without a path, those that come with the package."""
+    from arena_newton import trackers
+
+    if options.checkpoint is None:
+        shipped = trackers.shipped_weights(options.tracker)
+        return None, hash_path(shipped) if shipped else None
+    given = Path(options.checkpoint).expanduser()
+    files = [given] if given.exists() else [Path(part).expanduser() for part in options.checkpoint.split(",")]
+    for file in files:
+        if not str(file) or not file.exists():
+            raise InputError(f"--checkpoint {options.checkpoint}: no such file")
+    path = Path(",".join(str(file.resolve()) for file in files))
+    hashes = [hash_path(file) for file in files]
+    return path, hashes[0] if len(hashes) == 1 else config_hash(hashes)
 
 
 def _existing(flag: str, given: str | None) -> Path | None:

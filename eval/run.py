@@ -92,9 +92,7 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
         print(f"  {key:<13} {_shown(value)}")
     print(f"  {len(episodes)} episodes -> {folder}", flush=True)
     if config.tracker == "pd":
-        print(
-            "  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2 --checkpoint <its ONNX>"
-        )
+        print("  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2")
 
     began = time.perf_counter()
     resume = f"python -m arena_newton.eval resume {shlex.quote(str(folder))}"
@@ -191,6 +189,10 @@ def _check_parts(config: RunConfig, factories: Factories) -> Any:
     factories.tracker(config.tracker, config.checkpoint)
     policy = factories.policy(config.policy)
     policy.check()
+    known = getattr(policy, "tasks", None)
+    for task in config.tasks:
+        if known is not None and task not in known:
+            raise InputError(f"--policy {config.policy}: cannot do task {task}; it can do {', '.join(known)}")
     if config.variant is not None:
         factories.check_variant(config.variant, config.tasks[0])
     return policy

@@ -48,6 +48,8 @@ class Policy:
     """Whether the head camera must be rendered for `act`."""
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
+    tasks: tuple[str, ...] | None = None
+    """Tasks it can do; None: any."""
     chunk_size: int = 1
     """Actions a chunk, where the policy knows it beforehand."""
 

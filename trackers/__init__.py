@@ -1,5 +1,5 @@
 """Trackers: whole-body controllers that execute a reference on the robot."""
 
-from arena_newton.trackers.base import RobotState, Tracker, TrackerCommand, get, names, register
+from arena_newton.trackers.base import RobotState, Tracker, TrackerCommand, get, names, register, shipped_weights
 
-__all__ = ["RobotState", "Tracker", "TrackerCommand", "get", "names", "register"]
+__all__ = ["RobotState", "Tracker", "TrackerCommand", "get", "names", "register", "shipped_weights"]

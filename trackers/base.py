@@ -18,7 +18,16 @@ from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE, DriveGains, PhysicsR
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["ENTRY_POINT_GROUP", "RobotState", "Tracker", "TrackerCommand", "get", "names", "register"]
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "RobotState",
+    "Tracker",
+    "TrackerCommand",
+    "get",
+    "names",
+    "register",
+    "shipped_weights",
+]
 
 ENTRY_POINT_GROUP = "arena_newton.trackers"
 """Other packages offer trackers under this entry point group: a callable that takes `checkpoint: Path | None`."""
@@ -98,6 +107,12 @@ def _entry_points() -> dict[str, importlib.metadata.EntryPoint]:
 def names() -> tuple[str, ...]:
     """Names of all trackers that `get` knows, sorted."""
     return tuple(sorted({*_BUILT_IN, *_registered, *_entry_points()}))
+
+
+def shipped_weights(spec: str) -> Path | None:
+    """The weights that come with the package for a built-in tracker; None without any."""
+    path = Path(__file__).parent / "weights" / f"{spec}.safetensors"
+    return path if spec in _BUILT_IN and path.is_file() else None
 
 
 def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:

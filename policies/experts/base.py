@@ -125,6 +125,7 @@ class ExpertPolicy(Policy):
             chunk_size: Ticks between two looks at the world.
         """
         self.experts = experts
+        self.tasks = tuple(sorted(experts))
         self.chunk_size = chunk_size
         self.expert: Expert | None = None
         """The expert at work; None before `attach`."""

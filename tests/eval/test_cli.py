@@ -197,3 +197,12 @@ def test_identity_covers_scenes_and_code():
     assert len(identity["code"]) == len(identity["scenes"]) == 12
     other = config.resolve(config.RunOptions(task=("boxing",))).identity()
     assert identity["scenes"] != other["scenes"] and identity["code"] == other["code"]
+
+
+def test_task_without_an_expert_is_refused_first(tmp_path, capsys):
+    """A policy that cannot do one of the tasks is refused before the first episode of any."""
+    out = tmp_path / "out"
+    assert main(["--task", "vis_navi", "football", "--policy", "expert", "--tracker", "pd", "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "football" in message and "boxing, vis_navi" in message and message.count("\n") == 1
+    assert not out.exists()

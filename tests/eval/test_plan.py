@@ -100,3 +100,34 @@ def test_planning_imports_no_heavy_package():
         "print([m for m in ('warp', 'torch', 'pxr', 'mujoco', 'newton', 'cv2') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_weights_of_the_package_count():
+    """Without --checkpoint a run's identity holds the hash of the weights that come with the package."""
+    from arena_newton import trackers
+    from arena_newton.eval import config
+
+    path = trackers.shipped_weights("twist2")
+    assert path is not None
+    resolved = config.resolve(config.RunOptions(task=("football",), tracker="twist2"))
+    assert resolved.checkpoint is None and resolved.checkpoint_hash == config.hash_path(path)
+    named = config.resolve(config.RunOptions(task=("football",), tracker="twist2", checkpoint=str(path)))
+    assert named.checkpoint_hash == resolved.checkpoint_hash
+    assert config.resolve(config.RunOptions(task=("football",), tracker="pd")).checkpoint_hash is None
+
+
+def test_two_files_and_folders_as_checkpoint(tmp_path):
+    """SONIC's two files, or the folder that holds them, are one checkpoint; a missing one of them is named."""
+    from arena_newton.errors import InputError
+    from arena_newton.eval import config
+
+    for name in ("model_encoder.onnx", "model_decoder.onnx"):
+        (tmp_path / name).write_bytes(name.encode())
+    pair = ",".join(str(tmp_path / n) for n in ("model_encoder.onnx", "model_decoder.onnx"))
+    hashes = {
+        config.resolve(config.RunOptions(task=("football",), tracker="sonic", checkpoint=given)).checkpoint_hash
+        for given in (pair, str(tmp_path), str(tmp_path / "model_encoder.onnx"))
+    }
+    assert len(hashes) == 3
+    with pytest.raises(InputError, match="--checkpoint .*absent.onnx"):
+        config.resolve(config.RunOptions(task=("football",), checkpoint=f"{tmp_path}/absent.onnx,{pair}"))
