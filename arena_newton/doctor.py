@@ -88,8 +88,9 @@ def _devices() -> list[Finding]:
     try:
         import warp as wp
 
-        wp.config.log_level = wp.LOG_WARNING
-        wp.init()
+        from arena_newton.quiet import quiet_warp
+
+        quiet_warp()
         devices = wp.get_cuda_devices()
     except Exception as error:
         return [*findings, Finding("warp", f"does not start ({_short(error)})", "bad", _INSTALL)]

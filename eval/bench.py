@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from arena_newton.errors import InputError
-from arena_newton.eval.config import quiet_warp
+from arena_newton.quiet import quiet_warp
 
 __all__ = ["BenchOptions", "Figure", "run"]
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +26,6 @@ __all__ = [
     "explicit",
     "hash_path",
     "policy_label",
-    "quiet_warp",
     "resolve",
 ]
 
@@ -192,6 +189,7 @@ def resolve(options: RunOptions) -> RunConfig:
     from arena_newton import rules as rule_sets
     from arena_newton import tasks as task_specs
     from arena_newton.physics import resolve_engine
+    from arena_newton.quiet import quiet_warp
 
     quick = not (options.task or options.mode or options.seeds) and (options.repeats, options.max_steps) == (None, None)
     if "all" in options.task and len(options.task) > 1:
@@ -259,26 +257,6 @@ def episodes(config: RunConfig) -> list[Episode]:
         repeats=config.repeats,
         max_steps=config.max_steps,
     )
-
-
-def quiet_warp() -> None:
-    """Start Warp without its banner, and without its driver's complaint on a machine that has no GPU.
-
-    The complaint is written by native code to the error stream, where the answer to bad input shall be one line.
-    """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
-    sys.stderr.flush()
-    kept = os.dup(2)
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        wp.init()
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(sink)
 
 
 def explicit(options: RunOptions, config: RunConfig) -> RunOptions:

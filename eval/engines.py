@@ -18,6 +18,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.eval.stats import wilson
+from arena_newton.quiet import quiet_warp
 
 __all__ = ["EngineOptions", "Rates", "fisher", "measure", "run"]
 
@@ -168,6 +169,7 @@ def run(options: EngineOptions) -> int:
     if not (math.isfinite(options.noise) and options.noise >= 0.0):
         raise InputError(f"--noise {options.noise}: must be a distance of 0 or more [m]")
     earlier = _earlier(options.against)
+    quiet_warp()
     rates = [*earlier]
     for engine in options.engines:
         rates.append(measure(options, engine))

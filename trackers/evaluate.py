@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
     from arena_newton.trackers.base import Tracker
@@ -193,7 +194,9 @@ def _evaluate(args: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; 0 done, 2 bad input."""
     try:
-        return _evaluate(_parser().parse_args(argv))
+        args = _parser().parse_args(argv)
+        quiet_warp()
+        return _evaluate(args)
     except (InputError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

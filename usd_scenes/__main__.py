@@ -89,6 +89,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     commands = {"build": _build, "validate": _validate, "list": _list, "preview": _preview}
     try:
+        if args.command == "preview":
+            from arena_newton.quiet import quiet_warp
+
+            quiet_warp()
         return commands[args.command](args)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

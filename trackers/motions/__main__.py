@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.formats import ReadOptions
@@ -197,6 +198,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 2 bad input, 130 interrupted."""
     try:
         args = _parser().parse_args(argv)
+        if args.command in ("render", "generate"):
+            quiet_warp()
         _COMMANDS[args.command](args)
     except InputError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -36,8 +36,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB) and its card")
             return 0
         options = tyro.cli(TrainOptions, args=arguments, prog=PROG)
+        from arena_newton.quiet import quiet_warp
         from arena_newton.trackers.train.session import train
 
+        quiet_warp()
         train(options)
         return 0
     except InputError as error:
