@@ -186,6 +186,86 @@ def test_worlds_of_a_batch_differ_as_asked(engine):
     assert lab.overflows() == 0
 
 
+def _exact_follower(name: str):
+    """The lab and a cell's reference as positions and velocities of every tick, [ticks, nq] and [ticks, nv]."""
+    import mujoco
+
+    from arena_newton import rules
+    from arena_newton.scene import load_scene
+    from arena_newton.trackers.motions.frames import actions_to_motion
+
+    cell = next(c for c in suite("full") if c.name == name)
+    tables = plan([cell], 1, 0).tables(torch.device("cpu"))
+    motion = actions_to_motion(tables.actions.transpose(0, 1))
+    scene = load_scene(
+        "lab", hands="fixed", variant="ball", rules=rules.get("paper"), drive=g1.TWIST2_DRIVE, native=True, device="cpu"
+    )
+    m, robot = scene.mj_model, scene.robot
+    q, v = np.tile(m.qpos0, (cell.ticks, 1)), np.zeros((cell.ticks, m.nv))
+    q[:, robot.root_qpos : robot.root_qpos + 3] = motion.root_pos[0]
+    q[:, robot.root_qpos + 3 : robot.root_qpos + 7] = motion.root_quat[0]
+    q[:, robot.joint_qpos] = motion.joint_pos[0]
+    for k in range(cell.ticks - 1):
+        mujoco.mj_differentiatePos(m, v[k], g1.TICK, q[k], q[k + 1])
+    return cell, tables, scene, q, v
+
+
+def test_who_follows_the_kick_exactly_hits_the_ball():
+    """Moved as the reference says, the foot gives the ball 1.5 m/s and more wherever a draw may put it."""
+    import mujoco
+
+    from arena_newton.trackers.motions.kinematics import neutral_stance
+
+    cell, _, scene, q, v = _exact_follower("ball, standing kick")
+    m = scene.mj_model
+    ball_q, ball_v = scene.joint_qpos("/World/Ball"), scene.joint_qvel("/World/Ball")
+    rest_q = np.setdiff1d(np.arange(m.nq), np.arange(ball_q, ball_q + 7))
+    rest_v = np.setdiff1d(np.arange(m.nv), np.arange(ball_v, ball_v + 6))
+    moving = np.flatnonzero(np.abs(v).max(axis=1) > 1.0)
+    substeps = round(g1.TICK / m.opt.timestep)
+    # Half a start error of the place on top of the draws.
+    for distance in (cell.ball.distance[0] - 0.005, cell.ball.distance[1] + 0.005):
+        for aside in (-0.015, 0.015):
+            d = mujoco.MjData(m)
+            d.qpos[:] = m.qpos0
+            d.qpos[ball_q : ball_q + 3] = neutral_stance().ankle + distance, cell.ball.lateral + aside, 0.11
+            peak, between = 0.0, np.empty(m.nq)
+            for k in range(moving[0], moving[-1] + 1):
+                for step in range(substeps):
+                    between[:] = q[k]
+                    mujoco.mj_integratePos(m, between, v[k], step * m.opt.timestep)
+                    d.qpos[rest_q], d.qvel[rest_v] = between[rest_q], v[k][rest_v]
+                    mujoco.mj_step(m, d)
+                peak = max(peak, float(np.linalg.norm(d.qvel[ball_v : ball_v + 2])))
+            assert peak >= 1.5, (distance, aside)
+
+
+def test_who_steps_over_a_sill_exactly_does_not_touch_it():
+    """Moved as the reference says, no part of the robot touches the highest sill of the suite."""
+    import mujoco
+
+    cell, tables, scene, q, _ = _exact_follower("sill 0.09")
+    m = scene.mj_model
+    x, clearance = sill_place(tables.feet[:, 0].numpy())
+    assert clearance >= cell.support.height + 0.05
+    sill = set(scene.geom_ids("/World/Sill"))
+
+    def touches(height: float) -> bool:
+        d = mujoco.MjData(m)
+        d.mocap_pos[scene.mocap_id("/World/Sill")] = x, 0.0, height
+        for row in q:
+            d.qpos[:] = row
+            mujoco.mj_kinematics(m, d)
+            mujoco.mj_comPos(m, d)
+            mujoco.mj_collision(m, d)
+            if any(sill & {int(c.geom1), int(c.geom2)} and c.dist < 0.0 for c in d.contact[: d.ncon]):
+                return True
+        return False
+
+    assert not touches(cell.support.height)
+    assert touches(clearance + 0.03)
+
+
 def _mean_velocity(lab: Lab) -> list[float]:
     """Forward velocity of the robots' centres of mass [m/s]."""
     import mujoco

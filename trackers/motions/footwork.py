@@ -36,8 +36,8 @@ MISPLACED = (0.02, 0.07)
 """A standing robot steps when a foot is so far from its place [m, rad]."""
 PLACED = (0.004, 0.02)
 """A walk ends when both feet are so near to their places [m, rad]."""
-KICK_SHIFT, KICK_WIND, KICK_RETURN, KICK_SETTLE = 0.8, 0.4, 0.6, 0.8
-"""Times of a kick's phases around the swing [s]."""
+KICK_SHIFT, KICK_WIND, KICK_RETURN, KICK_SETTLE = 1.2, 0.4, 0.6, 1.2
+"""Times of a kick's phases around the swing [s]; a faster shift would need a support beside the standing foot."""
 KICK_BACK, KICK_FRONT = 0.18, 0.24
 """Ends of the swing behind and before the stance [m]."""
 KICK_TOE = (0.45, -0.25)

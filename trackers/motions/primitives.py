@@ -48,6 +48,8 @@ __all__ = [
 SIDES = {"left": 0, "right": 1}
 SEAT_APPROACH, SEAT_DEPTH = (0.24, 0.14), (0.25, 0.12)
 """Pelvis behind its standing place and above the seat [m], first until it touches, then pressed into it."""
+SEAT_CLEAR = 0.17
+"""Pelvis above a seat that it is about to leave [m]."""
 
 
 def mirrored_arms(left: Sequence[float]) -> tuple[float, ...]:
@@ -288,16 +290,16 @@ def sit(seat: float = 0.42, *, hold: float = 3.0, depth: float = SEAT_DEPTH[0], 
 
 
 def rise(seat: float = 0.42, *, depth: float = SEAT_DEPTH[0], press: float = SEAT_DEPTH[1]) -> Script:
-    """Stand up from a seat on which `sit` with the same numbers ended: lean forward, shift over the feet, rise."""
+    """Stand up from a seat on which `sit` with the same numbers ended: lean forward, slide over the feet, rise."""
     arms = {"arms": FORWARD_ARMS}
-    lean = {"pitch": 0.35, "waist": (0.0, 0.0, 0.25), **arms}
-    back, above = SEAT_APPROACH
+    lean = {"pitch": 0.45, "waist": (0.0, 0.0, 0.35), **arms}
+    # The weight comes over the feet while the seat still bears it; leaving it earlier, the robot falls back.
     return _script(
         Segment(0.8, {"height": seat + press, "pelvis_back": depth, **lean}, ramp=True),
-        Segment(0.9, {"height": seat + above, "pelvis_back": min(back, depth), **lean}, ramp=True),
-        Segment(0.9, {"height": 0.5 * (0.78 + seat + above), "pelvis_back": 0.0, **lean}, ramp=True),
-        Segment(0.9, {**arms}, ramp=True),
-        (1.0, {}),
+        Segment(0.4 + 4.0 * depth, {"height": seat + SEAT_CLEAR, "pelvis_back": 0.0, **lean}, ramp=True),
+        (0.2, {"height": seat + SEAT_CLEAR, **lean}),
+        Segment(1.2, {**arms}, ramp=True),
+        (0.8, {}),
     )
 
 

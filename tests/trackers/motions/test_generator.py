@@ -175,10 +175,25 @@ def test_kick_runs_once():
     assert float(away[lifted].max()) < 0.09
 
 
+def test_kick_shifts_no_faster_than_the_feet_can_push():
+    """Sideways, the weight shifts of a kick need a centre of pressure within the outer edge of the standing foot."""
+    on = constant(2, kick=[1, 2], kick_speed=1.5)
+    played = Played(lambda t: on if t > 0.1 else MotionCommand.neutral(2), 250)
+    com = played.poses().com
+    apart = 5
+    pull = (com[:, 2 * apart :] - 2.0 * com[:, apart:-apart] + com[:, : -2 * apart]) / (apart * TICK) ** 2
+    pressure = com[:, apart:-apart, 1] - com[:, apart:-apart, 2] / 9.81 * pull[..., 1]
+    feet = played.feet[:, apart:-apart, :, 1]
+    assert float((pressure - feet[..., 0]).max()) < 0.035
+    assert float((feet[..., 1] - pressure).max()) < 0.035
+    # The whole weight is over the standing foot.
+    assert float(pressure[0].min() - feet[0, 0, 1]) < 0.02 and float(feet[1, 0, 0] - pressure[1].max()) < 0.02
+
+
 def test_kick_waits_for_the_end_of_a_walk():
     """A kick asked for in the middle of a walk ends the walk first."""
     walk, kick = constant(velocity=[0.5, 0.0, 0.0]), constant(velocity=[0.5, 0.0, 0.0], kick=1)
-    played = Played(lambda t: kick if 2.0 < t < 2.2 else walk, 450)
+    played = Played(lambda t: kick if 2.0 < t < 2.2 else walk, 490)
     during = played.kick[0] > 0
     assert during.any()
     assert float((played.feet[0, 1:, 1] - played.feet[0, :-1, 1])[during[1:]].abs().max()) < 1e-6

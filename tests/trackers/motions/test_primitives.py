@@ -164,6 +164,28 @@ def test_seats_are_loaded(clips):
         assert float(root[-1, 2]) > float(root[lowest, 2]) + 0.1
 
 
+def test_the_weight_is_over_the_feet_before_a_seat_is_left():
+    """Rising from any seat of the training, the centre of mass is over the soles when the pelvis leaves the seat."""
+    settings = [(top, *where) for top in (0.36, 0.42, 0.48) for where in ((0.25, 0.12), (0.36, 0.14))]
+    scripts = [
+        primitives.sit(top, hold=1.0, depth=depth, press=press) + primitives.rise(top, depth=depth, press=press)
+        for top, depth, press in settings
+    ]
+    program = Program(scripts)
+    generator = ReferenceGenerator(program.worlds)
+    height, ahead = [], []
+    for tick in range(round(program.seconds / TICK)):
+        height.append(generator.step(program(tick * TICK)).root_pos[:, 2].clone())
+        ahead.append((generator.com[:, 0] - generator.feet_pos[..., 0].mean(1)).clone())
+    for world, (top, *_) in enumerate(settings):
+        z, com = torch.stack(height)[:, world], torch.stack(ahead)[:, world]
+        seated = int(z.argmin())
+        rising = z[seated:] > top + 0.16  # the robot's own pelvis rests 0.16 to 0.19 m above a seat
+        assert float(com[seated]) < -0.05 and rising.any()
+        assert float(com[seated:][rising].min()) > 0.0
+        assert float(z[-1]) > 0.77
+
+
 def test_random_clips_repeat_with_their_seed():
     """The same seed gives the same clips, another one gives others."""
     first, same, other = (programs.random_clips({"walk": 2}, seconds=2.0, seed=s)["joint_pos"] for s in (1, 1, 2))
