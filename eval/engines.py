@@ -168,6 +168,11 @@ def run(options: EngineOptions) -> int:
             raise InputError(f"{flag} {value}: must be at least {least}")
     if not (math.isfinite(options.noise) and options.noise >= 0.0):
         raise InputError(f"--noise {options.noise}: must be a distance of 0 or more [m]")
+    from arena_newton import policies
+
+    known = policies.get(options.policy).tasks
+    if known is not None and options.task not in known:
+        raise InputError(f"--policy {options.policy}: cannot do task {options.task}; it can do {', '.join(known)}")
     earlier = _earlier(options.against)
     quiet_warp()
     rates = [*earlier]

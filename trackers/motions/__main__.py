@@ -166,6 +166,7 @@ def _render(args: argparse.Namespace) -> None:
 
 
 def _generate(args: argparse.Namespace) -> None:
+    from arena_newton.physics import resolve_engine
     from arena_newton.trackers.motions import programs
     from arena_newton.trackers.motions.library import MotionLibrary
 
@@ -174,8 +175,10 @@ def _generate(args: argparse.Namespace) -> None:
     unknown = [name for name in families if name not in programs.FAMILIES]
     if unknown:
         raise InputError(f"--family {unknown[0]}: unknown, choose from {', '.join(programs.FAMILIES)}")
-    if args.seconds < 1.0:
-        raise InputError(f"--seconds {args.seconds:g}: expected 1 or more")
+    if not 1.0 <= args.seconds <= 3600.0:
+        raise InputError(f"--seconds {args.seconds:g}: expected 1 to 3600")
+    if args.device != "cpu":
+        resolve_engine("warp", args.device)
     made = programs.random_clips(families, seconds=args.seconds, seed=args.seed, device=args.device)
     source = f"arena_newton.trackers.motions generate --seconds {args.seconds:g} --seed {args.seed}"
     library = MotionLibrary.from_random(made, source=source)

@@ -30,6 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments and arguments[0] == "export":
             from arena_newton.trackers.train.export import ExportOptions, export
 
+            if arguments[1:] in (["-h"], ["--help"]):
+                tyro.cli(ExportOptions, args=["--help"], prog=f"{PROG} export CHECKPOINT")
             if len(arguments) < 2 or arguments[1].startswith("-"):
                 raise InputError(f"export: name the checkpoint: {PROG} export CHECKPOINT --out FILE.safetensors")
             out = export(Path(arguments[1]), tyro.cli(ExportOptions, args=arguments[2:], prog=f"{PROG} export"))

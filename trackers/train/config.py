@@ -27,7 +27,7 @@ class TrainOptions:
     minutes: float = 0.0
     """Most minutes to train, 0 = no limit."""
     iterations: int = 100000
-    """Most iterations."""
+    """Most iterations of this call."""
     seed: int = 0
     """Seed; every process of torchrun adds its rank."""
     resume: Path | None = None

@@ -65,7 +65,7 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         card["note"] = options.note
     if options.metrics is not None:
         try:
-            card["metrics"] = json.loads(options.metrics.read_text())
+            card["metrics"] = _figures(json.loads(options.metrics.read_text()))
         except (OSError, ValueError) as error:
             raise InputError(
                 f"--metrics {options.metrics}: not a readable JSON file ({type(error).__name__})"
@@ -85,6 +85,12 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     return options.out
 
 
+def _figures(metrics: dict[str, Any]) -> dict[str, Any]:
+    """The figures of an evaluation's first tracker, or the metrics as they are."""
+    measured = metrics.get("trackers")
+    return {"figures": measured[0]["figures"]} if measured else metrics
+
+
 def _drive(value: dict[str, Any]) -> DriveGains:
     from arena_newton.robot import DriveGains
 
@@ -101,7 +107,7 @@ def _markdown(card: dict[str, Any]) -> str:
         "command": f"`{card['command']}`",
         "commit": card["commit"],
         "samples": f"{card['samples']:,}",
-        "GPU minutes": card["gpu_minutes"],
+        "minutes": f"{card['minutes']} on {card.get('hardware', 'unnamed hardware')}",
         "iterations": card["iterations"],
         "worlds": f"{card['worlds']} x {card['processes']} processes",
         "seed": card["seed"],
@@ -111,6 +117,12 @@ def _markdown(card: dict[str, Any]) -> str:
     lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
     lines += ["## References", "", "| family | clips | minutes |", "|---|---|---|"]
     lines += [f"| {name} | {f['clips']} | {f['minutes']} |" for name, f in card["data"]["families"].items()]
+    if figures := card.get("metrics", {}).get("figures"):
+        lines += ["", "## Evaluation", ""]
+        if command := card["metrics"].get("command"):
+            lines += [f"`{command}`", ""]
+        lines += ["| figure | bar | value | |", "|---|---|---|---|"]
+        lines += [f"| {f['name']} | {f['bar']} | {f['value']} | {f['verdict']} |" for f in figures]
     lines += ["", "## At the end of training", "", "| | |", "|---|---|"]
     lines += [f"| {name} | {value} |" for name, value in card["training"].items()]
     return "\n".join(lines) + "\n"

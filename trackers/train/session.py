@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import math
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -101,7 +103,7 @@ def _card(options: TrainOptions, library: MotionLibrary, processes: int) -> dict
     sources = sorted({str(s) for s in library.source})
     return {
         "tracker": options.tracker,
-        "command": "python -m arena_newton.trackers.train " + " ".join(sys.argv[1:]),
+        "command": "python -m arena_newton.trackers.train " + shlex.join(sys.argv[1:]),
         "commit": _commit(options.commit),
         "processes": processes,
         "worlds": options.worlds,
@@ -109,6 +111,48 @@ def _card(options: TrainOptions, library: MotionLibrary, processes: int) -> dict
         "data": {"clips": library.clips, "families": families, "mirrored": options.mirror, "sources": sources[:64]},
         "licences": licences,
     }
+
+
+def check(options: TrainOptions) -> None:
+    """Refuse numbers that no training can use, before anything is made.
+
+    Raises:
+        InputError: A flag's number is out of range.
+    """
+    bounds: tuple[tuple[str, float, float, float], ...] = (
+        ("--worlds", options.worlds, 1, math.inf),
+        ("--minutes", options.minutes, 0, math.inf),
+        ("--iterations", options.iterations, 1, math.inf),
+        ("--adaptive", options.adaptive, 0, 1),
+        ("--episode-s", options.episode_s, 0.1, math.inf),
+        ("--steps", options.steps, 2, math.inf),
+        ("--epochs", options.epochs, 1, math.inf),
+        ("--minibatches", options.minibatches, 1, options.worlds * options.steps),
+        ("--learning-rate", options.learning_rate, 1e-8, 1),
+        ("--desired-kl", options.desired_kl, 1e-6, 10),
+        ("--entropy", options.entropy, 0, math.inf),
+        ("--init-std", options.init_std, 1e-3, 10),
+        ("--mirror-loss", options.mirror_loss, 0, math.inf),
+        ("--save-interval", options.save_interval, 1, math.inf),
+        ("--print-interval", options.print_interval, 1, math.inf),
+        ("--log-interval", options.log_interval, 1, math.inf),
+        ("--contacts-per-world", options.contacts_per_world, 1, math.inf),
+        ("--constraints-per-world", options.constraints_per_world, 1, math.inf),
+        *((f"--families {name}", count, 1, math.inf) for name, count in options.families.items()),
+        *((f"--family-weights {name}", w, 0, math.inf) for name, w in options.family_weights.items()),
+        *((f"--rewards {name}", w, -1e6, 1e6) for name, w in options.rewards.items()),
+    )
+    for flag, value, low, high in bounds:
+        if not (low <= value <= high and math.isfinite(value)):
+            until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
+            raise InputError(f"{flag} {value}: expected a number {until}")
+    if options.log_dir.exists() and not options.log_dir.is_dir():
+        raise InputError(f"--log-dir {options.log_dir}: is a file")
+    used = sorted(options.log_dir.glob("model_*.pt")) if options.resume is None and not options.bench else []
+    if used:
+        raise InputError(
+            f"--log-dir {options.log_dir}: holds a training ({used[0].name}); --resume goes on with it, or name another"
+        )
 
 
 def _device(name: str) -> str:
@@ -139,6 +183,7 @@ def build(options: TrainOptions) -> TrackerRunner:
 
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
+    check(options)
     unknown = sorted(set(options.rewards) - set(REWARDS))
     if unknown:
         raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")

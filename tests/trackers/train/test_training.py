@@ -229,3 +229,24 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys):
         assert words in error and error.count("\n") == 1
     with pytest.raises(InputError, match="pass one of the two"):
         session.make_library(TrainOptions(library=tmp_path / "a.npz", families={"walk": 1}), "cpu")
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--worlds", "0"],
+        ["--iterations", "0"],
+        ["--minutes", "-1"],
+        ["--minibatches", "1000"],
+        ["--learning-rate", "nan"],
+        ["--families", "walk", "-3"],
+        ["--rewards", "heading", "nan"],
+    ],
+)
+def test_numbers_out_of_range_are_refused_first(flags, tmp_path, capsys):
+    """A number that no training can use is one line with its flag, before references are made."""
+    log_dir = tmp_path / "log"
+    assert command_line.main(["--device", "cpu", "--worlds", "8", "--log-dir", str(log_dir), *flags]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and flags[0] in message
+    assert not log_dir.exists()
