@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
+from arena_newton.streams import on_torch_stream
 
 if TYPE_CHECKING:
     import torch
@@ -65,17 +66,6 @@ def _backpropagate(
     return result
 
 
-def _stream(tensor: "torch.Tensor") -> Any:
-    """Context in which Warp works on torch's current stream, so that the two need not wait for each other."""
-    import contextlib
-
-    import warp as wp
-
-    if not tensor.is_cuda:
-        return contextlib.nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(tensor.device))
-
-
 def _function() -> "type[torch.autograd.Function]":
     """The autograd function, made once torch is there."""
     import torch
@@ -87,7 +77,7 @@ def _function() -> "type[torch.autograd.Function]":
         def forward(ctx: Any, record: Callable, *tensors: "torch.Tensor") -> tuple["torch.Tensor", ...]:
             import warp as wp
 
-            with _stream(tensors[0]):
+            with on_torch_stream(tensors[0].device):
                 arrays = [
                     wp.from_torch(t.detach().contiguous(), requires_grad=need)
                     for t, need in zip(tensors, ctx.needs_input_grad[1:], strict=True)
@@ -100,7 +90,7 @@ def _function() -> "type[torch.autograd.Function]":
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *grads: "torch.Tensor | None") -> tuple:
-            with _stream(next(g for g in grads if g is not None)):
+            with on_torch_stream(next(g for g in grads if g is not None).device):
                 return None, *_backpropagate(ctx.tape, ctx.arrays, ctx.outputs, grads)
 
     return _Recorded

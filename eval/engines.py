@@ -12,13 +12,16 @@ import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.eval.stats import wilson
+from arena_newton.intervals import wilson
 from arena_newton.quiet import quiet_warp
+
+if TYPE_CHECKING:
+    from arena_newton.policies.base import Policy
 
 __all__ = ["EngineOptions", "Rates", "fisher", "measure", "run"]
 
@@ -90,11 +93,11 @@ def fisher(a: int, n: int, b: int, m: int) -> float:
     return sum(weight(x) for x in possible if weight(x) <= seen) / math.comb(n + m, a + b)
 
 
-def measure(options: EngineOptions, engine: str) -> Rates:
+def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     """Run the rollouts on one engine."""
     from tqdm import tqdm
 
-    from arena_newton import policies, trackers
+    from arena_newton import trackers
     from arena_newton.env import ArenaEnv
 
     env: Any = ArenaEnv(
@@ -105,8 +108,6 @@ def measure(options: EngineOptions, engine: str) -> Rates:
         fast_physics=options.fast_physics,
     )
     _move_spawns(env, options)
-    policy = policies.get(options.policy)
-    policy.check()
     rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
     began = time.perf_counter()
     with tqdm(total=len(rollouts), desc=engine, unit="rollout") as bar:
@@ -145,7 +146,7 @@ def _move_spawns(env: Any, options: EngineOptions) -> None:
 
 def _line(rates: Rates) -> str:
     def share(count: int) -> str:
-        low, high = wilson(count, rates.rollouts) or (0.0, 1.0)
+        low, high = wilson(count, rates.rollouts)
         return f"{count}/{rates.rollouts} ({count / rates.rollouts:.1%}, 95 % {low:.1%} to {high:.1%})"
 
     return (
@@ -170,14 +171,14 @@ def run(options: EngineOptions) -> int:
         raise InputError(f"--noise {options.noise}: must be a distance of 0 or more [m]")
     from arena_newton import policies
 
-    known = policies.get(options.policy).tasks
-    if known is not None and options.task not in known:
-        raise InputError(f"--policy {options.policy}: cannot do task {options.task}; it can do {', '.join(known)}")
+    policy = policies.get(options.policy)
+    policy.check()
+    policy.check_task(options.task)
     earlier = _earlier(options.against)
     quiet_warp()
     rates = [*earlier]
     for engine in options.engines:
-        rates.append(measure(options, engine))
+        rates.append(measure(options, engine, policy))
     for one in rates:
         print(_line(one), flush=True)
     for i, one in enumerate(rates):

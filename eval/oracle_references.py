@@ -16,14 +16,11 @@ import numpy as np
 from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, MUJOCO_JOINTS, TICK
+from arena_newton.trackers.motions.kinematics import SOLE_CENTRE, SOLE_HEIGHT
 
 __all__ = ["FEET", "Gait", "LegSolver", "Reference", "clip", "squat", "stand", "walk"]
 
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
-SOLE_HEIGHT = 0.035
-"""Height of the ankle roll frame above the ground with a flat foot [m]: contact spheres at -0.03, radius 0.005."""
-SOLE_CENTRE = 0.035
-"""Middle of the four contact spheres before the ankle roll frame [m]."""
 BLEND = 1.0
 """Time from standing to a reference's first pose [s], without displacement."""
 

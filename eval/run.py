@@ -189,10 +189,8 @@ def _check_parts(config: RunConfig, factories: Factories) -> Any:
     factories.tracker(config.tracker, config.checkpoint)
     policy = factories.policy(config.policy)
     policy.check()
-    known = getattr(policy, "tasks", None)
     for task in config.tasks:
-        if known is not None and task not in known:
-            raise InputError(f"--policy {config.policy}: cannot do task {task}; it can do {', '.join(known)}")
+        policy.check_task(task)
     if config.variant is not None:
         factories.check_variant(config.variant, config.tasks[0])
     return policy

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from arena_newton import intervals
+
 __all__ = ["SUITES", "aggregate", "cell", "pooled", "population_std", "wilson"]
 
 SUITES: dict[str, tuple[str, ...]] = {
@@ -14,9 +16,6 @@ SUITES: dict[str, tuple[str, ...]] = {
     "ALL_AVG": ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"),
 }
 """Task groups of the paper's tables: human-object and human-scene interaction."""
-
-_Z95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
 
 
 def population_std(values: Sequence[float]) -> float | None:
@@ -32,12 +31,7 @@ def wilson(successes: int, episodes: int) -> list[float] | None:
 
     Wilson, E. B. (1927): Probable inference, the law of succession, and statistical inference.
     """
-    if episodes == 0:
-        return None
-    rate, z2 = successes / episodes, _Z95 * _Z95
-    centre = (rate + z2 / (2 * episodes)) / (1 + z2 / episodes)
-    half = _Z95 * math.sqrt(rate * (1 - rate) / episodes + z2 / (4 * episodes * episodes)) / (1 + z2 / episodes)
-    return [0.0 if successes == 0 else centre - half, 1.0 if successes == episodes else centre + half]
+    return list(intervals.wilson(successes, episodes)) if episodes else None
 
 
 def seed_rates(records: Iterable[dict[str, Any]]) -> dict[int, float]:

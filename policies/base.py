@@ -48,8 +48,6 @@ class Policy:
     """Whether the head camera must be rendered for `act`."""
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
-    tasks: tuple[str, ...] | None = None
-    """Tasks it can do; None: any."""
     chunk_size: int = 1
     """Actions a chunk, where the policy knows it beforehand."""
 
@@ -58,6 +56,13 @@ class Policy:
 
         Raises:
             InputError: It cannot, for a reason that the user can mend.
+        """
+
+    def check_task(self, task: str) -> None:
+        """Look, before the first episode, whether the policy can do a task.
+
+        Raises:
+            InputError: It cannot.
         """
 
     def attach(self, env: Any) -> None:

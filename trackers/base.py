@@ -109,9 +109,14 @@ def names() -> tuple[str, ...]:
     return tuple(sorted({*_BUILT_IN, *_registered, *_entry_points()}))
 
 
+def weights_path(interface: str) -> Path:
+    """Where the weights that come with the package lie: `trackers/weights/<interface>.safetensors`."""
+    return Path(__file__).parent / "weights" / f"{interface}.safetensors"
+
+
 def shipped_weights(spec: str) -> Path | None:
     """The weights that come with the package for a built-in tracker; None without any."""
-    path = Path(__file__).parent / "weights" / f"{spec}.safetensors"
+    path = weights_path(spec)
     return path if spec in _BUILT_IN and path.is_file() else None
 
 

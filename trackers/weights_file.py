@@ -18,7 +18,7 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TICK, DriveGains, PhysicsRate
-from arena_newton.trackers import networks
+from arena_newton.trackers import base, networks
 from arena_newton.trackers.front_end import JOINTS, ActionForm
 
 __all__ = ["FORMAT", "METADATA_KEY", "Weights", "default", "default_path", "load", "save"]
@@ -65,7 +65,7 @@ class Weights:
 
 def default_path(interface: str) -> Path:
     """Where the weights that come with the package lie: `trackers/weights/<interface>.safetensors`."""
-    return Path(__file__).parent / "weights" / f"{interface}.safetensors"
+    return base.weights_path(interface)
 
 
 def default(interface: str, otherwise: str) -> Path:

@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Policy, world_mask
 from arena_newton.robot import TICK
-from arena_newton.trackers.motions.navigate import heading
+from arena_newton.trackers.motions.frames import heading
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.commands import MotionCommand
@@ -125,10 +125,18 @@ class ExpertPolicy(Policy):
             chunk_size: Ticks between two looks at the world.
         """
         self.experts = experts
-        self.tasks = tuple(sorted(experts))
         self.chunk_size = chunk_size
         self.expert: Expert | None = None
         """The expert at work; None before `attach`."""
+
+    def check_task(self, task: str) -> None:
+        """Refuse a task without an expert.
+
+        Raises:
+            InputError: There is no expert for the task.
+        """
+        if task not in self.experts:
+            raise InputError(f"--policy expert: no expert for task {task}; there are {', '.join(sorted(self.experts))}")
 
     def attach(self, env: Any) -> None:
         """Get the privileged view of an environment and pick the expert of its task.
@@ -137,8 +145,7 @@ class ExpertPolicy(Policy):
             InputError: There is no expert for the task.
         """
         task = env.spec.name
-        if task not in self.experts:
-            raise InputError(f"--policy expert: no expert for task {task}; there are {', '.join(sorted(self.experts))}")
+        self.check_task(task)
         from arena_newton.trackers.motions.generator import ReferenceGenerator
 
         self.sight = Sight(env)

@@ -16,8 +16,9 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import Floor, plan, signed_distance
 from arena_newton.tasks.boxing import PALMS, TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
+from arena_newton.trackers.motions.frames import wrap_angle
 from arena_newton.trackers.motions.kinematics import HAND_POINT
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate, wrap
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate
 
 __all__ = ["BoxingExpert"]
 
@@ -124,7 +125,7 @@ class BoxingExpert(Expert):
 
         def chosen(points: Tensor) -> Tensor:
             xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
-            return torch.cat([xy, wrap(torch.gather(side, 1, pick) + math.pi)], dim=1)
+            return torch.cat([xy, wrap_angle(torch.gather(side, 1, pick) + math.pi)], dim=1)
 
         place = chosen(ready)
         ways = plan(pose[:, :2], place[:, :2], Floor(self._boxes, *ROOM))

@@ -9,7 +9,8 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.tasks.vis_navi import SIGN
 from arena_newton.trackers.motions.commands import MotionCommand
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, heading, rotate
+from arena_newton.trackers.motions.frames import heading
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate
 
 __all__ = ["VisNaviExpert"]
 

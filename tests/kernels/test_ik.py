@@ -7,7 +7,7 @@ import warp as wp
 
 from arena_newton.kernels import ik
 from arena_newton.robot import DEFAULT_POSE
-from arena_newton.trackers.motions import kinematics
+from arena_newton.trackers.motions import frames, kinematics
 
 WORLDS = 24
 
@@ -142,7 +142,7 @@ def test_hands_reach(device):
     poses = s.poses()
     wrist = [kinematics.link_index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
     palm = torch.tensor([kinematics.HAND_POINT, 0.0, 0.0], dtype=torch.float64).expand(s.worlds, 2, 3)
-    hands = poses.position[:, wrist] + kinematics.quat_rotate(poses.quat[:, wrist], palm)
+    hands = poses.position[:, wrist] + frames.quat_apply(poses.quat[:, wrist], palm)
     root = np.concatenate([s.state.pelvis.numpy(), s.goal[:, ik.GOAL["height"]]], 1)
     np.testing.assert_allclose(hands.numpy() - root[:, None], points, atol=3e-3)
     np.testing.assert_allclose(s.state.hands.numpy().reshape(-1, 2, 3), points, atol=3e-3)

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from arena_newton import robot as g1
+from arena_newton.intervals import wilson
 from arena_newton.trackers.evaluate import main
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
-from arena_newton.trackers.evaluation.figures import Result, figures, wilson
+from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
 from arena_newton.trackers.evaluation.measure import FEET, LINKS, Meter, Reference
 from arena_newton.trackers.evaluation.rollout import Outcome, plan, run, sill_place

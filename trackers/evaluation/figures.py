@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from arena_newton.intervals import wilson
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.rollout import Outcome, Plan
 
-__all__ = ["Figure", "Result", "figures", "wilson"]
+__all__ = ["Figure", "Result", "figures"]
 
-_Z95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
 GOAL_PLACE, GOAL_TURN = 0.08, 5.0
 """A goal counts as reached within this [m], [deg]."""
 SEAT_TIME = 2.0
@@ -78,19 +76,6 @@ class Figure:
     def verdict(self) -> str:
         """`pass`, `MISS` or nothing."""
         return "" if self.met is None else "pass" if self.met else "MISS"
-
-
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """95 % Wilson score interval of a rate; 0 to 1 without trials.
-
-    Wilson, E. B. (1927): Probable inference, the law of succession, and statistical inference.
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    rate, z2 = successes / trials, _Z95 * _Z95
-    centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z95 * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials * trials)) / (1 + z2 / trials)
-    return (0.0 if successes == 0 else centre - half), (1.0 if successes == trials else centre + half)
 
 
 def _falls(result: Result, rows: np.ndarray) -> tuple[int, int, str]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.physics import MujocoPhysics, WarpPhysics, resolve_engine
+from arena_newton.trackers.motions.library import FIXTURES
 
 if TYPE_CHECKING:
     import torch
@@ -27,7 +28,6 @@ CHEST = "torso_link"
 HANDS = ("left_wrist_yaw_link", "right_wrist_yaw_link")
 GRIP = (0.10, 0.0, 0.0)
 """Where a payload sits in the frame of a wrist [m]: in the palm."""
-SUPPORTS = ("Seat", "Sill", "Platform")
 BALL = "/World/Ball"
 CONTACTS, CONSTRAINTS = 64, 224
 """Buffers a world of engine `warp`: feet, seat and ball at once, with room for a fall."""
@@ -200,7 +200,7 @@ class Lab:
         )
         native = self.engine == "mujoco"
         self.physics: Any = _LabMujoco(self.scene, rate, threads) if native else _LabWarp(self.scene, rate)
-        supports = [g for name in SUPPORTS for g in self.scene.geom_ids(f"/World/{name}")]
+        supports = [g for name in FIXTURES for g in self.scene.geom_ids(f"/World/{name}")]
         robot = [g for g, label in enumerate(self.scene.geom_labels) if label.startswith("/World/Robot/")]
         self.physics.watch_pair(supports, robot)
         self.physics.prepare(kinds, watched)

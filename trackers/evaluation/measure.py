@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from arena_newton.robot import TICK
+from arena_newton.trackers.motions.frames import heading, wrap_angle
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
-from arena_newton.trackers.motions.navigate import heading, rotate, wrap
+from arena_newton.trackers.motions.navigate import rotate
 
 if TYPE_CHECKING:
     from arena_newton.trackers.evaluation.lab import Lab
@@ -156,7 +157,7 @@ class Meter:
 
         moved = rotate((position - last["position"])[:, :2], -yaw) / TICK
         ref_moved = rotate((reference.position - last["ref_position"])[:, :2], -ref_yaw) / TICK
-        turned, ref_turned = wrap(yaw - last["yaw"]) / TICK, wrap(ref_yaw - last["ref_yaw"]) / TICK
+        turned, ref_turned = wrap_angle(yaw - last["yaw"]) / TICK, wrap_angle(ref_yaw - last["ref_yaw"]) / TICK
 
         feet = lab.xpos[:, self._feet]
         down = (torch.maximum(feet[..., 2], last["feet"][..., 2]) < CONTACT_HEIGHT).float()
@@ -189,7 +190,7 @@ class Meter:
         self._window_count += counted
 
         self._end_offset = torch.where(live[:, None], (position - reference.position)[:, :2], self._end_offset)
-        self._end_turn = torch.where(live, wrap(yaw - ref_yaw), self._end_turn)
+        self._end_turn = torch.where(live, wrap_angle(yaw - ref_yaw), self._end_turn)
         self._end_root = torch.where(live[:, None], torch.cat([position, yaw[:, None]], 1), self._end_root)
         self._lowest = torch.where(live, torch.minimum(self._lowest, position[:, 2]), self._lowest)
         self._lowest_ref = torch.where(

@@ -13,10 +13,11 @@ import torch
 from arena_newton import robot as g1
 from arena_newton.errors import ArenaError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.trackers.evaluation.lab import SUPPORTS, Lab, Start, WorldKind
+from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
 from arena_newton.trackers.evaluation.measure import Meter, Reference
 from arena_newton.trackers.evaluation.suite import Cell, Tables, tabulate
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
+from arena_newton.trackers.motions.library import FIXTURES
 
 if TYPE_CHECKING:
     from arena_newton.trackers.base import Tracker
@@ -105,7 +106,7 @@ def plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
 
 
 def _supports(plan: Plan, tables: Tables) -> dict[str, np.ndarray]:
-    out = {name: np.full((len(plan.cell), 4), np.nan) for name in SUPPORTS}
+    out = {name: np.full((len(plan.cell), 4), np.nan) for name in FIXTURES}
     for i, cell in enumerate(plan.cells):
         if cell.support is not None:
             x = cell.support.x
@@ -243,8 +244,8 @@ def run(
     import warp as wp
 
     from arena_newton.kernels import canonical
+    from arena_newton.trackers.motions.frames import heading
     from arena_newton.trackers.motions.kinematics import neutral_stance
-    from arena_newton.trackers.motions.navigate import heading
 
     began = time.perf_counter()
     cells, worlds = plan.cells, len(plan.cell)

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.command_line import exit_code
+from arena_newton.errors import InputError
 from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -199,24 +200,18 @@ _COMMANDS = {"convert": _convert, "inspect": _inspect, "render": _render, "gener
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 2 bad input, 130 interrupted."""
-    try:
+
+    def work() -> None:
         args = _parser().parse_args(argv)
         if args.command in ("render", "generate"):
             quiet_warp()
         _COMMANDS[args.command](args)
-    except InputError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except ArenaError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
-        return 130
+
+    try:
+        return exit_code(work)
     except BrokenPipeError:
         sys.stderr.close()
         return 0
-    return 0
 
 
 if __name__ == "__main__":

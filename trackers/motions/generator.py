@@ -8,12 +8,12 @@ feasible reference. Torch plans, one Warp kernel solves the joints (`kernels.ik`
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
+from arena_newton.streams import on_torch_stream
 from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, MotionCommand, neutral_row
 from arena_newton.trackers.motions.footwork import (
     SHORTEST_STEP,
@@ -284,7 +284,7 @@ class ReferenceGenerator:
             self._solved.copy_(mask)
         else:
             self._solved.copy_(self._all)
-        with self._stream():
+        with on_torch_stream(self.device):
             self._ik.launch_ik(self._model, self._wp_goal, self._wp_mask, self._wp_state)
         root = torch.cat([self._pelvis, new["channels"][:, CHANNELS["height"]]], dim=1)
         if mask is None:
@@ -295,18 +295,6 @@ class ReferenceGenerator:
         self._s = new
         self._publish()
         return self.frames
-
-    def _stream(self) -> contextlib.AbstractContextManager:
-        """Warp works on torch's current stream, so that the two need not wait for each other."""
-        import torch
-        import warp as wp
-
-        if self.device.type != "cuda":
-            return contextlib.nullcontext()
-        # Where torch already works on Warp's own stream, a second handle of it would end the first one with its life.
-        if torch.cuda.current_stream(self.device).cuda_stream == wp.get_stream(str(self.device)).cuda_stream:
-            return contextlib.nullcontext()
-        return wp.ScopedStream(wp.stream_from_torch(self.device))
 
     def _plan(self, s: State, row: torch.Tensor) -> None:
         """Advances the state of all worlds by one tick and writes the goals of the solver."""

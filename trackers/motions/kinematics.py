@@ -29,8 +29,6 @@ __all__ = [
     "forward",
     "link_index",
     "neutral_stance",
-    "quat_multiply",
-    "quat_rotate",
 ]
 
 SOLE_HEIGHT = 0.035
@@ -48,32 +46,6 @@ _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 def link_index(name: str) -> int:
     """Row of a link in `Poses`."""
     return LINK_NAMES.index(name)
-
-
-def quat_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Product of quaternions, wxyz, shape [..., 4]."""
-    import torch
-
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
-
-
-def quat_rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Vectors turned by quaternions; q wxyz, shape [..., 4], v, shape [..., 3]."""
-    import torch
-
-    xyz = q[..., 1:].expand(v.shape)
-    t = 2.0 * torch.linalg.cross(xyz, v)
-    return v + q[..., :1] * t + torch.linalg.cross(xyz, t)
 
 
 @dataclass(frozen=True)
@@ -98,6 +70,8 @@ def forward(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch.Te
     """
     import torch
 
+    from arena_newton.trackers.motions import frames
+
     def constant(values: tuple[float, ...]) -> torch.Tensor:
         return root_pos.new_tensor(values)
 
@@ -111,15 +85,15 @@ def forward(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch.Te
             position, quat = root_pos, root_quat
         else:
             up = link_index(link.parent)
-            position = positions[up] + quat_rotate(quats[up], constant(link.offset).expand(root_pos.shape))
-            quat = quat_multiply(quats[up], constant(link.quat).expand(root_quat.shape))
+            position = positions[up] + frames.quat_apply(quats[up], constant(link.offset).expand(root_pos.shape))
+            quat = frames.quat_multiply(quats[up], constant(link.quat).expand(root_quat.shape))
             if link.hinge is not None and link.hinge.name in MUJOCO_JOINTS:
                 j = MUJOCO_JOINTS.index(link.hinge.name)
                 turn = torch.cat([cos[..., j : j + 1], sin[..., j : j + 1] * constant(_AXES[link.hinge.axis])], -1)
-                quat = quat_multiply(quat, turn)
+                quat = frames.quat_multiply(quat, turn)
         positions.append(position)
         quats.append(quat)
-        moment = moment + link.mass * (position + quat_rotate(quat, constant(link.com).expand(root_pos.shape)))
+        moment = moment + link.mass * (position + frames.quat_apply(quat, constant(link.com).expand(root_pos.shape)))
     total = sum(link.mass for link in LINKS)
     return Poses(torch.stack(positions, -2), torch.stack(quats, -2), moment / total)
 
@@ -198,6 +172,8 @@ def neutral_stance() -> Stance:
     """Numbers of `robot.DEFAULT_POSE`, whose feet are flat when the pelvis is upright."""
     import torch
 
+    from arena_newton.trackers.motions import frames
+
     poses = forward(
         torch.zeros(3, dtype=torch.float64),
         torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64),
@@ -206,7 +182,7 @@ def neutral_stance() -> Stance:
     feet = poses.position[[link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]]
     wrist = [link_index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
     palm = torch.tensor([HAND_POINT, 0.0, 0.0], dtype=torch.float64).expand(2, 3)
-    hands = poses.position[wrist] + quat_rotate(poses.quat[wrist], palm)
+    hands = poses.position[wrist] + frames.quat_apply(poses.quat[wrist], palm)
     left, right = ((float(h[0]), float(h[1]), float(h[2])) for h in hands)
     return Stance(
         height=SOLE_HEIGHT - float(feet[:, 2].mean()),

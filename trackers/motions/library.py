@@ -30,6 +30,7 @@ __all__ = [
     "MIRROR_JOINTS",
     "MIRROR_SIGNS",
     "SUPPORTS",
+    "FIXTURES",
     "DeviceLibrary",
     "MotionLibrary",
 ]
@@ -39,6 +40,8 @@ FORMAT = "arena-newton-motions-1"
 FPS = round(1.0 / TICK)
 SUPPORTS = ("none", "seat", "sill", "platform")
 """Names of `support_kind`."""
+FIXTURES = tuple(name.capitalize() for name in SUPPORTS[1:])
+"""The lab's fixtures for `support_kind` 1, 2, 3."""
 UNKNOWN = "unknown"
 """Licence and source of a clip for which none was given."""
 

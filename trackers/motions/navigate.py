@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Command", "NavigationLimits", "Navigator", "heading", "rotate", "steer", "wrap"]
+from arena_newton.trackers.motions.frames import wrap_angle
+
+__all__ = ["Command", "NavigationLimits", "Navigator", "rotate", "steer"]
 
 
 @dataclass(frozen=True)
@@ -71,17 +73,6 @@ class Command:
     """Distance from the route [m], 0 without one, [worlds]."""
 
 
-def wrap(angle: Tensor) -> Tensor:
-    """The same angle in -π … π [rad]."""
-    return torch.atan2(torch.sin(angle), torch.cos(angle))
-
-
-def heading(quat: Tensor) -> Tensor:
-    """Yaw of orientations wxyz [rad]: atan2(2(wz + xy), 1 - 2(y² + z²)); shape [..., 4] to [...]."""
-    w, x, y, z = quat.unbind(-1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
 def rotate(vector: Tensor, yaw: Tensor) -> Tensor:
     """Planar vectors turned by yaw; shapes [..., 2] and [...]."""
     c, s = torch.cos(yaw), torch.sin(yaw)
@@ -108,8 +99,8 @@ def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: Nav
     direction = offset / distance.clamp_min(1e-6)[:, None]
     share = ((left - limits.near) / (limits.far - limits.near)).clamp(0.0, 1.0)
     bearing = torch.atan2(offset[:, 1], offset[:, 0])
-    wanted = goal_yaw + share * wrap(bearing - goal_yaw)
-    error = wrap(wanted - yaw)
+    wanted = goal_yaw + share * wrap_angle(bearing - goal_yaw)
+    error = wrap_angle(wanted - yaw)
     turn = (limits.heading_gain * error).clamp(-limits.turn, limits.turn)
 
     local = rotate(direction, -yaw)
@@ -187,7 +178,7 @@ class Navigator:
             travelled, aim, left, stray = follow(torch.cat([route, goal[:, None, :2]], dim=1), here, self._travelled, k)
             self._travelled = torch.where(every, travelled, self._travelled)
 
-        error = wrap(goal[:, 2] - yaw)
+        error = wrap_angle(goal[:, 2] - yaw)
         off = torch.linalg.vector_norm(goal[:, :2] - smooth, dim=1)
         stays = (off < k.leave_position) & (error.abs() < k.leave_heading)
         missed = every & self.holding & ~stays
@@ -199,7 +190,7 @@ class Navigator:
 
         shift, turned = -rotate(self._bias[:, :2], yaw), goal[:, 2] - self._bias[:, 2]
         aimed_off = torch.linalg.vector_norm(goal[:, :2] + shift - smooth, dim=1)
-        close = (aimed_off < k.arrive_position) & (wrap(turned - yaw).abs() < k.arrive_heading)
+        close = (aimed_off < k.arrive_position) & (wrap_angle(turned - yaw).abs() < k.arrive_heading)
         holding = torch.where(self.holding, stays, close & (left < k.near))
         self.holding = torch.where(every, holding, self.holding)
         near = (left < k.lookahead)[:, None]

@@ -12,15 +12,14 @@ from arena_newton.errors import InputError
 from arena_newton.robot import TICK
 from arena_newton.trackers.motions import primitives as p
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
+from arena_newton.trackers.motions.library import SUPPORTS
 from arena_newton.trackers.motions.primitives import Program, Script
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["FAMILIES", "SUPPORTS", "random_clips"]
+__all__ = ["FAMILIES", "random_clips"]
 
-SUPPORTS = ("none", "seat", "sill", "platform")
-"""Names of `support_kind`."""
 SEAT_SIZE = (0.5, 0.6)
 """Length and width of a seat [m]."""
 SILL_SIZE = (0.10, 1.4)

@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, heading, rotate, steer, wrap
+from arena_newton.trackers.motions.frames import heading, wrap_angle
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate, steer
 
 DT = 0.02
 
@@ -28,7 +29,7 @@ def test_heading_and_wrap():
     quat = torch.stack([torch.cos(yaw / 2), torch.zeros(3), torch.zeros(3), torch.sin(yaw / 2)], dim=1)
     assert torch.allclose(heading(quat), yaw, atol=1e-6)
     assert torch.allclose(
-        wrap(torch.tensor([2 * math.pi + 0.1, -4.0])), torch.tensor([0.1, 2 * math.pi - 4.0]), atol=1e-5
+        wrap_angle(torch.tensor([2 * math.pi + 0.1, -4.0])), torch.tensor([0.1, 2 * math.pi - 4.0]), atol=1e-5
     )
 
 
@@ -42,7 +43,7 @@ def test_goals_are_reached_and_held():
     assert command.arrived.all()
     assert (command.velocity == 0).all()
     assert torch.linalg.vector_norm(pose[:, :2] - goal[:, :2], dim=1).max() < 0.08
-    assert wrap(pose[:, 2] - goal[:, 2]).abs().max() < math.radians(5)
+    assert wrap_angle(pose[:, 2] - goal[:, 2]).abs().max() < math.radians(5)
 
 
 def test_command_stays_within_limits():
