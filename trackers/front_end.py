@@ -10,6 +10,7 @@ Everything runs on any torch device without waiting for it, so a CUDA graph can 
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +87,7 @@ def plain(*signs: float) -> tuple[Sequence[int], Sequence[float]]:
     return range(len(signs)), signs
 
 
-class FrontEnd:
+class FrontEnd(abc.ABC):
     """Base of all front ends; a subclass sets the widths and writes `reset`, `write` and `advance`."""
 
     interface: str = ""
@@ -97,6 +98,8 @@ class FrontEnd:
     """Width of the raw action."""
     default_pose: tuple[float, ...] = (0.0,) * JOINTS
     """Pose that measured joints are taken relative to [rad], MuJoCo order."""
+    graphable: bool = False
+    """Whether a tick on CUDA is the same operations on the same buffers each time, so that a CUDA graph may hold it."""
 
     obs: torch.Tensor
     """The observation's buffer, float32, shape [worlds, obs_width]."""
@@ -125,13 +128,13 @@ class FrontEnd:
         self.base = self._default.repeat(worlds, 1)
         self._targets = torch.zeros(worlds, JOINTS, device=self.device)
 
+    @abc.abstractmethod
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Forget the past of the worlds in `mask` (all without one); shape [worlds], bool."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Pretend that the worlds in `mask` have held this command and state for a while."""
-        raise NotImplementedError
 
     @torch.no_grad()
     def observe(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
@@ -161,20 +164,20 @@ class FrontEnd:
         return self._targets.mul_(self._scale).add_(self.base)
 
     def mirror_obs(self) -> Mirror:
-        """Mirror image of an observation; for training."""
-        raise NotImplementedError
+        """Mirror image of an observation; only a training with a mirror loss asks for it."""
+        raise NotImplementedError(f"{type(self).__name__} has no mirror image: train it without a mirror loss")
 
     def mirror_action(self) -> Mirror:
-        """Mirror image of a raw action; for training."""
-        raise NotImplementedError
+        """Mirror image of a raw action; only a training with a mirror loss asks for it."""
+        raise NotImplementedError(f"{type(self).__name__} has no mirror image: train it without a mirror loss")
 
+    @abc.abstractmethod
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write this tick's observation into `obs`."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def advance(self) -> None:
         """Move histories on, after `last_action` took the raw output."""
-        raise NotImplementedError
 
     def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
         """The raw output in MuJoCo order."""
@@ -233,6 +236,8 @@ class NetworkTracker(Tracker):
             self.network.to(device)
         self._runner = BlockRunner(self.network, self.front_end.obs_width, worlds, device)
         self.front_end.bind(worlds, device, self._runner.input)
+        graphable = device.type == "cuda" and self.front_end.graphable and isinstance(self.network, torch.nn.Module)
+        self._graph = _TickGraph(self._tick, worlds, device) if graphable else None
         self.reset()
 
     @property
@@ -257,8 +262,50 @@ class NetworkTracker(Tracker):
     @torch.inference_mode()
     def step(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
         """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; the buffer is reused by the next call."""
+        return self._tick(command, state) if self._graph is None else self._graph(command, state)
+
+    def _tick(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
         self.front_end.observe(command, state)
         return self.front_end.act(self._runner.run())
+
+
+class _TickGraph:
+    """A tick held in a CUDA graph: some sixty small launches become one."""
+
+    def __init__(self, tick: Callable[[TrackerCommand, RobotState], torch.Tensor], worlds: int, device: torch.device):
+        """Allocate the inputs that the graph reads.
+
+        Args:
+            tick: What to hold; it always writes the same result buffer.
+            worlds: Number of worlds.
+            device: A CUDA device.
+        """
+        self._tick = tick
+
+        def row(width: int) -> torch.Tensor:
+            return torch.zeros(worlds, width, device=device)
+
+        self._command = TrackerCommand(mimic=row(35), joints=row(JOINTS), joint_vel=row(JOINTS), quat=row(4))
+        self._state = RobotState(quat=row(4), ang_vel_body=row(3), joint_pos=row(JOINTS), joint_vel=row(JOINTS))
+        self._inputs = [*vars(self._command).values(), *vars(self._state).values()]
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._targets = row(0)
+        self._warm = False
+
+    def __call__(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+        """One tick; the first runs as it is, which makes libraries allocate what they need."""
+        if not self._warm:
+            self._warm = True
+            return self._tick(command, state)
+        torch._foreach_copy_(self._inputs, [*vars(command).values(), *vars(state).values()])
+        if self._graph is None:
+            graph = torch.cuda.CUDAGraph()
+            # Other threads may use the device meanwhile.
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                self._targets = self._tick(self._command, self._state)
+            self._graph = graph
+        self._graph.replay()
+        return self._targets
 
 
 def column(values: Sequence[bool] | torch.Tensor, device: torch.device) -> torch.Tensor:

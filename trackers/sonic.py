@@ -111,6 +111,7 @@ class SonicFrontEnd(FrontEnd):
     interface = "sonic"
     obs_width = OBSERVATION
     default_pose = SONIC_DEFAULT_POSE
+    graphable = True
 
     def __init__(self, action_form: ActionForm = SONIC_FORM):
         """Take SONIC's action form or another."""

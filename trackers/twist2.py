@@ -57,6 +57,7 @@ class Twist2FrontEnd(FrontEnd):
     interface = "twist2"
     obs_width = OBSERVATION
     default_pose = DEFAULT_POSE
+    graphable = True
 
     def __init__(self, action_form: ActionForm = OFFICIAL_FORM):
         """Take the official action form or another."""

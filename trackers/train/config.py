@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 __all__ = ["FAMILY_WEIGHTS", "TrainOptions", "runner_config"]
 
-FAMILY_WEIGHTS: dict[str, float] = {"clips": 8.0}
+FAMILY_WEIGHTS: dict[str, float] = {"clips": 40.0}
 """Weights of families in the sampling, per second of motion: a few minutes of captured motion stand beside hours that
 were generated."""
 
@@ -47,7 +47,7 @@ class TrainOptions:
     mirror: bool = True
     """Add the mirror image of every clip."""
     family_weights: dict[str, float] = field(default_factory=dict)
-    """Weights of families in the sampling, per second of motion; 8 for clips and 1 for the others where not named."""
+    """Weights of families in the sampling, per second of motion; 40 for clips and 1 for the others where not named."""
     log_dir: Path = Path("runs/tracker")
     """Folder for checkpoints, progress.jsonl and TensorBoard."""
     logger: Literal["tensorboard", "wandb"] = "tensorboard"
@@ -74,6 +74,8 @@ class TrainOptions:
     """Divergence of an iteration that the learning rate aims at."""
     entropy: float = 0.0015
     """Weight of the entropy."""
+    settle: float = 0.0
+    """Share of `--minutes` at whose end the aimed divergence and the entropy's weight fall to a tenth."""
     init_std: float = 0.5
     """Standard deviation of the action noise at the start."""
     mirror_loss: float = 0.0
@@ -126,6 +128,7 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "network": network,
             "init_std": options.init_std,
         },
+        "settle": options.settle,
         "fit_steps": 300,
         "critic_iterations": 20,
         "critic": {

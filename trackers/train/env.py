@@ -40,6 +40,8 @@ _PREFILL = 0.5
 """Share of the episodes that start with a history of the present frame; the others start with an empty one."""
 _LOOKAHEAD = (4, 10, 25)
 """Frames ahead of the state whose commands the critic sees."""
+NO_PUSH = 1e3
+"""`since_push` of an episode in which none has struck yet [s]."""
 _VALUE_CLIP = 50.0
 """Largest magnitude of a critic observation."""
 
@@ -161,6 +163,7 @@ class TrackerEnv(VecEnv):
         self._feet, self._foot_vel = zeros(worlds, 2, 3), zeros(worlds, 2, 3)
         self._next_rows = zeros(worlds, self.bank.data.shape[1])
         self._next = self.bank.split(self._next_rows)
+        self.since_push = zeros(worlds)
         self._reward, self._done = zeros(worlds), zeros(worlds, dtype=torch.long)
         self._time_out = zeros(worlds, dtype=torch.bool)
         self._critic_obs: torch.Tensor | None = None
@@ -235,6 +238,7 @@ class TrackerEnv(VecEnv):
         """The new state is judged, ended worlds start again, the next observations are made."""
         self.frame.add_(1)
         self.episode_length_buf.add_(1)
+        self.since_push.add_(TICK)
         motion = self._measure(self._next)
         reward, failed = self._judge(motion)
         over = (self.frame >= self.bank.last.index_select(0, self.frame)) | (
@@ -303,6 +307,7 @@ class TrackerEnv(VecEnv):
             foot_vel=moved,
             action=self._action,
             last_action=self._last_action,
+            since_push=self.since_push,
             finite=finite,
             first=first,
         )
@@ -353,6 +358,7 @@ class TrackerEnv(VecEnv):
         self._foot_vel.masked_fill_(row[:, None], 0.0)
         sim.overflow.masked_fill_(mask, 0)
         self.episode_length_buf.masked_fill_(mask, 0)
+        self.since_push.masked_fill_(mask, NO_PUSH)
         clip = self.bank.clip_of.index_select(0, self.frame)
         bank = self.bank
         sim.place_supports(

@@ -55,6 +55,8 @@ class World(Protocol):
     """The references."""
     frame: torch.Tensor
     """Reference frame of each world, shape [worlds]."""
+    since_push: torch.Tensor
+    """Time since the last push of each world [s], shape [worlds]."""
 
 
 @dataclass(frozen=True)
@@ -176,13 +178,25 @@ def _write_force(
 
 
 def push(env: World, mask: torch.Tensor, every: float, planar: float, vertical: float, turn: float) -> None:
-    """A kick of the base: a jump of its velocity [m/s, rad/s], every `every` seconds on average."""
+    """A kick of the base, every `every` seconds on average: its velocity jumps.
+
+    Args:
+        env: What is pushed.
+        mask: Worlds that may be struck.
+        every: Mean time between two pushes of a world [s].
+        planar: Largest jump over the ground, in any direction [m/s].
+        vertical: Largest jump up or down [m/s].
+        turn: Largest jump of each component of the angular velocity [rad/s].
+    """
     worlds = env.sim.worlds
-    struck = (_chance(env.sim.qpos, TICK / every, worlds) & mask).float()[:, None]
-    jump = uniform(env.sim.qpos, -1.0, 1.0, worlds, 6) * struck
-    env.sim.root_vel[:, :2].add_(jump[:, :2], alpha=planar)
-    env.sim.root_vel[:, 2:].add_(jump[:, 2:3], alpha=vertical)
-    env.sim.root_ang_vel.add_(jump[:, 3:], alpha=turn)
+    struck = _chance(env.sim.qpos, TICK / every, worlds) & mask
+    hit = struck.float()[:, None]
+    flat = torch.nn.functional.normalize(torch.randn(worlds, 2, device=mask.device), dim=1)
+    env.sim.root_vel[:, :2].add_(flat * uniform(env.sim.qpos, 0.0, planar, worlds, 1) * hit)
+    jump = uniform(env.sim.qpos, -1.0, 1.0, worlds, 4) * hit
+    env.sim.root_vel[:, 2:].add_(jump[:, :1], alpha=vertical)
+    env.sim.root_ang_vel.add_(jump[:, 1:], alpha=turn)
+    env.since_push.masked_fill_(struck, 0.0)
 
 
 EVENTS: dict[str, Event] = {
@@ -194,7 +208,7 @@ EVENTS: dict[str, Event] = {
     "action_delay": Event("reset", action_delay, {"share": 0.2}),
     "hand_force": Event("reset", hand_force, {"share": 0.1, "force": 5.0}),
     "trunk_force": Event("reset", trunk_force, {"share": 0.1, "force": 10.0, "resistance": 12.0}),
-    "push": Event("interval", push, {"every": 4.0, "planar": 0.5, "vertical": 0.05, "turn": 0.4}),
+    "push": Event("interval", push, {"every": 5.0, "planar": 1.2, "vertical": 0.05, "turn": 0.5}),
 }
 
 

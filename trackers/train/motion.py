@@ -55,6 +55,8 @@ class Motion:
     """Raw action of this tick, shape [worlds, 29]."""
     last_action: torch.Tensor
     """Raw action of the tick before, shape [worlds, 29]."""
+    since_push: torch.Tensor
+    """Time since the last push [s], long for an episode without one, shape [worlds]."""
     finite: torch.Tensor
     """Whether the measured state is finite, bool, shape [worlds]."""
     first: torch.Tensor = field(repr=False)

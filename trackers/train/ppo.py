@@ -87,6 +87,10 @@ class IterationPPO(PPO):
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
         self.storage.clear()
+        if self.is_multi_gpu:
+            # Gradients are averaged, input statistics are not: each process would read its inputs its own way.
+            for statistic in (*self.actor.buffers(), *self.critic.buffers()):
+                torch.distributed.broadcast(statistic, 0)
         divergence /= self.num_mini_batches
         if self.is_multi_gpu:
             torch.distributed.all_reduce(divergence)

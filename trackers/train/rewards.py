@@ -19,6 +19,8 @@ __all__ = ["REWARDS", "TERMINATION_REWARD", "Term"]
 
 TERMINATION_REWARD = -3.0
 """Reward of an episode's early end, once."""
+LEGS = slice(0, 12)
+"""The legs among the joints, MuJoCo order."""
 _CONTACT_HEIGHT = SOLE_HEIGHT + 0.01
 """A foot whose frame is lower than this stands on the ground [m]."""
 
@@ -87,6 +89,19 @@ def foot_height(m: Motion) -> torch.Tensor:
     return _closeness((m.keys[:, FEET, 2] - m.reference.keys[:, FEET, 2]).square().mean(1), 0.04)
 
 
+def legs(m: Motion) -> torch.Tensor:
+    """Closeness of the legs' joint angles, RMS against 0.08 rad: a mean over all joints hides them among the arms."""
+    return _closeness((m.joint_pos - m.reference.joint_pos)[:, LEGS].square().mean(1), 0.08)
+
+
+def feet(m: Motion) -> torch.Tensor:
+    """Closeness of the feet in the heading frame, RMS distance against 0.08 m.
+
+    Among nine links a foot that stays on the ground through a short kick costs next to nothing.
+    """
+    return _closeness((m.keys[:, FEET] - m.reference.keys[:, FEET]).square().sum(2).mean(1), 0.08)
+
+
 def alive(m: Motion) -> torch.Tensor:
     """One a tick."""
     return torch.ones_like(m.heading)
@@ -130,6 +145,8 @@ REWARDS: dict[str, Term] = {
     "height": Term(height, 1.0),
     "position": Term(position, 0.75),
     "foot_height": Term(foot_height, 0.6),
+    "legs": Term(legs, 1.5),
+    "feet": Term(feet, 1.5),
     "alive": Term(alive, 0.5),
     "action_rate": Term(action_rate, -0.03),
     "foot_slip": Term(foot_slip, -0.15),

@@ -6,6 +6,7 @@ Its log keeps statistics on the device and fetches them once an iteration.
 from __future__ import annotations
 
 import json
+import os
 import signal
 import statistics
 import threading
@@ -26,6 +27,8 @@ from arena_newton.trackers.train.ppo import IterationPPO
 
 __all__ = ["TrackerRunner"]
 
+_SETTLED = 0.1
+"""What is left of the aimed divergence and of the entropy's weight at the end of a time limit."""
 _SEEN = 1e9
 """Observations that the input statistics of a weights file stand for: a training that starts from it leaves them."""
 
@@ -92,6 +95,19 @@ class TrackerRunner(OnPolicyRunner):
         """What each logged iteration measured."""
         self._stop = False
         self._started = False
+
+    def _configure_multi_gpu(self) -> None:
+        """As rsl-rl, which knows GPUs only; processes on the CPU talk through gloo."""
+        processes = int(os.environ.get("WORLD_SIZE", "1"))
+        if processes == 1 or self.device != "cpu":
+            super()._configure_multi_gpu()
+            return
+        self.is_distributed, self.gpu_world_size = True, processes
+        self.gpu_local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+        self.gpu_global_rank = int(os.environ.get("RANK", "0"))
+        ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank, "world_size": processes}
+        self.cfg["multi_gpu"] = ranks
+        torch.distributed.init_process_group(backend="gloo", rank=self.gpu_global_rank, world_size=processes)
 
     def start_from(self, path: Path) -> None:
         """Begin with the network of a weights file; its critic is learnt anew before the network changes.
@@ -208,8 +224,10 @@ class TrackerRunner(OnPolicyRunner):
             self.seconds += now - mark
             self._report(it, first, iterations, collected - mark, now - collected, losses, metrics, batch)
             mark = now
-            if self._should_stop(0.0 < 60.0 * minutes <= now - began):
+            stop, elapsed = self._agree((now - began) / (60.0 * minutes) if minutes > 0.0 else 0.0)
+            if stop:
                 break
+            self._settle(elapsed)
             if self._writes and (it + 1) % self.cfg["save_interval"] == 0:
                 self.save(str(Path(self.logger.log_dir or ".") / f"model_{it + 1}.pt"))
                 mark = time.monotonic()
@@ -222,14 +240,24 @@ class TrackerRunner(OnPolicyRunner):
     def _writes(self) -> bool:
         return self.logger.log_dir is not None and not self.logger.disable_logs
 
-    def _should_stop(self, out_of_time: bool) -> bool:
-        """Whether any process was told to stop or is out of time: all of them end after the same iteration."""
-        stop = bool(self._stop or out_of_time)
-        if not self.is_distributed:
-            return stop
-        flag = torch.tensor(float(stop), device=self.device)
-        torch.distributed.all_reduce(flag)
-        return bool(flag > 0)
+    def _agree(self, elapsed: float) -> tuple[bool, float]:
+        """Whether to stop, and the share of the time limit that has passed: the same answer in every process."""
+        shares = torch.tensor([float(self._stop), elapsed], dtype=torch.float64, device=self.device)
+        if self.is_distributed:
+            torch.distributed.all_reduce(shares, torch.distributed.ReduceOp.MAX)
+            stop, elapsed = shares.tolist()
+        else:
+            stop = float(self._stop)
+        return bool(stop > 0.0 or elapsed >= 1.0), elapsed
+
+    def _settle(self, elapsed: float) -> None:
+        """Towards the end of a time limit smaller and smaller steps, and less noise: what is learnt settles."""
+        share = self.cfg["settle"]
+        if not share:
+            return
+        left = min(max((1.0 - elapsed) / share, _SETTLED), 1.0)
+        self.alg.desired_kl = self.cfg["algorithm"]["desired_kl"] * left
+        self.alg.entropy_coef = self.cfg["algorithm"]["entropy_coef"] * left
 
     def _report(
         self,

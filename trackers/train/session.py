@@ -131,6 +131,7 @@ def check(options: TrainOptions) -> None:
         ("--learning-rate", options.learning_rate, 1e-8, 1),
         ("--desired-kl", options.desired_kl, 1e-6, 10),
         ("--entropy", options.entropy, 0, math.inf),
+        ("--settle", options.settle, 0, 1),
         ("--init-std", options.init_std, 1e-3, 10),
         ("--mirror-loss", options.mirror_loss, 0, math.inf),
         ("--save-interval", options.save_interval, 1, math.inf),
@@ -158,7 +159,7 @@ def check(options: TrainOptions) -> None:
 def _device(name: str) -> str:
     import torch
 
-    if "LOCAL_RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if name != "cpu" and "LOCAL_RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         name = f"cuda:{os.environ['LOCAL_RANK']}"
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"

@@ -12,14 +12,12 @@ import torch
 
 from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.scene import load_scene
+from arena_newton.trackers.motions.library import FIXTURES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = ["Simulation", "share_stream"]
-
-SUPPORTS = ("Seat", "Sill", "Platform")
-"""The lab's fixtures in the order of a library's `support_kind` 1, 2, 3."""
 
 
 def share_stream(device: str) -> None:
@@ -27,6 +25,7 @@ def share_stream(device: str) -> None:
     import warp as wp
 
     if device.startswith("cuda"):
+        wp.set_device(device)
         torch.cuda.set_device(torch.device(device))
         torch.cuda.set_stream(wp.stream_to_torch(device))
 
@@ -114,7 +113,7 @@ class Simulation:
             n: self.scene.link(n) for n in (p.rsplit("/", 1)[1] for p in self.scene.body_ids if "/Robot/" in p)
         }
         """Link name to body index."""
-        self.fixtures = torch.tensor([self.scene.mocap_id(f"/World/{n}") for n in SUPPORTS], device=device)
+        self.fixtures = torch.tensor([self.scene.mocap_id(f"/World/{n}") for n in FIXTURES], device=device)
         """Mocap index of seat, sill and platform, shape [3]."""
         order = self.fixtures.tolist()
         self.parked_pos, self.parked_quat = self.mocap_pos[:, order].clone(), self.mocap_quat[:, order].clone()
@@ -159,7 +158,7 @@ class Simulation:
             box: Centre of the support's top face [m], shape [worlds, 3].
             quat: Orientation of the support wxyz, shape [worlds, 4].
         """
-        for i in range(len(SUPPORTS)):
+        for i in range(len(FIXTURES)):
             used = (kind == i + 1)[:, None]
             place = torch.where(used, box, self.parked_pos[:, i])
             facing = torch.where(used, quat, self.parked_quat[:, i])

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import torch
 
 from arena_newton.trackers.train.motion import Motion
+from arena_newton.trackers.train.references import FEET
 
 __all__ = ["TERMINATIONS", "Bound"]
+
+RECOVERY = 1.5
+"""So long after a push the feet may leave their reference [s]."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,12 @@ def heading(m: Motion) -> torch.Tensor:
     return m.heading_error.abs()
 
 
+def feet(m: Motion) -> torch.Tensor:
+    """Distance of the farther foot from its reference in the heading frame [m]; 0 while a push may ask for steps."""
+    error = (m.keys[:, FEET] - m.reference.keys[:, FEET]).norm(dim=2).amax(1)
+    return torch.where(m.since_push > RECOVERY, error, 0.0)
+
+
 def nonfinite(m: Motion) -> torch.Tensor:
     """1 where the physics state is not finite."""
     return (~m.finite).float()
@@ -52,5 +62,6 @@ TERMINATIONS: dict[str, Bound] = {
     "tilt": Bound(tilt, 0.8),
     "position": Bound(position, 1.0),
     "heading": Bound(heading, 1.0),
+    "feet": Bound(feet, 0.2),
     "nonfinite": Bound(nonfinite, 0.5),
 }

@@ -1,12 +1,13 @@
 """Parts of the training that need no physics."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from arena_newton.trackers.motions import frames, kinematics
-from arena_newton.trackers.train import rotations
+from arena_newton.trackers.train import events, rotations
 from arena_newton.trackers.train.motion import Motion
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS
@@ -46,6 +47,7 @@ def perfect(bank: ReferenceBank, frame: torch.Tensor) -> Motion:
         foot_vel=torch.zeros(n, 2, 3),
         action=torch.zeros(n, 29),
         last_action=torch.zeros(n, 29),
+        since_push=torch.full((n,), 1e3),
         finite=torch.ones(n, dtype=torch.bool),
         first=torch.zeros(n, dtype=torch.bool),
     )
@@ -63,7 +65,7 @@ def test_perfect_tracking_earns_every_positive_weight(bank):
 @pytest.mark.parametrize(
     ("field", "error", "lost"),
     [
-        ("joint_pos", 0.2, {"joint_position"}),
+        ("joint_pos", 0.2, {"joint_position", "legs"}),
         ("velocity_error", 0.25, {"velocity"}),
         ("heading_error", 0.35, {"heading"}),
         ("tilt_error", 0.15, {"tilt"}),
@@ -76,6 +78,40 @@ def test_an_error_costs_its_own_term(bank, field, error, lost):
     worse = dataclasses.replace(motion, **{field: getattr(motion, field) + error})
     fallen = {n for n, t in REWARDS.items() if t.weight > 0.0 and (t.value(worse) < 0.99).any()}
     assert fallen == lost
+
+
+def test_a_foot_that_stays_behind_ends_the_episode_unless_a_push_may_ask_for_steps(bank):
+    """A kick that is left out ends the episode; a foot that catches a push does not."""
+    motion = perfect(bank, torch.tensor([10, 200]))
+    keys = motion.keys.clone()
+    keys[1, 0, 0] -= 0.3
+    worse = dataclasses.replace(motion, keys=keys)
+    bound = TERMINATIONS["feet"]
+    assert (bound.value(worse) > bound.limit).tolist() == [False, True]
+    assert (REWARDS["feet"].value(worse) < 0.5).tolist() == [False, True]
+    pushed = dataclasses.replace(worse, since_push=torch.tensor([0.1, 0.1]))
+    assert not (bound.value(pushed) > bound.limit).any()
+
+
+def test_pushes_strike_as_often_and_as_hard_as_set():
+    """Jumps have any direction and every size up to the largest; a struck world remembers when."""
+    torch.manual_seed(0)
+    worlds = 20000
+    sim = SimpleNamespace(
+        worlds=worlds,
+        qpos=torch.zeros(worlds, 36),
+        root_vel=torch.zeros(worlds, 3),
+        root_ang_vel=torch.zeros(worlds, 3),
+    )
+    env = SimpleNamespace(sim=sim, since_push=torch.full((worlds,), 1e3))
+    mask = torch.arange(worlds) % 2 == 0
+    events.push(env, mask, every=0.04, planar=1.2, vertical=0.0, turn=0.0)
+    speed = sim.root_vel[:, :2].norm(dim=1)
+    struck = env.since_push == 0.0
+    assert (struck == (speed > 0.0)).all() and not struck[~mask].any()
+    assert float(struck[mask].float().mean()) == pytest.approx(0.5, abs=0.02)
+    assert float(speed.max()) <= 1.2 and float(speed[struck].mean()) == pytest.approx(0.6, abs=0.02)
+    assert float(sim.root_vel[struck, :2].mean(0).norm()) < 0.03
 
 
 def test_key_links_are_seen_from_the_heading_frame(library):
