@@ -58,7 +58,7 @@ class RunOptions:
     """The tracker's weights: a .safetensors or official .onnx file (SONIC: a folder or two files with a comma between);
     those that come with the package when none is named."""
     policy: str = "stand"
-    """Policy that decides it: stand, expert, replay:<clip or episode>, remote:<url>."""
+    """Policy that decides it: stand, expert, replay:<clip, or actions of --actions>, remote:<url>."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
@@ -83,6 +83,8 @@ class RunOptions:
     """Write ego and world videos (H.264 MP4), one pair per episode."""
     strip: bool = False
     """Write the 10-frame picture strip of each episode."""
+    actions: bool = False
+    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
     retry_errors: bool = False
@@ -113,6 +115,7 @@ class RunConfig:
     worlds: int
     video: bool
     strip: bool
+    actions: bool
     scenes_hash: str = ""
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str = ""
@@ -231,6 +234,7 @@ def resolve(options: RunOptions) -> RunConfig:
         worlds=options.worlds,
         video=options.video,
         strip=options.strip,
+        actions=options.actions,
     )
     episodes(config)  # names and numbers are wrong at once, before Warp starts
     quiet_warp()

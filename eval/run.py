@@ -21,6 +21,7 @@ from arena_newton.eval import config as configs
 from arena_newton.eval import report
 from arena_newton.eval.config import RunConfig, RunOptions
 from arena_newton.eval.journal import Journal, StorageError, write_atomic
+from arena_newton.eval.recordings import RecordingPolicy
 
 __all__ = ["Factories", "execute", "stored_options"]
 
@@ -255,14 +256,19 @@ def _run_group(
 
             recorder = EpisodeRecorder(folder, video=config.video, strip=config.strip)
 
+        actor = RecordingPolicy(policy, folder / "actions") if config.actions else policy
+
         def on_finish(result: Any) -> None:
+            if isinstance(actor, RecordingPolicy):
+                assert env is not None
+                actor.write(result, env.spec.gym_id)
             media = _media(folder, recorder.label(result.episode)) if recorder is not None else {}
             journal.append(_record(config, result, media))
             left.pop(result.episode.index, None)
             bar.update()
 
         env.run_episodes(
-            policy, episodes, on_finish=on_finish, on_tick=rate.tick, recorder=recorder, max_steps=episodes[0].max_steps
+            actor, episodes, on_finish=on_finish, on_tick=rate.tick, recorder=recorder, max_steps=episodes[0].max_steps
         )
     except (InputError, StorageError):
         raise

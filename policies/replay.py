@@ -1,4 +1,4 @@
-"""The policy that plays a recording: a motion clip, turned into canonical actions, or a file of actions."""
+"""Policies that play recordings: a motion clip turned into canonical actions, a file of actions, recorded episodes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from arena_newton.canonical import ACTION
+from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Observation, Policy, world_mask
 from arena_newton.trackers.motions import load_actions, load_clip
 from arena_newton.trackers.motions.playback import clip_actions, startup_actions
 
-__all__ = ["ReplayPolicy", "from_spec"]
+__all__ = ["ReplayEpisodes", "ReplayPolicy", "from_spec"]
 
 _XY = ACTION["root_xy_delta"]
 
@@ -94,7 +94,75 @@ class ReplayPolicy(Policy):
             self._steps = np.zeros(worlds, dtype=np.int64)
 
 
-def from_spec(argument: str | None) -> ReplayPolicy:
+class ReplayEpisodes(Policy):
+    """Plays each episode's own recording from a folder that `run --actions` wrote, open loop.
+
+    What one tracker made of a policy's actions, another one gets word for word: the difference is the tracker's.
+    """
+
+    chunk_size = 20
+
+    def __init__(self, folder: str | Path):
+        """Read the recordings.
+
+        Args:
+            folder: Files with the arrays `action` [ticks, 40] and `episode_seed`, and the text `task` (a Gym id).
+
+        Raises:
+            InputError: There are none, one is unfit, or two are of the same episode.
+        """
+        self.path = Path(folder)
+        self.name = f"replay-{self.path.parent.name if self.path.name == 'actions' else self.path.name}"
+        self._episodes: dict[tuple[str, int], np.ndarray] = {}
+        files = sorted(self.path.glob("*.npz"))
+        if not files:
+            raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; run --actions writes them")
+        for file in files:
+            actions = load_actions(file)
+            with np.load(file, allow_pickle=False) as arrays:
+                if not {"episode_seed", "task"} <= set(arrays.files):
+                    raise InputError(f"--policy replay:{file}: arrays episode_seed and task are missing")
+                episode = str(arrays["task"]), int(arrays["episode_seed"])
+            if episode in self._episodes:
+                raise InputError(f"--policy replay:{file}: a second recording of episode seed {episode[1]}, keep one")
+            self._episodes[episode] = actions
+        self._playing: list[np.ndarray | None] = []
+        self._asked: list[tuple[str, int]] = []
+        self._steps = np.zeros(0, dtype=np.int64)
+
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
+        """Take the recordings of the worlds in `mask`."""
+        if len(self._steps) != len(seeds):
+            self._steps = np.zeros(len(seeds), dtype=np.int64)
+            self._playing, self._asked = [None] * len(seeds), [("", 0)] * len(seeds)
+        for world in np.flatnonzero(world_mask(mask, len(seeds))):
+            self._asked[world] = (tasks[world], int(seeds[world]))
+            self._playing[world] = self._episodes.get(self._asked[world])
+            self._steps[world] = 0
+
+    def act(self, observation: Observation) -> Chunk:
+        """The next actions of the worlds that ask; a world without a recording gets an error."""
+        worlds = len(observation.state)
+        actions = np.zeros((worlds, self.chunk_size, ACTION_WIDTH), dtype=np.float32)
+        errors = {}
+        for world in np.flatnonzero(world_mask(observation.mask, worlds)):
+            recording = self._playing[world]
+            if recording is None:
+                task, seed = self._asked[world]
+                errors[int(world)] = f"{self.path}: no recording of {task}, episode seed {seed}"
+                continue
+            ticks = self._steps[world] + np.arange(self.chunk_size)
+            actions[world] = recording[np.minimum(ticks, len(recording) - 1)]
+            actions[world, ticks >= len(recording), _XY] = 0.0
+            self._steps[world] += self.chunk_size
+        return Chunk(actions, errors)
+
+    def describe(self) -> dict[str, Any]:
+        """Folder and number of episodes."""
+        return {"name": self.name, "folder": self.path.name, "episodes": len(self._episodes)}
+
+
+def from_spec(argument: str | None) -> ReplayPolicy | ReplayEpisodes:
     """Make the policy for `--policy replay:<path>`.
 
     Raises:
@@ -102,4 +170,4 @@ def from_spec(argument: str | None) -> ReplayPolicy:
     """
     if not argument:
         raise InputError("--policy replay: needs a file, as in replay:walk.pkl or replay:actions.npz")
-    return ReplayPolicy(argument)
+    return ReplayEpisodes(argument) if Path(argument).is_dir() else ReplayPolicy(argument)

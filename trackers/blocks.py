@@ -5,16 +5,20 @@ and a walking robot amplifies that to another trajectory. Rows are therefore pad
 Which size leaves a row's bits alone wherever it stands in a block depends on the network, the library and the
 processor, so it is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it
 replaces the separate ones. All of it runs on one thread: results then do not depend on the number of threads either,
-and a second thread loses more than it wins in an evaluation, where it has to fetch the weights anew each tick. The
-network is traced, which takes Python out from between its operations. On other devices the batch runs whole, without
-that promise.
+and a second thread loses more than it wins in an evaluation, where it has to fetch the weights anew each tick.
+
+A network is compiled by ONNX Runtime, whose products of a few rows cost little more than reading the weights and give
+a row the same bits among any others. Where that fails it is traced, which takes Python out from between its operations.
+On other devices the batch runs whole, without that promise.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import warnings
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 
@@ -22,6 +26,10 @@ __all__ = ["BLOCK_SIZES", "BlockRunner"]
 
 BLOCK_SIZES = (4, 8, 16, 32)
 """Block sizes tried, in this order; rows run one at a time where none keeps the bits."""
+_COMPILED_SIZES = (1, 2, 4)
+"""Block sizes tried of a compiled network."""
+_MERGED = (2, 3, 5, 8, 13, 20, 32)
+"""Products of so many blocks must give a block's bits before a compiled network may run as one product of any size."""
 
 _PROBE_SEED = 20240
 _WARM_UP = 3
@@ -38,6 +46,35 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def _compiled(network: Network, in_width: int) -> Network | None:
+    """The network on ONNX Runtime, on one thread, or None where that is impossible or changes its results."""
+    if not isinstance(network, torch.nn.Module):
+        return None
+    import onnxruntime
+
+    probe = torch.randn(8, in_width, generator=torch.Generator().manual_seed(8))
+    file: Any = io.BytesIO()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")  # the exporter that needs no further package is deprecated
+            torch.onnx.export(
+                network.eval(), (probe,), file, dynamo=False, input_names=["obs"], output_names=["action"],
+                dynamic_axes={"obs": {0: "rows"}, "action": {0: "rows"}},
+            )  # fmt: skip
+            session = onnxruntime.InferenceSession(file.getvalue(), options, providers=["CPUExecutionProvider"])
+
+            def run(rows: torch.Tensor) -> torch.Tensor:
+                return torch.from_numpy(session.run(None, {"obs": rows.numpy()})[0])
+
+            torch.testing.assert_close(run(probe), network(probe), rtol=1e-4, atol=1e-5)
+    except Exception:  # exporter and runtime raise what they like; the traced network stands in
+        return None
+    return run
 
 
 def _traced(network: Network, in_width: int, rows: int) -> Network | None:
@@ -117,6 +154,17 @@ class BlockRunner:
     def _find_plan(self) -> tuple[int, bool]:
         generator = torch.Generator().manual_seed(_PROBE_SEED)
         width = self._buffer.shape[1]
+        compiled = _compiled(self.network, width)
+        if compiled is not None:
+            for block in _COMPILED_SIZES:
+                rows = torch.randn(block * max(_MERGED), width, generator=generator)
+                blocks = rows.split(block)
+                expected = torch.cat([compiled(part.clone()) for part in blocks])
+                turned = torch.cat([torch.roll(compiled(torch.roll(part, 1, 0)), -1, 0) for part in blocks])
+                whole = (torch.equal(compiled(rows[: n * block].clone()), expected[: n * block]) for n in _MERGED)
+                if torch.equal(turned, expected) and all(whole):
+                    self._product = compiled
+                    return block, True
         self._product = _traced(self.network, width, max(BLOCK_SIZES)) or self.network
         for block in BLOCK_SIZES:
             # The choice must be the same for every number of worlds: it looks at one block only.

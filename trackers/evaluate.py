@@ -119,9 +119,11 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
         cells = [cell for cell in cells if cell.goal is None] + goals(count, args.seed)
     cells += clip_cells(args.clips)
     if args.only:
-        cells = [c for c in cells if any(word in c.name or word == c.group for word in args.only)]
-        if not cells:
-            raise InputError(f"--only {' '.join(args.only)}: no such cell; --list prints them")
+        kept = {word: [c for c in cells if word in c.name or word == c.group] for word in args.only}
+        for word, matches in kept.items():
+            if not matches:
+                raise InputError(f"--only {word}: no such cell; --list prints them")
+        cells = [c for c in cells if any(c in matches for matches in kept.values())]
     return cells
 
 

@@ -21,6 +21,7 @@ import torch
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import MUJOCO_JOINTS, DriveGains
+from arena_newton.trackers import networks
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.blocks import BlockRunner
 
@@ -101,6 +102,8 @@ class FrontEnd(abc.ABC):
     graphable: bool = False
     """Whether a tick on CUDA is the same operations on the same buffers each time, so that a CUDA graph may hold it."""
 
+    device: torch.device = torch.device("cpu")
+    """Where the buffers live; set by `bind`."""
     obs: torch.Tensor
     """The observation's buffer, float32, shape [worlds, obs_width]."""
     last_action: torch.Tensor
@@ -218,10 +221,14 @@ class NetworkTracker(Tracker):
             front_end: Front end of its interface and action form.
             checkpoint: The file.
         """
+        network = weights.network.deployed()
+        if weights.symmetric:
+            obs, action = front_end.mirror_obs(), front_end.mirror_action()
+            network = networks.Symmetric(network, (obs.index, obs.sign), (action.index, action.sign)).eval()
         NetworkTracker.__init__(
             self,
             front_end,
-            weights.network.deployed(),
+            network,
             checkpoint=str(checkpoint),
             checkpoint_hash=weights.sha256[:12],
         )
@@ -236,9 +243,15 @@ class NetworkTracker(Tracker):
             self.network.to(device)
         self._runner = BlockRunner(self.network, self.front_end.obs_width, worlds, device)
         self.front_end.bind(worlds, device, self._runner.input)
-        graphable = device.type == "cuda" and self.front_end.graphable and isinstance(self.network, torch.nn.Module)
-        self._graph = _TickGraph(self._tick, worlds, device) if graphable else None
+        self._graph = _TickGraph(self._tick, worlds, device) if device.type == "cuda" and self._graphable else None
         self.reset()
+
+    @property
+    def _graphable(self) -> bool:
+        """Whether a CUDA graph may hold a tick: everything runs on the device, by the same operations each time."""
+        if not (self.front_end.graphable and isinstance(self.network, torch.nn.Module)):
+            return False
+        return not any(getattr(module, "on_host", False) for module in self.network.modules())
 
     @property
     def last_action(self) -> torch.Tensor:

@@ -226,6 +226,42 @@ class _DeployedSonic(nn.Module):
         return self.decoder(torch.cat((latent, obs[:, SONIC_ENCODER_WIDTH:]), 1))
 
 
+class Symmetric(nn.Module):
+    """The mean of a network's two ways to an action: straight, and mirrored there and back.
+
+    A network has a preferred side that no training takes away wholly; the mean has none, whatever the network.
+    """
+
+    obs_index: torch.Tensor
+    obs_sign: torch.Tensor
+    action_index: torch.Tensor
+    action_sign: torch.Tensor
+
+    def __init__(
+        self,
+        network: nn.Module,
+        obs: tuple[torch.Tensor, torch.Tensor],
+        action: tuple[torch.Tensor, torch.Tensor],
+    ):
+        """Join network and mirrors.
+
+        Args:
+            network: Maps [rows, obs_width] to [rows, action_width], each row by itself.
+            obs: Index and sign of an observation's mirror image, each of shape [obs_width].
+            action: Index and sign of a raw action's mirror image, each of shape [action_width].
+        """
+        super().__init__()
+        self.network = network
+        for name, tensor in zip(("obs_index", "obs_sign", "action_index", "action_sign"), (*obs, *action), strict=True):
+            self.register_buffer(name, tensor)
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Raw actions, shape [rows, 29]."""
+        both = torch.cat((obs, obs.index_select(1, self.obs_index) * self.obs_sign))
+        straight, mirrored = self.network(both).chunk(2)
+        return (straight + mirrored.index_select(1, self.action_index) * self.action_sign) * 0.5
+
+
 _NETWORKS: dict[str, type[Twist2Net] | type[SonicNet]] = {"twist2": Twist2Net, "sonic": SonicNet}
 
 

@@ -23,6 +23,9 @@ _PROBE_ROWS = 2
 class OnnxSession(torch.nn.Module):
     """One network in onnxruntime: [rows, in_width] to [rows, out_width], float32."""
 
+    on_host = True
+    """It computes on the CPU whatever the device of its rows: no CUDA graph can hold it."""
+
     def __init__(self, path: str | Path, *, in_width: int, out_width: int, flag: str = "--checkpoint"):
         """Open the file.
 

@@ -1,7 +1,7 @@
 """Weights of our own trackers: one `.safetensors` file that says how it wants to be driven.
 
 The file holds the network's tensors and one metadata entry, `arena_newton`, a JSON object: format, interface, widths,
-action form, drive, physics rate and the card (how the weights came to be). Nothing in it is code.
+action form, drive, physics rate, symmetry and the card (how the weights came to be). Nothing in it is code.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ class Weights:
     """Physics rate that it was trained at."""
     card: dict[str, Any] = field(default_factory=dict)
     """How the weights came to be: `commit`, `command`, `samples`, `minutes`, `data`, `licences`, `metrics`, …"""
+    symmetric: bool = False
+    """Whether the tracker answers the mean of both ways to a mirrored action (`networks.Symmetric`)."""
     sha256: str = ""
     """SHA-256 of the file, after loading."""
 
@@ -58,6 +60,7 @@ class Weights:
             "action_form": form,
             "drive": drive,
             "physics": physics,
+            "symmetric": self.symmetric,
             "commit": self.card.get("commit"),
             "card": self.card,
         }
@@ -158,6 +161,7 @@ def load(path: str | Path, interface: str | None = None, *, flag: str = "--check
             action_form=_action_form(meta["action_form"]),
             drive=_drive(meta["drive"]),
             physics=_physics(meta["physics"]),
+            symmetric=bool(meta.get("symmetric", False)),
             card=dict(meta.get("card") or {}),
             sha256=hashlib.sha256(data).hexdigest(),
         )

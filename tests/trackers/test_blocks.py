@@ -41,6 +41,25 @@ def test_bit_identity(shape):
         torch.set_num_threads(before)
 
 
+def test_modules_run_compiled_and_in_one_product():
+    """Networks of modules need no blocks: every row has its bits in any product."""
+    runner = BlockRunner(mlp(451, 64, 29), 451, 20)
+    assert runner.plan() == (1, True)
+    rows = torch.randn(20, 451)
+    runner.input.copy_(rows)
+    assert runner.run().shape == (20, 29)
+
+
+def test_a_module_that_cannot_be_compiled_runs_all_the_same(monkeypatch):
+    """Where the exporter fails, blocks of a traced network give the same promise."""
+    monkeypatch.setattr(torch.onnx, "export", lambda *a, **k: 1 / 0)
+    network, rows = mlp(451, 64, 29), torch.randn(20, 451)
+    whole = outputs(network, rows)
+    torch.testing.assert_close(whole, network(rows), atol=1e-5, rtol=1e-4)
+    for row in range(20):
+        assert torch.equal(outputs(network, rows[row : row + 1]), whole[row : row + 1])
+
+
 def test_network_that_mixes_positions():
     """Where no block size keeps a row's bits, rows run one at a time and still do not depend on each other."""
 

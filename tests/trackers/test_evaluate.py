@@ -378,6 +378,7 @@ def test_command_line_writes_tables_side_by_side(tmp_path, capsys):
         (["--tracker", "nowhere:factory"], "nowhere"),
         (["--tracker", "pd", "--tracker", "pd"], "--label"),
         (["--tracker", "pd", "--only", "nothing"], "no such cell"),
+        (["--tracker", "pd", "--only", "stand", "nothing"], "--only nothing: no such cell"),
         (["--tracker", "pd", "--rollouts", "0"], "--rollouts 0"),
         (["--tracker", "pd", "--clips", "absent.pkl"], "absent.pkl"),
         (["--tracker", "pd", "--film"], "--out"),

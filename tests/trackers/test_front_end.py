@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand
@@ -80,3 +81,24 @@ def test_action_forms():
     for arguments in (("torque", (1.0,) * 29), ("default", (1.0,)), ("residual", (1.0,) * 29, -1.0)):
         with pytest.raises(InputError, match="action form"):
             ActionForm(*arguments)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("name", ["twist2", "sonic"])
+def test_graph_of_a_tick_is_the_tick(name):
+    """On CUDA a tick held in a graph gives the targets of the tick run as it is, resets in between included."""
+    held, plain = (trackers.get(name) for _ in range(2))
+    for tracker in (held, plain):
+        tracker.bind(5, "cuda")
+    plain._graph = None
+    assert held._graph is not None
+    rng = torch.Generator(device="cuda").manual_seed(0)
+    for tick in range(6):
+        c = [torch.randn(5, n, generator=rng, device="cuda") for n in (35, 29, 29, 4)]
+        s = [torch.randn(5, n, generator=rng, device="cuda") for n in (4, 3, 29, 29)]
+        c[3], s[0] = torch.nn.functional.normalize(c[3]), torch.nn.functional.normalize(s[0])
+        targets = [t.step(TrackerCommand(*c), RobotState(*s)).clone() for t in (held, plain)]
+        torch.testing.assert_close(*targets)
+        if tick == 3:
+            for tracker in (held, plain):
+                tracker.reset(torch.tensor([True, False, False, True, False], device="cuda"))

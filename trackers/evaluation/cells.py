@@ -116,7 +116,7 @@ def _contact() -> list[Cell]:
     for speed in (1.5, 2.5, 3.5):
         cells.append(_cell(f"kick {speed:g}", "kick", p.stand(0.5) + p.kick("right", speed, pause=1.0)))
     kick = p.stand(0.5) + p.kick("right", 3.5, pause=1.0)
-    cells.append(_cell("ball, standing kick", "ball", kick, ball=Ball((0.30, 0.34), RIGHT_FOOT)))
+    cells.append(_cell("ball, standing kick", "ball", kick, ball=Ball((0.26, 0.30), RIGHT_FOOT)))
     through = p.walk(0.6, seconds=4.5, pause=2.5)
     cells.append(_cell("ball, walk through 0.6", "ball", through, ball=Ball((1.0, 1.6), RIGHT_FOOT)))
     for z in (0.05, 0.07, 0.09):

@@ -38,12 +38,13 @@ PLACED = (0.004, 0.02)
 """A walk ends when both feet are so near to their places [m, rad]."""
 KICK_SHIFT, KICK_WIND, KICK_RETURN, KICK_SETTLE = 1.2, 0.4, 0.6, 1.2
 """Times of a kick's phases around the swing [s]; a faster shift would need a support beside the standing foot."""
-KICK_BACK, KICK_FRONT = 0.18, 0.24
+KICK_BACK, KICK_FRONT = 0.20, 0.24
 """Ends of the swing behind and before the stance [m]."""
 KICK_TOE = (0.45, -0.25)
 """Pitch of the foot there [rad], toes down positive: within the ankle's range."""
-KICK_LIFT, KICK_LOW = 0.07, 0.04
-"""Height of the foot at the end of the wind-up and of the swing [m]."""
+KICK_LIFT, KICK_LOW = 0.10, 0.09
+"""Height of the foot at the end of the wind-up and of the swing [m]: it meets a ball at its middle. 5 cm lower it
+scoops the ball up, and a third of the speed goes there."""
 
 
 def smooth(share: torch.Tensor) -> torch.Tensor:

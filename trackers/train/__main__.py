@@ -1,4 +1,4 @@
-"""Command line: ``python -m arena_newton.trackers.train [flags]`` and ``... export CHECKPOINT --out FILE``."""
+"""Command line: ``python -m arena_newton.trackers.train [flags]``, with subcommands ``export`` and ``curves``."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
 
     def work() -> None:
-        if arguments and arguments[0] == "export":
-            _export(arguments[1:])
+        if arguments and arguments[0] in ("export", "curves"):
+            (_export if arguments[0] == "export" else _curves)(arguments[1:])
             return
         options = tyro.cli(TrainOptions, args=arguments, prog=PROG)
         from arena_newton.quiet import quiet_warp
@@ -53,6 +53,17 @@ def _export(arguments: Sequence[str]) -> None:
         raise InputError(f"export: name the checkpoint: {PROG} export CHECKPOINT --out FILE.safetensors")
     out = export(Path(arguments[0]), tyro.cli(ExportOptions, args=arguments[1:], prog=f"{PROG} export"))
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB) and its card")
+
+
+def _curves(arguments: Sequence[str]) -> None:
+    import tyro
+
+    from arena_newton.trackers.train.curves import CurveOptions, draw
+
+    options = tyro.cli(CurveOptions, args=list(arguments), prog=f"{PROG} curves")
+    if not options.runs:
+        raise InputError(f"curves: name the folders of trainings: {PROG} curves RUN [RUN ...] --out FILE.png")
+    print(f"wrote {draw(options.runs, options.out)}")
 
 
 if __name__ == "__main__":

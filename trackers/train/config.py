@@ -53,7 +53,7 @@ class TrainOptions:
     logger: Literal["tensorboard", "wandb"] = "tensorboard"
     """Where curves go."""
     action_form: Literal["auto", "residual", "default"] = "auto"
-    """Raw actions correct the reference (residual) or a default pose; auto: twist2 residual, sonic default."""
+    """Raw actions correct the reference (residual, auto) or a default pose."""
     rewards: dict[str, float] = field(default_factory=dict)
     """Other weights for reward terms, by name."""
     randomise: bool = True

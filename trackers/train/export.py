@@ -11,8 +11,9 @@ from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
     from arena_newton.robot import DriveGains
+    from arena_newton.trackers.weights_file import Weights
 
-__all__ = ["ExportOptions", "export"]
+__all__ = ["ExportOptions", "export", "write"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,9 @@ class ExportOptions:
     """JSON file of an evaluation, for the card."""
     note: str = ""
     """A sentence for the card."""
+    symmetric: bool = True
+    """The tracker answers the mean of an action and the mirrored action of the mirrored observation: training leaves a
+    preferred side, and a walk whose command has no heading turns that way."""
 
 
 def export(checkpoint: Path, options: ExportOptions) -> Path:
@@ -76,13 +80,25 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         action_form=ActionForm(form["kind"], tuple(form["scale"]), form["clip"]),
         drive=_drive(drive),
         physics=PhysicsRate(**physics),
-        card=card,
+        symmetric=options.symmetric,
+        card=card | {"symmetric": options.symmetric},
     )
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    weights_file.save(options.out, weights)
-    options.out.with_suffix(".json").write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
-    options.out.with_suffix(".md").write_text(_markdown(card))
-    return options.out
+    return write(weights, options.out)
+
+
+def write(weights: Weights, out: Path) -> Path:
+    """Write a weights file and its card beside it, as .json and .md; returns the file.
+
+    Raises:
+        InputError: A file cannot be written.
+    """
+    from arena_newton.trackers import weights_file
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    weights_file.save(out, weights)
+    out.with_suffix(".json").write_text(json.dumps(weights.card, indent=2, sort_keys=True) + "\n")
+    out.with_suffix(".md").write_text(_markdown(dict(weights.card)))
+    return out
 
 
 def _figures(metrics: dict[str, Any]) -> dict[str, Any]:
@@ -111,9 +127,12 @@ def _markdown(card: dict[str, Any]) -> str:
         "iterations": card["iterations"],
         "worlds": f"{card['worlds']} x {card['processes']} processes",
         "seed": card["seed"],
+        "answers": "mean of both ways to a mirrored action" if card.get("symmetric") else "the network as it is",
         "licences of the data": ", ".join(f"{name} ({count} clips)" for name, count in card["licences"].items()),
         "sources of the data": "; ".join(card["data"]["sources"]),
     }
+    if started := card.get("started_from"):
+        rows["started from"] = f"the weights of commit {started}"
     lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
     lines += ["## References", "", "| family | clips | minutes |", "|---|---|---|"]
     lines += [f"| {name} | {f['clips']} | {f['minutes']} |" for name, f in card["data"]["families"].items()]

@@ -41,8 +41,7 @@ def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveG
     kind: type[FrontEnd] = sonic.SonicFrontEnd if tracker == "sonic" else twist2.Twist2FrontEnd
     drive = SONIC_DRIVE if tracker == "sonic" else TWIST2_DRIVE
     default: ActionForm = sonic.SONIC_FORM if tracker == "sonic" else twist2.OFFICIAL_FORM
-    wanted = ("default" if tracker == "sonic" else "residual") if action_form == "auto" else action_form
-    form = residual_form(drive) if wanted == "residual" else dataclasses.replace(default, clip=10.0)
+    form = dataclasses.replace(default, clip=10.0) if action_form == "default" else residual_form(drive)
     return kind(form), drive, PhysicsRate(dt=0.005, substeps=4)
 
 

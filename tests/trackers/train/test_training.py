@@ -1,9 +1,13 @@
 """Training end to end on the CPU: 8 worlds, engine `warp`."""
 
 import dataclasses
+import json
+import subprocess
+import sys
 
 import pytest
 import torch
+from PIL import Image
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
@@ -16,6 +20,7 @@ from arena_newton.trackers.train.env import EnvConfig, TrackerEnv
 from arena_newton.trackers.train.export import ExportOptions, export
 from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, read_checkpoint
+from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
 
@@ -183,6 +188,80 @@ def test_export_is_what_was_trained(env, tmp_path):
     assert weights.card["samples"] == 8 * WORLDS and weights.card["licences"] == {"Apache-2.0": 2}
     card = out.with_suffix(".md").read_text()
     assert "A test." in card and "| stand | 1 | 0.1 |" in card
+
+
+def test_exported_tracker_has_no_preferred_side(env, tmp_path):
+    """In a mirrored world the exported tracker gives the mirrored targets, though its network alone does not."""
+    runner = make_runner(env, str(tmp_path))
+    runner.learn(1)
+    for symmetric in (True, False):
+        out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
+        tracker = Twist2Tracker(out)
+        mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
+        seen = env.get_observations()["actor"]
+        tracker.bind(2 * WORLDS)
+        tracker.observation().copy_(torch.cat([seen, mirror[0](seen)]))
+        straight, mirrored = tracker._runner.run().chunk(2)
+        difference = (mirror[1](straight) - mirrored).abs().max()
+        assert (difference < 1e-5) if symmetric else (difference > 1e-3)
+        assert ("mean of both ways" in out.with_suffix(".md").read_text()) == symmetric
+
+
+def test_time_limit_lets_the_training_settle(env):
+    """Towards the end of `--minutes` the aimed divergence and the entropy fall to a tenth; without it they stay."""
+    runner = make_runner(env, settle=0.5, desired_kl=0.02, entropy=0.01)
+    for elapsed, left in ((0.2, 1.0), (0.75, 0.5), (0.99, 0.1)):
+        runner._settle(elapsed)
+        assert runner.alg.desired_kl == pytest.approx(0.02 * left)
+        assert runner.alg.entropy_coef == pytest.approx(0.01 * left)
+    plain = make_runner(env, desired_kl=0.02)
+    plain._settle(0.99)
+    assert plain.alg.desired_kl == 0.02
+
+
+def test_two_processes_train_one_network(library, tmp_path):
+    """Torchrun on the CPU: both processes end after the same iteration with the same network and input statistics."""
+    library.save(tmp_path / "library.npz")
+    flags = ["--device", "cpu", "--worlds", "4", "--steps", "4", "--iterations", "2", "--no-mirror"]
+    flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import os, sys, torch\n"
+        "from arena_newton.trackers.train import session\n"
+        "from arena_newton.trackers.train.config import TrainOptions\n"
+        "import tyro\n"
+        "options = tyro.cli(TrainOptions, args=sys.argv[1:])\n"
+        "runner = session.build(options)\n"
+        "runner.learn(options.iterations)\n"
+        f"torch.save(runner.alg.get_policy().state_dict(), {str(tmp_path)!r} + '/rank' + os.environ['RANK'])\n"
+        "torch.distributed.destroy_process_group()\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    done = subprocess.run([*command, *flags], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    one, two = (torch.load(tmp_path / f"rank{k}", weights_only=True) for k in (0, 1))
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        assert torch.equal(value, two[name]), name
+    row = json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[0])
+    assert row["samples"] == 2 * 4 * 4
+
+
+def test_curves(env, tmp_path, capsys):
+    """A picture of one training or several; a folder without a log is named."""
+    runner = make_runner(env, str(tmp_path / "a"), log_interval=1)
+    runner.learn(2)
+    out = tmp_path / "curves.png"
+    assert command_line.main(["curves", str(tmp_path / "a"), str(tmp_path / "a"), "--out", str(out)]) == 0
+    with Image.open(out) as picture:
+        assert picture.width > 1000 and len(set(picture.convert("L").resize((60, 30)).getdata())) > 10
+    for arguments, words in (
+        (["curves", str(tmp_path / "b")], "b/progress.jsonl: cannot be read"),
+        (["curves"], "name the folders"),
+        (["curves", str(tmp_path / "a"), "--out", str(tmp_path / "a.txt")], "expected .png"),
+    ):
+        assert command_line.main(arguments) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_start_from_weights(env, tmp_path):

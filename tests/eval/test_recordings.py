@@ -1,0 +1,78 @@
+"""`run --actions` keeps what a policy decided; `replay:` plays each episode's own recording."""
+
+import json
+
+import numpy as np
+import pytest
+
+from arena_newton import policies
+from arena_newton.errors import InputError
+from arena_newton.eval import __main__ as command_line
+from arena_newton.interfaces import Observation
+
+RUN = ["--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco", "--max-steps", "50", "--worlds", "2"]
+
+
+def journal(folder):
+    return [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+
+
+def ends(folder):
+    return {r["episode_seed"]: (r["outcome"], r["steps"], r["margin"]) for r in journal(folder)}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A run of the expert in closed loop, with its actions."""
+    out = tmp_path_factory.mktemp("recorded") / "run"
+    assert command_line.main(["run", *RUN, "--policy", "expert", "--actions", "--out", str(out)]) == 0
+    return out
+
+
+def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path):
+    """Open loop, the same tracker comes to the same end, margin included, with other worlds beside it."""
+    files = sorted(p.name for p in (recorded / "actions").iterdir())
+    assert files == ["boxing_base_s3_r0.npz", "boxing_base_s3_r1.npz"]
+    with np.load(recorded / "actions" / files[0]) as arrays:
+        assert arrays["action"].shape == (50, 40) and str(arrays["task"]).startswith("Isaac-Move-Boxing")
+    out = tmp_path / "again"
+    replay = ["--policy", f"replay:{recorded / 'actions'}"]
+    assert command_line.main(["run", *RUN[:-1], "1", *replay, "--out", str(out)]) == 0
+    assert ends(out) == ends(recorded)
+
+
+def test_another_tracker_gets_the_same_actions(recorded, tmp_path):
+    """The swap: sonic plays what was decided while twist2 walked, and ends elsewhere."""
+    out = tmp_path / "swap"
+    replay = ["--policy", f"replay:{recorded / 'actions'}", "--tracker", "sonic"]
+    assert command_line.main(["run", *RUN, *replay, "--out", str(out)]) == 0
+    assert {r["outcome"] for r in journal(out)} <= {"timeout", "fall", "success"}
+    assert ends(out) != ends(recorded)
+
+
+def test_an_episode_without_a_recording_is_an_error_of_its_own(recorded):
+    """It names task and seed; the other worlds go on."""
+    policy = policies.get(f"replay:{recorded / 'actions'}")
+    seed = journal(recorded)[0]["episode_seed"]
+    with np.load(recorded / "actions" / "boxing_base_s3_r0.npz") as arrays:
+        task = str(arrays["task"])
+    policy.reset([seed, seed + 1], [task, task])
+    chunk = policy.act(Observation(np.zeros((2, 64)), None, np.array([True, True]), "boxing", task, ""))
+    assert list(chunk.errors) == [1] and f"{task}, episode seed {seed + 1}" in chunk.errors[1]
+    assert np.isfinite(chunk.actions).all() and chunk.actions[0].any()
+
+
+def test_unfit_folders_are_refused(recorded, tmp_path):
+    """No recordings, no seed in them, or two of one episode."""
+    with pytest.raises(InputError, match="no recordings"):
+        policies.get(f"replay:{tmp_path}")
+    source = recorded / "actions" / "boxing_base_s3_r0.npz"
+    for name in ("a.npz", "b.npz"):
+        (tmp_path / name).write_bytes(source.read_bytes())
+    with pytest.raises(InputError, match="b.npz: a second recording of episode seed"):
+        policies.get(f"replay:{tmp_path}")
+    (tmp_path / "b.npz").unlink()
+    with np.load(source) as arrays:
+        np.savez(tmp_path / "c.npz", action=arrays["action"])
+    with pytest.raises(InputError, match="c.npz: arrays episode_seed and task are missing"):
+        policies.get(f"replay:{tmp_path}")

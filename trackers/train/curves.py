@@ -1,0 +1,106 @@
+"""Curves of trainings as one picture, from their `progress.jsonl`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from arena_newton.errors import InputError
+
+__all__ = ["PANELS", "CurveOptions", "draw", "read"]
+
+PANELS: tuple[tuple[str, str, bool], ...] = (
+    ("Train/reward_per_s", "reward a second", False),
+    ("Train/seconds_between_ends", "time between early ends [s]", True),
+    ("Error/legs_rad", "leg joints, RMS error [rad]", False),
+    ("Error/velocity_m_s", "root velocity error [m/s]", False),
+    ("std", "standard deviation of the action noise", False),
+    ("learning_rate", "learning rate", True),
+)
+"""What is drawn: name in the log, title, logarithmic or not."""
+_SMOOTH = 15
+"""Points of the running mean."""
+
+
+@dataclass(frozen=True)
+class CurveOptions:
+    """Draw the curves of trainings over each other."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of trainings (their --log-dir), or progress.jsonl files."""
+    out: Path = Path("curves.png")
+    """Picture: .png, .svg or .pdf."""
+
+
+def read(folder: Path) -> list[dict[str, Any]]:
+    """Logged iterations of a training.
+
+    Raises:
+        InputError: The folder holds no readable log.
+    """
+    path = folder if folder.suffix == ".jsonl" else folder / "progress.jsonl"
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as error:
+        raise InputError(f"curves {path}: cannot be read ({error.strerror})") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            if number < len(lines):
+                raise InputError(f"curves {path}: line {number} is not JSON") from None
+    missing = [name for name, _, _ in PANELS if not rows or name not in rows[-1]]
+    if missing:
+        raise InputError(f"curves {path}: no logged iterations with {missing[0]}")
+    return rows
+
+
+def draw(folders: Sequence[Path], out: Path) -> Path:
+    """Draw trainings over each other; the thin lines are what was logged, the thick ones running means.
+
+    Args:
+        folders: Their folders, or log files.
+        out: Picture, `.png`, `.svg` or `.pdf`.
+
+    Raises:
+        InputError: A log or the picture's path is unfit.
+    """
+    if out.suffix not in (".png", ".svg", ".pdf"):
+        raise InputError(f"--out {out}: expected .png, .svg or .pdf")
+    runs = {folder.stem if folder.suffix == ".jsonl" else folder.name: read(folder) for folder in folders}
+    import matplotlib as mpl
+    import numpy as np
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(2, 3, figsize=(13.0, 6.5), layout="constrained")
+    for axis, (name, title, logarithmic) in zip(axes.flat, PANELS, strict=True):
+        for k, (label, rows) in enumerate(runs.items()):
+            minutes = np.array([row["seconds"] for row in rows]) / 60.0
+            values = np.array([row[name] for row in rows])
+            weights = np.ones(min(_SMOOTH, len(values)))
+            mean = np.convolve(values, weights, "same") / np.convolve(np.ones_like(values), weights, "same")
+            axis.plot(minutes, values, color=f"C{k}", alpha=0.25, linewidth=0.8)
+            axis.plot(minutes, mean, color=f"C{k}", label=label)
+        axis.set_title(title, fontsize=10)
+        axis.grid(alpha=0.3)
+        if logarithmic:
+            axis.set_yscale("log")
+    for axis in axes[1]:
+        axis.set_xlabel("minutes of training")
+    axes[0, 0].legend()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(out, dpi=110)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+    finally:
+        pyplot.close(figure)
+    return out
