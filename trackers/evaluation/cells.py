@@ -122,6 +122,10 @@ def _contact() -> list[Cell]:
     for z in (0.05, 0.07, 0.09):
         over = p.stand(0.3) + p.step_over(seconds=5.0)
         cells.append(_cell(f"sill {z:.2f}", "sill", over, support=Placed("Sill", z)))
+    for z in (0.06, 0.10):
+        cells.append(_cell(f"platform {z:.2f}", "platform", p.step_up(z), support=Placed("Platform", z)))
+    down = p.step_up(0.10, pairs=3, down=True)
+    cells.append(_cell("platform 0.10, up and down", "platform", down, support=Placed("Platform", 0.10)))
     for payload in (0.0, 1.0, 2.0):
         walk, start = p.carry(0.3, seconds=7.0), CARRY_WALK + 1.0
         name = f"carry {payload:g} kg a hand, walk 0.3"

@@ -18,6 +18,7 @@ from arena_newton.trackers.evaluation.measure import Meter, Reference
 from arena_newton.trackers.evaluation.suite import Cell, Tables, tabulate
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 from arena_newton.trackers.motions.library import FIXTURES
+from arena_newton.trackers.motions.programs import place_platform
 
 if TYPE_CHECKING:
     from arena_newton.trackers.base import Tracker
@@ -110,7 +111,14 @@ def _supports(plan: Plan, tables: Tables) -> dict[str, np.ndarray]:
     for i, cell in enumerate(plan.cells):
         if cell.support is not None:
             x = cell.support.x
-            if x is None:
+            if x is None and cell.support.name == "Platform":
+                feet = tables.feet[None, : cell.ticks, i]
+                height = feet.new_tensor([cell.support.height])
+                place, room = place_platform(feet[..., :2].mean(2), feet, height)
+                if float(room) < 0.0:
+                    raise ArenaError(f"{cell.name}: the reference's feet do not tread on the platform")
+                x = float(place[0, 0])
+            elif x is None:
                 x, clear = sill_place(tables.feet[: cell.ticks, i].cpu().numpy())
                 if clear < cell.support.height:
                     raise ArenaError(f"{cell.name}: the reference's feet clear only {clear:.3f} m")

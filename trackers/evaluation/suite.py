@@ -30,7 +30,8 @@ class Placed:
     height: float
     """Height of its top [m]."""
     x: float | None = None
-    """Centre [m]; None finds the place of a sill that the reference's feet step over with the most clearance."""
+    """Centre [m]; None finds the place of a sill that the reference's feet step over with the most clearance,
+    or of a platform that they tread on."""
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "reach": (2,),
     "arm_speed": (),
     "kick_speed": (),
+    "ground": (),
     "step_in_place": (),
     "kick": (),
     "hands": (2,),
@@ -122,6 +123,9 @@ class MotionCommand:
     """Largest speed of an arm joint [rad/s], shape [worlds]; a punch takes 10. Hand points move at 0.4 m a rad."""
     kick_speed: torch.Tensor
     """Speed of the swinging foot [m/s], shape [worlds]."""
+    ground: torch.Tensor
+    """Height of the ground ahead [m], 0 to 0.2, shape [worlds]: the next foot that lands 0.2 m before the other one
+    steps onto it, the other one follows."""
     step_in_place: torch.Tensor
     """Whether to step without moving, bool, shape [worlds]."""
     kick: torch.Tensor

@@ -32,6 +32,10 @@ SIDE_STRIDE = 0.11
 """Longest step sideways [m]: the feet keep off each other."""
 SHORTEST_STEP = 0.32
 """Shortest time of a step [s]."""
+EDGE = 0.2
+"""A foot steps onto other ground when it lands so far before the other one [m]: a sole and room for the edge."""
+LEAST_CLEARANCE = 0.05
+"""Least height of a step down above the ground it leaves [m]."""
 MISPLACED = (0.02, 0.07)
 """A standing robot steps when a foot is so far from its place [m, rad]."""
 PLACED = (0.004, 0.02)
@@ -150,6 +154,14 @@ def walk(s: State, moving: torch.Tensor, free: torch.Tensor) -> None:
     swing = ((s["share"] - 0.5 * DOUBLE_SUPPORT) / (1.0 - DOUBLE_SUPPORT)).clamp(0.0, 1.0)
     left = (1.0 - s["share"]).clamp(min=0.0) * pace + 0.5 * pace
     planned = nominal_feet(s, left)[rows, side]
+    # Onto other ground goes the foot that leads by enough for the edge between them, and then the other one.
+    yaw = s["body"][:, 2]
+    lead = rotate(-yaw, planned[:, :2] - feet[rows, 1 - side, :2])[:, 0]
+    beside = s["floor"][rows, 1 - side]
+    land = torch.where((lead > EDGE) | (beside == s["ground"]), s["ground"], beside)
+    s["left_floor"] = torch.where(begin, s["floor"][rows, side], s["left_floor"])
+    chosen = torch.stack([side == 0, side == 1], dim=1) & begin[:, None]
+    s["floor"] = torch.where(chosen, land[:, None], s["floor"])
     # The end of a swing no longer follows the plan, so that a foot comes down without sliding.
     gain = ((0.9 - swing) / 0.4).clamp(0.0, 1.0)
     gain = torch.where(begin, 1.0, gain)[:, None]
@@ -158,8 +170,15 @@ def walk(s: State, moving: torch.Tensor, free: torch.Tensor) -> None:
     early = ((s["channels"][:, at["swing_height"]].squeeze(1) - 0.08) * 1.6).clamp(0.0, 0.16)
     course = smooth((swing - early) / (1.0 - 2.0 * early))[:, None]
     flat = s["lifted"] + course * (s["landing"] - s["lifted"])
-    rise = s["channels"][:, at["swing_height"]].squeeze(1) * torch.sin(math.pi * swing).square()
-    moved = torch.stack([flat[:, 0], flat[:, 1], SOLE_HEIGHT + rise, flat[:, 2], torch.zeros_like(rise)], dim=1)
+    climb = s["floor"][rows, side] - s["left_floor"]
+    # Down from higher ground the way over its edge is short, and the bent knee has no more to give.
+    clearance = s["channels"][:, at["swing_height"]].squeeze(1)
+    clearance = torch.where(climb < 0.0, (clearance + climb).clamp(min=LEAST_CLEARANCE), clearance)
+    rise = clearance * torch.sin(math.pi * swing).square()
+    # Up first and then ahead, ahead first and then down.
+    level = s["left_floor"] + climb * torch.where(climb > 0.0, smooth(swing / 0.5), smooth((swing - 0.5) / 0.5))
+    z = SOLE_HEIGHT + level + rise
+    moved = torch.stack([flat[:, 0], flat[:, 1], z, flat[:, 2], torch.zeros_like(rise)], dim=1)
     swings = torch.stack([side == 0, side == 1], dim=1) & s["stepping"][:, None]
     s["feet"] = torch.where(swings[:, :, None], moved[:, None], feet)
     s["support"] = ~(swings & ((swing > 0.0) & (swing < 1.0))[:, None])
@@ -217,7 +236,7 @@ def kick(s: State, row: torch.Tensor) -> None:
     base = s["lifted"]
     xy = base[:, :2] + rotate(base[:, 2], torch.stack([x, torch.zeros_like(x)], dim=1))
     toe = KICK_TOE[0] * wind + (KICK_TOE[1] - KICK_TOE[0]) * swing - KICK_TOE[1] * home
-    pose = torch.cat([xy, (SOLE_HEIGHT + z)[:, None], base[:, 2:], toe[:, None]], dim=1)
+    pose = torch.cat([xy, (SOLE_HEIGHT + s["floor"][rows, foot] + z)[:, None], base[:, 2:], toe[:, None]], dim=1)
     kicks = torch.stack([s["kick_side"] == 1, s["kick_side"] == 2], dim=1)
     s["feet"] = torch.where(kicks[:, :, None], pose[:, None], s["feet"])
     s["support"] = s["support"] & ~(kicks & (z > 1e-6)[:, None])

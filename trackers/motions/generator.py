@@ -40,6 +40,10 @@ LONGEST_BEHIND = 0.22
 """A foot farther behind the pelvis at the end of its stance lowers the walk [m]."""
 STAND_HEIGHT = 0.785
 """Highest pelvis of all [m]: the knees are nearly straight."""
+HIGHEST_GROUND = 0.2
+"""Highest step up [m]."""
+LIFT_SPEED, LIFT_SLOPE = 0.35, 2.0
+"""The pelvis follows the ground under the feet with this speed [m/s] and acceleration [m/s²]."""
 LOWEST = 0.38
 DEEP, DEEP_LEAN = 0.55, 2.6
 """Below this pelvis height [m] the pelvis leans so much per metre [rad/m]: upright, ankles would not bend enough."""
@@ -182,6 +186,7 @@ class ReferenceGenerator:
             "reach": (0.0, 1.0),
             "arm_speed": (0.1, 12.0),
             "kick_speed": (0.5, 4.0),
+            "ground": (0.0, HIGHEST_GROUND),
         }.items():
             part = CHANNELS[name]
             low[part], high[part] = [a] * (part.stop - part.start), [b] * (part.stop - part.start)
@@ -228,6 +233,10 @@ class ReferenceGenerator:
             "first": zeros(dtype=torch.bool),
             "final": zeros(dtype=torch.bool),
             "gait": zeros(2),
+            "ground": zeros(),
+            "floor": zeros(2),
+            "left_floor": zeros(),
+            "base": zeros(2),
             "kick_side": zeros(dtype=torch.int64),
             "kick_asked": zeros(dtype=torch.int64),
             "kick_last": zeros(dtype=torch.int64),
@@ -286,7 +295,8 @@ class ReferenceGenerator:
             self._solved.copy_(self._all)
         with on_torch_stream(self.device):
             self._ik.launch_ik(self._model, self._wp_goal, self._wp_mask, self._wp_state)
-        root = torch.cat([self._pelvis, new["channels"][:, CHANNELS["height"]]], dim=1)
+        height = new["channels"][:, CHANNELS["height"]] + new["base"][:, :1]
+        root = torch.cat([self._pelvis, height], dim=1)
         if mask is None:
             new["before"], new["root"] = old["root"], root
         else:
@@ -313,10 +323,15 @@ class ReferenceGenerator:
         in_place = free & (row[:, at["step_in_place"]].squeeze(1) >= 0.5)
         moving = in_place | (velocity != 0.0).any(1)
 
+        s["ground"] = row[:, at["ground"]].squeeze(1)
         self._limit(s, row, velocity, moving | s["stepping"], busy)
         self._advance_body(s)
         walk(s, moving, free)
         kick(s, row)
+        base, rate = s["base"].unbind(1)
+        top, slope = torch.full_like(base, LIFT_SPEED), torch.full_like(base, LIFT_SLOPE)
+        # A foot counts where it will land: the body rises when the second foot leaves the floor, sinks with the first.
+        s["base"] = torch.stack(approach(base, rate, s["floor"].amin(1), top, slope), dim=1)
         self._aim(s)
         s["hands"] = (row[:, at["hands"]] >= 0.5).float()
 
@@ -396,7 +411,7 @@ class ReferenceGenerator:
                 com,
                 pelvis,
                 gait,
-                height,
+                height + s["base"][:, :1],
                 seat,
                 body,
                 pitch,

@@ -42,6 +42,7 @@ __all__ = [
     "stand",
     "step",
     "step_over",
+    "step_up",
     "walk",
 ]
 
@@ -214,6 +215,36 @@ def step_over(
     speed = 0.5 * stride / step_time
     stepping = {"velocity": (speed, 0.0, 0.0), "stagger": 0.5 * stride, **high}
     return _script((0.5, high), (seconds, stepping), (1.5, high), (0.5, {}))
+
+
+def step_up(
+    height: float = 0.10,
+    stride: float = 0.40,
+    pairs: int = 2,
+    *,
+    ahead: float = 1.3,
+    down: bool = False,
+    swing_height: float = 0.16,
+    step_time: float = 0.56,
+) -> Script:
+    """Walk with high steps, the right foot beside the left one, onto ground of another height, and stand there.
+
+    Args:
+        height: Height of a platform [m], up to 0.2.
+        stride: Way of a foot in one swing [m]; two steps.
+        pairs: Pairs of steps once the ground ahead is higher.
+        ahead: Time of walking before [s].
+        down: Go on and step down at the other end.
+        swing_height: Height of a step above the ground that it leaves and meets [m].
+        step_time: Time of a step [s].
+    """
+    high = {"swing_height": swing_height, "step_time": step_time, "height": 0.73}
+    stepping = {"velocity": (0.5 * stride / step_time, 0.0, 0.0), "stagger": 0.5 * stride, **high}
+    seconds = 2.0 * step_time * pairs
+    parts = _script((0.5, high), (ahead, stepping), (seconds, {**stepping, "ground": height}))
+    if down:
+        return parts + _script((4.0 * step_time, stepping), (1.5, high), (0.5, {}))
+    return parts + _script((1.5, {**high, "ground": height}), (0.5, {"ground": height}))
 
 
 def squat(height: float = 0.45, *, pitch: float = 0.3, down: float = 1.5, hold: float = 1.0) -> Script:

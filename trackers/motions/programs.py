@@ -18,7 +18,7 @@ from arena_newton.trackers.motions.primitives import Program, Script
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["FAMILIES", "random_clips"]
+__all__ = ["FAMILIES", "place_platform", "random_clips"]
 
 SEAT_SIZE = (0.5, 0.6)
 """Length and width of a seat [m]."""
@@ -28,6 +28,10 @@ SILL_CLEARANCE = 0.05
 """Least height of a sole above a sill [m]."""
 SILL_HEIGHTS = (0.05, 0.10)
 """Lowest and highest sill [m]."""
+PLATFORM_SIZE = (1.0, 1.4)
+"""Length and width of a platform [m]."""
+PLATFORM_HEIGHTS = (0.05, 0.12)
+"""Lowest and highest platform [m]."""
 SOLE_BACK, SOLE_FRONT = 0.06, 0.14
 """Ends of the foot behind and before the ankle [m], with a centimetre to spare."""
 LARGEST_ERROR = 0.02
@@ -56,6 +60,7 @@ FAMILIES: dict[str, int] = {
     "walk_sit": 96,
     "sill": 128,
     "mixed": 160,
+    "platform": 96,
 }
 """Clips of each family in the default library."""
 
@@ -69,7 +74,7 @@ class _Plan:
     start: float = 0.0
     """When the robot begins to sit down [s]."""
     height: float = 0.0
-    """Height of the seat, wanted height of the sill [m]."""
+    """Height of the seat or the platform, wanted height of the sill [m]."""
     edge: float = 0.0
     """Front edge of the seat behind the standing pelvis [m]."""
 
@@ -299,6 +304,21 @@ def _sill(d: _Draw, seconds: float) -> _Plan:
     return _Plan(d.upper(lead + over + p.stand(1.0), 0.3), "sill", height=d(*SILL_HEIGHTS))
 
 
+def _platform(d: _Draw, seconds: float) -> _Plan:
+    """A walk onto a platform, half of them over it and down again; where it stands is found afterwards."""
+    height, down = d(*PLATFORM_HEIGHTS), d.chance(0.5)
+    over = p.step_up(
+        height,
+        d(0.38, 0.42),
+        3 if down else 2,
+        ahead=d(1.0, 2.0),
+        down=down,
+        swing_height=d(0.14, 0.18),
+        step_time=d(0.5, 0.6),
+    )
+    return _Plan(d.upper(p.stand(d(0.1, 0.5)) + over, 0.3), "platform", height=height)
+
+
 def _mixed(d: _Draw, seconds: float) -> _Plan:
     parts = p.stand(d(0.1, 0.6))
     while parts.seconds < seconds:
@@ -339,6 +359,7 @@ _MAKERS: dict[str, Callable[[_Draw, float], _Plan]] = {
     "walk_sit": _walk_sit,
     "sill": _sill,
     "mixed": _mixed,
+    "platform": _platform,
 }
 
 
@@ -433,6 +454,57 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
     return box, top >= SILL_HEIGHTS[0]
 
 
+def place_platform(
+    root_xy: torch.Tensor, feet: torch.Tensor, height: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where along a straight walk a platform stands under the feet that tread at its height.
+
+    Args:
+        root_xy: Pelvis [m], shape [clips, ticks, 2].
+        feet: Ankles [m], shape [clips, ticks, 2, 3 or more].
+        height: Height of the platform [m], shape [clips].
+
+    Returns:
+        Centre x, y and yaw [m, rad], shape [clips, 3], and the least distance of a foot's tread from an end of the
+        platform [m], shape [clips]: below 0 where there is no place.
+    """
+    import torch
+
+    start, way = root_xy[:, 0], root_xy[:, -1] - root_xy[:, 0]
+    length = way.square().sum(1).sqrt().clamp(min=1e-3)
+    ahead = way / length[:, None]
+    along = ((feet[..., :2] - start[:, None, None]) * ahead[:, None, None]).sum(-1)
+    above = feet[..., 2] - SOLE_HEIGHT - height[:, None, None]
+    still = torch.zeros_like(above, dtype=torch.bool)
+    still[:, 1:] = (feet[:, 1:, :, :3] - feet[:, :-1, :, :3]).abs().amax(-1) < 1e-4
+    treads = (still & (above.abs() < 1e-3)).flatten(1)
+    along, above = along.flatten(1), above.flatten(1)
+    best, where = torch.full_like(length, -1.0), torch.zeros_like(length)
+    for edge in torch.linspace(0.2, 4.0, 191, device=feet.device).tolist():
+        far = edge + PLATFORM_SIZE[0]
+        within = (along + SOLE_FRONT > edge) & (along - SOLE_BACK < far)
+        clear = torch.where(within, above, 1.0).amin(1) > -1e-3
+        room = torch.minimum(along - SOLE_BACK - edge, far - along)
+        room = torch.where(treads, room, 1.0).amin(1)
+        room = torch.where(clear & treads.any(1), room, -1.0)
+        where = torch.where(room > best, edge, where)
+        best = torch.maximum(best, room)
+    centre = start + ahead * (where + 0.5 * PLATFORM_SIZE[0])[:, None]
+    return torch.cat([centre, torch.atan2(ahead[:, 1], ahead[:, 0])[:, None]], dim=1), best
+
+
+def _platform_box(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Platforms under the feet, and which of them every foot treads on whole or passes over."""
+    import torch
+
+    root = out["root_pos"]
+    height = torch.tensor([plan.height for plan in plans], device=root.device)
+    place, room = place_platform(root[..., :2], out["feet"], height)
+    size = torch.tensor(PLATFORM_SIZE, device=root.device).expand(len(plans), 2)
+    box = torch.cat([place[:, :2], height[:, None], place[:, 2:], size, height[:, None]], dim=1)
+    return box, room >= 0.0
+
+
 def random_clips(
     families: Mapping[str, int] | None = None, seconds: float = 12.0, seed: int = 0, device: Any = "cpu"
 ) -> dict[str, Any]:
@@ -452,6 +524,7 @@ def random_clips(
       edge 3-8 cm behind the standing pelvis, really loaded (the pelvis ends 24-36 cm back and at seat + 0.09-0.14 m);
       after standing, or after turning and walking backwards to it.
     - `sill`: steps of 15-20 cm, the feet beside each other; a sill of 5-10 cm lies where every sole clears it by 5 cm.
+    - `platform`: up onto a platform of 5-12 cm that every tread stands on whole; half of them go over it and down.
     - `mixed`: walk, reach, crouch, kick, punch, squat in any order.
 
     A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support that feet run into is drawn anew.
@@ -492,8 +565,11 @@ def random_clips(
         kind = torch.tensor([SUPPORTS.index(plan.support) for plan in plans], device=sound.device)
         seat, clear = _seat(plans, out)
         sill, cleared = _place_sill(plans, out)
-        sound &= torch.where(kind == 1, clear, True) & torch.where(kind == 2, cleared, True)
-        box = torch.where((kind == 1)[:, None], seat, torch.where((kind == 2)[:, None], sill, 0.0))
+        platform, trodden = _platform_box(plans, out)
+        box = torch.zeros_like(seat)
+        for k, (found, fits) in enumerate(((seat, clear), (sill, cleared), (platform, trodden)), start=1):
+            sound &= torch.where(kind == k, fits, True)
+            box = torch.where((kind == k)[:, None], found, box)
         out = {**out, "support_kind": kind, "support_box": box}
         good = sound.cpu().numpy()
         to = torch.tensor(missing[good], device=sound.device)

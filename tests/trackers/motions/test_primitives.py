@@ -17,6 +17,8 @@ EVERY: dict[str, Script] = {
     "step": primitives.step(2.0),
     "walk": primitives.walk(0.6, 0.0, 0.2, 3.0),
     "step over": primitives.step_over(seconds=4.0),
+    "step up": primitives.step_up(0.10),
+    "step up and down": primitives.step_up(0.08, pairs=3, down=True),
     "squat": primitives.squat(0.42),
     "reach": primitives.reach("left", (0.35, 0.2, 0.4)),
     "crouch and reach": primitives.crouch_reach("right", (0.35, -0.15, 0.0), 0.5),
@@ -147,6 +149,39 @@ def test_no_foot_enters_the_ground_or_a_sill(clips):
         assert float(along.min()) < -0.3 and float(along.max()) > 0.3
         over = (along > -0.12 - 0.5 * length) & (along < 0.05 + 0.5 * length)
         assert float(feet[clip, ..., 2][over].min()) - kinematics.SOLE_HEIGHT >= top + 0.045
+
+
+def test_platforms_carry_both_feet(clips):
+    """The robot walks up from the floor; then a foot stands whole on the platform or off it, and never in it."""
+    rows = [kinematics.link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]
+    poses = kinematics.forward(*(clips[k].double() for k in ("root_pos", "root_quat", "joint_pos")))
+    platforms = torch.nonzero(clips["support_kind"] == programs.SUPPORTS.index("platform")).flatten().tolist()
+    assert len(platforms) == 2
+    for clip in platforms:
+        x, y, top, yaw, length, _, _ = clips["support_box"][clip].double().tolist()
+        assert programs.PLATFORM_HEIGHTS[0] <= top <= programs.PLATFORM_HEIGHTS[1]
+        feet = poses.position[clip, :, rows]
+        along = (feet[..., 0] - x) * np.cos(yaw) + (feet[..., 1] - y) * np.sin(yaw)
+        height = feet[..., 2] - kinematics.SOLE_HEIGHT
+        assert float(height[0].abs().max()) < 0.005 and float(along[0].max()) < -0.5 * length - 0.12
+        above = (along + 0.13 > -0.5 * length) & (along - 0.05 < 0.5 * length)
+        assert float(height[above].min()) > top - 0.012
+        stood = ((height - top).abs() < 0.012).all(1)
+        assert int(stood.sum()) > 20, "both feet stand on it for a while"
+        root = clips["root_pos"][clip, :, 2]
+        assert float(root[stood].mean() - root[:25].mean()) == pytest.approx(top, abs=0.06)
+
+
+def test_a_step_up_needs_room_for_the_edge():
+    """Short steps stay on their ground; a long one goes up, and the other foot follows without such a lead."""
+    short = Script((Segment(3.0, {"velocity": (0.2, 0.0, 0.0), "ground": 0.1}),))
+    program = Program([short, primitives.step_up(0.1)])
+    generator = ReferenceGenerator(2)
+    for tick in range(round((program.seconds + 3.0) / TICK)):
+        generator.step(program(tick * TICK))
+    height = generator.feet_pos[..., 2] - kinematics.SOLE_HEIGHT
+    assert float(height[0].max()) < 0.09 and generator._s["floor"][0].tolist() == [0.0, 0.0]
+    assert height[1].tolist() == pytest.approx([0.1, 0.1], abs=1e-6)
 
 
 def test_seats_are_loaded(clips):
