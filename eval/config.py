@@ -286,7 +286,10 @@ def explicit(options: RunOptions, config: RunConfig) -> RunOptions:
 def policy_label(policy: str) -> str:
     """Name of a policy in tables: the spec, with a local path shortened to its file name."""
     scheme, _, target = policy.partition(":")
-    return f"{scheme}:{Path(target).name}" if scheme in POLICY_PATH_SCHEMES and target else policy
+    if scheme not in POLICY_PATH_SCHEMES or not target:
+        return policy
+    path = Path(target)
+    return f"{scheme}:{path.parent.name if path.name == 'actions' and path.parent.name else path.name}"
 
 
 def _hash_scene(path: Path) -> str:

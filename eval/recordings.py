@@ -24,7 +24,7 @@ class RecordingPolicy(Policy):
         Args:
             policy: What decides.
             folder: Where the files go: `<task>_<mode>_s<group seed>_r<repeat>.npz` with the arrays `action`
-                [ticks, 40] and `episode_seed`, and the text `task`, the task's Gym id.
+                [ticks, 40] and `episode_seed`, and the texts `task`, the task's Gym id, and `mode`.
         """
         self.policy, self.folder = policy, folder
         self.name, self.needs_image, self.camera = policy.name, policy.needs_image, policy.camera
@@ -95,6 +95,7 @@ class RecordingPolicy(Policy):
                     action=np.concatenate(chunks)[: result.steps],
                     episode_seed=np.int64(episode.episode_seed),
                     task=np.str_(task),
+                    mode=np.str_(episode.mode),
                 )
             partial.replace(path)
         except OSError as error:

@@ -106,37 +106,56 @@ class ReplayEpisodes(Policy):
         """Read the recordings.
 
         Args:
-            folder: Files with the arrays `action` [ticks, 40] and `episode_seed`, and the text `task` (a Gym id).
+            folder: Files with the arrays `action` [ticks, 40] and `episode_seed`, and the texts `task` (a Gym id) and
+                `mode`.
 
         Raises:
             InputError: There are none, one is unfit, or two are of the same episode.
         """
         self.path = Path(folder)
         self.name = f"replay-{self.path.parent.name if self.path.name == 'actions' else self.path.name}"
-        self._episodes: dict[tuple[str, int], np.ndarray] = {}
+        self._episodes: dict[tuple[str, str, int], np.ndarray] = {}
+        self._mode = "base"
         files = sorted(self.path.glob("*.npz"))
         if not files:
             raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; run --actions writes them")
         for file in files:
             actions = load_actions(file)
-            with np.load(file, allow_pickle=False) as arrays:
-                if not {"episode_seed", "task"} <= set(arrays.files):
-                    raise InputError(f"--policy replay:{file}: arrays episode_seed and task are missing")
-                episode = str(arrays["task"]), int(arrays["episode_seed"])
+            try:
+                with np.load(file, allow_pickle=False) as arrays:
+                    episode = str(arrays["task"]), str(arrays["mode"]), int(arrays["episode_seed"])
+            except (KeyError, TypeError, ValueError):
+                where = f"--policy replay:{file}"
+                raise InputError(f"{where}: episode_seed, task and mode are missing or unfit") from None
             if episode in self._episodes:
-                raise InputError(f"--policy replay:{file}: a second recording of episode seed {episode[1]}, keep one")
+                raise InputError(f"--policy replay:{file}: a second recording of episode seed {episode[2]}, keep one")
             self._episodes[episode] = actions
         self._playing: list[np.ndarray | None] = []
-        self._asked: list[tuple[str, int]] = []
+        self._asked: list[tuple[str, str, int]] = []
         self._steps = np.zeros(0, dtype=np.int64)
+
+    def check_task(self, task: str) -> None:
+        """Refuse a task without a recording.
+
+        Raises:
+            InputError: There is none.
+        """
+        from arena_newton import tasks
+
+        if tasks.get(task).gym_id not in {recorded for recorded, _, _ in self._episodes}:
+            raise InputError(f"--policy replay:{self.path}: no recording of task {task}")
+
+    def attach(self, env: Any) -> None:
+        """Learn the mode whose recordings are played."""
+        self._mode = env.mode
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
         """Take the recordings of the worlds in `mask`."""
         if len(self._steps) != len(seeds):
             self._steps = np.zeros(len(seeds), dtype=np.int64)
-            self._playing, self._asked = [None] * len(seeds), [("", 0)] * len(seeds)
+            self._playing, self._asked = [None] * len(seeds), [("", "", 0)] * len(seeds)
         for world in np.flatnonzero(world_mask(mask, len(seeds))):
-            self._asked[world] = (tasks[world], int(seeds[world]))
+            self._asked[world] = (tasks[world], self._mode, int(seeds[world]))
             self._playing[world] = self._episodes.get(self._asked[world])
             self._steps[world] = 0
 
@@ -148,8 +167,8 @@ class ReplayEpisodes(Policy):
         for world in np.flatnonzero(world_mask(observation.mask, worlds)):
             recording = self._playing[world]
             if recording is None:
-                task, seed = self._asked[world]
-                errors[int(world)] = f"{self.path}: no recording of {task}, episode seed {seed}"
+                task, mode, seed = self._asked[world]
+                errors[int(world)] = f"{self.path}: no recording of {task}, mode {mode}, episode seed {seed}"
                 continue
             ticks = self._steps[world] + np.arange(self.chunk_size)
             actions[world] = recording[np.minimum(ticks, len(recording) - 1)]
@@ -169,5 +188,7 @@ def from_spec(argument: str | None) -> ReplayPolicy | ReplayEpisodes:
         InputError: No path was given, or the file is unfit.
     """
     if not argument:
-        raise InputError("--policy replay: needs a file, as in replay:walk.pkl or replay:actions.npz")
+        raise InputError(
+            "--policy replay: needs a file or a folder, as in replay:walk.pkl, replay:actions.npz, replay:run/actions"
+        )
     return ReplayEpisodes(argument) if Path(argument).is_dir() else ReplayPolicy(argument)

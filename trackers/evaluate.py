@@ -161,6 +161,11 @@ def _evaluate(args: argparse.Namespace) -> int:
     from arena_newton.trackers.evaluation.rollout import plan, run
 
     resolve_engine(args.engine, args.device)
+    if args.out is not None:
+        try:
+            args.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--out {args.out}: cannot be made ({error.strerror})") from None
     played = plan(_cells(args), rollouts, args.seed)
     options = {"engine": args.engine, "device": args.device, "fast_physics": args.fast_physics, "threads": args.threads}
     results = []

@@ -167,12 +167,12 @@ class FrontEnd(abc.ABC):
         return self._targets.mul_(self._scale).add_(self.base)
 
     def mirror_obs(self) -> Mirror:
-        """Mirror image of an observation; only a training with a mirror loss asks for it."""
-        raise NotImplementedError(f"{type(self).__name__} has no mirror image: train it without a mirror loss")
+        """Mirror image of an observation; for symmetric weights and a mirror loss."""
+        raise NotImplementedError(f"{type(self).__name__} has no mirror image: no mirror loss and no symmetric weights")
 
     def mirror_action(self) -> Mirror:
-        """Mirror image of a raw action; only a training with a mirror loss asks for it."""
-        raise NotImplementedError(f"{type(self).__name__} has no mirror image: train it without a mirror loss")
+        """Mirror image of a raw action; for symmetric weights and a mirror loss."""
+        raise NotImplementedError(f"{type(self).__name__} has no mirror image: no mirror loss and no symmetric weights")
 
     @abc.abstractmethod
     def write(self, command: TrackerCommand, state: RobotState) -> None:

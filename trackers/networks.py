@@ -13,7 +13,7 @@ from torch import nn
 
 from arena_newton.errors import InputError
 
-__all__ = ["InputNorm", "SonicNet", "Twist2Net", "make"]
+__all__ = ["InputNorm", "SonicNet", "Symmetric", "Twist2Net", "make"]
 
 TWIST2_WIDTH = 1432
 """Width of TWIST2's observation."""

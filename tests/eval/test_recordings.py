@@ -58,8 +58,22 @@ def test_an_episode_without_a_recording_is_an_error_of_its_own(recorded):
         task = str(arrays["task"])
     policy.reset([seed, seed + 1], [task, task])
     chunk = policy.act(Observation(np.zeros((2, 64)), None, np.array([True, True]), "boxing", task, ""))
-    assert list(chunk.errors) == [1] and f"{task}, episode seed {seed + 1}" in chunk.errors[1]
+    assert list(chunk.errors) == [1] and f"{task}, mode base, episode seed {seed + 1}" in chunk.errors[1]
     assert np.isfinite(chunk.actions).all() and chunk.actions[0].any()
+
+
+def test_modes_are_kept_apart(tmp_path, capsys):
+    """A run of two modes plays again, each mode with its own recordings; another task is refused first."""
+    out, again = tmp_path / "run", tmp_path / "again"
+    modes = [*RUN, "--mode", "base", "execution", "--max-steps", "20", "--repeats", "1"]
+    assert command_line.main(["run", *modes, "--policy", "stand", "--actions", "--out", str(out)]) == 0
+    replay = ["--policy", f"replay:{out / 'actions'}"]
+    assert command_line.main(["run", *modes, *replay, "--out", str(again)]) == 0
+    first, second = (sorted((r["mode"], r["outcome"], r["margin"]) for r in journal(f)) for f in (out, again))
+    assert first == second and {r["policy"] for r in journal(again)} == {"replay:run"}
+    capsys.readouterr()
+    assert command_line.main(["run", "--task", "football", *replay, "--out", str(tmp_path / "no")]) == 2
+    assert "no recording of task football" in capsys.readouterr().err
 
 
 def test_unfit_folders_are_refused(recorded, tmp_path):
@@ -74,5 +88,5 @@ def test_unfit_folders_are_refused(recorded, tmp_path):
     (tmp_path / "b.npz").unlink()
     with np.load(source) as arrays:
         np.savez(tmp_path / "c.npz", action=arrays["action"])
-    with pytest.raises(InputError, match="c.npz: arrays episode_seed and task are missing"):
+    with pytest.raises(InputError, match="c.npz: episode_seed, task and mode are missing or unfit"):
         policies.get(f"replay:{tmp_path}")

@@ -48,6 +48,8 @@ def read(folder: Path) -> list[dict[str, Any]]:
         lines = path.read_text().splitlines()
     except OSError as error:
         raise InputError(f"curves {path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"curves {path}: not a text file") from None
     rows = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -55,9 +57,13 @@ def read(folder: Path) -> list[dict[str, Any]]:
         except ValueError:
             if number < len(lines):
                 raise InputError(f"curves {path}: line {number} is not JSON") from None
-    missing = [name for name, _, _ in PANELS if not rows or name not in rows[-1]]
-    if missing:
-        raise InputError(f"curves {path}: no logged iterations with {missing[0]}")
+    needed = ("seconds", *(name for name, _, _ in PANELS))
+    for row in rows:
+        missing = needed if not isinstance(row, dict) else [name for name in needed if name not in row]
+        if missing:
+            raise InputError(f"curves {path}: a logged iteration lacks {missing[0]}")
+    if not rows:
+        raise InputError(f"curves {path}: no logged iterations")
     return rows
 
 
@@ -73,7 +79,9 @@ def draw(folders: Sequence[Path], out: Path) -> Path:
     """
     if out.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(f"--out {out}: expected .png, .svg or .pdf")
-    runs = {folder.stem if folder.suffix == ".jsonl" else folder.name: read(folder) for folder in folders}
+    names = [folder.stem if folder.suffix == ".jsonl" else folder.resolve().name for folder in folders]
+    unique = len(set(names)) == len(names)
+    runs = [(name if unique else str(folder), read(folder)) for name, folder in zip(names, folders, strict=True)]
     import matplotlib as mpl
     import numpy as np
 
@@ -82,7 +90,7 @@ def draw(folders: Sequence[Path], out: Path) -> Path:
 
     figure, axes = pyplot.subplots(2, 3, figsize=(13.0, 6.5), layout="constrained")
     for axis, (name, title, logarithmic) in zip(axes.flat, PANELS, strict=True):
-        for k, (label, rows) in enumerate(runs.items()):
+        for k, (label, rows) in enumerate(runs):
             minutes = np.array([row["seconds"] for row in rows]) / 60.0
             values = np.array([row[name] for row in rows])
             weights = np.ones(min(_SMOOTH, len(values)))

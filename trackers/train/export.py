@@ -26,6 +26,8 @@ class ExportOptions:
     """JSON file of an evaluation, for the card."""
     note: str = ""
     """A sentence for the card."""
+    hardware: str = ""
+    """What it was trained on, for the card."""
     symmetric: bool = True
     """The tracker answers the mean of an action and the mirrored action of the mirrored observation: training leaves a
     preferred side, and a walk whose command has no heading turns that way."""
@@ -51,6 +53,8 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
 
     if options.out.suffix != ".safetensors":
         raise InputError(f"--out {options.out}: expected a .safetensors file")
+    if options.metrics is not None and options.metrics.resolve() == options.out.with_suffix(".json").resolve():
+        raise InputError(f"--out {options.out}: its card would overwrite --metrics {options.metrics}")
     state = read_checkpoint(checkpoint)
     card = dict(state["card"])
     network = networks.make(card["tracker"], state["network"])
@@ -67,13 +71,10 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     }
     if options.note:
         card["note"] = options.note
+    if options.hardware:
+        card["hardware"] = options.hardware
     if options.metrics is not None:
-        try:
-            card["metrics"] = _figures(json.loads(options.metrics.read_text()))
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--metrics {options.metrics}: not a readable JSON file ({type(error).__name__})"
-            ) from error
+        card["metrics"] = _figures(options.metrics, card["tracker"])
     weights = weights_file.Weights(
         interface=card["tracker"],
         network=network,
@@ -94,17 +95,36 @@ def write(weights: Weights, out: Path) -> Path:
     """
     from arena_newton.trackers import weights_file
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    weights_file.save(out, weights)
-    out.with_suffix(".json").write_text(json.dumps(weights.card, indent=2, sort_keys=True) + "\n")
-    out.with_suffix(".md").write_text(_markdown(dict(weights.card)))
+    text = _markdown(dict(weights.card))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        weights_file.save(out, weights)
+        out.with_suffix(".json").write_text(json.dumps(weights.card, indent=2, sort_keys=True) + "\n")
+        out.with_suffix(".md").write_text(text)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return out
 
 
-def _figures(metrics: dict[str, Any]) -> dict[str, Any]:
-    """The figures of an evaluation's first tracker, or the metrics as they are."""
-    measured = metrics.get("trackers")
-    return {"figures": measured[0]["figures"]} if measured else metrics
+def _figures(path: Path, interface: str) -> dict[str, Any]:
+    """Figures of the first tracker of an evaluation that has the interface, and how they were measured.
+
+    Raises:
+        InputError: The file is no evaluation of such a tracker.
+    """
+    try:
+        document = json.loads(path.read_text())
+        measured = next(t for t in document["trackers"] if t["name"] == interface)
+        figures = [{key: str(f[key]) for key in ("name", "bar", "value", "verdict")} for f in measured["figures"]]
+        settings = dict(document["options"])
+    except (OSError, ValueError) as error:
+        raise InputError(f"--metrics {path}: not a readable JSON file ({type(error).__name__})") from error
+    except StopIteration:
+        raise InputError(f"--metrics {path}: an evaluation of other trackers than {interface}") from None
+    except (KeyError, TypeError, AttributeError):
+        raise InputError(f"--metrics {path}: not an evaluation.json of trackers.evaluate") from None
+    kept = ("suite", "rollouts", "seed", "engine", "device", "clips", "only")
+    return {"figures": figures, "settings": {k: settings[k] for k in kept if settings.get(k) not in (None, "")}}
 
 
 def _drive(value: dict[str, Any]) -> DriveGains:
@@ -140,6 +160,8 @@ def _markdown(card: dict[str, Any]) -> str:
         lines += ["", "## Evaluation", ""]
         if command := card["metrics"].get("command"):
             lines += [f"`{command}`", ""]
+        if settings := card["metrics"].get("settings"):
+            lines += [", ".join(f"{name} {value}" for name, value in settings.items()), ""]
         lines += ["| figure | bar | value | |", "|---|---|---|---|"]
         lines += [f"| {f['name']} | {f['bar']} | {f['value']} | {f['verdict']} |" for f in figures]
     lines += ["", "## At the end of training", "", "| | |", "|---|---|"]

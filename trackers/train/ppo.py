@@ -88,8 +88,8 @@ class IterationPPO(PPO):
         self.critic.update_normalization(observations)
         self.storage.clear()
         if self.is_multi_gpu:
-            # Gradients are averaged, input statistics are not: each process would read its inputs its own way.
-            for statistic in (*self.actor.buffers(), *self.critic.buffers()):
+            # The actor's input statistics are summed over the processes, the critic's are each process' own.
+            for statistic in self.critic.buffers():
                 torch.distributed.broadcast(statistic, 0)
         divergence /= self.num_mini_batches
         if self.is_multi_gpu:

@@ -325,6 +325,7 @@ class TrackerRunner(OnPolicyRunner):
             "learning_rate": self.alg.learning_rate,
             "samples": self.samples,
             "seconds": self.seconds,
+            "started": self._started,
             "sampler": self.env.sampler.state_dict(),
             "rng": torch.get_rng_state(),
             "cuda_rng": cuda,
@@ -347,6 +348,12 @@ class TrackerRunner(OnPolicyRunner):
             InputError: The file is absent or no checkpoint of this training.
         """
         state = read_checkpoint(path, map_location or str(self.device))
+        tracker = self.cfg.get("card", {}).get("tracker")
+        if tracker is not None and state["card"].get("tracker") != tracker:
+            raise InputError(f"--resume {path}: a training of {state['card'].get('tracker')}, not of {tracker}")
+        if state["network"] != self.alg.get_policy().net.config():
+            raise InputError(f"--resume {path}: a network of other widths than this training's")
+        self._started = bool(state.get("started", False))
         parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
         self.alg.load(state, load_cfg or parts, strict)
         self.alg.set_learning_rate(state["learning_rate"])

@@ -146,8 +146,18 @@ def check(options: TrainOptions) -> None:
         if not (low <= value <= high and math.isfinite(value)):
             until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
             raise InputError(f"{flag} {value}: expected a number {until}")
+    if options.settle > 0.0 and options.minutes <= 0.0:
+        raise InputError(f"--settle {options.settle}: a share of --minutes, which is not given")
+    for flag, file in (("--resume", options.resume), ("--start-from", options.start_from)):
+        if file is not None and not file.is_file():
+            raise InputError(f"{flag} {file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
     if options.log_dir.exists() and not options.log_dir.is_dir():
         raise InputError(f"--log-dir {options.log_dir}: is a file")
+    if not options.bench:
+        try:
+            options.log_dir.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--log-dir {options.log_dir}: cannot be made ({error.strerror})") from None
     used = sorted(options.log_dir.glob("model_*.pt")) if options.resume is None and not options.bench else []
     if used:
         raise InputError(
@@ -195,6 +205,13 @@ def build(options: TrainOptions) -> TrackerRunner:
     began = time.monotonic()
     library = make_library(options, device, options.seed + 1000 * rank)
     told = time.monotonic()
+    weights = FAMILY_WEIGHTS | options.family_weights
+    unknown = sorted(set(options.family_weights) - {str(name) for name in library.family_names})
+    if unknown:
+        known = ", ".join(str(name) for name in library.family_names)
+        raise InputError(f"--family-weights {unknown[0]}: no such family in the library; there are {known}")
+    if not any(weights.get(str(name), 1.0) > 0.0 for name in library.family_names):
+        raise InputError("--family-weights: every family of the library has weight 0")
     front, drive, rate = front_end(options.tracker, options.action_form)
     rewards = {n: dataclasses.replace(t, weight=options.rewards.get(n, t.weight)) for n, t in REWARDS.items()}
     env = TrackerEnv(
@@ -214,7 +231,7 @@ def build(options: TrainOptions) -> TrackerRunner:
         ),
         device,
         rewards=rewards,
-        family_weights=FAMILY_WEIGHTS | options.family_weights,
+        family_weights=weights,
     )
     if rank == 0:
         print(

@@ -207,6 +207,44 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
         assert ("mean of both ways" in out.with_suffix(".md").read_text()) == symmetric
 
 
+def test_export_takes_fitting_figures_only(env, tmp_path):
+    """Figures of another tracker or no figures at all are refused, nothing is written then or overwritten."""
+    runner = make_runner(env, str(tmp_path))
+    runner.learn(1)
+    checkpoint, metrics, out = tmp_path / "model_last.pt", tmp_path / "evaluation.json", tmp_path / "w.safetensors"
+    figure = {"name": "falls", "bar": "no", "value": "0/8", "verdict": "pass"}
+    document = {"options": {"engine": "mujoco", "rollouts": 8}, "trackers": [{"name": "sonic", "figures": [figure]}]}
+    for text, words in (
+        ("[1]", "not an evaluation.json"),
+        ('{"trackers": [{}]}', "not an evaluation.json"),
+        (json.dumps(document), "other trackers than twist2"),
+        ("{", "not a readable JSON file"),
+    ):
+        metrics.write_text(text)
+        with pytest.raises(InputError, match=words):
+            export(checkpoint, ExportOptions(out, metrics=metrics))
+    assert not out.exists()
+    document["trackers"][0]["name"] = "twist2"
+    metrics.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="would overwrite"):
+        export(checkpoint, ExportOptions(tmp_path / "evaluation.safetensors", metrics=metrics))
+    card = export(checkpoint, ExportOptions(out, metrics=metrics)).with_suffix(".md").read_text()
+    assert "| falls | no | 0/8 | pass |" in card and "rollouts 8, engine mujoco" in card
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="--out .*cannot be written"):
+        export(checkpoint, ExportOptions(tmp_path / "file" / "w.safetensors"))
+
+
+def test_resume_refuses_another_interface(env, tmp_path):
+    """A checkpoint of the other tracker is refused by name."""
+    make_runner(env, str(tmp_path)).learn(1)
+    state = torch.load(tmp_path / "model_last.pt", weights_only=True)
+    state["card"]["tracker"] = "sonic"
+    torch.save(state, tmp_path / "other.pt")
+    with pytest.raises(InputError, match="--resume .*other.pt: a training of sonic, not of twist2"):
+        make_runner(env).load(str(tmp_path / "other.pt"))
+
+
 def test_time_limit_lets_the_training_settle(env):
     """Towards the end of `--minutes` the aimed divergence and the entropy fall to a tenth; without it they stay."""
     runner = make_runner(env, settle=0.5, desired_kl=0.02, entropy=0.01)
@@ -255,9 +293,11 @@ def test_curves(env, tmp_path, capsys):
     assert command_line.main(["curves", str(tmp_path / "a"), str(tmp_path / "a"), "--out", str(out)]) == 0
     with Image.open(out) as picture:
         assert picture.width > 1000 and len(set(picture.convert("L").resize((60, 30)).getdata())) > 10
+    (tmp_path / "bad.jsonl").write_text("3\n{}\n")
     for arguments, words in (
         (["curves", str(tmp_path / "b")], "b/progress.jsonl: cannot be read"),
         (["curves"], "name the folders"),
+        (["curves", str(tmp_path / "bad.jsonl")], "a logged iteration lacks seconds"),
         (["curves", str(tmp_path / "a"), "--out", str(tmp_path / "a.txt")], "expected .png"),
     ):
         assert command_line.main(arguments) == 2
@@ -302,6 +342,9 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys):
         (["--rewards", "nonsense", "1.0"], "nonsense"),
         (["export", str(tmp_path / "bad.pt"), "--out", str(tmp_path / "x.safetensors")], "not a training checkpoint"),
         (["export", str(tmp_path / "none.pt"), "--out", str(tmp_path / "x.safetensors")], "no such checkpoint"),
+        (["--device", "cpu", "--start-from", str(tmp_path)], "--start-from"),
+        (["--device", "cpu", "--settle", "0.3"], "--settle"),
+        (["--device", "cpu", "--log-dir", str(tmp_path / "bad.pt" / "x")], "--log-dir"),
     ):
         assert command_line.main(arguments) == 2
         error = capsys.readouterr().err
