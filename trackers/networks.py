@@ -6,7 +6,7 @@ Input normalisation lives inside: a network takes the front end's observation as
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -222,8 +222,20 @@ class _DeployedSonic(nn.Module):
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         pos, vel, anchor = obs[:, 4:33], obs[:, 294:323], obs[:, 595:601]
-        latent = self.encoder(torch.cat((pos, vel, anchor), 1))
-        return self.decoder(torch.cat((latent, obs[:, SONIC_ENCODER_WIDTH:]), 1))
+        return self._act(torch.cat((pos, vel, anchor), 1), obs[:, SONIC_ENCODER_WIDTH:])
+
+    def columns(self) -> torch.Tensor:
+        """Columns of the observation that are read, in the order of `from_columns`, shape [994]."""
+        spans = (range(4, 33), range(294, 323), range(595, 601), range(SONIC_ENCODER_WIDTH, SONIC_WIDTH))
+        return torch.tensor([column for span in spans for column in span])
+
+    def from_columns(self, used: torch.Tensor) -> torch.Tensor:
+        """Raw actions of those columns, shape [rows, 29]."""
+        reference = used.shape[1] - SONIC_PROPRIO_WIDTH
+        return self._act(used[:, :reference], used[:, reference:])
+
+    def _act(self, reference: torch.Tensor, proprio: torch.Tensor) -> torch.Tensor:
+        return self.decoder(torch.cat((self.encoder(reference), proprio), 1))
 
 
 class Symmetric(nn.Module):
@@ -232,6 +244,7 @@ class Symmetric(nn.Module):
     A network has a preferred side that no training takes away wholly; the mean has none, whatever the network.
     """
 
+    used: torch.Tensor
     obs_index: torch.Tensor
     obs_sign: torch.Tensor
     action_index: torch.Tensor
@@ -252,13 +265,21 @@ class Symmetric(nn.Module):
         """
         super().__init__()
         self.network = network
+        # A network that reads some of its columns is mirrored in those alone.
+        self.narrow = isinstance(network, _DeployedSonic)
+        if isinstance(network, _DeployedSonic):
+            columns = network.columns()
+            self.register_buffer("used", columns)
+            obs = obs[0][columns], obs[1][columns]
         for name, tensor in zip(("obs_index", "obs_sign", "action_index", "action_sign"), (*obs, *action), strict=True):
             self.register_buffer(name, tensor)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Raw actions, shape [rows, 29]."""
-        both = torch.cat((obs, obs.index_select(1, self.obs_index) * self.obs_sign))
-        straight, mirrored = self.network(both).chunk(2)
+        straight = obs.index_select(1, self.used) if self.narrow else obs
+        both = torch.cat((straight, obs.index_select(1, self.obs_index) * self.obs_sign))
+        answers = cast(_DeployedSonic, self.network).from_columns(both) if self.narrow else self.network(both)
+        straight, mirrored = answers.chunk(2)
         return (straight + mirrored.index_select(1, self.action_index) * self.action_sign) * 0.5
 
 

@@ -6,7 +6,7 @@ import torch
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
-from arena_newton.trackers import RobotState, TrackerCommand
+from arena_newton.trackers import RobotState, TrackerCommand, weights_file
 from arena_newton.trackers.front_end import ActionForm, residual_form
 from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.twist2 import Twist2FrontEnd
@@ -81,6 +81,25 @@ def test_action_forms():
     for arguments in (("torque", (1.0,) * 29), ("default", (1.0,)), ("residual", (1.0,) * 29, -1.0)):
         with pytest.raises(InputError, match="action form"):
             ActionForm(*arguments)
+
+
+@pytest.mark.parametrize("name", ["twist2", "sonic"])
+def test_symmetric_weights_answer_the_mean_of_both_ways(name):
+    """What is deployed is the mean of the network's action and the mirrored action of the mirrored observation."""
+    weights = weights_file.load(weights_file.default_path(name), name)
+    tracker = trackers.get(name)
+    tracker.bind(4)
+    tracker.observation().copy_(torch.randn(4, tracker.front_end.obs_width, generator=torch.Generator().manual_seed(0)))
+    if name == "sonic":  # its front end writes ten equal frames, and zeros where nothing is read
+        seen = tracker.observation()
+        for start, width in ((4, 29), (294, 29), (595, 6)):
+            frames = 11 if width == 6 else 10
+            seen[:, start : start + frames * width] = seen[:, start : start + width].repeat(1, frames)
+    obs, mirror = tracker.observation().clone(), (tracker.front_end.mirror_obs(), tracker.front_end.mirror_action())
+    assert weights.symmetric
+    with torch.no_grad():
+        mean = 0.5 * (weights.network(obs) + mirror[1](weights.network(mirror[0](obs))))
+    torch.testing.assert_close(tracker._runner.run(), mean, atol=2e-4, rtol=1e-3)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
