@@ -30,7 +30,7 @@ class RecordingPolicy(Policy):
         self.name, self.needs_image, self.camera = policy.name, policy.needs_image, policy.camera
         self.chunk_size = policy.chunk_size
         self._chunks: dict[int, list[np.ndarray]] = {}
-        self._of_world: list[tuple[int, str] | None] = []
+        self._seeds = np.zeros(0, dtype=np.int64)
 
     def check(self) -> None:
         """As the policy behind."""
@@ -47,10 +47,10 @@ class RecordingPolicy(Policy):
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
         """As the policy behind; the episodes of the worlds in `mask` begin."""
         self.policy.reset(seeds, tasks, mask)
-        if len(self._of_world) != len(seeds):
-            self._of_world = [None] * len(seeds)
+        if len(self._seeds) != len(seeds):
+            self._seeds = np.zeros(len(seeds), dtype=np.int64)
         for world in np.flatnonzero(world_mask(mask, len(seeds))):
-            self._of_world[world] = (int(seeds[world]), tasks[world])
+            self._seeds[world] = seeds[world]
             self._chunks[int(seeds[world])] = []
 
     def act(self, observation: Observation) -> Chunk:
@@ -58,9 +58,7 @@ class RecordingPolicy(Policy):
         chunk = self.policy.act(observation)
         actions = np.asarray(chunk.actions.detach().cpu() if hasattr(chunk.actions, "detach") else chunk.actions)
         for world in np.flatnonzero(world_mask(observation.mask, len(observation.state))):
-            episode = self._of_world[world]
-            if episode is not None:
-                self._chunks[episode[0]].append(actions[world].astype(np.float32))
+            self._chunks[int(self._seeds[world])].append(actions[world].astype(np.float32))
         return chunk
 
     def describe(self) -> dict[str, Any]:

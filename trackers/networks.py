@@ -6,7 +6,7 @@ Input normalisation lives inside: a network takes the front end's observation as
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -265,9 +265,7 @@ class Symmetric(nn.Module):
         """
         super().__init__()
         self.network = network
-        # A network that reads some of its columns is mirrored in those alone.
-        self.narrow = isinstance(network, _DeployedSonic)
-        if isinstance(network, _DeployedSonic):
+        if isinstance(network, _DeployedSonic):  # it reads some of its columns and is mirrored in those alone
             columns = network.columns()
             self.register_buffer("used", columns)
             obs = obs[0][columns], obs[1][columns]
@@ -276,10 +274,12 @@ class Symmetric(nn.Module):
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Raw actions, shape [rows, 29]."""
-        straight = obs.index_select(1, self.used) if self.narrow else obs
-        both = torch.cat((straight, obs.index_select(1, self.obs_index) * self.obs_sign))
-        answers = cast(_DeployedSonic, self.network).from_columns(both) if self.narrow else self.network(both)
-        straight, mirrored = answers.chunk(2)
+        image = obs.index_select(1, self.obs_index) * self.obs_sign
+        if isinstance(self.network, _DeployedSonic):
+            both = self.network.from_columns(torch.cat((obs.index_select(1, self.used), image)))
+        else:
+            both = self.network(torch.cat((obs, image)))
+        straight, mirrored = both.chunk(2)
         return (straight + mirrored.index_select(1, self.action_index) * self.action_sign) * 0.5
 
 

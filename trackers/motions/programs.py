@@ -387,21 +387,16 @@ def _play(plans: list[_Plan], ticks: int, device: Any) -> dict[str, torch.Tensor
     return out
 
 
-def _yaw(quat: torch.Tensor) -> torch.Tensor:
-    import torch
-
-    w, x, y, z = quat.unbind(-1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
 def _seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Boxes behind the standing pelvis, and which stay clear of feet and of the walk before."""
     import torch
 
+    from arena_newton.trackers.motions.frames import heading
+
     root = out["root_pos"]
     at = torch.tensor([min(round(plan.start / TICK), root.shape[1] - 1) for plan in plans], device=root.device)
     rows = torch.arange(len(plans), device=root.device)
-    place, yaw = root[rows, at], _yaw(out["root_quat"][rows, at])
+    place, yaw = root[rows, at], heading(out["root_quat"][rows, at])
     edge = torch.tensor([plan.edge for plan in plans], device=root.device)
     height = torch.tensor([plan.height for plan in plans], device=root.device)
     ahead = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
