@@ -94,6 +94,8 @@ class TrainOptions:
     """Capture the physics of a tick on CUDA."""
     tick_graph: bool = True
     """Capture what a tick does around the physics on CUDA."""
+    update_graph: bool = True
+    """Capture PPO's work on a minibatch on CUDA."""
     bench: bool = False
     """Only measure: train for `--minutes` (one by default), write nothing, print samples/s."""
     commit: str = ""
@@ -132,7 +134,7 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
         "fit_steps": 300,
         "critic_iterations": 20,
         "critic": {
-            "class_name": "MLPModel",
+            "class_name": "arena_newton.trackers.train.model:TrackerCritic",
             "hidden_dims": hidden,
             "activation": "elu",
             "obs_normalization": True,
@@ -151,6 +153,7 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "entropy_coef": options.entropy,
             "max_grad_norm": 1.0,
             "mirror_loss": options.mirror_loss,
+            "graph": options.update_graph,
             # Returns are about 16; clipping value steps to 0.2 would slow the critic down by that much.
             "use_clipped_value_loss": False,
         },

@@ -9,7 +9,6 @@ waits for the device.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -22,6 +21,7 @@ from arena_newton.kernels.newton_state import LOST_CONTACTS
 from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.train import events, rotations
+from arena_newton.trackers.train.graphs import captured
 from arena_newton.trackers.train.motion import Motion
 from arena_newton.trackers.train.references import FEET, KEY_LINKS, Frame, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS, TERMINATION_REWARD, Term
@@ -173,23 +173,13 @@ class TrackerEnv(VecEnv):
 
     @torch.no_grad()
     def _capture(self) -> None:
-        """Hold what a tick does around the physics in two CUDA graphs; without them it runs as it is, more slowly."""
+        """Hold what a tick does around the physics in two CUDA graphs."""
         for _ in range(3):
             self.step(self.reference_action())
         torch.cuda.synchronize(self.device)
-        graphs = {}
-        try:
-            for name, work in (("before", self._before), ("after", self._after)):
-                graphs[name] = torch.cuda.CUDAGraph()
-                # Other threads (a process group's watchdog) may use the device meanwhile.
-                with torch.cuda.graph(graphs[name], capture_error_mode="thread_local"):
-                    work()
-        except RuntimeError as error:
-            reason = " ".join(str(error).split())[:200]
-            warnings.warn(f"the training tick is not captured, it runs more slowly: {reason}", stacklevel=2)
-            graphs = {}
+        for name, work in (("before", self._before), ("after", self._after)):
+            self._graphs[name] = captured(work, "tick-graph")
         torch.cuda.synchronize(self.device)
-        self._graphs = graphs
         self._restart(self._every)
         self._observe(self._every)
         self.sampler.clear()

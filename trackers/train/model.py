@@ -1,4 +1,4 @@
-"""The actor for rsl-rl: a tracker's own network, so that what was trained is what is shipped."""
+"""The actor for rsl-rl, a tracker's own network, so that what was trained is what is shipped; and its critic."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from torch import nn
 
 from arena_newton.trackers import networks
 
-__all__ = ["TrackerActor"]
+__all__ = ["TrackerActor", "TrackerCritic"]
+
+
+class _Gaussian(GaussianDistribution):
+    """rsl-rl's, drawn without the check of the deviations, for which torch would wait for the device each tick."""
+
+    def sample(self) -> torch.Tensor:
+        """Sample, shape [rows, actions]."""
+        with torch.no_grad():
+            return self.mean + self.std * torch.randn_like(self.mean)
 
 
 class TrackerActor(MLPModel):
@@ -51,7 +60,7 @@ class TrackerActor(MLPModel):
             raise ValueError(
                 f"interface {interface}: {self.obs_dim} observations, the network takes {self.net.obs_width}"
             )
-        self.distribution = GaussianDistribution(output_dim, init_std=init_std, std_range=std_range, std_type="log")
+        self.distribution = _Gaussian(output_dim, init_std=init_std, std_range=std_range, std_type="log")
 
     def forward(
         self,
@@ -78,3 +87,13 @@ class TrackerActor(MLPModel):
     def _pick(self, obs: TensorDict) -> torch.Tensor:
         groups = [obs[name] for name in self.obs_groups]
         return groups[0] if len(groups) == 1 else torch.cat(groups, -1)
+
+
+class TrackerCritic(MLPModel):
+    """rsl-rl's critic with the input statistics of the trackers, which never move in memory: a graph may hold them."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        """Take rsl-rl's arguments."""
+        super().__init__(*args, **kwargs)
+        if self.obs_normalization:
+            self.obs_normalizer = networks.InputNorm(self.obs_dim)

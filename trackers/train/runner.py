@@ -355,7 +355,10 @@ class TrackerRunner(OnPolicyRunner):
             raise InputError(f"--resume {path}: a network of other widths than this training's")
         self._started = bool(state.get("started", False))
         parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
-        self.alg.load(state, load_cfg or parts, strict)
+        try:
+            self.alg.load(state, load_cfg or parts, strict)
+        except (RuntimeError, KeyError) as error:
+            raise InputError(f"--resume {path}: a checkpoint of another version of this training") from error
         self.alg.set_learning_rate(state["learning_rate"])
         for name, count in self.alg.get_policy().counts().items():
             count.copy_(state["norm_counts"][name])

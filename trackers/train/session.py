@@ -271,15 +271,30 @@ def train(options: TrainOptions) -> TrackerRunner:
         export(options.log_dir / "model_last.pt", ExportOptions(out))
         print(f"wrote {out} and its card")
     if options.bench and not runner.logger.disable_logs:
-        # The first iterations warm up allocators and libraries.
-        rows = runner.history[3:] or runner.history
-        total = sum(r["samples"] for r in rows[-1:]) - (rows[0]["samples"] if len(rows) > 1 else 0)
-        spent = rows[-1]["seconds"] - (rows[0]["seconds"] if len(rows) > 1 else 0.0)
-        collect = sum(r["collect_s"] for r in rows) / len(rows)
-        learn = sum(r["learn_s"] for r in rows) / len(rows)
-        print(
-            f"bench: {total / max(spent, 1e-9):.0f} samples/s, iteration {1e3 * (collect + learn):.1f} ms "
-            f"(collect {1e3 * collect:.1f}, update {1e3 * learn:.1f}), tick {1e3 * collect / options.steps:.2f} ms, "
-            f"{options.worlds} worlds x {options.steps} ticks, {options.tracker}"
-        )
+        print(_bench_line(runner, options))
     return runner
+
+
+def _bench_line(runner: TrackerRunner, options: TrainOptions) -> str:
+    """What a training has shown of its speed, and the share of the physics in a tick."""
+    import torch
+
+    # The first iterations warm up allocators and libraries.
+    rows = runner.history[3:] or runner.history
+    total = sum(r["samples"] for r in rows[-1:]) - (rows[0]["samples"] if len(rows) > 1 else 0)
+    spent = rows[-1]["seconds"] - (rows[0]["seconds"] if len(rows) > 1 else 0.0)
+    collect = sum(r["collect_s"] for r in rows) / len(rows)
+    learn = sum(r["learn_s"] for r in rows) / len(rows)
+    ticks = 50 if runner.device != "cpu" else 5
+    wait = (lambda: torch.cuda.synchronize(runner.device)) if runner.device != "cpu" else (lambda: None)
+    wait()
+    began = time.perf_counter()
+    for _ in range(ticks):
+        runner.env.sim.step()
+    wait()
+    physics = (time.perf_counter() - began) / ticks
+    return (
+        f"bench: {total / max(spent, 1e-9):.0f} samples/s, iteration {1e3 * (collect + learn):.1f} ms "
+        f"(collect {1e3 * collect:.1f}, update {1e3 * learn:.1f}), tick {1e3 * collect / options.steps:.2f} ms "
+        f"(physics {1e3 * physics:.2f}), {options.worlds} worlds x {options.steps} ticks, {options.tracker}"
+    )

@@ -20,6 +20,7 @@ from arena_newton.trackers.train.env import EnvConfig, TrackerEnv
 from arena_newton.trackers.train.export import ExportOptions, export
 from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, read_checkpoint
+from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
@@ -50,7 +51,25 @@ def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
         "drive": dataclasses.asdict(TWIST2_DRIVE),
         "physics": dataclasses.asdict(PhysicsRate(0.005, 4)),
     }
-    return TrackerRunner(env, runner_config(options, {"hidden": [64, 64]}, card), log_dir, "cpu")
+    return TrackerRunner(env, runner_config(options, {"hidden": [64, 64]}, card), log_dir, env.device)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_a_rollout_does_not_wait_for_the_device(library):
+    """Torch reports each wait as an error: from observation to action to reward there is none."""
+    share_stream("cuda:0")
+    front, drive, rate = session.front_end("twist2")
+    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), EnvConfig(worlds=WORLDS), "cuda:0")
+    algorithm = make_runner(env).alg
+    obs = env.get_observations()
+    try:
+        with torch.no_grad():
+            for tick in range(4):
+                torch.cuda.set_sync_debug_mode("error" if tick else "default")
+                obs, rewards, dones, extras = env.step(algorithm.act(obs))
+                algorithm.process_env_step(obs, rewards, dones, extras)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 def test_worlds_differ_and_the_critic_knows(env):
@@ -235,14 +254,19 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
         export(checkpoint, ExportOptions(tmp_path / "file" / "w.safetensors"))
 
 
-def test_resume_refuses_another_interface(env, tmp_path):
-    """A checkpoint of the other tracker is refused by name."""
+def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, tmp_path):
+    """A checkpoint of the other tracker, or one whose critic has other parts, is refused by name."""
     make_runner(env, str(tmp_path)).learn(1)
     state = torch.load(tmp_path / "model_last.pt", weights_only=True)
     state["card"]["tracker"] = "sonic"
     torch.save(state, tmp_path / "other.pt")
     with pytest.raises(InputError, match="--resume .*other.pt: a training of sonic, not of twist2"):
         make_runner(env).load(str(tmp_path / "other.pt"))
+    state["card"]["tracker"] = "twist2"
+    state["critic_state_dict"] = {f"old.{name}": value for name, value in state["critic_state_dict"].items()}
+    torch.save(state, tmp_path / "old.pt")
+    with pytest.raises(InputError, match="--resume .*old.pt: a checkpoint of another version"):
+        make_runner(env).load(str(tmp_path / "old.pt"))
 
 
 def test_time_limit_lets_the_training_settle(env):

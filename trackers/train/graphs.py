@@ -1,0 +1,33 @@
+"""CUDA graphs of what a training does again and again: one launch instead of hundreds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from arena_newton.trackers.train.tally import TrainingError
+
+__all__ = ["captured"]
+
+
+def captured(work: Callable[[], None], option: str, stream: torch.cuda.Stream | None = None) -> torch.cuda.CUDAGraph:
+    """Hold work in a graph; it is recorded, not done.
+
+    Args:
+        work: What to hold: no host synchronisation, the same tensors each time.
+        option: The command line's switch of this graph, such as `tick-graph`.
+        stream: Where to record, a stream of torch's own choice by default.
+
+    Raises:
+        TrainingError: The work cannot be recorded. The device's random numbers may be unusable then.
+    """
+    graph = torch.cuda.CUDAGraph()
+    try:
+        # Other threads (a process group's watchdog) may use the device meanwhile.
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            work()
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise TrainingError(f"no CUDA graph could be captured, --no-{option} does without ({reason})") from error
+    return graph
