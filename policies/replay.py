@@ -20,6 +20,13 @@ __all__ = ["ReplayEpisodes", "ReplayPolicy", "from_spec"]
 _XY = ACTION["root_xy_delta"]
 
 
+def _played(recording: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Actions at ticks of any shape; after the end the last one without displacement, shape [..., 40]."""
+    actions = recording[np.minimum(ticks, len(recording) - 1)]
+    actions[ticks >= len(recording), _XY] = 0.0
+    return actions
+
+
 class ReplayPolicy(Policy):
     """Plays actions from the start of each episode; afterwards it holds the last one without displacement."""
 
@@ -56,8 +63,6 @@ class ReplayPolicy(Policy):
             self.actions = np.concatenate([lead, actions])
         self._startup = (startup_stand, startup_blend)
         self._hash = hashlib.sha256(self.path.read_bytes()).hexdigest()[:12]
-        self._held = self.actions[-1].copy()
-        self._held[_XY] = 0.0
         self._steps = np.zeros(0, dtype=np.int64)
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
@@ -71,10 +76,8 @@ class ReplayPolicy(Policy):
         self._grow(worlds)
         asking = world_mask(observation.mask, worlds)
         ticks = self._steps[:, None] + np.arange(self.chunk_size)
-        actions = self.actions[np.minimum(ticks, len(self.actions) - 1)]
-        actions[ticks >= len(self.actions)] = self._held
         self._steps[asking] += self.chunk_size
-        return Chunk(actions)
+        return Chunk(_played(self.actions, ticks))
 
     def describe(self) -> dict[str, Any]:
         """File name and hash, and the times of the start."""
@@ -171,8 +174,7 @@ class ReplayEpisodes(Policy):
                 errors[int(world)] = f"{self.path}: no recording of {task}, mode {mode}, episode seed {seed}"
                 continue
             ticks = self._steps[world] + np.arange(self.chunk_size)
-            actions[world] = recording[np.minimum(ticks, len(recording) - 1)]
-            actions[world, ticks >= len(recording), _XY] = 0.0
+            actions[world] = _played(recording, ticks)
             self._steps[world] += self.chunk_size
         return Chunk(actions, errors)
 
