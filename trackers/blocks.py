@@ -4,8 +4,9 @@ Matrix products and vectorised activations on a CPU give a row other last bits i
 and a walking robot amplifies that to another trajectory. Rows are therefore padded to a multiple of a fixed block size.
 Which size leaves a row's bits alone wherever it stands in a block depends on the network, the library and the
 processor, so it is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it
-replaces the separate ones. All of it runs on one thread: results then do not depend on the number of threads either,
-and a second thread loses more than it wins in an evaluation, where it has to fetch the weights anew each tick.
+replaces the separate ones. A product runs on one thread: results then do not depend on the number of threads either,
+and a second thread loses more than it wins on the few rows of an evaluation, where it has to fetch the weights anew
+each tick. Hundreds of rows are shared among threads, each with a product of its own.
 
 A network is compiled by ONNX Runtime, whose products of a few rows cost little more than reading the weights and give
 a row the same bits among any others. Where that fails it is traced, which takes Python out from between its operations.
@@ -18,6 +19,7 @@ import contextlib
 import io
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
@@ -30,6 +32,9 @@ _COMPILED_SIZES = (1, 2, 4)
 """Block sizes tried of a compiled network."""
 _MERGED = (2, 3, 5, 8, 13, 20, 32)
 """Products of so many blocks must give a block's bits before a compiled network may run as one product of any size."""
+
+_SHARE = 128
+"""Fewest rows that are worth a thread."""
 
 _PROBE_SEED = 20240
 _WARM_UP = 3
@@ -129,6 +134,8 @@ class BlockRunner:
         self.input = self._buffer[:worlds]
         self._product: Network = network
         self._plan: tuple[int, bool] | None = None
+        self._threads = min(torch.get_num_threads(), worlds // _SHARE)
+        self._pool = ThreadPoolExecutor(self._threads) if self.fixed and self._threads > 1 else None
 
     @torch.inference_mode()
     def run(self) -> torch.Tensor:
@@ -138,6 +145,9 @@ class BlockRunner:
         block, merged = self.plan()
         rows = -(-self.worlds // block) * block
         with _one_thread():
+            if merged and self._pool is not None:
+                share = -(-rows // (block * self._threads)) * block
+                return torch.cat(list(self._pool.map(self._product, self._buffer[:rows].split(share))))[: self.worlds]
             if merged or rows == block:
                 return self._product(self._buffer[:rows])[: self.worlds]
             blocks = [self._product(self._buffer[i : i + block].clone()) for i in range(0, rows, block)]

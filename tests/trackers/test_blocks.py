@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from arena_newton.trackers import blocks
 from arena_newton.trackers.blocks import BlockRunner
 
 
@@ -48,6 +49,23 @@ def test_modules_run_compiled_and_in_one_product():
     rows = torch.randn(20, 451)
     runner.input.copy_(rows)
     assert runner.run().shape == (20, 29)
+
+
+@pytest.mark.parametrize("worlds", [41, 64])
+def test_many_rows_are_shared_among_threads(monkeypatch, worlds):
+    """Threads with a product each give the bits of one product."""
+    network, rows = mlp(451, 64, 29), torch.randn(worlds, 451)
+    whole = outputs(network, rows)
+    monkeypatch.setattr(blocks, "_SHARE", 8)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    runner = BlockRunner(network, 451, worlds)
+    used = set()
+    runner.input.copy_(rows)
+    runner.plan()
+    product = runner._product
+    runner._product = lambda part: used.add(len(part)) or product(part)
+    assert torch.equal(runner.run(), whole)
+    assert max(used) <= -(-worlds // 3) + 1
 
 
 def test_a_module_that_cannot_be_compiled_runs_all_the_same(monkeypatch):
