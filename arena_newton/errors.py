@@ -1,6 +1,9 @@
 """The product's errors: one small hierarchy."""
 
-__all__ = ["ArenaError", "InputError"]
+import contextlib
+from collections.abc import Iterator
+
+__all__ = ["ArenaError", "InputError", "naming"]
 
 
 class ArenaError(Exception):
@@ -9,3 +12,12 @@ class ArenaError(Exception):
 
 class InputError(ArenaError):
     """The user's input (flag, file, prim, field) is wrong; the command line prints it and exits with code 2."""
+
+
+@contextlib.contextmanager
+def naming(flag: str) -> Iterator[None]:
+    """Put the flag that brought an input before what is wrong with it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{flag} {error}") from error

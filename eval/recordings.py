@@ -36,9 +36,9 @@ class RecordingPolicy(Policy):
         """As the policy behind."""
         self.policy.check()
 
-    def check_task(self, task: str) -> None:
+    def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
         """As the policy behind."""
-        self.policy.check_task(task)
+        self.policy.check_task(task, mode, seeds)
 
     def attach(self, env: Any) -> None:
         """As the policy behind."""

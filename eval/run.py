@@ -21,6 +21,7 @@ from arena_newton.eval import config as configs
 from arena_newton.eval import report
 from arena_newton.eval.config import RunConfig, RunOptions
 from arena_newton.eval.journal import Journal, StorageError, write_atomic
+from arena_newton.eval.plan import Episode
 from arena_newton.eval.recordings import RecordingPolicy
 
 __all__ = ["Factories", "execute", "stored_options"]
@@ -84,8 +85,8 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
     folder = Path(options.out).expanduser() if options.out else _new_folder()
     document = _document(options, config)
     _check_folder(folder, document)
-    policy = _check_parts(config, factories)
     episodes = configs.episodes(config)
+    policy = _check_parts(config, episodes, factories)
     document["planned"] = len(episodes)
     _open_folder(folder, document)
     print(f"configuration {config.hash}")
@@ -185,13 +186,16 @@ def _open_folder(folder: Path, document: dict[str, Any]) -> None:
         raise InputError(f"--out {folder}: cannot be created ({error.strerror})") from None
 
 
-def _check_parts(config: RunConfig, factories: Factories) -> Any:
-    """Build tracker and policy and look into the variant, so that wrong input shows before the first episode."""
+def _check_parts(config: RunConfig, episodes: Sequence[Episode], factories: Factories) -> Any:
+    """Build tracker and policy and look into plan and variant, so that wrong input shows before the first episode."""
     factories.tracker(config.tracker, config.checkpoint)
     policy = factories.policy(config.policy)
     policy.check()
-    for task in config.tasks:
-        policy.check_task(task)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for episode in episodes:
+        groups.setdefault((episode.task, episode.mode), []).append(episode.episode_seed)
+    for (task, mode), seeds in groups.items():
+        policy.check_task(task, mode, seeds)
     if config.variant is not None:
         factories.check_variant(config.variant, config.tasks[0])
     return policy

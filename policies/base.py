@@ -58,8 +58,13 @@ class Policy:
             InputError: It cannot, for a reason that the user can mend.
         """
 
-    def check_task(self, task: str) -> None:
+    def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
         """Look, before the first episode, whether the policy can do a task.
+
+        Args:
+            task: The task.
+            mode: The mode of the coming episodes, if it is known yet.
+            seeds: Their episode seeds, if they are known yet.
 
         Raises:
             InputError: It cannot.

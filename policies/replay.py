@@ -137,8 +137,8 @@ class ReplayEpisodes(Policy):
         self._asked: list[tuple[str, str, int]] = []
         self._steps = np.zeros(0, dtype=np.int64)
 
-    def check_task(self, task: str) -> None:
-        """Refuse a task without a recording.
+    def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
+        """Refuse a task without a recording, or episodes of which none has one.
 
         Raises:
             InputError: There is none.
@@ -147,6 +147,12 @@ class ReplayEpisodes(Policy):
 
         if tasks.get(task).gym_id not in {recorded for recorded, _, _ in self._episodes}:
             raise InputError(f"--policy replay:{self.path}: no recording of task {task}")
+        here = [(m, s) for recorded, m, s in self._episodes if recorded == tasks.get(task).gym_id]
+        if mode is not None and mode not in {m for m, _ in here}:
+            modes = ", ".join(sorted({m for m, _ in here}))
+            raise InputError(f"--policy replay:{self.path}: no recording of task {task} in mode {mode}, only {modes}")
+        if seeds and not any((mode, seed) in here for seed in seeds):
+            raise InputError(f"--policy replay:{self.path}: recordings of task {task}, but of other --seeds")
 
     def attach(self, env: Any) -> None:
         """Learn the mode whose recordings are played."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,7 +138,7 @@ def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
     if path is not None and not all(Path(part).exists() for part in str(path).split(",")) and not path.exists():
         raise InputError(f"--checkpoint {path}: no such file")
     if spec in _registered:
-        return _registered[spec](path)
+        return _made(spec, _registered[spec], path)
     if spec in _BUILT_IN:
         module, _, attribute = _BUILT_IN[spec].partition(":")
         return getattr(importlib.import_module(module), attribute)(path)
@@ -146,4 +147,17 @@ def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
     except Exception as error:
         reason = " ".join(str(error).split())
         raise InputError(f"--tracker {spec}: its package does not load ({type(error).__name__}: {reason})") from error
-    return factory(path)
+    return _made(spec, factory, path)
+
+
+def _made(spec: str, factory: Callable[[Path | None], Tracker], path: Path | None) -> Tracker:
+    try:
+        inspect.signature(factory).bind(path)
+    except TypeError as error:
+        raise InputError(f"--tracker {spec}: its factory takes no checkpoint ({error})") from None
+    except ValueError:  # some of those written in C have no signature
+        pass
+    tracker = factory(path)
+    if not isinstance(tracker, Tracker):
+        raise InputError(f"--tracker {spec}: its factory makes a {type(tracker).__name__}, not a Tracker")
+    return tracker

@@ -129,7 +129,7 @@ class ExpertPolicy(Policy):
         self.expert: Expert | None = None
         """The expert at work; None before `attach`."""
 
-    def check_task(self, task: str) -> None:
+    def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
         """Refuse a task without an expert.
 
         Raises:

@@ -70,7 +70,7 @@ def fake_tracker(spec, checkpoint):
 def fake_policy(spec):
     """A policy that does not see."""
     return SimpleNamespace(
-        name=spec, needs_image=False, check=lambda: None, check_task=lambda task: None, close=lambda: None
+        name=spec, needs_image=False, check=lambda: None, check_task=lambda *episodes: None, close=lambda: None
     )
 
 

@@ -74,6 +74,11 @@ def test_modes_are_kept_apart(tmp_path, capsys):
     capsys.readouterr()
     assert command_line.main(["run", "--task", "football", *replay, "--out", str(tmp_path / "no")]) == 2
     assert "no recording of task football" in capsys.readouterr().err
+    assert command_line.main(["run", *RUN, *replay, "--mode", "semantic", "--out", str(tmp_path / "no")]) == 2
+    assert "in mode semantic, only base, execution" in capsys.readouterr().err
+    other = [*modes, "--seeds", "999", *replay, "--out", str(tmp_path / "no")]
+    assert command_line.main(["run", *other]) == 2
+    assert "but of other --seeds" in capsys.readouterr().err
 
 
 def test_unfit_folders_are_refused(recorded, tmp_path):

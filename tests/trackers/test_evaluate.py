@@ -376,6 +376,8 @@ def test_command_line_writes_tables_side_by_side(tmp_path, capsys):
         (["--checkpoint", "x.onnx"], "name its --tracker first"),
         (["--tracker", "nobody"], "unknown tracker"),
         (["--tracker", "nowhere:factory"], "nowhere"),
+        (["--tracker", "os:getcwd"], "--tracker os:getcwd: its factory takes no checkpoint"),
+        (["--tracker", "builtins:str"], "--tracker builtins:str: its factory makes a str, not a Tracker"),
         (["--tracker", "pd", "--tracker", "pd"], "--label"),
         (["--tracker", "pd", "--only", "nothing"], "no such cell"),
         (["--tracker", "pd", "--only", "stand", "nothing"], "--only nothing: no such cell"),

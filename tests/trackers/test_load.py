@@ -167,6 +167,8 @@ def test_bad_content(tmp_path):
         r"field dof_pos holds NaN": clip(dof_pos=nan),
         r"field fps must be": clip(fps=np.array(0.0)),
         r"root_rot has shape \[50, 4\]": clip(root_rot=np.tile([0.0, 0, 0, 1], (50, 1))),
+        r"root_pos holds 1e\+30, expected m up to 1000": clip(root_pos=np.full((60, 3), 1e30)),
+        r"dof_pos holds 57, expected rad": clip(dof_pos=np.full((60, 29), 57.0)),
         r"not of length 1": clip(root_rot=np.zeros((60, 4))),
         r"field root_pos holds no numbers": clip(root_pos="here"),
         r"field root_pos is missing": {"fps": 30.0},

@@ -178,6 +178,8 @@ def _generate(args: argparse.Namespace) -> None:
         raise InputError(f"--family {unknown[0]}: unknown, choose from {', '.join(programs.FAMILIES)}")
     if not 1.0 <= args.seconds <= 3600.0:
         raise InputError(f"--seconds {args.seconds:g}: expected 1 to 3600")
+    if not 0 <= args.seed < 2**63:
+        raise InputError(f"--seed {args.seed}: expected a number of at least 0")
     if args.device != "cpu":
         resolve_engine("warp", args.device)
     made = programs.random_clips(families, seconds=args.seconds, seed=args.seed, device=args.device)

@@ -146,7 +146,9 @@ def read_file(path: str | Path, options: ReadOptions | None = None) -> Reading:
     """
     path, options = Path(path), options or ReadOptions()
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: {'is a folder, expected a file' if path.is_dir() else 'no such file'}")
+    if options.fps is not None and not 1.0 <= options.fps <= 1000.0:
+        raise InputError(f"--fps {options.fps:g}: expected a frame rate from 1 to 1000")
     suffix = path.suffix.lower()
     if suffix in (".pkl", ".pickle", ".joblib"):
         return _pickle(path, options)

@@ -191,7 +191,7 @@ class MotionLibrary:
             return int(found[0])
         if name_or_number.isdecimal() and int(name_or_number) < self.clips:
             return int(name_or_number)
-        raise InputError(f"clip {name_or_number}: the library has no clip of that name among its {self.clips}")
+        raise InputError(f"--clip {name_or_number}: neither a clip's name nor a number from 0 to {self.clips - 1}")
 
     @classmethod
     def from_clips(

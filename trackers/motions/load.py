@@ -39,6 +39,8 @@ JOINTS_23: tuple[int, ...] = (*range(19), *range(22, 26))
 """The joints of 23-DoF clips (GMT, ASAP): legs, waist, shoulders and elbows; their wrists stand at zero."""
 FIELDS = {"root_pos": "root_trans_offset", "root_rot": "root_rot", "dof_pos": "dof"}
 """TWIST2's name of a field → ASAP's."""
+FAR = 1000.0
+"""Farthest that a root may be from the origin [m]; beyond it a file is in other units or damaged."""
 START_FRAMES = 15
 """A motion capture jump is looked for in this many first frames."""
 START_HEIGHT = 1.3
@@ -256,7 +258,8 @@ def checked_clip(
         trim: Cut a motion capture jump off the start.
 
     Raises:
-        InputError: A frame rate outside 1 to 1000, a wrong shape, or a quaternion that is none.
+        InputError: A frame rate outside 1 to 1000, a wrong shape, a quaternion that is none, or numbers so large that
+            they are in other units.
     """
     if not 1.0 <= fps <= 1000.0:
         raise InputError(f"{where}: field fps must be one number from 1 to 1000")
@@ -269,6 +272,9 @@ def checked_clip(
         if array.shape != (frames, width) or frames < 2:
             shape = list(array.shape)
             raise InputError(f"{where}: {field} has shape {shape}, expected [frames, {width}] with 2 or more frames")
+    for field, array, most, unit in (("root_pos", root_pos, FAR, "m"), ("dof_pos", dof_pos, 2.0 * np.pi, "rad")):
+        if np.abs(array).max() > most:
+            raise InputError(f"{where}: {field} holds {np.abs(array).max():.3g}, expected {unit} up to {most:.4g}")
     norm = np.linalg.norm(root_rot, axis=1, keepdims=True)
     if (np.abs(norm - 1.0) > 0.1).any():
         raise InputError(f"{where}: root_rot holds a quaternion that is not of length 1")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
@@ -45,13 +44,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _export(arguments: Sequence[str]) -> None:
     import tyro
 
-    from arena_newton.trackers.train.export import ExportOptions, export
+    from arena_newton.trackers.train.export import ExportCommand, export
 
-    if list(arguments) in (["-h"], ["--help"]):
-        tyro.cli(ExportOptions, args=["--help"], prog=f"{PROG} export CHECKPOINT")
-    if not arguments or arguments[0].startswith("-"):
+    if not arguments:
         raise InputError(f"export: name the checkpoint: {PROG} export CHECKPOINT --out FILE.safetensors")
-    out = export(Path(arguments[0]), tyro.cli(ExportOptions, args=arguments[1:], prog=f"{PROG} export"))
+    options = tyro.cli(ExportCommand, args=list(arguments), prog=f"{PROG} export")
+    out = export(options.checkpoint, options)
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB) and its card")
 
 

@@ -62,9 +62,18 @@ def read(folder: Path) -> list[dict[str, Any]]:
         missing = needed if not isinstance(row, dict) else [name for name in needed if name not in row]
         if missing:
             raise InputError(f"curves {path}: a logged iteration lacks {missing[0]}")
+        wrong = [name for name in ("iteration", *needed) if not isinstance(row.get(name, 0), int | float)]
+        if wrong:
+            raise InputError(f"curves {path}: {wrong[0]} of a logged iteration is no number")
     if not rows:
         raise InputError(f"curves {path}: no logged iterations")
-    return rows
+    # A training that went on from an older checkpoint logged some iterations twice: the later ones count.
+    kept: list[dict[str, Any]] = []
+    for row in rows:
+        while kept and kept[-1].get("iteration", 0) >= row.get("iteration", 1):
+            kept.pop()
+        kept.append(row)
+    return kept
 
 
 def draw(folders: Sequence[Path], out: Path) -> Path:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import tyro
 
 from arena_newton.errors import InputError
 
@@ -13,7 +16,7 @@ if TYPE_CHECKING:
     from arena_newton.robot import DriveGains
     from arena_newton.trackers.weights_file import Weights
 
-__all__ = ["ExportOptions", "export", "write"]
+__all__ = ["ExportCommand", "ExportOptions", "export", "write"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,14 @@ class ExportOptions:
     symmetric: bool = True
     """The tracker answers the mean of an action and the mirrored action of the mirrored observation: training leaves a
     preferred side, and a walk whose command has no heading turns that way."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportCommand(ExportOptions):
+    """Write a tracker's weights file and its card."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """Checkpoint of a training, such as runs/tracker/model_last.pt."""
 
 
 def export(checkpoint: Path, options: ExportOptions) -> Path:
@@ -55,18 +66,24 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         raise InputError(f"--out {options.out}: expected a .safetensors file")
     if options.metrics is not None and options.metrics.resolve() == options.out.with_suffix(".json").resolve():
         raise InputError(f"--out {options.out}: its card would overwrite --metrics {options.metrics}")
+    cards = [options.out.with_suffix(suffix) for suffix in (".json", ".md")]
+    if not options.out.exists() and (taken := [c for c in cards if c.exists()]):
+        raise InputError(f"--out {options.out}: its card would overwrite {taken[0]}, which is not of these weights")
     state = read_checkpoint(checkpoint)
     card = dict(state["card"])
     network = networks.make(card["tracker"], state["network"])
     prefix = "net."
     tensors = {k[len(prefix) :]: v for k, v in state["actor_state_dict"].items() if k.startswith(prefix)}
-    network.load_state_dict(tensors, strict=False)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InputError(f"{checkpoint}: its network does not fit interface {card['tracker']}") from error
     form, drive, physics = card.pop("action_form"), card.pop("drive"), card.pop("physics")
     card |= {
         "iterations": state["iter"],
         "samples": state["samples"],
         "minutes": round(state["seconds"] / 60.0, 2),
-        "gpu_minutes": round(state["seconds"] / 60.0 * card.get("processes", 1), 2),
+        "gpu_minutes": round(_process_seconds(state) / 60.0, 2),
         "training": {k: round(v, 5) for k, v in state["last"].items() if "/" in k},
     }
     if options.note:
@@ -104,6 +121,15 @@ def write(weights: Weights, out: Path) -> Path:
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return out
+
+
+def _process_seconds(state: Mapping[str, Any]) -> float:
+    """Seconds of training times the processes that trained, over all parts of a training that was resumed."""
+    total, before = 0.0, 0.0
+    for part in (*state["card"].get("earlier", ()), state["card"] | {"seconds": state["seconds"]}):
+        total += (part["seconds"] - before) * part["processes"]
+        before = part["seconds"]
+    return total
 
 
 def _figures(path: Path, interface: str) -> dict[str, Any]:
@@ -151,6 +177,8 @@ def _markdown(card: dict[str, Any]) -> str:
         "licences of the data": ", ".join(f"{name} ({count} clips)" for name, count in card["licences"].items()),
         "sources of the data": "; ".join(card["data"]["sources"]),
     }
+    for k, part in enumerate(card.get("earlier", ()), start=1):
+        rows[f"part {k}"] = f"to iteration {part['iter']}, commit {part['commit']}: `{part['command']}`"
     if started := card.get("started_from"):
         rows["started from"] = f"the weights of commit {started}"
     lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]

@@ -11,7 +11,9 @@ import signal
 import statistics
 import threading
 import time
+import warnings
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,16 @@ __all__ = ["TrackerRunner"]
 
 _SETTLED = 0.1
 """What is left of the aimed divergence and of the entropy's weight at the end of a time limit."""
+_PART = ("command", "commit", "worlds", "processes", "seed", "data", "licences")
+"""What the card tells of each part of a training that was resumed."""
+_CARD = {*_PART, "tracker", "action_form", "drive", "physics"}
+_KEPT = {
+    "actor_state_dict", "critic_state_dict", "iter", "network", "norm_counts", "learning_rate", "samples", "seconds",
+    "families", "sampler", "rng", "cuda_rng", "card", "last",
+}  # fmt: skip
+"""What every checkpoint holds."""
+_STRIDE = 7919
+"""Between the seeds of the further processes of trainings that are resumed at successive iterations."""
 _SEEN = 1e9
 """Observations that the input statistics of a weights file stand for: a training that starts from it leaves them."""
 
@@ -41,6 +53,10 @@ class DeviceLogger(Logger):
         super().__init__(**settings)
         self.rewbuffer, self.lenbuffer = deque(maxlen=10), deque(maxlen=10)
         self._ended = torch.zeros(3, device=self.device)  # episodes, their rewards, their lengths
+
+    def _store_code_state(self) -> list[str]:
+        """Nothing: the card names the commit, and nobody asked for a copy of his changed sources."""
+        return []
 
     def process_env_step(self, rewards, dones, extras, intrinsic_rewards=None) -> None:
         """Count one tick."""
@@ -94,6 +110,7 @@ class TrackerRunner(OnPolicyRunner):
         self.history: list[dict[str, float]] = []
         """What each logged iteration measured."""
         self._stop = False
+        self._logged: float = 0
         self._started = False
 
     def _configure_multi_gpu(self) -> None:
@@ -140,12 +157,13 @@ class TrackerRunner(OnPolicyRunner):
             minutes: Most minutes to run, 0 = no limit. The last iteration is finished.
         """
         main = threading.current_thread() is threading.main_thread()
-        previous = signal.signal(signal.SIGTERM, self._on_terminate) if main else None
+        signals = (signal.SIGTERM, signal.SIGINT) if main else ()
+        previous = {number: signal.signal(number, self._on_signal) for number in signals}
         try:
             self._learn(num_learning_iterations, minutes)
         finally:
-            if previous is not None:
-                signal.signal(signal.SIGTERM, previous)
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
     def _prepare(self) -> None:
         """Before the first iteration: see what observations look like and ask for the reference.
@@ -182,8 +200,13 @@ class TrackerRunner(OnPolicyRunner):
         if not self.logger.disable_logs:
             print(f"fitted to the reference: {float(loss.detach()) ** 0.5:.3f} RMS of raw action", flush=True)
 
-    def _on_terminate(self, *_: Any) -> None:
+    def _on_signal(self, number: int, _: Any) -> None:
+        """SIGTERM and Ctrl-C end the training after this iteration; a second Ctrl-C ends it at once."""
+        if self._stop and number == signal.SIGINT:
+            raise KeyboardInterrupt
         self._stop = True
+        if number == signal.SIGINT and not self.logger.disable_logs:
+            print("\nstopping after this iteration; Ctrl-C once more stops without writing", flush=True)
 
     def _learn(self, iterations: int, minutes: float) -> None:
         self.alg.train_mode()
@@ -196,9 +219,10 @@ class TrackerRunner(OnPolicyRunner):
         batch = steps * self.env.num_envs * self.gpu_world_size
         obs = self.env.get_observations()
         first = self.current_learning_iteration
-        rate = self.alg.learning_rate
         learning = list(self.alg.get_policy().parameters())
         alone = self.cfg["critic_iterations"] if self._started else 0
+        # While the critic learns alone nothing diverges, and the rate only grows.
+        rate = self.cfg["algorithm"]["learning_rate"] if first < alone else self.alg.learning_rate
         for parameter in learning:
             parameter.requires_grad_(first >= alone)
         began = mark = time.monotonic()
@@ -232,6 +256,8 @@ class TrackerRunner(OnPolicyRunner):
                 self.save(str(Path(self.logger.log_dir or ".") / f"model_{it + 1}.pt"))
                 mark = time.monotonic()
         if self._writes:
+            if self.history and self.history[-1]["iteration"] != self._logged:
+                self._log(self.history[-1])
             self.save(str(Path(self.logger.log_dir or ".") / "model_last.pt"))
             self.save(str(Path(self.logger.log_dir or ".") / "model_slim.pt"), slim=True)
             self.logger.stop_logging_writer()
@@ -297,15 +323,17 @@ class TrackerRunner(OnPolicyRunner):
                 f"std {row['std']:.2f}  value {losses['value']:.3f}",
                 flush=True,
             )
-        writer = self.logger.writer
-        if writer is None:
-            return
-        if it == first or (it + 1) % self.cfg["log_interval"] == 0:
-            with (Path(self.logger.log_dir) / "progress.jsonl").open("a") as file:
-                file.write(json.dumps(row) + "\n")
-            for name, value in row.items():
-                if name != "iteration":
-                    writer.add_scalar(name if "/" in name else f"Train/{name}", value, it + 1)
+        if self.logger.writer is not None and (it == first or (it + 1) % self.cfg["log_interval"] == 0):
+            self._log(row)
+
+    def _log(self, row: dict[str, float]) -> None:
+        """Add an iteration to progress.jsonl and to the curves."""
+        self._logged = row["iteration"]
+        with (Path(self.logger.log_dir) / "progress.jsonl").open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        for name, value in row.items():
+            if name != "iteration":
+                self.logger.writer.add_scalar(name if "/" in name else f"Train/{name}", value, int(row["iteration"]))
 
     def save(self, path: str, infos: dict | None = None, *, slim: bool = False) -> None:
         """Write everything that a resumed training needs.
@@ -326,6 +354,7 @@ class TrackerRunner(OnPolicyRunner):
             "samples": self.samples,
             "seconds": self.seconds,
             "started": self._started,
+            "families": list(self.env.bank.family_names),
             "sampler": self.env.sampler.state_dict(),
             "rng": torch.get_rng_state(),
             "cuda_rng": cuda,
@@ -347,10 +376,16 @@ class TrackerRunner(OnPolicyRunner):
         Raises:
             InputError: The file is absent or no checkpoint of this training.
         """
-        state = read_checkpoint(path, map_location or str(self.device))
-        tracker = self.cfg.get("card", {}).get("tracker")
-        if tracker is not None and state["card"].get("tracker") != tracker:
-            raise InputError(f"--resume {path}: a training of {state['card'].get('tracker')}, not of {tracker}")
+        state = read_checkpoint(path, map_location or str(self.device), flag="--resume")
+        card, previous = self.cfg["card"], state["card"]
+        if previous["tracker"] != card["tracker"]:
+            raise InputError(f"--resume {path}: a training of {previous['tracker']}, not of {card['tracker']}")
+        kinds = previous["action_form"]["kind"], card["action_form"]["kind"]
+        if kinds[0] != kinds[1]:
+            raise InputError(f"--resume {path}: its action form is {kinds[0]}, not {kinds[1]}")
+        if state["families"] != self.env.bank.family_names:
+            theirs, ours = ", ".join(state["families"]), ", ".join(self.env.bank.family_names)
+            raise InputError(f"--resume {path}: its references are of the families {theirs}; these are {ours}")
         if state["network"] != self.alg.get_policy().net.config():
             raise InputError(f"--resume {path}: a network of other widths than this training's")
         self._started = bool(state.get("started", False))
@@ -364,28 +399,58 @@ class TrackerRunner(OnPolicyRunner):
             count.copy_(state["norm_counts"][name])
         self.current_learning_iteration = state["iter"]
         self.samples, self.seconds = state["samples"], state["seconds"]
-        self.env.sampler.load_state_dict(state["sampler"])
         rank = getattr(self, "gpu_global_rank", 0)
-        if rank == 0:
+        if not self.env.sampler.load_state_dict(state["sampler"]) and rank == 0:
+            print(f"--resume {path}: other references, so where the tracker fails is found out anew")
+        card |= resumed_card(state, card)
+        if rank > 0:
+            torch.manual_seed(self.cfg["seed"] + rank + _STRIDE * state["iter"])
+        else:
             torch.set_rng_state(state["rng"].cpu())
             if state["cuda_rng"] is not None and str(self.device).startswith("cuda"):
                 torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
         return state["infos"] or {}
 
 
-def read_checkpoint(path: str | Path, device: str = "cpu") -> dict[str, Any]:
+def resumed_card(state: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
+    """What the card of a training gains when it goes on with another: its parts before, and all of their licences.
+
+    Args:
+        state: The checkpoint.
+        card: The card of this part.
+    """
+    previous = state["card"]
+    part = {name: previous[name] for name in _PART} | {name: state[name] for name in ("iter", "samples", "seconds")}
+    gained = {
+        "earlier": [*previous.get("earlier", []), part],
+        "licences": {**previous["licences"], **card["licences"]},
+    }
+    return gained | {name: previous[name] for name in ("started_from",) if name in previous}
+
+
+def read_checkpoint(path: str | Path, device: str = "cpu", flag: str = "") -> dict[str, Any]:
     """Read a training checkpoint: tensors and plain containers only.
+
+    Args:
+        path: The file.
+        device: Where its tensors go.
+        flag: Command-line flag that errors name.
 
     Raises:
         InputError: The file is absent or no checkpoint of this training.
     """
+    where = f"{flag} {path}".strip()
     try:
-        state = torch.load(path, weights_only=True, map_location=device)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of files that are something else altogether
+            state = torch.load(path, weights_only=True, map_location=device)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such checkpoint") from None
+        raise InputError(f"{where}: no such checkpoint") from None
     except Exception as error:
-        raise InputError(f"{path}: not a training checkpoint ({type(error).__name__})") from error
-    missing = {"actor_state_dict", "network", "norm_counts", "sampler", "card"} - set(state)
+        raise InputError(f"{where}: not a training checkpoint ({type(error).__name__})") from error
+    if not isinstance(state, dict) or not isinstance(state.get("card"), dict):
+        raise InputError(f"{where}: not a checkpoint of this training")
+    missing = sorted((_KEPT - set(state)) | (_CARD - set(state["card"])))
     if missing:
-        raise InputError(f"{path}: not a checkpoint of this training, it lacks {', '.join(sorted(missing))}")
+        raise InputError(f"{where}: not a checkpoint of this training, it lacks {', '.join(missing)}")
     return state

@@ -6,6 +6,7 @@ a factor that grows with its failure rate. All statistics live on the device; th
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import torch
@@ -40,6 +41,9 @@ class ClipSampler:
             family_weights: Weights of families by name relative to their seconds of motion; 1 where not named.
         """
         self.bank, self.adaptive = bank, adaptive
+        first = bank.data.index_select(0, bank.start).cpu().numpy().tobytes()
+        self.library = hashlib.sha256(bank.length.cpu().numpy().tobytes() + first).hexdigest()[:16]
+        """Tells libraries apart, by the lengths and the first frames of their clips."""
         device = bank.start.device
         bins = (bank.length + BIN - 1) // BIN
         clip = torch.repeat_interleave(torch.arange(len(bins), device=device), bins)
@@ -103,11 +107,18 @@ class ClipSampler:
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed training needs."""
-        return {"seconds": self.seconds, "failures": self.failures, "cumulative": self.cumulative}
+        return {
+            "library": self.library,
+            "seconds": self.seconds,
+            "failures": self.failures,
+            "cumulative": self.cumulative,
+        }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up the evidence of a checkpoint, if it is of the same library."""
-        if state["seconds"].shape == self.seconds.shape:
-            self.seconds.copy_(state["seconds"])
-            self.failures.copy_(state["failures"])
-            self.cumulative.copy_(state["cumulative"])
+    def load_state_dict(self, state: dict[str, Any]) -> bool:
+        """Take up the evidence of a checkpoint; False where it is of another library and stays out."""
+        if state.get("library") != self.library:
+            return False
+        self.seconds.copy_(state["seconds"])
+        self.failures.copy_(state["failures"])
+        self.cumulative.copy_(state["cumulative"])
+        return True

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
+import io
 import math
 import os
 import shlex
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, naming
 from arena_newton.trackers.train.config import FAMILY_WEIGHTS, TrainOptions, runner_config
 
 if TYPE_CHECKING:
@@ -60,16 +63,19 @@ def make_library(options: TrainOptions, device: str, seed: int = 0) -> MotionLib
         raise InputError("--families makes references, --library reads them: pass one of the two")
     parts = []
     if options.library is not None:
-        parts.append(MotionLibrary.load(options.library))
+        with naming("--library"):
+            parts.append(MotionLibrary.load(options.library))
     else:
         from arena_newton.trackers.motions import programs
 
         wanted: dict[str, Any] = {"families": options.families} if options.families else {}
-        parts.append(MotionLibrary.from_random(programs.random_clips(**wanted, seed=seed, device=device)))
+        with naming("--families"):
+            parts.append(MotionLibrary.from_random(programs.random_clips(**wanted, seed=seed, device=device)))
     if options.clips:
-        more, reports = read_library(
-            options.clips, family="clips", licence=options.clips_licence, source=options.clips_source
-        )
+        with naming("--clips"):
+            more, reports = read_library(
+                options.clips, family="clips", licence=options.clips_licence, source=options.clips_source
+            )
         for report in reports:
             print(report.line())
         parts.append(more)
@@ -123,7 +129,8 @@ def check(options: TrainOptions) -> None:
         ("--minutes", options.minutes, 0, math.inf),
         ("--iterations", options.iterations, 1, math.inf),
         ("--adaptive", options.adaptive, 0, 1),
-        ("--episode-s", options.episode_s, 0.1, math.inf),
+        ("--episode-s", options.episode_s, 0.1, 3600),
+        ("--seed", options.seed, 0, 2**31),
         ("--steps", options.steps, 2, math.inf),
         ("--epochs", options.epochs, 1, math.inf),
         ("--minibatches", options.minibatches, 1, options.worlds * options.steps),
@@ -151,18 +158,51 @@ def check(options: TrainOptions) -> None:
     for flag, file in (("--resume", options.resume), ("--start-from", options.start_from)):
         if file is not None and not file.is_file():
             raise InputError(f"{flag} {file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
-    if options.log_dir.exists() and not options.log_dir.is_dir():
-        raise InputError(f"--log-dir {options.log_dir}: is a file")
-    if not options.bench:
-        try:
-            options.log_dir.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"--log-dir {options.log_dir}: cannot be made ({error.strerror})") from None
-    used = sorted(options.log_dir.glob("model_*.pt")) if options.resume is None and not options.bench else []
-    if used:
-        raise InputError(
-            f"--log-dir {options.log_dir}: holds a training ({used[0].name}); --resume goes on with it, or name another"
-        )
+
+
+def check_folder(options: TrainOptions) -> None:
+    """Make the log folder; refuse one that cannot be written, or whose files are another training's.
+
+    Raises:
+        InputError: The folder is no place for this training.
+    """
+    folder = options.log_dir
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--log-dir {folder}: is a file")
+    if options.resume is None or options.resume.resolve().parent != folder.resolve():
+        used = [f for kind in ("model_*.pt", "progress.jsonl", "*.safetensors") for f in sorted(folder.glob(kind))]
+        if used:
+            raise InputError(
+                f"--log-dir {folder}: holds {used[0].name}; --resume a checkpoint of that training, or name another"
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"--log-dir {folder}: cannot be written ({error.strerror})") from None
+
+
+def _action_form(options: TrainOptions) -> str:
+    """The action form of a training; that of its checkpoint, if it goes on with one.
+
+    Raises:
+        InputError: The file to begin with is unfit, or of another form than asked for.
+    """
+    from arena_newton.trackers import weights_file
+    from arena_newton.trackers.train.runner import read_checkpoint
+
+    if options.start_from is not None:
+        weights_file.load(options.start_from, options.tracker, flag="--start-from")
+    if options.resume is None:
+        return options.action_form
+    card = read_checkpoint(options.resume, flag="--resume")["card"]
+    if card["tracker"] != options.tracker:
+        raise InputError(f"--resume {options.resume}: a training of {card['tracker']}, not of {options.tracker}")
+    kind = str(card["action_form"]["kind"])
+    if options.action_form not in ("auto", kind):
+        raise InputError(f"--action-form {options.action_form}: that of --resume {options.resume} is {kind}")
+    return kind
 
 
 def _device(name: str) -> str:
@@ -197,7 +237,9 @@ def build(options: TrainOptions) -> TrackerRunner:
     unknown = sorted(set(options.rewards) - set(REWARDS))
     if unknown:
         raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
-    device = _device(options.device)
+    device, form = _device(options.device), _action_form(options)
+    if not options.bench:
+        check_folder(options)
     rank, processes = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     share_stream(device)
     torch.set_float32_matmul_precision("high")
@@ -212,7 +254,7 @@ def build(options: TrainOptions) -> TrackerRunner:
         raise InputError(f"--family-weights {unknown[0]}: no such family in the library; there are {known}")
     if not any(weights.get(str(name), 1.0) > 0.0 for name in library.family_names):
         raise InputError("--family-weights: every family of the library has weight 0")
-    front, drive, rate = front_end(options.tracker, options.action_form)
+    front, drive, rate = front_end(options.tracker, form)
     rewards = {n: dataclasses.replace(t, weight=options.rewards.get(n, t.weight)) for n, t in REWARDS.items()}
     env = TrackerEnv(
         front,
@@ -247,7 +289,8 @@ def build(options: TrainOptions) -> TrackerRunner:
     }
     config = runner_config(options, networks.make(options.tracker).config(), card)
     log_dir = None if options.bench else str(options.log_dir)
-    runner = TrackerRunner(env, config, log_dir, device)
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints both networks layer by layer
+        runner = TrackerRunner(env, config, log_dir, device)
     if options.resume is not None:
         runner.load(str(options.resume), map_location=device)
     elif options.start_from is not None:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import os
+import signal
 import subprocess
 import sys
 
@@ -254,19 +256,109 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
         export(checkpoint, ExportOptions(tmp_path / "file" / "w.safetensors"))
 
 
-def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, tmp_path):
-    """A checkpoint of the other tracker, or one whose critic has other parts, is refused by name."""
-    make_runner(env, str(tmp_path)).learn(1)
-    state = torch.load(tmp_path / "model_last.pt", weights_only=True)
-    state["card"]["tracker"] = "sonic"
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda state: state["card"].update(tracker="sonic"), "a training of sonic, not of twist2"),
+        (lambda state: state["card"]["action_form"].update(kind="default"), "its action form is default, not residual"),
+        (lambda state: state.update(families=["walk"]), "of the families walk; these are stand, squat"),
+        (lambda state: state.update(critic_state_dict={"old": torch.zeros(1)}), "a checkpoint of another version"),
+        (lambda state: state.update(network={"hidden": [8]}), "a network of other widths"),
+        (lambda state: state.pop("rng"), "it lacks rng"),
+        (lambda state: state["card"].pop("licences"), "it lacks licences"),
+        (lambda state: state.update(card=5), "not a checkpoint of this training"),
+    ],
+)
+def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, tmp_path, change, words):
+    """Every difference that would change what is learnt is refused in words."""
+    runner = make_runner(env, str(tmp_path))
+    runner.save(str(tmp_path / "last.pt"))
+    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    change(state)
     torch.save(state, tmp_path / "other.pt")
-    with pytest.raises(InputError, match="--resume .*other.pt: a training of sonic, not of twist2"):
+    with pytest.raises(InputError, match=f"--resume .*other.pt: .*{words}"):
         make_runner(env).load(str(tmp_path / "other.pt"))
-    state["card"]["tracker"] = "twist2"
-    state["critic_state_dict"] = {f"old.{name}": value for name, value in state["critic_state_dict"].items()}
-    torch.save(state, tmp_path / "old.pt")
-    with pytest.raises(InputError, match="--resume .*old.pt: a checkpoint of another version"):
-        make_runner(env).load(str(tmp_path / "old.pt"))
+
+
+def test_a_resumed_training_tells_of_all_its_parts(env, tmp_path, capsys):
+    """Card and weights keep the licences, commands and processes of the parts before, and what they started from."""
+    first = make_runner(env, str(tmp_path / "a"))
+    first.cfg["card"] |= {"licences": {"CC-BY-NC": 5}, "processes": 2, "started_from": "abc"}
+    first.seconds = 60.0
+    first.save(str(tmp_path / "a.pt"))
+    second = make_runner(env, str(tmp_path / "b"))
+    second.load(str(tmp_path / "a.pt"))
+    second.seconds = 180.0
+    second.save(str(tmp_path / "b.pt"))
+    out = export(tmp_path / "b.pt", ExportOptions(tmp_path / "w.safetensors"))
+    card = json.loads(out.with_suffix(".json").read_text())
+    assert card["licences"] == {"CC-BY-NC": 5, "Apache-2.0": 2} and card["started_from"] == "abc"
+    assert [part["processes"] for part in card["earlier"]] == [2] and card["processes"] == 1
+    assert card["minutes"] == 3.0 and card["gpu_minutes"] == 2 * 1.0 + 1 * 2.0
+    assert "CC-BY-NC (5 clips)" in out.with_suffix(".md").read_text()
+    assert "other references" not in capsys.readouterr().out
+
+
+def test_other_references_start_without_evidence(env, tmp_path, capsys):
+    """What was learnt about one library's clips says nothing about another's of the same shape."""
+    runner = make_runner(env, str(tmp_path))
+    runner.save(str(tmp_path / "last.pt"))
+    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    state["sampler"] |= {"library": "another", "seconds": state["sampler"]["seconds"] + 1e6}
+    torch.save(state, tmp_path / "other.pt")
+    make_runner(env).load(str(tmp_path / "other.pt"))
+    assert "other references" in capsys.readouterr().out and (env.sampler.seconds < 1e5).all()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_training_with_its_files(env, tmp_path, number):
+    """The iteration in flight is finished, logged and written."""
+    runner = make_runner(env, str(tmp_path), log_interval=100)
+    report = runner._report
+
+    def interrupt(it, *rest) -> None:
+        report(it, *rest)
+        if it == 1:
+            os.kill(os.getpid(), number)
+
+    runner._report = interrupt
+    runner.learn(50)
+    assert runner.current_learning_iteration == 2 and (tmp_path / "model_last.pt").is_file()
+    assert [json.loads(line)["iteration"] for line in (tmp_path / "progress.jsonl").read_text().splitlines()] == [1, 2]
+    assert not (tmp_path / "git").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_interrupt_stops_at_once(env):
+    """Who presses Ctrl-C twice does not want to wait."""
+    runner = make_runner(env)
+    runner._on_signal(signal.SIGINT, None)
+    with pytest.raises(KeyboardInterrupt):
+        runner._on_signal(signal.SIGINT, None)
+
+
+def test_export_overwrites_nothing_foreign_and_needs_every_tensor(env, tmp_path):
+    """A card's neighbour of the same name stays; a checkpoint without a network is no tracker."""
+    make_runner(env).save(str(tmp_path / "last.pt"))
+    (tmp_path / "x.json").write_text("mine")
+    with pytest.raises(InputError, match=r"--out .*x.safetensors: its card would overwrite .*x.json"):
+        export(tmp_path / "last.pt", ExportOptions(tmp_path / "x.safetensors"))
+    assert (tmp_path / "x.json").read_text() == "mine"
+    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    state["actor_state_dict"] = {}
+    torch.save(state, tmp_path / "empty.pt")
+    with pytest.raises(InputError, match="empty.pt: its network does not fit interface twist2"):
+        export(tmp_path / "empty.pt", ExportOptions(tmp_path / "y.safetensors"))
+
+
+@pytest.mark.parametrize("held", ["twist2.safetensors", "model_5.pt", "progress.jsonl"])
+def test_a_folder_with_a_training_or_weights_is_left_alone(held, tmp_path):
+    """A new training wants a folder of its own; one that goes on from a checkpoint of the folder writes there."""
+    (tmp_path / held).write_text("mine")
+    with pytest.raises(InputError, match=f"--log-dir .*: holds {held}"):
+        session.check_folder(TrainOptions(log_dir=tmp_path))
+    (tmp_path / "model_7.pt").write_text("checkpoint")
+    session.check_folder(TrainOptions(log_dir=tmp_path, resume=tmp_path / "model_7.pt"))
 
 
 def test_time_limit_lets_the_training_settle(env):
@@ -365,6 +457,9 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys):
         (["--library", str(tmp_path / "none.npz"), "--device", "cpu"], "no such file"),
         (["--rewards", "nonsense", "1.0"], "nonsense"),
         (["export", str(tmp_path / "bad.pt"), "--out", str(tmp_path / "x.safetensors")], "not a training checkpoint"),
+        (["export", "--out", str(tmp_path / "x.safetensors"), str(tmp_path / "bad.pt")], "not a training checkpoint"),
+        (["--resume", str(tmp_path / "bad.pt"), "--device", "cpu"], "--resume"),
+        (["--families", "stnd", "3", "--device", "cpu"], "--families"),
         (["export", str(tmp_path / "none.pt"), "--out", str(tmp_path / "x.safetensors")], "no such checkpoint"),
         (["--device", "cpu", "--start-from", str(tmp_path)], "--start-from"),
         (["--device", "cpu", "--settle", "0.3"], "--settle"),
@@ -386,6 +481,8 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys):
         ["--minibatches", "1000"],
         ["--learning-rate", "nan"],
         ["--families", "walk", "-3"],
+        ["--seed", "-1"],
+        ["--episode-s", "1e30"],
         ["--rewards", "heading", "nan"],
     ],
 )
