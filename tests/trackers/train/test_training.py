@@ -450,8 +450,9 @@ def test_start_from_unfit_weights(env, tmp_path):
             make_runner(env).start_from(weights_file.default_path("twist2"))
 
 
-def test_mistakes_answer_in_one_line(tmp_path, capsys):
+def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
     """Wrong flags and files exit with 2 and name what is wrong."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
     for arguments, words in (
         (["--library", str(tmp_path / "none.npz"), "--device", "cpu"], "no such file"),
