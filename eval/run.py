@@ -191,14 +191,19 @@ def _check_parts(config: RunConfig, episodes: Sequence[Episode], factories: Fact
     factories.tracker(config.tracker, config.checkpoint)
     policy = factories.policy(config.policy)
     policy.check()
-    groups: dict[tuple[str, str], list[int]] = {}
-    for episode in episodes:
-        groups.setdefault((episode.task, episode.mode), []).append(episode.episode_seed)
-    for (task, mode), seeds in groups.items():
-        policy.check_task(task, mode, seeds)
+    for (task, mode), group in _groups(episodes).items():
+        policy.check_task(task, mode, [episode.episode_seed for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.tasks[0])
     return policy
+
+
+def _groups(episodes: Sequence[Episode]) -> dict[tuple[str, str], list[Episode]]:
+    """Episodes by task and mode: a group runs in one environment."""
+    groups: dict[tuple[str, str], list[Episode]] = {}
+    for episode in episodes:
+        groups.setdefault((episode.task, episode.mode), []).append(episode)
+    return groups
 
 
 def _run_groups(
@@ -213,9 +218,7 @@ def _run_groups(
 ) -> None:
     from tqdm import tqdm
 
-    groups: dict[tuple[str, str], list[Any]] = {}
-    for episode in waiting:
-        groups.setdefault((episode.task, episode.mode), []).append(episode)
+    groups = _groups(waiting)
     with tqdm(total=planned, initial=finished, unit="episode", dynamic_ncols=True, smoothing=0.05) as bar:
         for (task, mode), episodes in groups.items():
             bar.set_description(f"{task} {mode}")

@@ -145,14 +145,16 @@ class ReplayEpisodes(Policy):
         """
         from arena_newton import tasks
 
-        if tasks.get(task).gym_id not in {recorded for recorded, _, _ in self._episodes}:
-            raise InputError(f"--policy replay:{self.path}: no recording of task {task}")
-        here = [(m, s) for recorded, m, s in self._episodes if recorded == tasks.get(task).gym_id]
-        if mode is not None and mode not in {m for m, _ in here}:
-            modes = ", ".join(sorted({m for m, _ in here}))
-            raise InputError(f"--policy replay:{self.path}: no recording of task {task} in mode {mode}, only {modes}")
+        gym_id = tasks.get(task).gym_id
+        here = {(recorded, seed) for name, recorded, seed in self._episodes if name == gym_id}
+        where = f"--policy replay:{self.path}"
+        if not here:
+            raise InputError(f"{where}: no recording of task {task}")
+        modes = {recorded for recorded, _ in here}
+        if mode is not None and mode not in modes:
+            raise InputError(f"{where}: no recording of task {task} in mode {mode}, only {', '.join(sorted(modes))}")
         if seeds and not any((mode, seed) in here for seed in seeds):
-            raise InputError(f"--policy replay:{self.path}: recordings of task {task}, but of other --seeds")
+            raise InputError(f"{where}: recordings of task {task}, but of other --seeds")
 
     def attach(self, env: Any) -> None:
         """Learn the mode whose recordings are played."""

@@ -6,10 +6,11 @@ Which size leaves a row's bits alone wherever it stands in a block depends on th
 processor, so it is tried out on the real weights. Where a larger product of whole blocks gives the same bits, it
 replaces the separate ones. A product runs on one thread: results then do not depend on the number of threads either,
 and a second thread loses more than it wins on the few rows of an evaluation, where it has to fetch the weights anew
-each tick. Hundreds of rows are shared among threads, each with a product of its own.
+each tick.
 
 A network is compiled by ONNX Runtime, whose products of a few rows cost little more than reading the weights and give
-a row the same bits among any others. Where that fails it is traced, which takes Python out from between its operations.
+a row the same bits among any others; hundreds of rows are shared among threads, each with a product of its own. Where
+that fails it is traced, which takes Python out from between its operations.
 On other devices the batch runs whole, without that promise.
 """
 
@@ -135,7 +136,7 @@ class BlockRunner:
         self._product: Network = network
         self._plan: tuple[int, bool] | None = None
         self._threads = min(torch.get_num_threads(), worlds // _SHARE)
-        self._pool = ThreadPoolExecutor(self._threads) if self.fixed and self._threads > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
 
     @torch.inference_mode()
     def run(self) -> torch.Tensor:
@@ -145,7 +146,7 @@ class BlockRunner:
         block, merged = self.plan()
         rows = -(-self.worlds // block) * block
         with _one_thread():
-            if merged and self._pool is not None:
+            if self._pool is not None:
                 share = -(-rows // (block * self._threads)) * block
                 return torch.cat(list(self._pool.map(self._product, self._buffer[:rows].split(share))))[: self.worlds]
             if merged or rows == block:
@@ -174,6 +175,8 @@ class BlockRunner:
                 whole = (torch.equal(compiled(rows[: n * block].clone()), expected[: n * block]) for n in _MERGED)
                 if torch.equal(turned, expected) and all(whole):
                     self._product = compiled
+                    if self._threads > 1:
+                        self._pool = ThreadPoolExecutor(self._threads)
                     return block, True
         self._product = _traced(self.network, width, max(BLOCK_SIZES)) or self.network
         for block in BLOCK_SIZES:

@@ -25,6 +25,8 @@ SONIC_WIDTH = SONIC_ENCODER_WIDTH + SONIC_PROPRIO_WIDTH
 """Width of SONIC's observation: encoder input, then proprioception."""
 SONIC_USED = (slice(4, 584), slice(595, 661))
 """Encoder inputs of mode 0: joint positions and velocities of ten frames, the anchor, the anchor of ten frames."""
+_SONIC_FRAME = (slice(4, 33), slice(294, 323), slice(595, 601))
+"""One frame of them: joint positions and velocities, and the anchor."""
 JOINTS = 29
 
 _STD_FLOOR = 1e-2
@@ -221,13 +223,12 @@ class _DeployedSonic(nn.Module):
         )
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        pos, vel, anchor = obs[:, 4:33], obs[:, 294:323], obs[:, 595:601]
-        return self._act(torch.cat((pos, vel, anchor), 1), obs[:, SONIC_ENCODER_WIDTH:])
+        return self._act(torch.cat([obs[:, part] for part in _SONIC_FRAME], 1), obs[:, SONIC_ENCODER_WIDTH:])
 
     def columns(self) -> torch.Tensor:
         """Columns of the observation that are read, in the order of `from_columns`, shape [994]."""
-        spans = (range(4, 33), range(294, 323), range(595, 601), range(SONIC_ENCODER_WIDTH, SONIC_WIDTH))
-        return torch.tensor([column for span in spans for column in span])
+        read = (*_SONIC_FRAME, slice(SONIC_ENCODER_WIDTH, SONIC_WIDTH))
+        return torch.cat([torch.arange(part.start, part.stop) for part in read])
 
     def from_columns(self, used: torch.Tensor) -> torch.Tensor:
         """Raw actions of those columns, shape [rows, 29]."""

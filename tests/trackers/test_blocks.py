@@ -78,6 +78,20 @@ def test_a_module_that_cannot_be_compiled_runs_all_the_same(monkeypatch):
         assert torch.equal(outputs(network, rows[row : row + 1]), whole[row : row + 1])
 
 
+def test_blocks_of_a_traced_network_stay_on_one_thread(monkeypatch):
+    """Only of a compiled network is it known that a row has its bits in any product."""
+    monkeypatch.setattr(torch.onnx, "export", lambda *a, **k: 1 / 0)
+    monkeypatch.setattr(blocks, "_SHARE", 8)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    network, rows = mlp(451, 64, 29), torch.randn(40, 451)
+    runner = BlockRunner(network, 451, 40)
+    runner.input.copy_(rows)
+    whole = runner.run()
+    assert runner._pool is None
+    for row in range(0, 40, 7):
+        assert torch.equal(outputs(network, rows[row : row + 1]), whole[row : row + 1])
+
+
 def test_network_that_mixes_positions():
     """Where no block size keeps a row's bits, rows run one at a time and still do not depend on each other."""
 

@@ -417,6 +417,23 @@ def _seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tenso
     return box, ~(stepped | crossed)
 
 
+def _along(root_xy: torch.Tensor, feet: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The line of a walk from its start to its end, and where the feet are on it.
+
+    Args:
+        root_xy: Pelvis [m], shape [clips, ticks, 2].
+        feet: Ankles [m], shape [clips, ticks, 2, 2 or more].
+
+    Returns:
+        Start [m] and direction, shape [clips, 2], length [m], shape [clips], and the way of each foot along it [m],
+        shape [clips, ticks, 2].
+    """
+    start, way = root_xy[:, 0], root_xy[:, -1] - root_xy[:, 0]
+    length = way.square().sum(1).sqrt().clamp(min=1e-3)
+    ahead = way / length[:, None]
+    return start, ahead, length, ((feet[..., :2] - start[:, None, None]) * ahead[:, None, None]).sum(-1)
+
+
 def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Where along the walk a sill is cleared best, and whether it is cleared by enough; lowers it where need be.
 
@@ -425,11 +442,8 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
     import torch
 
     root, feet = out["root_pos"], out["feet"]
-    start, end = root[:, 0, :2], root[:, -1, :2]
-    way = end - start
-    length = way.square().sum(1).sqrt().clamp(min=1e-3)
-    ahead = way / length[:, None]
-    along = ((feet[..., :2] - start[:, None, None]) * ahead[:, None, None]).sum(-1).flatten(1)
+    start, ahead, length, along = _along(root[..., :2], feet)
+    along = along.flatten(1)
     height = (feet[..., 2] - SOLE_HEIGHT).flatten(1)
     best = torch.full_like(length, -1.0)
     where = torch.zeros_like(length)
@@ -465,10 +479,7 @@ def place_platform(
     """
     import torch
 
-    start, way = root_xy[:, 0], root_xy[:, -1] - root_xy[:, 0]
-    length = way.square().sum(1).sqrt().clamp(min=1e-3)
-    ahead = way / length[:, None]
-    along = ((feet[..., :2] - start[:, None, None]) * ahead[:, None, None]).sum(-1)
+    start, ahead, length, along = _along(root_xy, feet)
     above = feet[..., 2] - SOLE_HEIGHT - height[:, None, None]
     still = torch.zeros_like(above, dtype=torch.bool)
     still[:, 1:] = (feet[:, 1:, :, :3] - feet[:, :-1, :, :3]).abs().amax(-1) < 1e-4

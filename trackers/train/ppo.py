@@ -55,9 +55,8 @@ class IterationPPO(PPO):
         super().__init__(*args, **kwargs)
         self.last_kl = 0.0
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self._on_cuda = str(self.device).startswith("cuda")
-        self._want_graph = graph and self._on_cuda
-        self._stream = torch.cuda.Stream(self.device) if self._on_cuda else None
+        self._stream = torch.cuda.Stream(self.device) if str(self.device).startswith("cuda") else None
+        self._want_graph = graph and self._stream is not None
         self._captured: _Captured | None = None
         self._entropy_weight = torch.zeros((), device=self.device)
         self._fit_optimizer()
@@ -72,9 +71,10 @@ class IterationPPO(PPO):
     def _fit_optimizer(self) -> None:
         """On CUDA the optimiser keeps its rate and its counts there, so that a graph can hold a step; elsewhere not."""
         self._captured = None
+        on_cuda = self._stream is not None
         for group in self.optimizer.param_groups:
-            rate = torch.tensor(self.learning_rate, device=self.device) if self._on_cuda else self.learning_rate
-            group.update(capturable=self._on_cuda, fused=True if self._on_cuda else None, lr=rate)
+            rate = torch.tensor(self.learning_rate, device=self.device) if on_cuda else self.learning_rate
+            group.update(capturable=on_cuda, fused=True if on_cuda else None, lr=rate)
         for state in self.optimizer.state.values():
             state["step"] = state["step"].to(self.device)
 
@@ -123,19 +123,17 @@ class IterationPPO(PPO):
                 self.optimizer.zero_grad(set_to_none=True)
                 if self._want_graph and k == _WARM:
                     self._captured = _Captured(self, batch, learning)
-            losses = self._gradients(batch) if self._captured is None else self._captured.gradients(batch)
+            work = self._captured or self
+            losses = work.gradients(batch)
             if self.is_multi_gpu:
                 self.reduce_parameters()
-            if self._captured is None:
-                self._step()
-            else:
-                self._captured.step()
+            work.step()
             totals += losses[:3]
             if k >= last_epoch:
                 divergence += losses[3]
         return totals, divergence
 
-    def _gradients(self, batch: RolloutStorage.Batch) -> torch.Tensor:
+    def gradients(self, batch: RolloutStorage.Batch) -> torch.Tensor:
         """Gradients of a minibatch; its value loss, surrogate loss, entropy and divergence, shape [4]."""
         self.actor.distribution.update(self.actor(batch.observations))
         log_prob = self.actor.get_output_log_prob(batch.actions)
@@ -159,7 +157,7 @@ class IterationPPO(PPO):
         loss.backward()
         return torch.stack((value.detach(), surrogate.detach(), entropy.detach(), divergence))
 
-    def _step(self) -> None:
+    def step(self) -> None:
         """One step along the gradients."""
         nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
         nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
@@ -204,28 +202,27 @@ class _Captured:
             learning: Which parameters learn.
         """
         self.learning = learning
-        tensors = _tensors(batch)
-        self._inputs = [tensor.clone() for tensor in tensors]
-        own = dict(zip(_FIELDS, self._inputs, strict=False))
-        names = list(batch.observations.keys())
-        groups, old = self._inputs[len(_FIELDS) :][: len(names)], self._inputs[len(_FIELDS) + len(names) :]
-        observations = TensorDict(dict(zip(names, groups, strict=True)), batch_size=batch.observations.batch_size)
-        mine = RolloutStorage.Batch(observations, **own, old_distribution_params=tuple(old))
+        mine = RolloutStorage.Batch(
+            batch.observations.clone(),
+            **{name: getattr(batch, name).clone() for name in _FIELDS},
+            old_distribution_params=tuple(parameter.clone() for parameter in batch.old_distribution_params),
+        )
+        self._inputs = _tensors(mine)
 
         def gradients() -> None:
-            self._losses = ppo._gradients(mine)
+            self._losses = ppo.gradients(mine)
 
         self._gradients = captured(gradients, "update-graph", ppo._stream)
-        self._step = captured(ppo._step, "update-graph", ppo._stream)
+        self._step = captured(ppo.step, "update-graph", ppo._stream)
 
     def gradients(self, batch: RolloutStorage.Batch) -> torch.Tensor:
-        """As `IterationPPO._gradients`; the result's buffer is reused by the next call."""
+        """As `IterationPPO.gradients`; the result's buffer is reused by the next call."""
         torch._foreach_copy_(self._inputs, _tensors(batch))
         self._gradients.replay()
         return self._losses
 
     def step(self) -> None:
-        """As `IterationPPO._step`."""
+        """As `IterationPPO.step`."""
         self._step.replay()
 
 

@@ -22,7 +22,7 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.logger import Logger
 from tensordict import TensorDict
 
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, naming
 from arena_newton.trackers.train.env import TrackerEnv
 from arena_newton.trackers.train.model import TrackerActor
 from arena_newton.trackers.train.ppo import IterationPPO
@@ -376,24 +376,36 @@ class TrackerRunner(OnPolicyRunner):
         Raises:
             InputError: The file is absent or no checkpoint of this training.
         """
-        state = read_checkpoint(path, map_location or str(self.device), flag="--resume")
-        card, previous = self.cfg["card"], state["card"]
-        if previous["tracker"] != card["tracker"]:
-            raise InputError(f"--resume {path}: a training of {previous['tracker']}, not of {card['tracker']}")
-        kinds = previous["action_form"]["kind"], card["action_form"]["kind"]
-        if kinds[0] != kinds[1]:
-            raise InputError(f"--resume {path}: its action form is {kinds[0]}, not {kinds[1]}")
+        with naming("--resume"):
+            return self.take_up(read_checkpoint(path, map_location or str(self.device)), path, load_cfg, strict)
+
+    def take_up(
+        self, state: dict[str, Any], path: str | Path, load_cfg: dict | None = None, strict: bool = True
+    ) -> dict[str, Any]:
+        """Go on with the training of a checkpoint.
+
+        Args:
+            state: What `read_checkpoint` gave.
+            path: Its file, for errors.
+            load_cfg: rsl-rl's choice of parts; all by default.
+            strict: Whether every parameter must be there.
+
+        Raises:
+            InputError: It is of another training.
+        """
+        card = self.cfg["card"]
+        check_same(state["card"], card["tracker"], card["action_form"]["kind"], path)
         if state["families"] != self.env.bank.family_names:
             theirs, ours = ", ".join(state["families"]), ", ".join(self.env.bank.family_names)
-            raise InputError(f"--resume {path}: its references are of the families {theirs}; these are {ours}")
+            raise InputError(f"{path}: its references are of the families {theirs}; these are {ours}")
         if state["network"] != self.alg.get_policy().net.config():
-            raise InputError(f"--resume {path}: a network of other widths than this training's")
+            raise InputError(f"{path}: a network of other widths than this training's")
         self._started = bool(state.get("started", False))
         parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
         try:
             self.alg.load(state, load_cfg or parts, strict)
         except (RuntimeError, KeyError) as error:
-            raise InputError(f"--resume {path}: a checkpoint of another version of this training") from error
+            raise InputError(f"{path}: a checkpoint of another version of this training") from error
         self.alg.set_learning_rate(state["learning_rate"])
         for name, count in self.alg.get_policy().counts().items():
             count.copy_(state["norm_counts"][name])
@@ -425,32 +437,50 @@ def resumed_card(state: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str,
         "earlier": [*previous.get("earlier", []), part],
         "licences": {**previous["licences"], **card["licences"]},
     }
-    return gained | {name: previous[name] for name in ("started_from",) if name in previous}
+    if "started_from" in previous:
+        gained["started_from"] = previous["started_from"]
+    return gained
 
 
-def read_checkpoint(path: str | Path, device: str = "cpu", flag: str = "") -> dict[str, Any]:
+def check_same(card: Mapping[str, Any], tracker: str, kind: str, path: str | Path) -> None:
+    """Refuse to go on with the training of another tracker or action form.
+
+    Args:
+        card: The card of the checkpoint.
+        tracker: Interface of this training.
+        kind: Kind of this training's action form.
+        path: The checkpoint's file, for errors.
+
+    Raises:
+        InputError: They differ.
+    """
+    if card["tracker"] != tracker:
+        raise InputError(f"{path}: a training of {card['tracker']}, not of {tracker}")
+    if card["action_form"]["kind"] != kind:
+        raise InputError(f"{path}: its action form is {card['action_form']['kind']}, not {kind}")
+
+
+def read_checkpoint(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     """Read a training checkpoint: tensors and plain containers only.
 
     Args:
         path: The file.
         device: Where its tensors go.
-        flag: Command-line flag that errors name.
 
     Raises:
         InputError: The file is absent or no checkpoint of this training.
     """
-    where = f"{flag} {path}".strip()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of files that are something else altogether
             state = torch.load(path, weights_only=True, map_location=device)
     except FileNotFoundError:
-        raise InputError(f"{where}: no such checkpoint") from None
+        raise InputError(f"{path}: no such checkpoint") from None
     except Exception as error:
-        raise InputError(f"{where}: not a training checkpoint ({type(error).__name__})") from error
+        raise InputError(f"{path}: not a training checkpoint ({type(error).__name__})") from error
     if not isinstance(state, dict) or not isinstance(state.get("card"), dict):
-        raise InputError(f"{where}: not a checkpoint of this training")
+        raise InputError(f"{path}: not a checkpoint of this training")
     missing = sorted((_KEPT - set(state)) | (_CARD - set(state["card"])))
     if missing:
-        raise InputError(f"{where}: not a checkpoint of this training, it lacks {', '.join(missing)}")
+        raise InputError(f"{path}: not a checkpoint of this training, it lacks {', '.join(missing)}")
     return state

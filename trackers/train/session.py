@@ -183,26 +183,25 @@ def check_folder(options: TrainOptions) -> None:
         raise InputError(f"--log-dir {folder}: cannot be written ({error.strerror})") from None
 
 
-def _action_form(options: TrainOptions) -> str:
-    """The action form of a training; that of its checkpoint, if it goes on with one.
+def _checkpoint(options: TrainOptions) -> tuple[dict[str, Any] | None, str]:
+    """The checkpoint that a training goes on with, if any, and the action form: the checkpoint's, if there is one.
 
     Raises:
-        InputError: The file to begin with is unfit, or of another form than asked for.
+        InputError: The file to begin with is unfit, or of another tracker or form than asked for.
     """
     from arena_newton.trackers import weights_file
-    from arena_newton.trackers.train.runner import read_checkpoint
+    from arena_newton.trackers.train.runner import check_same, read_checkpoint
 
     if options.start_from is not None:
         weights_file.load(options.start_from, options.tracker, flag="--start-from")
     if options.resume is None:
-        return options.action_form
-    card = read_checkpoint(options.resume, flag="--resume")["card"]
-    if card["tracker"] != options.tracker:
-        raise InputError(f"--resume {options.resume}: a training of {card['tracker']}, not of {options.tracker}")
-    kind = str(card["action_form"]["kind"])
-    if options.action_form not in ("auto", kind):
-        raise InputError(f"--action-form {options.action_form}: that of --resume {options.resume} is {kind}")
-    return kind
+        return None, options.action_form
+    with naming("--resume"):
+        state = read_checkpoint(options.resume)
+        kind = str(state["card"]["action_form"]["kind"])
+        asked = kind if options.action_form == "auto" else options.action_form
+        check_same(state["card"], options.tracker, asked, options.resume)
+    return state, kind
 
 
 def _device(name: str) -> str:
@@ -237,7 +236,8 @@ def build(options: TrainOptions) -> TrackerRunner:
     unknown = sorted(set(options.rewards) - set(REWARDS))
     if unknown:
         raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
-    device, form = _device(options.device), _action_form(options)
+    device = _device(options.device)
+    state, form = _checkpoint(options)
     if not options.bench:
         check_folder(options)
     rank, processes = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
@@ -291,8 +291,9 @@ def build(options: TrainOptions) -> TrackerRunner:
     log_dir = None if options.bench else str(options.log_dir)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints both networks layer by layer
         runner = TrackerRunner(env, config, log_dir, device)
-    if options.resume is not None:
-        runner.load(str(options.resume), map_location=device)
+    if state is not None:
+        with naming("--resume"):
+            runner.take_up(state, str(options.resume))
     elif options.start_from is not None:
         runner.start_from(options.start_from)
     return runner
