@@ -4,10 +4,12 @@ Forward runs the very kernel that the benchmark runs, recorded on a `wp.Tape`; b
 those of a function that is smooth almost everywhere: at ties of a minimum they are one of the one-sided ones.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from arena_newton.quiet import quiet_warp
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
 from arena_newton.streams import on_torch_stream
 
@@ -66,9 +68,12 @@ def _backpropagate(
     return result
 
 
+@functools.cache
 def _function() -> "type[torch.autograd.Function]":
-    """The autograd function, made once torch is there."""
+    """The autograd function, made once torch is there; this may be the first that the process asks of Warp."""
     import torch
+
+    quiet_warp()
 
     class _Recorded(torch.autograd.Function):
         """`record(*arrays) -> (tape, outputs)` as a torch function of the tensors behind the arrays."""
@@ -94,15 +99,6 @@ def _function() -> "type[torch.autograd.Function]":
                 return None, *_backpropagate(ctx.tape, ctx.arrays, ctx.outputs, grads)
 
     return _Recorded
-
-
-_RECORDED: list["type[torch.autograd.Function]"] = []
-
-
-def _apply(record: Callable, *tensors: "torch.Tensor") -> tuple["torch.Tensor", ...]:
-    if not _RECORDED:
-        _RECORDED.append(_function())
-    return _RECORDED[0].apply(record, *tensors)
 
 
 def reference_step(
@@ -146,7 +142,7 @@ def reference_step(
         steps.copy_(wp.to_torch(after.steps))
         return tape, [after.mimic, *(getattr(after, name) for name in _FLOAT_STATE), after.joint_vel]
 
-    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = _apply(
+    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = _function().apply(
         record, action, *(getattr(state, name) for name in _FLOAT_STATE)
     )
     return mimic, ReferenceState(position, quat, joints, prev_yaw, prev_z, state.heading, steps, joint_vel)
@@ -166,6 +162,7 @@ def success_margin(launch: Callable[..., None], **arguments: Any) -> "torch.Tens
     import torch
     import warp as wp
 
+    function = _function()
     floats = {k: v for k, v in arguments.items() if isinstance(v, torch.Tensor) and v.is_floating_point()}
     if not floats:
         raise TypeError(f"{launch.__name__} needs at least one floating-point tensor to differentiate")
@@ -189,4 +186,4 @@ def success_margin(launch: Callable[..., None], **arguments: Any) -> "torch.Tens
             launch(**dict(zip(floats, arrays, strict=True)), **fixed, **made, margin=margin)
         return tape, [margin]
 
-    return _apply(record, *floats.values())[0]
+    return function.apply(record, *floats.values())[0]

@@ -1,12 +1,13 @@
 """ArenaEnv: a batch of worlds of one task, judged by one rule set, moved by one tracker.
 
-A world's episode has two phases: the start-up (`SETTLE_TICKS` with a standing command, objects come to rest, the
-tracker's history fills) and the episode proper, whose step 0 is the policy's first action.
+A world's episode has two phases: the start-up, in which the robot takes its stance under a standing command for as many
+ticks as the rule set says (none in `released`), and the episode proper, whose step 0 is the policy's first action.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -19,12 +20,13 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeResult, Observation, RobotState, TrackerCommand
 
 if TYPE_CHECKING:
+    from arena_newton.robot import DriveGains
     from arena_newton.rules import RuleSet
 
-__all__ = ["SETTLE_TICKS", "STAND_ACTION", "ArenaEnv"]
+__all__ = ["STAND_ACTION", "ArenaEnv", "Spawn"]
 
-SETTLE_TICKS = 50
-"""Start-up length [ticks]: dropped obstacles come to rest, the tracker takes its stance."""
+Spawn = Callable[[int], tuple[Sequence[float], Sequence[float]]]
+"""Episode seed → the robot's root position [m] and orientation wxyz at the reset."""
 
 STAND_ACTION = np.array(
     [0.0, 0.0, g1.SPAWN_HEIGHT, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0]
@@ -54,6 +56,7 @@ class ArenaEnv:
         mode: str = "base",
         variant_file: str | None = None,
         fast_physics: bool = False,
+        drive: DriveGains | None = None,
         camera: Any = None,
         threads: int | None = None,
     ):
@@ -69,6 +72,7 @@ class ArenaEnv:
             mode: `base`, `execution`, `semantic` or `visual`.
             variant_file: A user's USD layer instead of the task's own scene.
             fast_physics: Use the tracker's fast physics rate.
+            drive: Drive of the robot's joints instead of the one that tracker and rule set ask for.
             camera: `CameraConfig` of the head camera for policies that see, or None.
             threads: CPU threads of engine `mujoco`; all by default.
 
@@ -92,13 +96,14 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
+        self.drive = drive or self._own_drive(tracker, self.rules)
         self.scene = load_scene(
             task,
             worlds=worlds,
             device=device,
             variant=None if variant_file and mode != "semantic" else self.spec.variant(mode, self.rules),
             rules=self.rules,
-            drive=tracker.drive,
+            drive=self.drive,
             variant_file=variant_file,
             native=self.engine == "mujoco",
         )
@@ -135,14 +140,13 @@ class ArenaEnv:
         self._stand = wp.array(STAND_ACTION, dtype=wp.float32, device=self.device)
         self._streak, self._fallen = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
         self._bad_state, self._bad_action = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
+        self._bad_targets, self._targets = zeros(worlds, dtype=wp.int32), zeros(worlds, len(h.joint_ctrl))
         self._status, self._mask = zeros(worlds, dtype=wp.int32), zeros(worlds, dtype=wp.int32)
         self._mask_host = np.zeros(worlds, dtype=np.int32)
-        self._targets: Any = None
-        self._targets_at = 0
 
         t = wp.to_torch
         self._t_qpos, self._t_qvel = t(self.physics.qpos), t(self.physics.qvel)
-        self._t_action, self._t_state = t(self._action), t(self._state64)
+        self._t_action, self._t_state, self._t_targets = t(self._action), t(self._state64), t(self._targets)
 
         def indices(values: Sequence[int] | np.ndarray) -> Any:
             return torch.tensor(values, dtype=torch.long, device=self.torch_device)
@@ -154,16 +158,41 @@ class ArenaEnv:
         self._t_mimic, self._t_ref_quat = t(self.reference.mimic), t(self.reference.quat)
         tracker.bind(worlds, self.torch_device)
 
+        self.startup_ticks: int = self.rules.startup.ticks
+        """Length of the start-up [ticks]."""
         self.tick = np.zeros(worlds, dtype=np.int64)
-        """Ticks since each world's step 0; negative while it settles."""
+        """Ticks since each world's step 0; negative during its start-up."""
         self.active = np.zeros(worlds, dtype=bool)
         """Worlds that run an episode."""
-        self._fresh = np.zeros(worlds, dtype=bool)
+        self._fresh, self._anchored = np.zeros(worlds, dtype=bool), np.zeros(worlds, dtype=bool)
         self.draws: list[Any] = [None] * worlds
         self.lights: Any = None
         self.camera: Any = None
         if camera is not None:
             self.add_camera(camera)
+
+    @staticmethod
+    def _own_drive(tracker: Any, rules: RuleSet) -> DriveGains:
+        original = getattr(tracker, "original_drive", None)
+        return original if rules.original_drive and original is not None else tracker.drive
+
+    def describe(self) -> dict[str, Any]:
+        """What ran, for results to record: engine, physics rate, drive, start-up and tracker."""
+        return {
+            "engine": self.engine,
+            "device": str(self.device),
+            "physics_dt": self.rate.dt,
+            "substeps": self.rate.substeps,
+            "drive": self.drive.name,
+            "startup_ticks": self.startup_ticks,
+            "history": self.rules.startup.history,
+            "tracker": self.tracker.describe(),
+        }
+
+    def close(self) -> None:
+        """Let go of the physics' threads; the environment steps no more."""
+        self.physics.close()
+        self.active[:] = False
 
     def add_camera(self, config: Any) -> Any:
         """Attach the head camera (done at construction when `camera` is given)."""
@@ -190,27 +219,39 @@ class ArenaEnv:
                 self.lights.set(w, draws.light if draws is not None else None)
         return self.lights
 
-    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None) -> None:
+    def reset(
+        self,
+        seeds: Sequence[int],
+        worlds: Sequence[int] | np.ndarray | None = None,
+        *,
+        spawn: Spawn | None = None,
+    ) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone.
 
         Args:
             seeds: Episode seeds, one a world.
             worlds: World indices; all worlds by default.
+            spawn: Where the robot stands at the reset instead of the task's spawn pose.
+
+        Raises:
+            InputError: Another number of seeds than of worlds, or a world that is not in the batch or named twice.
         """
         from arena_newton.kernels import canonical, reset
 
         rows = np.arange(self.worlds) if worlds is None else np.asarray(worlds, dtype=np.int64)
         if len(seeds) != len(rows):
             raise InputError(f"{len(seeds)} seeds for {len(rows)} worlds")
+        if len(rows) and (rows.min() < 0 or rows.max() >= self.worlds or len(set(rows.tolist())) < len(rows)):
+            raise InputError(f"worlds {rows.tolist()}: expected different numbers from 0 to {self.worlds - 1}")
         p, h = self.physics, self.scene.robot
         qpos = p.qpos0[rows].copy()
         mocap_pos = np.tile(p.mocap_pos0, (len(rows), 1, 1))
         mocap_quat = np.tile(p.mocap_quat0, (len(rows), 1, 1))
-        qpos[:, h.root_qpos : h.root_qpos + 3] = self.spec.spawn_position
-        qpos[:, h.root_qpos + 3 : h.root_qpos + 7] = self.spec.spawn_quat
+        place = spawn or (lambda _: (self.spec.spawn_position, self.spec.spawn_quat))
         qpos[:, h.joint_qpos] = g1.DEFAULT_POSE
         qpos[:, h.hand_qpos] = 0.0
         for k, (seed, w) in enumerate(zip(seeds, rows, strict=True)):
+            qpos[k, h.root_qpos : h.root_qpos + 7] = np.concatenate(place(int(seed)))
             draws = self.draws[w] = self.spec.draw(int(seed), self.mode, self.rules)
             for prim, pose in draws.placed.items():
                 if self.scene.has_body(f"{prim}/Frame"):
@@ -228,9 +269,10 @@ class ArenaEnv:
         self.judge.reset(mask)
         reset.launch_clear(mask, self._streak)
         self.tracker.reset(self._torch_mask(rows))
-        self.tick[rows] = -SETTLE_TICKS
+        self.tick[rows] = -self.startup_ticks
         self.active[rows] = True
-        self._fresh[rows] = True
+        self._fresh[rows] = self.rules.startup.prefill
+        self._anchored[rows] = False
 
     def _upload(self, rows: np.ndarray) -> Any:
         host = np.zeros(self.worlds, dtype=np.int32)
@@ -240,14 +282,22 @@ class ArenaEnv:
             self._mask.assign(host)
         return self._mask
 
-    def _as_warp(self, targets: Any) -> Any:
-        """Warp view of a tracker's answer; most trackers fill the same buffer each tick."""
-        if targets.data_ptr() != self._targets_at:
-            targets = targets.contiguous()
-            import warp as wp
+    def _take_targets(self, targets: Any) -> None:
+        """Copy a tracker's answer into the environment's own buffer.
 
-            self._targets, self._targets_at = wp.from_torch(targets, dtype=wp.float32), targets.data_ptr()
-        return self._targets
+        Raises:
+            InputError: It is no float32 tensor of one row a world.
+        """
+        import torch
+
+        expected = self._t_targets.shape
+        if not isinstance(targets, torch.Tensor) or targets.shape != expected or targets.dtype != torch.float32:
+            given = f"{targets.dtype} {list(targets.shape)}" if hasattr(targets, "dtype") else type(targets).__name__
+            raise InputError(
+                f"tracker {self.tracker.name}: joint targets are {given}, expected a torch.float32 tensor of shape "
+                f"{list(expected)}"
+            )
+        self._t_targets.copy_(targets)
 
     def _torch_mask(self, rows: np.ndarray) -> Any:
         import torch
@@ -257,9 +307,20 @@ class ArenaEnv:
         return torch.from_numpy(host).to(self.torch_device)
 
     def observe(self, mask: np.ndarray | None = None, *, image: bool = False) -> Observation:
-        """State 64 of every world and, if asked, the head camera's picture of the worlds in `mask`."""
+        """State 64 of every world and, if asked, the head camera's picture of the worlds in `mask`.
+
+        At a world's step 0 its frame is laid down first: headings are relative to the robot as it stands then.
+
+        Args:
+            mask: Worlds that ask, bool, shape [worlds]; by default all that run and are past their start-up.
+            image: Render the head camera too.
+
+        Returns:
+            The observation; its state is a live view of the environment's buffer.
+        """
         from arena_newton.kernels import canonical
 
+        self._anchor()
         p, h = self.physics, self.scene.robot
         canonical.launch_state64(
             p.qpos,
@@ -293,33 +354,45 @@ class ArenaEnv:
         self.physics.write_newton_state(self._newton_state)
         return camera.render(self._newton_state, mask)
 
-    def _begin(self, rows: np.ndarray) -> None:
-        """Step 0 of an episode: heading and reference are taken from the robot as it stands now."""
+    def _anchor(self) -> None:
+        """Step 0 of episodes: heading and reference are taken from the robot as it stands now, counters restart."""
         from arena_newton.kernels import canonical
 
+        rows = np.flatnonzero(self.active & (self.tick == 0) & ~self._anchored)
+        if not len(rows):
+            return
+        self._anchored[rows] = True
         mask = self._upload(rows)
         p, h = self.physics, self.scene.robot
         canonical.launch_reset_reference(self.reference, p.qpos, h.root_qpos, mask)
         self.judge.reset(mask)
+        p.lock_latch(mask)
 
     def step(self, action: Any) -> np.ndarray:
         """Advance every active world one tick.
 
         Args:
-            action: Canonical actions, float32 torch tensor [worlds, 40]; rows of settling worlds are replaced by the
-                standing command.
+            action: Canonical actions, float32 tensor or array [worlds, 40]; rows of worlds in their start-up are
+                replaced by the standing command.
 
         Returns:
-            Status codes of `arena_newton.kernels.tick`, int32 [worlds].
+            Status codes of `arena_newton.kernels.tick`, int32 [worlds]; in the start-up only falls and errors count.
+            A world goes on until its next reset, whatever its code.
+
+        Raises:
+            InputError: No world was reset yet, actions of another shape, or a tracker's answer that fits no robot.
         """
         import torch
 
         from arena_newton.kernels import canonical, fall, reset, tick
 
         p, h = self.physics, self.scene.robot
-        starting = np.flatnonzero(self.active & (self.tick == 0))
-        if len(starting):
-            self._begin(starting)
+        action = torch.as_tensor(action)
+        if action.shape != self._t_action.shape:
+            raise InputError(f"actions of shape {list(action.shape)}, expected {list(self._t_action.shape)}")
+        if not self.active.any():
+            raise InputError("no world runs an episode: call reset() first")
+        self._anchor()
         self._t_action.copy_(action)
         settling = self.active & (self.tick < 0)
         if settling.any():
@@ -344,9 +417,16 @@ class ArenaEnv:
         if self._fresh.any():
             self.tracker.prefill(command, state, self._torch_mask(np.flatnonzero(self._fresh)))
             self._fresh[:] = False
-        targets = self._as_warp(self.tracker.step(command, state))
+        self._take_targets(self.tracker.step(command, state))
+        tick.launch_check_targets(self._targets, self._joint_ctrl, p.ctrl, self._bad_targets)
         tick.launch_write_ctrl(
-            targets, self._joint_ctrl, self.reference.hands, self._hand_ctrl, self._hand_open, self._hand_close, p.ctrl
+            self._targets,
+            self._joint_ctrl,
+            self.reference.hands,
+            self._hand_ctrl,
+            self._hand_open,
+            self._hand_close,
+            p.ctrl,
         )
         p.set_active(self.active)
         p.step()
@@ -358,14 +438,26 @@ class ArenaEnv:
             self._critical,
             self._streak,
             self._fallen,
-            **dataclasses.asdict(self.rules.fall),
+            **self._fall_rule,
         )
         reset.launch_nonfinite(p.qpos, p.qvel, self._bad_state)
         tick.launch_status(
-            self.judge.success, self._fallen, self.judge.event, self._bad_state, self._bad_action, self._status
+            self.judge.success,
+            self._fallen,
+            self.judge.event,
+            self._bad_state,
+            self._bad_action,
+            self._bad_targets,
+            self._status,
         )
         self.tick[self.active] += 1
-        return self._status.numpy()
+        status = self._status.numpy().copy()
+        status[settling & ((status == tick.SUCCESS) | (status > tick.EVENT))] = tick.RUNNING
+        return status
+
+    @functools.cached_property
+    def _fall_rule(self) -> dict[str, Any]:
+        return dataclasses.asdict(self.rules.fall)
 
     def run_episodes(
         self,
@@ -375,6 +467,7 @@ class ArenaEnv:
         on_tick: Callable[[int], None] | None = None,
         recorder: Any = None,
         max_steps: int | None = None,
+        spawn: Spawn | None = None,
     ) -> list[EpisodeResult]:
         """Run planned episodes, giving each world the next one as soon as it is free.
 
@@ -385,6 +478,7 @@ class ArenaEnv:
             on_tick: Called each tick with the number of active worlds.
             recorder: Takes pictures: `.start(env, world, episode)`, `.tick(env)`, `.finish(env, world, result)`.
             max_steps: Step budget instead of the rule set's.
+            spawn: Where the robot stands at a reset instead of the task's spawn pose.
 
         Returns:
             Results in the order of `episodes`.
@@ -411,7 +505,7 @@ class ArenaEnv:
             if not taken:
                 return
             worlds = [w for w, _, _ in taken]
-            self.reset([e.episode_seed for _, _, e in taken], worlds)
+            self.reset([e.episode_seed for _, _, e in taken], worlds, spawn=spawn)
             mask = np.zeros(self.worlds, dtype=bool)
             mask[worlds] = True
             seeds = [0] * self.worlds
@@ -434,7 +528,7 @@ class ArenaEnv:
                 margin=float(self.judge.margin.numpy()[w]),
                 startup_fall=startup,
                 overflow=self.physics.overflowed(w),
-                sim_s=float((self.tick[w] + SETTLE_TICKS) * g1.TICK),
+                sim_s=float((self.tick[w] + self.startup_ticks) * g1.TICK),
                 wall_s=time.perf_counter() - started[w],
                 error=error,
             )
@@ -451,9 +545,6 @@ class ArenaEnv:
         while self.active.any():
             asks = self.active & (self.tick >= 0) & (cursor >= length)
             if asks.any():
-                starting = np.flatnonzero(asks & (self.tick == 0))
-                if len(starting):
-                    self._begin(starting)
                 answer = policy.act(self.observe(asks, image=policy.needs_image))
                 actions = torch.as_tensor(answer.actions, dtype=torch.float32, device=self.torch_device)
                 if actions.shape[1] > chunk.shape[1]:
@@ -479,13 +570,15 @@ class ArenaEnv:
                 code, t = int(status[w]), int(self.tick[w])
                 if code == codes.ERROR_STATE:
                     finish(w, "error", "nonfinite_state", "the simulation state of this world became non-finite")
-                elif code == codes.ERROR_ACTION and t > 0:
+                elif code == codes.ERROR_TARGETS:
+                    finish(w, "error", "tracker", f"tracker {self.tracker.name}: a joint target is not finite")
+                elif code == codes.ERROR_ACTION:
                     finish(w, "error", "bad_action", "the policy's action is non-finite or its rot6d is degenerate")
-                elif code == codes.SUCCESS and t > 0:
+                elif code == codes.SUCCESS:
                     finish(w, "success", "success")
                 elif code == codes.FALL:
                     finish(w, "fall", "fall")
-                elif code > codes.EVENT and t > 0:
+                elif code > codes.EVENT:
                     finish(w, "timeout", EVENTS[code - codes.EVENT])
                 elif t >= budget:
                     finish(w, "timeout", "timeout")

@@ -6,6 +6,8 @@ shape [worlds, n]; the free joint's quaternion is wxyz, its angular velocity is 
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -72,6 +74,8 @@ class Physics:
 
         self.scene = scene
         self.rate = rate
+        self.mj_model = self._own_model(scene, rate)
+        """The MuJoCo model at this physics' rate; the scene's own stays as it was built."""
         self.worlds = scene.worlds
         self.device = wp.get_device(scene.device)
         self.want_forces = False
@@ -86,7 +90,15 @@ class Physics:
             self.contact_force = wp.zeros((self.worlds, m.nbody), dtype=wp.float32)
             self.pair_force = wp.zeros(self.worlds, dtype=wp.float32)
             self.latch_locked = wp.full(self.worlds, 1, dtype=wp.int32)
+            """1 = the door's latch holds the leaf, shape [worlds]."""
         self._pair: tuple[np.ndarray, np.ndarray] | None = None
+
+    @staticmethod
+    def _own_model(scene: Scene, rate: PhysicsRate) -> Any:
+        """A copy of the scene's MuJoCo model whose time step is the rate's."""
+        model = copy.copy(scene.mj_model)
+        model.opt.timestep = rate.dt
+        return model
 
     def watch_pair(self, geoms_a: list[int], geoms_b: list[int]) -> None:
         """Report the normal force between two groups of geoms in `pair_force` [N], shape [worlds]."""
@@ -94,11 +106,11 @@ class Physics:
         a[geoms_a], b[geoms_b] = 1, 1
         self._pair = (a, b)
 
-    def set_latch(self, locked: Any) -> None:
-        """Lock (1) or release (0) the door latch of each world; int32 Warp array [worlds]."""
-        import warp as wp
+    def lock_latch(self, mask: Any) -> None:
+        """Lock the door's latch again in the worlds of a mask; int32 Warp array [worlds], 1 = lock."""
+        from arena_newton.kernels import latch
 
-        wp.copy(self.latch_locked, locked)
+        latch.launch_lock(mask, self.latch_locked)
 
     def step(self) -> None:
         """Advance one 50 Hz tick under the current `ctrl`."""
@@ -118,6 +130,9 @@ class Physics:
 
     def set_active(self, mask: np.ndarray) -> None:
         """Say which worlds run an episode, bool [worlds]."""
+
+    def close(self) -> None:
+        """Let go of threads; the physics steps no more."""
 
     def mj_step_only(self) -> None:
         """Nothing but the solver: what `bench` divides by."""
@@ -157,8 +172,8 @@ class MujocoPhysics(Physics):
 
         super().__init__(scene, rate)
         self._mj = mujoco
-        m = self._m = scene.mj_model
-        m.opt.timestep = rate.dt
+        mujoco.set_mju_user_warning(_warn_nobody)
+        m = self._m = self.mj_model
         m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._data = [mujoco.MjData(m) for _ in range(self.worlds)]
         self._np: dict[str, np.ndarray] = {}
@@ -196,21 +211,28 @@ class MujocoPhysics(Physics):
         for other in others:
             other.result()
 
+    def close(self) -> None:
+        """See `Physics.close`."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False)
+
     def set_active(self, mask: np.ndarray) -> None:
         """Step only the worlds of a bool mask [worlds]; the others keep their state."""
         self._active[:] = mask
 
     def _step_share(self, share: Iterator[int]) -> None:
         m, n, step = self._m, self.rate.substeps, self._mj.mj_step
-        latch, equality = self._np["latch"], self.scene.latch_equality
+        latch, locked, qpos = self.scene.latch, self._np["latch"], self._np["qpos"]
         for w in share:
             d = self._data[w]
             target, source = self._targets[w]
             target[:] = source
-            if equality >= 0:
-                d.eq_active[equality] = latch[w]
+            if latch is not None:
+                d.eq_active[latch.equality] = locked[w]
             step(m, d, n)
             self._publish(w, d)
+            if latch is not None and qpos[w, latch.handle_qpos] <= latch.release_angle:
+                locked[w] = 0
 
     def _publish(self, w: int, d: Any) -> None:
         self._mj.mj_kinematics(self._m, d)
@@ -259,21 +281,32 @@ class MujocoPhysics(Physics):
         return np.linalg.norm(total, axis=1)
 
     def _contact_forces(self, d: Any, pick: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Normal [c], tangential [c, 2], frame [c, 3, 3] and bodies [c, 2] of contacts, pyramidal cone, condim 3.
+        """Normal [c], tangential [c, 2], frame [c, 3, 3] and bodies [c, 2] of contacts, pyramidal cone.
 
-        Normal force is the sum of the four edge forces, a tangent's is μ times the difference of its two edges
-        (MuJoCo's `mju_decodePyramid`).
+        A contact without friction (condim 1) has one row, its normal force. Others have two edges a direction: the
+        normal force is the sum of all, a tangent's is μ times the difference of its two (MuJoCo's
+        `mju_decodePyramid`); torsion and rolling press too but push nowhere.
         """
         contact = d.contact
         rows = np.asarray(contact.efc_address)[pick]
         live = rows >= 0
         rows = rows[live]
-        edges = d.efc_force[rows[:, None] + np.arange(4)] if len(rows) else np.zeros((0, 4))
-        mu = np.asarray(contact.friction)[pick][live][:, :2]
-        tangent = np.stack([edges[:, 0] - edges[:, 1], edges[:, 2] - edges[:, 3]], axis=1) * mu
+        dim = np.asarray(contact.dim)[pick][live]
+        edges = np.where(dim == 1, 1, 2 * (dim - 1))
+        mu = np.asarray(contact.friction)[pick][live]
+        normal, tangent = np.zeros(len(rows)), np.zeros((len(rows), 2))
+        for k in range(int(edges.max(initial=0))):
+            has = np.flatnonzero(edges > k)
+            force = d.efc_force[rows[has] + k]
+            normal[has] += force
+            if k < 4:
+                has_tangent = dim[has] > 1
+                sign = 1.0 if k % 2 == 0 else -1.0
+                tangent[has[has_tangent], k // 2] += sign * force[has_tangent]
+        tangent *= mu[:, :2]
         frame = np.asarray(contact.frame)[pick][live].reshape(-1, 3, 3)
         bodies = self._m.geom_bodyid[np.asarray(contact.geom)[pick][live]]
-        return edges.sum(axis=1), tangent, frame, bodies
+        return normal, tangent, frame, bodies
 
     def _pair_normal(self, d: Any) -> float:
         if not d.ncon or self._pair is None:
@@ -292,8 +325,8 @@ class MujocoPhysics(Physics):
             d.mocap_pos[:] = mocap_pos[k]
             d.mocap_quat[:] = mocap_quat[k]
             self._np["latch"][w] = 1
-            if self.scene.latch_equality >= 0:
-                d.eq_active[self.scene.latch_equality] = 1
+            if self.scene.latch is not None:
+                d.eq_active[self.scene.latch.equality] = 1
             d.ctrl[:] = 0
             self._np["ctrl"][w] = 0
             self._np["contact_force"][w] = 0
@@ -313,10 +346,7 @@ class WarpPhysics(Physics):
 
         super().__init__(scene, rate)
         self._mjw = mujoco_warp
-        self._m, self._d = scene.solver.mjw_model, scene.solver.mjw_data
-        self._m.opt.timestep.fill_(rate.dt)
-        scene.mj_model.opt.timestep = rate.dt
-        self._m.opt.warn_overflow = 0
+        self._m, self._d = self._own_batch(scene, rate)
         d = self._d
 
         def view(array: Any, *shape: int) -> Any:
@@ -341,16 +371,32 @@ class WarpPhysics(Physics):
         mocap = (np.tile(self.mocap_pos0, (self.worlds, 1, 1)), np.tile(self.mocap_quat0, (self.worlds, 1, 1)))
         self.reset_worlds(every, self.qpos0, *mocap)
 
+    @staticmethod
+    def _own_batch(scene: Scene, rate: PhysicsRate) -> tuple[Any, Any]:
+        """The solver's model at this rate and its data; the data are copied for a second physics over the scene."""
+        model, data = scene.solver.mjw_model, scene.solver.mjw_data
+        timestep = _cloned(model.opt.timestep)
+        timestep.fill_(rate.dt)
+        model = dataclasses.replace(model, opt=dataclasses.replace(model.opt, timestep=timestep, warn_overflow=0))
+        if scene.batch_taken:
+            data = _cloned(data)
+        scene.batch_taken = True
+        return model, data
+
     def _launch_tick(self) -> None:
+        from arena_newton.kernels import latch as latches
         from arena_newton.kernels import newton_state
 
-        if self.scene.latch_equality >= 0:
-            newton_state.launch_latch(self.latch_locked, self.scene.latch_equality, self._d.eq_active)
+        latch = self.scene.latch
+        if latch is not None:
+            newton_state.launch_latch(self.latch_locked, latch.equality, self._d.eq_active)
         for _ in range(self.rate.substeps):
             self._mjw.step(self._m, self._d)
         newton_state.launch_overflow(self._d.overflow, self.overflow)
         self._mjw.kinematics(self._m, self._d)
         self._mjw.com_pos(self._m, self._d)
+        if latch is not None:
+            latches.launch_release(self.qpos, latch.handle_qpos, latch.release_angle, self.latch_locked)
         if self.device.is_cuda:
             self._launch_contacts()
 
@@ -459,6 +505,22 @@ class WarpPhysics(Physics):
             self.latch_locked.assign(latch)
             self._mjw.kinematics(self._m, self._d)
             self._mjw.com_pos(self._m, self._d)
+
+
+def _warn_nobody(message: str) -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the working folder; what it warns of is read from each `MjData`."""
+
+
+def _cloned(value: Any) -> Any:
+    """A deep copy of a struct of Warp arrays; everything else in it is shared."""
+    import warp as wp
+
+    if isinstance(value, wp.array):
+        return wp.clone(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: _cloned(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        return dataclasses.replace(value, **fields)
+    return value
 
 
 def make_physics(scene: Scene, rate: PhysicsRate, engine: str, threads: int | None = None) -> Physics:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from arena_newton.errors import InputError
-from arena_newton.robot import PhysicsRate
 
 __all__ = [
     "ByRules",
@@ -25,6 +24,7 @@ __all__ = [
     "PoseRange",
     "RuleSet",
     "StandingRule",
+    "StartupRule",
     "TaskRules",
     "get",
     "markdown",
@@ -149,6 +149,22 @@ class FallRule:
 
 
 @dataclass(frozen=True)
+class StartupRule:
+    """What happens between a reset and the policy's first action."""
+
+    ticks: int
+    """Length [50 Hz ticks] under a standing command; 0: the policy is asked at the spawn pose."""
+    prefill: bool
+    """True: the tracker's history holds the first frame, as if the robot had stood there before. False: it starts as
+    the original resets it (TWIST2: zeros; SONIC: the first joints, zeros otherwise)."""
+
+    @property
+    def history(self) -> str:
+        """What the tracker's history holds at the reset, in one phrase."""
+        return "first frame" if self.prefill else "as the original"
+
+
+@dataclass(frozen=True)
 class StandingRule:
     """What the predicates of OpenDoor and VisNavi call standing."""
 
@@ -168,10 +184,11 @@ class RuleSet:
     navi_visual_room_swap: bool
     """The original's released VisNavi visual configuration also exchanges the room's asset. No room of ours stands in
     for that asset, so this records the difference and changes nothing in the scene."""
+    startup: StartupRule
+    original_drive: bool
+    """Official TWIST2 checkpoints are driven by the gains of the original's robot asset instead of TWIST2's own."""
     standing: StandingRule = StandingRule()
     visual_light: LightRange = LightRange()
-    twist2_rate: PhysicsRate = PhysicsRate(dt=0.001, substeps=20)
-    """Physics rate under the TWIST2 tracker."""
     success_judged: str = "once a tick, the first tick that satisfies it ends the episode"
 
     def task(self, name: str) -> TaskRules:
@@ -231,6 +248,8 @@ def get(name: str) -> RuleSet:
         fall=FallRule(at_once=paper),
         tasks=tuple(tasks.get(task).rules.of(name) for task in tasks.names()),
         navi_visual_room_swap=not paper,
+        startup=StartupRule(ticks=50, prefill=True) if paper else StartupRule(ticks=0, prefill=False),
+        original_drive=not paper,
     )
 
 
@@ -258,6 +277,19 @@ def _fall_text(rule: FallRule) -> str:
     )
 
 
+def _startup_text(rule: StartupRule) -> str:
+    if rule.ticks:
+        text = f"{rule.ticks} ticks under a standing command (the original has none), then the policy is asked"
+    else:
+        text = "none: the policy is asked at the spawn pose"
+    history = (
+        "the tracker's history holds the first frame"
+        if rule.prefill
+        else "the tracker's history starts as the original's (TWIST2: zeros; SONIC: the first joints, else zeros)"
+    )
+    return f"{text}; {history}"
+
+
 def _football_text(s: Any) -> str:
     (x0, x1), (y0, y1), (z0, z1) = s.goal_x, s.goal_y, s.goal_z
     text = f"ball centre in {_num(x0)} < x < {_num(x1)}, y > {_num(y0)}, {_num(z0)} < z < {_num(z1)}"
@@ -277,12 +309,11 @@ def _pp_box_text(s: Any) -> str:
 
 
 def _door_text(s: Any) -> str:
-    latch = f"the latch releases at {_num(s.release_deg)}° of the handle"
     if hasattr(s, "min_leaf_deg"):
-        return f"latch released, leaf ≥ {_num(s.min_leaf_deg)}°, standing; {latch}"
+        return f"latch released, leaf ≥ {_num(s.min_leaf_deg)}°, standing"
     return (
         f"root through the frame plane: |x_local| ≤ {_num(s.half_width)} m, y_local > {_num(s.min_y)} m in the "
-        f"door's frame, standing; {latch}"
+        f"door's frame, standing"
     )
 
 
@@ -374,7 +405,11 @@ def _rows(rules: RuleSet) -> list[tuple[str, str]]:
             if rules.navi_visual_room_swap
             else "light only",
         ),
-        ("TWIST2 physics rate", f"{_num(1e3 * rules.twist2_rate.dt)} ms × {rules.twist2_rate.substeps}"),
+        ("start-up before step 0", _startup_text(rules.startup)),
+        (
+            "drive of official TWIST2 checkpoints",
+            "the original's robot asset" if rules.original_drive else "TWIST2's own gains",
+        ),
         ("success is judged", rules.success_judged),
     ]
 

@@ -5,6 +5,7 @@ Handles (bodies, joints, geoms, markers, frames) are found by prim path; nothing
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ from arena_newton.errors import InputError
 if TYPE_CHECKING:
     from arena_newton.rules import RuleSet
 
-__all__ = ["Frame", "Marker", "RobotHandles", "Scene", "ball_solref", "load_scene", "scene_path"]
+__all__ = ["Frame", "Latch", "Marker", "RobotHandles", "Scene", "ball_solref", "load_scene", "scene_path"]
 
 SCENES = Path(__file__).resolve().parent / "usd_scenes"
 ROBOT = "/World/Robot"
@@ -26,6 +27,11 @@ BALL_STIFFNESS = 10000.0
 """Contact stiffness of the ball [1/s²·kg-normalised, MuJoCo direct solref], measured: the stated bounce at 5 ms."""
 
 
+LATCH = "arena:latch"
+"""Label of the equality constraint that is the latch."""
+LATCH_RELEASE_DEG = 20.0
+"""Angle from its rest at which a pressed handle releases the latch [deg] (the original's), where a stage's
+`arena:releaseAngle` does not say otherwise."""
 LATCH_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Constraint impedance of the latch: at the default, the light handle softens it, 10 N·m turn the locked leaf 12°."""
 
@@ -48,6 +54,18 @@ class Marker(Frame):
 
     half: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Half extents [m]."""
+
+
+@dataclass(frozen=True)
+class Latch:
+    """What locks a door's leaf until its handle is pressed."""
+
+    equality: int
+    """MuJoCo equality constraint that holds the leaf while it is active."""
+    handle_qpos: int
+    """Address of the handle's hinge in qpos."""
+    release_angle: float
+    """The latch releases once the handle is at or below this angle [rad]."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +140,10 @@ class Scene:
     geom_labels: list[str]
     """Prim path of each MuJoCo geom."""
     drive: g1.DriveGains
-    latch_equality: int = -1
-    """MuJoCo equality that locks the door leaf, −1 without a latch."""
+    latch: Latch | None = None
+    """The door's latch, where the stage has one."""
+    batch_taken: bool = False
+    """A physics of engine `warp` steps the solver's own batch; the next one copies it."""
     _robot: RobotHandles | None = field(default=None, repr=False)
 
     def body_id(self, prim_path: str) -> int:
@@ -326,7 +346,8 @@ def _free_fixtures(builder: Any) -> None:
             builder.body_flags[builder.joint_child[joint]] = int(BodyFlags.KINEMATIC)
 
 
-def _add_latch(builder: Any, stage: Any) -> bool:
+def _add_latch(builder: Any, stage: Any) -> tuple[int, float] | None:
+    """Add the equality that locks a latched leaf; the handle's joint in the builder and its release angle [deg]."""
     from newton.solvers import mujoco
 
     for prim in stage.Traverse():
@@ -344,10 +365,21 @@ def _add_latch(builder: Any, stage: Any) -> bool:
                 raise InputError(f"{stage.GetRootLayer().identifier}: {prim.GetPath()} has a latch but no HandleHinge")
             # leaf = 0 + 0·handle: the leaf is held at its closed angle while the equality is active.
             mujoco.add_equality_joint(
-                builder, leaf, handle, polycoef=(0.0, 0.0), label="latch", enabled=True, solimp=LATCH_SOLIMP
+                builder, leaf, handle, polycoef=(0.0, 0.0), label=LATCH, enabled=True, solimp=LATCH_SOLIMP
             )
-            return True
-    return False
+            own = prim.GetAttribute("arena:releaseAngle").Get()
+            return handle, LATCH_RELEASE_DEG if own is None else float(own)
+    return None
+
+
+def _find_latch(scene: Scene, handle: int, release_deg: float) -> Latch:
+    """The latch in the compiled model, whose other equalities a layer may have brought."""
+    labels = scene.solver.model.mujoco.equality_constraint_label
+    rows = scene.solver.mjc_eq_to_newton_eq.numpy()[0]
+    equality = next(e for e, row in enumerate(rows) if row >= 0 and labels[row].endswith(LATCH))
+    address = scene.joint_qpos(scene.solver.model.joint_label[handle])
+    rest = float(scene.mj_model.qpos0[address])
+    return Latch(equality, address, rest - math.radians(release_deg))
 
 
 def load_scene(
@@ -395,7 +427,7 @@ def load_scene(
     template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False)
     _set_drives(template, drive)
     _free_fixtures(template)
-    latched = _add_latch(template, stage)
+    latch = _add_latch(template, stage)
 
     def finalize(count: int) -> Any:
         builder = newton.ModelBuilder()
@@ -450,8 +482,9 @@ def load_scene(
         body_to_newton=map_body,
         geom_labels=geom_labels,
         drive=drive,
-        latch_equality=0 if latched else -1,
     )
+    if latch is not None:
+        scene.latch = _find_latch(scene, *latch)
     if rules is not None and scene.has_body("/World/Ball"):
         _set_restitution(scene, rules.ball_restitution)
     return scene

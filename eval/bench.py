@@ -206,7 +206,7 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
     import numpy as np
     import torch
 
-    from arena_newton.env import SETTLE_TICKS, STAND_ACTION, ArenaEnv
+    from arena_newton.env import STAND_ACTION, ArenaEnv
 
     tracker, note = _twist2(options)
     env = ArenaEnv("football", worlds=worlds, tracker=tracker, engine=engine, fast_physics=fast)
@@ -230,7 +230,7 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
         _sync(env)
         return (time.perf_counter() - began) / count
 
-    ticks(SETTLE_TICKS + 10)
+    ticks(env.startup_ticks + 10)
     with _as_before(env.physics):
         bare(2)
     full, alone = [], []

@@ -21,6 +21,7 @@ from arena_newton.intervals import wilson
 from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
+    from arena_newton.env import Spawn
     from arena_newton.policies.base import Policy
 
 __all__ = ["EngineOptions", "Rates", "fisher", "measure", "run"]
@@ -107,11 +108,16 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
         engine=engine,
         fast_physics=options.fast_physics,
     )
-    _move_spawns(env, options)
     rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
     began = time.perf_counter()
     with tqdm(total=len(rollouts), desc=engine, unit="rollout") as bar:
-        results = env.run_episodes(policy, rollouts, on_finish=lambda _: bar.update(), max_steps=options.max_steps)
+        results = env.run_episodes(
+            policy,
+            rollouts,
+            on_finish=lambda _: bar.update(),
+            max_steps=options.max_steps,
+            spawn=_moved_spawn(env.spec, options.noise),
+        )
     outcomes = [result.outcome for result in results]
     return Rates(
         engine=engine,
@@ -125,23 +131,15 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     )
 
 
-def _move_spawns(env: Any, options: EngineOptions) -> None:
-    """Let every reset of `env` move the robot by noise that its episode seed alone decides."""
-    reset, place = env.reset, env.physics.reset_worlds
-    seeds_of: dict[int, int] = {}
+def _moved_spawn(spec: Any, noise: float) -> Spawn:
+    """The task's spawn pose, moved by noise [m] that the episode seed alone decides."""
 
-    def noted_reset(seeds: Any, worlds: Any = None) -> None:
-        rows = range(env.worlds) if worlds is None else worlds
-        seeds_of.update({int(w): int(s) for w, s in zip(rows, seeds, strict=True)})
-        reset(seeds, worlds)
+    def spawn(seed: int) -> tuple[Any, Any]:
+        position = np.array(spec.spawn_position, dtype=np.float32)
+        position[:2] += noise * np.random.default_rng(seed).standard_normal(2)
+        return position, spec.spawn_quat
 
-    def moved(rows: Any, qpos: Any, *fixtures: Any) -> None:
-        root = env.scene.robot.root_qpos
-        for k, w in enumerate(rows):
-            qpos[k, root : root + 2] += options.noise * np.random.default_rng(seeds_of[int(w)]).standard_normal(2)
-        place(rows, qpos, *fixtures)
-
-    env.reset, env.physics.reset_worlds = noted_reset, moved
+    return spawn
 
 
 def _line(rates: Rates) -> str:

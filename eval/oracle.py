@@ -263,16 +263,15 @@ def run_ours(
     import torch
 
     from arena_newton import trackers
-    from arena_newton.env import SETTLE_TICKS, ArenaEnv
+    from arena_newton.env import ArenaEnv
 
     worlds = len(streams)
     driver = trackers.get(tracker, checkpoint)
     env = ArenaEnv("football", tracker=driver, worlds=worlds, engine="mujoco", device="cpu", fast_physics=fast)
-    env.spec = dataclasses.replace(env.spec, spawn_position=OPEN_GROUND)
-    env.reset([0] * worlds)
+    env.reset([0] * worlds, spawn=lambda _: (OPEN_GROUND, env.spec.spawn_quat))
     h, p = env.scene.robot, env.physics
     waiting = torch.zeros(worlds, 40)
-    for _ in range(SETTLE_TICKS):
+    for _ in range(env.startup_ticks):
         env.step(waiting)
     history = []
     for actions in _padded(streams):
@@ -313,10 +312,10 @@ def run_oracle(
     import mujoco
     import torch
 
-    from arena_newton import trackers
-    from arena_newton.env import SETTLE_TICKS, STAND_ACTION
+    from arena_newton import rules, trackers
+    from arena_newton.env import STAND_ACTION
 
-    worlds = len(streams)
+    worlds, startup = len(streams), rules.get("paper").startup.ticks
     driver = trackers.get(tracker, checkpoint)
     rate = driver.rate(fast=fast)
     m = model if model is not None else load_official(mjcf, driver.drive, rate.dt)
@@ -337,9 +336,9 @@ def run_oracle(
         return torch.from_numpy(np.stack(values).astype(np.float32))
 
     commands, history = anchor(), []
-    settle = np.repeat(np.repeat(STAND_ACTION[None, None], worlds, axis=1), SETTLE_TICKS, axis=0)
+    settle = np.repeat(np.repeat(STAND_ACTION[None, None], worlds, axis=1), startup, axis=0)
     for tick, actions in enumerate(np.concatenate([settle, _padded(streams)])):
-        if tick == SETTLE_TICKS:
+        if tick == startup:
             commands = anchor()
         mimic = rows([c.advance(a) for c, a in zip(commands, actions, strict=True)])
         velocity, quat = rows([c.joint_vel for c in commands]), rows([c.quat for c in commands])
@@ -356,7 +355,7 @@ def run_oracle(
         for d, target in zip(sims, targets, strict=True):
             d.ctrl[ctrl_of] = target
             mujoco.mj_step(m, d, rate.substeps)
-        if tick >= SETTLE_TICKS:
+        if tick >= startup:
             history.append(
                 (
                     np.stack([d.qpos[q_of] for d in sims]),

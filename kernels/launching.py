@@ -12,16 +12,16 @@ import warp as wp
 
 __all__ = ["launch_again"]
 
-_LIMIT = 256
-"""Recorded launches that are kept; they keep their arrays alive."""
-_recorded: dict[tuple[Any, ...], Any] = {}
+_LIMIT = 64
+"""Recordings that one array keeps."""
+_KEPT_AT = "_recorded_launches"
 
 
 def launch_again(kernel: Any, *, dim: Any, inputs: Sequence[Any], outputs: Sequence[Any], device: Any) -> None:
     """Do what `wp.launch` does, from a recording where one was made with the very same arrays and numbers.
 
     Launches on CUDA, with vectors among the numbers, and of arrays that ask for gradients are plain ones: a `wp.Tape`
-    sees no recorded launch.
+    sees no recorded launch. A recording belongs to the launch's first output and goes with it.
 
     Args:
         kernel: Kernel.
@@ -30,21 +30,24 @@ def launch_again(kernel: Any, *, dim: Any, inputs: Sequence[Any], outputs: Seque
         outputs: Arrays.
         device: Warp device.
     """
+    for value in (*inputs, *outputs):
+        if getattr(value, "requires_grad", False):
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
+            return
     key = (kernel, dim, *inputs, *outputs)  # the arrays decide on the device
+    recorded: dict[tuple[Any, ...], Any] = outputs[0].__dict__.setdefault(_KEPT_AT, {})
     try:
-        command = _recorded.get(key)
+        command = recorded.get(key)
     except TypeError:  # a vector among the numbers has no hash
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
         return
-    if command is not None:
-        command.launch()
-        return
-    differentiable = any(getattr(value, "requires_grad", False) for value in (*inputs, *outputs))
-    if differentiable or wp.get_device(device).is_cuda:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
-        return
-    if len(_recorded) >= _LIMIT:
-        _recorded.clear()
-    command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
-    _recorded[key] = command
+    if command is None:
+        if wp.get_device(device).is_cuda:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
+            return
+        if len(recorded) >= _LIMIT:
+            recorded.clear()
+        command = recorded[key] = wp.launch(
+            kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True
+        )
     command.launch()

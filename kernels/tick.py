@@ -7,9 +7,11 @@ from arena_newton.kernels.launching import launch_again
 __all__ = [
     "ERROR_ACTION",
     "ERROR_STATE",
+    "ERROR_TARGETS",
     "FALL",
     "RUNNING",
     "SUCCESS",
+    "launch_check_targets",
     "launch_sanitize",
     "launch_status",
     "launch_write_ctrl",
@@ -20,6 +22,7 @@ SUCCESS = 1
 FALL = 2
 ERROR_STATE = 3
 ERROR_ACTION = 4
+ERROR_TARGETS = 5
 EVENT = 8
 """Codes from EVENT on carry a judge's event number."""
 
@@ -55,6 +58,34 @@ def launch_write_ctrl(targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_clo
 
 
 @wp.kernel
+def _check_targets(
+    targets: wp.array2d[wp.float32],
+    joint_ctrl: wp.array[wp.int32],
+    ctrl: wp.array2d[wp.float32],
+    bad: wp.array[wp.int32],
+):
+    world = wp.tid()
+    broken = wp.int32(0)
+    for i in range(joint_ctrl.shape[0]):
+        if not wp.isfinite(targets[world, i]):
+            targets[world, i] = ctrl[world, joint_ctrl[i]]
+            broken = wp.int32(1)
+    bad[world] = broken
+
+
+def launch_check_targets(targets: wp.array, joint_ctrl: wp.array, ctrl: wp.array, bad: wp.array) -> None:
+    """Flag worlds in `bad` [worlds] whose joint targets [worlds, 29] are not all finite, and hold those joints.
+
+    Args:
+        targets: Joint targets [rad], updated: a non-finite one becomes the actuator's present target.
+        joint_ctrl: Actuator of each joint, int32, shape [29].
+        ctrl: Actuator targets [rad], shape [worlds, nu].
+        bad: Output, 1 = a target was not finite, int32, shape [worlds].
+    """
+    launch_again(_check_targets, dim=bad.shape[0], inputs=[targets, joint_ctrl, ctrl], outputs=[bad], device=bad.device)
+
+
+@wp.kernel
 def _sanitize(bad: wp.array[wp.int32], neutral: wp.array[wp.float32], action: wp.array2d[wp.float32]):
     world, i = wp.tid()
     if bad[world] != 0:
@@ -73,6 +104,7 @@ def _status(
     event: wp.array[wp.int32],
     bad_state: wp.array[wp.int32],
     bad_action: wp.array[wp.int32],
+    bad_targets: wp.array[wp.int32],
     status: wp.array[wp.int32],
 ):
     world = wp.tid()
@@ -85,12 +117,14 @@ def _status(
         code = wp.int32(1)
     if bad_state[world] != 0:
         code = wp.int32(3)
+    if bad_targets[world] != 0:
+        code = wp.int32(5)
     if bad_action[world] != 0:
         code = wp.int32(4)
     status[world] = code
 
 
-def launch_status(success, fallen, event, bad_state, bad_action, status) -> None:
+def launch_status(success, fallen, event, bad_state, bad_action, bad_targets, status) -> None:
     """One code a world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
-    inputs = [success, fallen, event, bad_state, bad_action]
+    inputs = [success, fallen, event, bad_state, bad_action, bad_targets]
     launch_again(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)

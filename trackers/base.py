@@ -54,6 +54,8 @@ class Tracker:
     """Order of the joint targets."""
     drive: DriveGains = TWIST2_DRIVE
     """PD drive that executes the targets."""
+    original_drive: DriveGains | None = None
+    """Drive under which the original benchmark runs this checkpoint, where that is another one (rules `released`)."""
     physics_rate: PhysicsRate = PhysicsRate(dt=0.005, substeps=4)
     """Physics rate the tracker was made for."""
     fast_physics_rate: PhysicsRate = PhysicsRate(dt=0.005, substeps=4)

@@ -134,6 +134,8 @@ class BlockRunner:
         self._buffer = torch.zeros(self._rows, in_width, device=self.device)
         self.input = self._buffer[:worlds]
         self._product: Network = network
+        self.path = "torch"
+        """What runs the network: `onnxruntime`, `torch traced` or `torch`; known once the plan is made."""
         self._plan: tuple[int, bool] | None = None
         self._threads = min(torch.get_num_threads(), worlds // _SHARE)
         self._pool: ThreadPoolExecutor | None = None
@@ -145,7 +147,8 @@ class BlockRunner:
             return self.network(self.input)
         block, merged = self.plan()
         rows = -(-self.worlds // block) * block
-        with _one_thread():
+        # A compiled network runs on one thread by itself; torch's number of threads is the whole process's.
+        with contextlib.nullcontext() if self.path == "onnxruntime" else _one_thread():
             if self._pool is not None:
                 share = -(-rows // (block * self._threads)) * block
                 return torch.cat(list(self._pool.map(self._product, self._buffer[:rows].split(share))))[: self.worlds]
@@ -174,11 +177,12 @@ class BlockRunner:
                 turned = torch.cat([torch.roll(compiled(torch.roll(part, 1, 0)), -1, 0) for part in blocks])
                 whole = (torch.equal(compiled(rows[: n * block].clone()), expected[: n * block]) for n in _MERGED)
                 if torch.equal(turned, expected) and all(whole):
-                    self._product = compiled
+                    self._product, self.path = compiled, "onnxruntime"
                     if self._threads > 1:
                         self._pool = ThreadPoolExecutor(self._threads)
                     return block, True
-        self._product = _traced(self.network, width, max(BLOCK_SIZES)) or self.network
+        traced = _traced(self.network, width, max(BLOCK_SIZES))
+        self._product, self.path = (self.network, "torch") if traced is None else (traced, "torch traced")
         for block in BLOCK_SIZES:
             # The choice must be the same for every number of worlds: it looks at one block only.
             rows = torch.randn(block, width, generator=generator)

@@ -246,6 +246,18 @@ class NetworkTracker(Tracker):
         self._graph = _TickGraph(self._tick, worlds, device) if device.type == "cuda" and self._graphable else None
         self.reset()
 
+    def describe(self) -> dict[str, Any]:
+        """What a result must record to name this tracker exactly; once it is bound, what runs its network too."""
+        return super().describe() | {"inference": self._inference()}
+
+    def _inference(self) -> str | None:
+        runner = getattr(self, "_runner", None)
+        if runner is None:
+            return None
+        if runner.fixed:
+            runner.plan()
+        return f"{runner.path}, CUDA graph" if self._graph is not None else runner.path
+
     @property
     def _graphable(self) -> bool:
         """Whether a CUDA graph may hold a tick: everything runs on the device, by the same operations each time."""

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, PhysicsRate
+from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
 from arena_newton.trackers import onnx_mlp, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
@@ -167,6 +167,7 @@ class Twist2Tracker(NetworkTracker):
             return
         network = onnx_mlp.load(checkpoint, in_width=OBSERVATION, out_width=JOINTS)
         super().__init__(Twist2FrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
+        self.original_drive = TWIST2_HUMANOIDARENA_DRIVE
 
 
 def from_checkpoint(checkpoint: Path | None) -> Twist2Tracker:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from arena_newton.rules import ByRules, PoseRange, RuleSet
 from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
@@ -26,8 +26,6 @@ class DoorPassedRule:
     """Largest |x| of the root in the door's frame [m]."""
     min_y: float = 0.02
     """Smallest y of the root in the door's frame [m]."""
-    release_deg: float = 20.0
-    """Angle from its rest at which the pressed handle releases the latch [deg]."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +34,13 @@ class DoorOpenRule:
 
     min_leaf_deg: float = 60.0
     """[deg]."""
-    release_deg: float = 20.0
-    """Angle from its rest at which the pressed handle releases the latch [deg]."""
 
 
 class OpenDoorJudge(Judge):
-    """The door's predicate, and its latch: released once the handle has turned enough, locked again at reset only."""
+    """The robot behind the open door, or the leaf open; the latch itself belongs to the physics."""
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind doorway, leaf, handle and root."""
-        import warp as wp
-
         from arena_newton.kernels.success import Boxes
 
         super().__init__(scene)
@@ -54,19 +48,12 @@ class OpenDoorJudge(Judge):
         self.standing = rules.standing
         self.root = scene.robot.root_qpos
         self.leaf = scene.joint_qpos(f"{DOOR}/LeafHinge")
-        self.handle = scene.joint_qpos(f"{DOOR}/HandleHinge")
-        self.handle_rest = float(scene.mj_model.qpos0[self.handle])
         self.doorway = Boxes.upload([scene.marker(f"{DOOR}/Frame/Doorway")], self.device)
-        self.locked: Any = wp.full(self.worlds, 1, dtype=wp.int32, device=self.device)
-        """1 = the latch holds the leaf, shape [worlds]."""
 
     def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`; also releases latches for the next tick."""
-        from arena_newton.kernels import latch, success
+        """See `Judge.evaluate`."""
+        from arena_newton.kernels import success
 
-        release = math.radians(self.rule.release_deg)
-        latch.launch_release(physics.qpos, self.handle, self.handle_rest - release, self.locked)
-        physics.set_latch(self.locked)
         common = {
             "root_qpos_adr": self.root,
             "stand_height": self.standing.min_root_z,
@@ -87,17 +74,10 @@ class OpenDoorJudge(Judge):
             success.launch_open_door_released(
                 physics.qpos,
                 leaf_qpos_adr=self.leaf,
-                latched=self.locked,
+                latched=physics.latch_locked,
                 min_angle=math.radians(self.rule.min_leaf_deg),
                 **common,
             )
-
-    def reset(self, mask: Any) -> None:
-        """See `Judge.reset`; the latch locks again."""
-        from arena_newton.kernels import latch
-
-        super().reset(mask)
-        latch.launch_lock(mask, self.locked)
 
 
 TASK = TaskSpec(

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from arena_newton import trackers
-from arena_newton.env import SETTLE_TICKS, STAND_ACTION, ArenaEnv
+from arena_newton.env import STAND_ACTION, ArenaEnv
+from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.kernels import tick as codes
+from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, SONIC_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 
 STEPS = 30
 
@@ -158,4 +160,188 @@ def test_startup_fall_is_told_apart():
 def test_settle_ticks_precede_step_zero(env):
     """Reset starts a world at minus the start-up length; the policy is first asked at tick 0."""
     env.reset([1, 2])
-    assert (env.tick == -SETTLE_TICKS).all()
+    assert (env.tick == -env.startup_ticks).all()
+
+
+class Broken(trackers.base.Tracker):
+    """Answers the reference, spoiled by `spoil`."""
+
+    name = "broken"
+
+    def __init__(self, spoil):
+        self.spoil = spoil
+
+    def step(self, command, state):
+        return self.spoil(command.joints.clone())
+
+
+def _broken(env, spoil):
+    """The environment of this module with another tracker."""
+    tracker = Broken(spoil)
+    tracker.bind(env.worlds)
+    return tracker
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_nonfinite_targets_are_the_trackers_error(env, monkeypatch, value):
+    """A joint target that is not finite ends that world as error under the tracker's name; the other runs on."""
+
+    def spoil(targets):
+        if env.tick[0] == 3:
+            targets[0, 7] = value
+        return targets
+
+    monkeypatch.setattr(env, "tracker", _broken(env, spoil))
+    first, second = env.run_episodes(Sway(), _episodes(2), max_steps=8)
+    assert (first.outcome, first.reason, first.steps) == ("error", "tracker", 4)
+    assert "tracker broken" in first.error
+    assert second.outcome == "timeout" and second.steps == 8
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda targets: targets[:, :28], r"\[2, 28\]"),
+        (lambda targets: targets[:1], r"\[1, 29\]"),
+        (lambda targets: targets.double(), "float64"),
+        (lambda targets: targets.numpy(), "float32"),
+        (lambda targets: None, "NoneType"),
+    ],
+)
+def test_targets_of_another_kind_are_refused(env, monkeypatch, spoil, said):
+    """An answer of another shape or type stops the run with one line that names the tracker."""
+    monkeypatch.setattr(env, "tracker", _broken(env, spoil))
+    with pytest.raises(InputError, match=f"tracker broken: joint targets are .*{said}"):
+        env.run_episodes(Sway(), _episodes(2), max_steps=8)
+
+
+def test_startup_gives_no_success(env, monkeypatch):
+    """While the robot takes its stance neither success nor an event is reported; falls and errors are."""
+
+    def evaluate(physics):
+        env.judge.success.fill_(1)
+
+    monkeypatch.setattr(env.judge, "evaluate", evaluate)
+    env.reset([1, 2])
+    seen = [env.step(np.tile(STAND_ACTION, (2, 1))) for _ in range(env.startup_ticks + 1)]
+    assert all((status == codes.RUNNING).all() for status in seen[:-1])
+    assert (seen[-1] == codes.SUCCESS).all()
+
+
+def test_statuses_are_kept(env):
+    """What a step returned does not change with the next step."""
+    env.reset([1, 2])
+    action = torch.from_numpy(STAND_ACTION).repeat(2, 1)
+    for _ in range(env.startup_ticks):
+        env.step(action)
+    action[0, 20] = float("nan")
+    first = env.step(action)
+    kept = first.copy()
+    env.step(torch.from_numpy(STAND_ACTION).repeat(2, 1))
+    assert (first == kept).all() and first.tolist() == [codes.ERROR_ACTION, codes.RUNNING]
+
+
+def test_observe_lays_the_frame_down(env):
+    """At step 0 the state's heading is zero, whoever asks first, and stays relative to that moment."""
+    env.reset([1, 2])
+    for _ in range(env.startup_ticks):
+        env.step(np.tile(STAND_ACTION, (2, 1)))
+    turned = env.physics._data[1]
+    turned.qpos[env.scene.robot.root_qpos + 3 :][:4] = [np.cos(0.4), 0, 0, np.sin(0.4)]
+    env.physics._publish(1, turned)
+    state = env.observe().state
+    heading = torch.atan2(state[:, 2], state[:, 0])
+    assert heading.abs().max() < 1e-5
+    assert env.reference.heading.numpy()[1] == pytest.approx(0.8, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda env: env.reset([1], [7]), r"worlds \[7\]"),
+        (lambda env: env.reset([1, 2], [0, 0]), r"worlds \[0, 0\]"),
+        (lambda env: env.reset([1]), "1 seeds for 2 worlds"),
+        (lambda env: env.step(torch.zeros(40)), r"shape \[40\], expected \[2, 40\]"),
+    ],
+)
+def test_wrong_calls_are_named(env, call, said):
+    """Worlds outside the batch and actions of another shape are refused in one line."""
+    env.reset([1, 2])
+    with pytest.raises(InputError, match=said):
+        call(env)
+
+
+def test_step_before_reset_is_refused():
+    """An environment in which nothing runs does not step."""
+    fresh = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco")
+    with pytest.raises(InputError, match=r"reset\(\) first"):
+        fresh.step(np.tile(STAND_ACTION, (1, 1)))
+    fresh.close()
+
+
+def test_spawn_replaces_the_tasks_pose(env):
+    """A reset may put the robot elsewhere, by its episode seed."""
+    env.reset([3, 4], spawn=lambda seed: ((0.1 * seed, -5.0, 0.9), (1.0, 0.0, 0.0, 0.0)))
+    root = env.physics.qpos.numpy()[:, env.scene.robot.root_qpos :][:, :7]
+    assert np.allclose(root[:, :3], [[0.3, -5.0, 0.9], [0.4, -5.0, 0.9]]) and (root[:, 3] == 1.0).all()
+
+
+def test_released_asks_at_the_spawn_pose(env):
+    """`released` has no start-up: the policy's first state is the spawn pose at rest."""
+
+    class First(Sway):
+        state = None
+
+        def act(self, observation):
+            self.state = observation.state.clone() if self.state is None else self.state
+            return super().act(observation)
+
+    other = ArenaEnv("football", tracker=trackers.get("pd"), worlds=2, engine="mujoco", rules="released")
+    assert (other.startup_ticks, env.startup_ticks) == (0, 50)
+    policy = First()
+    results = other.run_episodes(policy, _episodes(2), max_steps=3)
+    assert [r.steps for r in results] == [3, 3] and results[0].sim_s == pytest.approx(0.06)
+    spawn = np.array(DEFAULT_POSE, np.float32)[list(CANONICAL_TO_MUJOCO)]
+    assert np.array_equal(policy.state[0, 6:35].numpy(), spawn)
+    assert not policy.state[:, 35:].any()
+
+
+@pytest.mark.parametrize("interface", ["twist2", "sonic"])
+def test_history_starts_as_the_rule_set_says(interface):
+    """`released` leaves the tracker's history as the original resets it, `paper` fills it with the first frame."""
+    history = {}
+    for rules in ("paper", "released"):
+        tracker = trackers.get(interface)
+        env = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco", rules=rules)
+        env.reset([1])
+        env.step(np.tile(STAND_ACTION, (1, 1)))
+        history[rules] = tracker.observation()[0].clone()
+    if interface == "twist2":
+        past = {name: row[127 : 127 + 9 * 127] for name, row in history.items()}  # the tenth holds the step itself
+        assert past["paper"].abs().sum() > 1.0 and not past["released"].any()
+    else:
+        assert not torch.equal(history["paper"], history["released"])
+
+
+def test_what_ran_is_described(env):
+    """Engine, physics rate, drive and start-up are those that run."""
+    said = env.describe()
+    assert (said["engine"], said["physics_dt"], said["substeps"]) == ("mujoco", 0.005, 4)
+    assert said["physics_dt"] == env.physics.mj_model.opt.timestep
+    assert (said["drive"], said["startup_ticks"], said["history"]) == ("pd", 50, "first frame")
+    assert said["tracker"]["name"] == "pd"
+
+
+def test_a_drive_can_be_chosen():
+    """A drive given by hand reaches the actuators; `released` takes the original's for a checkpoint that has one."""
+    tracker = trackers.get("pd")
+    tracker.original_drive = TWIST2_HUMANOIDARENA_DRIVE
+    for options, name in (
+        ({"drive": SONIC_DRIVE}, "sonic"),
+        ({"rules": "released"}, "twist2-humanoidarena"),
+        ({}, "pd"),
+    ):
+        env = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco", **options)
+        assert env.describe()["drive"] == env.drive.name == name
+        gains = env.physics.mj_model.actuator_gainprm[env.scene.robot.joint_ctrl, 0]
+        assert np.allclose(gains, env.drive.kp)

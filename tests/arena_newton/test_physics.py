@@ -1,5 +1,7 @@
 """The two engines step the same model and agree; worlds do not touch each other."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -136,6 +138,125 @@ def test_native_forces_match_mujoco(both):
         total[native._m.geom_bodyid[data.contact[c].geom[0]]] -= force
     assert data.ncon > 4
     assert np.allclose(native._body_forces(data), np.linalg.norm(total, axis=1), atol=1e-9)
+
+
+@pytest.mark.parametrize("condim", [1, 3, 4, 6])
+def test_native_forces_match_for_every_condim(football_native, condim):
+    """Contacts without friction, with torsion and with rolling give MuJoCo's forces too, also where kinds are mixed."""
+    import copy
+
+    import mujoco
+
+    scene = dataclasses.replace(football_native, mj_model=copy.copy(football_native.mj_model))
+    feet = {scene.link("left_ankle_roll_link"), scene.link("right_ankle_roll_link")}
+    geoms = [g for g, body in enumerate(scene.mj_model.geom_bodyid) if body in feet]
+    ground = [g for g, body in enumerate(scene.mj_model.geom_bodyid) if body == 0]
+    scene.mj_model.geom_condim[ground] = 1
+    scene.mj_model.geom_condim[geoms[: len(geoms) // 2]] = condim
+    scene.mj_model.geom_condim[geoms[len(geoms) // 2 :]] = 3
+    native = make_physics(scene, PhysicsRate(0.005, 4), "mujoco")
+    _standing(native)
+    for _ in range(8):
+        native.step()
+    data, wrench = native._data[0], np.zeros(6)
+    total, normals = np.zeros((native.nbody, 3)), []
+    assert condim in {data.contact[c].dim for c in range(data.ncon)}
+    for c in range(data.ncon):
+        mujoco.mj_contactForce(native._m, data, c, wrench)
+        normals.append(wrench[0])
+        force = data.contact[c].frame.reshape(3, 3).T @ wrench[:3]
+        total[native._m.geom_bodyid[data.contact[c].geom[1]]] += force
+        total[native._m.geom_bodyid[data.contact[c].geom[0]]] -= force
+    assert np.linalg.norm(total, axis=1).max() > 50.0
+    assert np.allclose(native._body_forces(data), np.linalg.norm(total, axis=1), atol=1e-9)
+    assert np.allclose(native._contact_forces(data, slice(None))[0], normals, atol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_two_physics_over_one_scene(football_native, football_warp, engine):
+    """Each keeps its own rate and state: a later one, slower and stepped in between, changes no bit of the first."""
+    scene = football_native if engine == "mujoco" else football_warp
+
+    def run(disturbed):
+        first = make_physics(scene, PhysicsRate(0.001, 5), engine)
+        other = make_physics(scene, PhysicsRate(0.005, 1), engine) if disturbed else None
+        _standing(first)
+        for _ in range(3):
+            first.step()
+            if other is not None:
+                other.step()
+        return first.qpos.numpy().copy()
+
+    assert np.array_equal(run(False), run(True))
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_the_physics_releases_the_latch(door, engine):
+    """A pressed handle unlocks the leaf without any judge, in its own world only, until it is locked again."""
+    import warp as wp
+
+    scene = door[engine]
+    physics = make_physics(scene, PhysicsRate(0.005, 4), engine)
+    mocap = (np.tile(physics.mocap_pos0, (2, 1, 1)), np.tile(physics.mocap_quat0, (2, 1, 1)))
+    physics.reset_worlds(np.arange(2), physics.qpos0, *mocap)
+    force = np.zeros((2, physics.nv), np.float32)
+    force[:, scene.joint_qvel("/World/Door/LeafHinge")] = 10.0
+    force[1, scene.joint_qvel("/World/Door/HandleHinge")] = -5.0
+    if engine == "mujoco":
+        for data, row in zip(physics._data, force, strict=True):
+            data.qfrc_applied[:] = row
+    else:
+        physics._d.qfrc_applied.assign(force)
+    for _ in range(10):
+        physics.step()
+    leaf = physics.qpos.numpy()[:, scene.joint_qpos("/World/Door/LeafHinge")]
+    assert physics.latch_locked.numpy().tolist() == [1, 0]
+    assert abs(leaf[0]) < 0.005 < 0.02 < leaf[1]
+    physics.lock_latch(wp.array([0, 1], dtype=wp.int32, device=physics.device))
+    assert physics.latch_locked.numpy().tolist() == [1, 1]
+
+
+@pytest.fixture(scope="module")
+def door():
+    """OpenDoor for both engines, two worlds."""
+    from arena_newton.scene import load_scene
+
+    return {"mujoco": load_scene("open_door", worlds=2, native=True), "warp": load_scene("open_door", worlds=2)}
+
+
+def test_the_latch_is_found_by_its_label(tmp_path):
+    """An equality that a layer brings with it is not taken for the latch, and stays active."""
+    from pxr import Sdf, Usd
+
+    from arena_newton.scene import load_scene, scene_path
+
+    path = tmp_path / "door.usda"
+    layer = Sdf.Layer.CreateNew(str(path))
+    layer.subLayerPaths.append(str(scene_path("open_door")))
+    layer.defaultPrim = "World"
+    layer.Save()
+    stage = Usd.Stage.Open(str(path))
+    weld = stage.DefinePrim("/World/Door/Tie", "PhysicsFixedJoint")
+    weld.AddAppliedSchema("MjcEqualityWeldAPI")
+    weld.CreateRelationship("physics:body0").SetTargets(["/World/Door/Frame"])
+    weld.CreateRelationship("physics:body1").SetTargets(["/World/Door/Handle"])
+    stage.Save()
+    scene = load_scene("open_door", native=True, variant_file=path)
+    assert scene.mj_model.neq == 2 and scene.latch.equality == 1, "the layer's weld comes first"
+    import mujoco
+
+    held = [int(scene.mj_model.eq_type[e]) for e in range(scene.mj_model.neq)]
+    assert held[scene.latch.equality] == mujoco.mjtEq.mjEQ_JOINT
+    assert int(scene.mj_model.eq_obj1id[scene.latch.equality]) == scene.joint("/World/Door/LeafHinge")
+
+
+def test_an_unstable_world_writes_no_file(football_native, tmp_path, monkeypatch):
+    """MuJoCo's warning of a broken state leaves no log file in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    physics = make_physics(football_native, PhysicsRate(0.005, 4), "mujoco")
+    physics._data[0].qpos[:] = np.nan
+    physics.step()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_overflow_is_reported(football_warp):

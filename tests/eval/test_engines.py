@@ -33,11 +33,11 @@ def test_spawn_noise_follows_the_seed():
     from arena_newton.env import ArenaEnv
 
     env = ArenaEnv("football", worlds=2, tracker=trackers.get("pd"), engine="mujoco")
-    engines._move_spawns(env, engines.EngineOptions(noise=1e-3))
+    spawn = engines._moved_spawn(env.spec, noise=1e-3)
     root = env.scene.robot.root_qpos
-    env.reset([1, 2])
+    env.reset([1, 2], spawn=spawn)
     first = env.physics.qpos.numpy()[:, root : root + 2].copy()
-    env.reset([2], [0])
+    env.reset([2], [0], spawn=spawn)
     again = env.physics.qpos.numpy()[:, root : root + 2]
     assert abs(first[0] - first[1]).max() > 1e-5
     assert (again[0] == first[1]).all() and (again[1] == first[1]).all()

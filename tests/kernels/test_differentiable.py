@@ -1,5 +1,8 @@
 """Gradients through `wp.Tape` agree with central differences of the very kernels, and torch's autograd sees them."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -228,3 +231,26 @@ def test_margin_needs_a_float_tensor(device, twin):
     launch, fixed, _ = _cases(twin, device)["boxing"]
     with pytest.raises(TypeError, match="launch_boxing"):
         success_margin(launch, **fixed)
+
+
+@pytest.mark.parametrize("call", ["reference", "margin"])
+def test_first_call_of_a_process(call):
+    """Both functions work, gradients and all, when nothing in the process has called Warp before."""
+    code = {
+        "reference": (
+            "state = differentiable.ReferenceState(torch.zeros(2, 3), torch.tensor([[1.0, 0, 0, 0]] * 2),\n"
+            "    torch.zeros(2, 29), *torch.zeros(3, 2), torch.zeros(2, dtype=torch.int32), torch.zeros(2, 29))\n"
+            "x = torch.zeros(2, 40); x[:, 3] = x[:, 6] = 1.0; x.requires_grad_()\n"
+            "differentiable.reference_step(x, state)[0].sum().backward()\n"
+        ),
+        "margin": (
+            "from arena_newton.kernels import success\n"
+            "x = torch.zeros(2, 9); x[:, 2], x[:, 3] = 0.8, 1.0; x.requires_grad_()\n"
+            "differentiable.success_margin(success.launch_open_door_released, qpos=x, root_qpos_adr=0,\n"
+            "    leaf_qpos_adr=7, latched=torch.zeros(2, dtype=torch.int32), min_angle=1.0, stand_height=0.45,\n"
+            "    stand_up=0.6).sum().backward()\n"
+        ),
+    }[call]
+    lines = f"import torch\nfrom arena_newton import differentiable\n{code}assert x.grad.isfinite().all()\n"
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-1500:]

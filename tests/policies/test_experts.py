@@ -9,7 +9,7 @@ import torch
 
 from arena_newton import policies, seeding, trackers
 from arena_newton.canonical import validate_action
-from arena_newton.env import SETTLE_TICKS, ArenaEnv
+from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Observation
 from arena_newton.policies.experts import EXPERTS
@@ -103,7 +103,7 @@ def play(task, indices, ticks):
     env = ArenaEnv(task, tracker=trackers.get("pd"), worlds=len(indices), engine="mujoco", device="cpu", threads=1)
     seeds = [seeding.episode_seed(env.spec.gym_id, i // 20, i % 20) for i in indices]
     env.reset(seeds)
-    for _ in range(SETTLE_TICKS):  # dropped obstacles come to rest; the robot is put back afterwards
+    for _ in range(env.startup_ticks):  # dropped obstacles come to rest; the robot is put back afterwards
         env.physics.step()
     spawn = np.array([*env.spec.spawn_position, *env.spec.spawn_quat])
     pose(env, np.tile(spawn, (env.worlds, 1)), np.tile(DEFAULT_POSE, (env.worlds, 1)))

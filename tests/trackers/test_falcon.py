@@ -73,13 +73,13 @@ def test_stands_and_walks(installed, weights):
     """FALCON keeps the robot up in our physics for 4 s and walks forward on command, through the usual environment."""
     import dataclasses
 
-    from arena_newton.env import SETTLE_TICKS, STAND_ACTION, ArenaEnv
+    from arena_newton.env import STAND_ACTION, ArenaEnv
 
     env = ArenaEnv("football", tracker=trackers.get("falcon", weights), worlds=2, engine="mujoco", device="cpu")
     env.spec = dataclasses.replace(env.spec, spawn_position=(0.0, -15.0, 0.8))
     env.reset([0, 0])
     actions = torch.from_numpy(STAND_ACTION).repeat(2, 1)
-    for _ in range(SETTLE_TICKS):
+    for _ in range(env.startup_ticks):
         env.step(actions)
     start = env.physics.qpos.numpy()[:, :2].copy()
     actions[1, 0] = 0.4 * 0.02

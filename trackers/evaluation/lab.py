@@ -63,7 +63,7 @@ class _LabMujoco(MujocoPhysics):
     """Native MuJoCo with a model a kind of world, forces on the chest, and pair forces of chosen worlds only."""
 
     def prepare(self, kinds: list[WorldKind], watched: np.ndarray) -> None:
-        models = {kind: variant(self.scene, kind) for kind in set(kinds)}
+        models = {kind: variant(self.scene, kind, self.mj_model) for kind in set(kinds)}
         self._models = [models[kind] for kind in kinds]
         self._watched = watched
         self._chest = self.scene.link(CHEST)
@@ -97,7 +97,7 @@ class _LabWarp(WarpPhysics):
     def prepare(self, kinds: list[WorldKind], watched: np.ndarray) -> None:
         import warp as wp
 
-        models = {kind: variant(self.scene, kind) for kind in set(kinds)}
+        models = {kind: variant(self.scene, kind, self.mj_model) for kind in set(kinds)}
         for name in (*_FIELDS, "geom_friction", "dof_invweight0"):
             array = getattr(self._m, name)
             rows = np.stack([getattr(models[kind], name) for kind in kinds]).astype(np.float32)
@@ -112,11 +112,11 @@ class _LabWarp(WarpPhysics):
         self._d.qvel.assign(qvel)
 
 
-def variant(scene: Any, kind: WorldKind) -> Any:
-    """The scene's MuJoCo model with another friction and a payload in each hand."""
+def variant(scene: Any, kind: WorldKind, model: Any = None) -> Any:
+    """A model of the scene (its own by default) with another friction and a payload in each hand."""
     import mujoco
 
-    m = copy.deepcopy(scene.mj_model)
+    m = copy.deepcopy(scene.mj_model if model is None else model)
     ball = scene.geom_ids(BALL) if scene.has_body(BALL) else []
     others = np.setdiff1d(np.arange(m.ngeom), ball)
     m.geom_friction[others, 0] = kind.friction
