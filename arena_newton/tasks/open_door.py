@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ DOOR = "/World/Door"
 
 
 @dataclass(frozen=True)
-class DoorPassedRule:
+class DoorPassedRule(SuccessRule):
     """The root is through the frame's plane and the robot stands."""
 
     half_width: float = 0.55
@@ -29,15 +29,30 @@ class DoorPassedRule:
     release_deg: float = 20.0
     """Angle from its rest at which the pressed handle releases the latch [deg]."""
 
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return (
+            f"root through the frame plane: |x_local| ≤ {num(self.half_width)} m, y_local > {num(self.min_y)} m in the "
+            f"door's frame, standing; {_latch(self.release_deg)}"
+        )
+
 
 @dataclass(frozen=True)
-class DoorOpenRule:
+class DoorOpenRule(SuccessRule):
     """The latch is released, the leaf is open and the robot stands."""
 
     min_leaf_deg: float = 60.0
     """[deg]."""
     release_deg: float = 20.0
     """Angle from its rest at which the pressed handle releases the latch [deg]."""
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return f"latch released, leaf ≥ {num(self.min_leaf_deg)}°, standing; {_latch(self.release_deg)}"
+
+
+def _latch(release_deg: float) -> str:
+    return f"the latch releases at {num(release_deg)}° of the handle"
 
 
 class OpenDoorJudge(Judge):
