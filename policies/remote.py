@@ -377,8 +377,10 @@ class RemotePolicy(Policy):
                 raise _RemoteError(f"{where}: an action holds something that is no number")
         try:
             return validate_action(rows, where)
-        except (InputError, OverflowError) as error:
+        except InputError as error:
             raise _RemoteError(str(error)) from error
+        except OverflowError as error:
+            raise _RemoteError(f"{where}: an action holds a number that is too large") from error
 
     def _ask[T](
         self, route: str, bodies: dict[int, bytes], read: Callable[[dict[str, Any]], T], *, sequential: bool
