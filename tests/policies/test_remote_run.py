@@ -6,13 +6,14 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "eval"))
 from eval_fakes import factories
 
 from arena_newton import policies, trackers
-from arena_newton.env import ArenaEnv
+from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
@@ -173,3 +174,26 @@ def test_entry_points_and_options(monkeypatch):
         with pytest.raises(policies.base.InputError) as caught:
             policies.get(spec, **options)
         assert str(caught.value).startswith(text) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("rules", ["paper", "released"])
+def test_episode_after_an_error_is_asked_for_its_first_action(rules):
+    """An episode that takes the place of one without an answer ends as it does alone, to the last bit."""
+
+    class Sway(policies.Policy):
+        def reset(self, seeds, tasks, mask=None):
+            self.seeds = list(seeds)
+
+        def act(self, observation):
+            actions = np.tile(STAND_ACTION, (len(observation.state), 4, 1))
+            actions[:, :, 9:38] += 0.05 * np.sin(10.0 * observation.state.numpy()[:, None, 6:35])
+            asked = observation.mask & (np.array(self.seeds) == 3)
+            return policies.Chunk(actions, dict.fromkeys(np.flatnonzero(asked).tolist(), "no answer"))
+
+    ends = []
+    env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", rules=rules)
+    for seeds in ((5,), (3, 3, 5)):
+        results = env.run_episodes(Sway(), [SimpleNamespace(episode_seed=s) for s in seeds], max_steps=10)
+        assert [r.outcome for r in results[:-1]] == ["error"] * (len(seeds) - 1)
+        ends.append((results[-1].outcome, results[-1].steps, results[-1].margin, results[-1].sim_s))
+    assert ends[0] == ends[1] and ends[0][1] == 10
