@@ -29,7 +29,7 @@ __all__ = [
     "resolve",
 ]
 
-POLICY_PATH_SCHEMES = ("replay", "lerobot")
+POLICY_PATH_SCHEMES = ("replay",)
 
 PROTOCOL_SEEDS = (0, 1, 2)
 """Group seeds of the benchmark's protocol (original benchmark: 3 seeds)."""
@@ -89,6 +89,14 @@ class RunOptions:
     """Results folder; results/<date>_<time> when none is named."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
+    remote_timeout: float = 60.0
+    """For --policy remote: deadline of a request with all its attempts [s]."""
+    remote_retries: int = 4
+    """For --policy remote: repeated attempts after a connection error, with pauses of 0.25, 0.5, 1 ... s."""
+    remote_sequential: bool = False
+    """For --policy remote: ask for one world after the other, in their order."""
+    remote_insecure: bool = False
+    """For --policy remote: do not check the certificate of an https server."""
 
 
 @dataclass(frozen=True)
@@ -120,11 +128,16 @@ class RunConfig:
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str = ""
     """The package's own code that moves and judges, by content."""
+    policy_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """What the policy is made with beside its spec."""
+    worlds_matter: bool = False
+    """Whether the policy depends on how many worlds ask at once; known when it was made and checked."""
 
     def identity(self) -> dict[str, Any]:
         """What the results depend on, by flag name; two runs with equal identity may share a results folder.
 
-        The number of worlds, videos and the folder are absent: they do not change an episode. Files count by content.
+        Videos and the folder are absent: they do not change an episode. So is the number of worlds, but for a policy
+        that depends on it. Files count by content.
         """
         return {
             "version": __version__,
@@ -134,6 +147,7 @@ class RunConfig:
             "checkpoint": self.checkpoint_hash,
             "policy": policy_label(self.policy),
             "policy_file": self.policy_hash,
+            "worlds": self.worlds if self.worlds_matter else None,
             "rules": self.rules,
             "rules_hash": self.rules_hash,
             "seeds": list(self.seeds),
@@ -189,6 +203,7 @@ def resolve(options: RunOptions) -> RunConfig:
     Raises:
         InputError: a flag names something unknown or absent; the message says what is known.
     """
+    from arena_newton import policies
     from arena_newton import rules as rule_sets
     from arena_newton import tasks as task_specs
     from arena_newton.physics import resolve_engine
@@ -205,6 +220,7 @@ def resolve(options: RunOptions) -> RunConfig:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
     repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else PROTOCOL_REPEATS)
     checkpoint, checkpoint_hash = _checkpoint(options)
+    policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
     variant = _existing("--variant", options.variant)
@@ -235,6 +251,7 @@ def resolve(options: RunOptions) -> RunConfig:
         video=options.video,
         strip=options.strip,
         actions=options.actions,
+        policy_options=_policy_options(options),
     )
     episodes(config)  # names and numbers are wrong at once, before Warp starts
     quiet_warp()
@@ -329,6 +346,22 @@ def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:
     path = Path(",".join(str(file.resolve()) for file in files))
     hashes = [hash_path(file) for file in files]
     return path, hashes[0] if len(hashes) == 1 else config_hash(hashes)
+
+
+def _policy_options(options: RunOptions) -> dict[str, Any]:
+    """What --policy remote is made with; the flags are refused with another policy."""
+    if options.policy.partition(":")[0] == "remote":
+        return {
+            "timeout": options.remote_timeout,
+            "retries": options.remote_retries,
+            "sequential": options.remote_sequential,
+            "verify_ssl": not options.remote_insecure,
+        }
+    for field in dataclasses.fields(options):
+        if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
+            flag = f"--{field.name.replace('_', '-')}"
+            raise InputError(f"{flag}: belongs to --policy remote:<url>, not {options.policy}")
+    return {}
 
 
 def _existing(flag: str, given: str | None) -> Path | None:

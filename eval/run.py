@@ -39,10 +39,10 @@ def _make_tracker(spec: str, checkpoint: Path | None) -> Any:
     return trackers.get(spec, checkpoint=str(checkpoint) if checkpoint else None)
 
 
-def _make_policy(spec: str) -> Any:
+def _make_policy(spec: str, **options: Any) -> Any:
     from arena_newton import policies
 
-    return policies.get(spec)
+    return policies.get(spec, **options)
 
 
 def _check_variant(path: Path, task: str) -> None:
@@ -57,7 +57,7 @@ class Factories:
 
     env: Callable[..., Any] = _make_env
     tracker: Callable[[str, Path | None], Any] = _make_tracker
-    policy: Callable[[str], Any] = _make_policy
+    policy: Callable[..., Any] = _make_policy
     check_variant: Callable[[Path, str], None] = _check_variant
     """Raises InputError for a file that is no scene of the task."""
 
@@ -83,16 +83,22 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
     factories = factories or Factories()
     config = configs.resolve(options)
     folder = Path(options.out).expanduser() if options.out else _new_folder()
-    document = _document(options, config)
-    _check_folder(folder, document)
     episodes = configs.episodes(config)
     policy = _check_parts(config, episodes, factories)
+    config = dataclasses.replace(config, worlds_matter=policy.depends_on_worlds)
+    document = _document(options, config)
+    _check_folder(folder, document)
     document["planned"] = len(episodes)
     _open_folder(folder, document)
     print(f"configuration {config.hash}")
     for key, value in config.identity().items():
         print(f"  {key:<13} {_shown(value)}")
     print(f"  {len(episodes)} episodes -> {folder}", flush=True)
+    if config.worlds_matter and config.worlds > 1:
+        print(
+            f"  the policy server does not declare that it honours seeds: if it draws random numbers, results depend "
+            f"on --worlds {config.worlds} and on timing; --worlds 1 is reproducible"
+        )
     if config.tracker == "pd":
         print("  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2")
 
@@ -189,7 +195,7 @@ def _open_folder(folder: Path, document: dict[str, Any]) -> None:
 def _check_parts(config: RunConfig, episodes: Sequence[Episode], factories: Factories) -> Any:
     """Build tracker and policy and look into plan and variant, so that wrong input shows before the first episode."""
     factories.tracker(config.tracker, config.checkpoint)
-    policy = factories.policy(config.policy)
+    policy = factories.policy(config.policy, **config.policy_options)
     policy.check()
     for (task, mode), group in _groups(episodes).items():
         policy.check_task(task, mode, [episode.episode_seed for episode in group])

@@ -67,10 +67,15 @@ def fake_tracker(spec, checkpoint):
     return SimpleNamespace(name=spec)
 
 
-def fake_policy(spec):
+def fake_policy(spec, **options):
     """A policy that does not see."""
     return SimpleNamespace(
-        name=spec, needs_image=False, check=lambda: None, check_task=lambda *episodes: None, close=lambda: None
+        name=spec,
+        needs_image=False,
+        depends_on_worlds=False,
+        check=lambda: None,
+        check_task=lambda *episodes: None,
+        close=lambda: None,
     )
 
 
