@@ -34,9 +34,9 @@ __all__ = [
 SCENES = Path(__file__).resolve().parent / "usd_scenes"
 ROBOT = "/World/Robot"
 BALL = "/World/Ball"
-BALL_SPRING = 0.04
-"""Part of a ball's penetration that the spring of its contact undoes in one physics step: the bounce varies by half of
-it with where within the step the ball meets the ground, and a ball at rest rises within some 1/BALL_SPRING steps."""
+BALL_SPRING = 0.025
+"""Part of a ball's penetration that the spring of its contact undoes in one physics step: the bounce grows by up to as
+much with the depth at which a step finds the ball, and a sunk ball at rest rises within some 1/BALL_SPRING steps."""
 BALL_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
 """Constraint impedance of the ball: constant and near 1, so that the contact does what its solref says."""
 
@@ -127,18 +127,17 @@ def ball_solref(restitution: float, dt: float) -> tuple[float, float]:
     """MuJoCo direct-form solref (−stiffness, −damping) of a contact with the given coefficient of restitution.
 
     The contact turns the velocity round within the physics step that finds it, as the original's engine does: a damper
-    of (1 + e)/dt takes the approach u away and adds e·u. It then no longer pulls the ball back, since a contact only
-    pushes; the closed form of a spring with damping, which also pulls, bounces 0.25 where 0.1 is asked. A weak spring
-    lifts the ball out. Its push in that step grows with the depth, from 0 to BALL_SPRING·u, and the damper is weaker by
-    half of that. MuJoCo divides stiffness by the impedance (twice) and damping by it (once).
+    of (1 + e)/dt takes the approach u away and adds e·u. It then does not pull the ball back, since a contact only
+    pushes; the closed form of a spring with damping, which pulls too, bounces 0.25 where 0.1 is asked. The weak spring
+    lifts the ball out; it adds at most BALL_SPRING·u. MuJoCo divides the stiffness by the impedance's square and the
+    damping by the impedance, and multiplies the stiffness by it.
 
     Args:
         restitution: Speed of parting over speed of approach, 0 to 1.
         dt: Physics step [s].
     """
     impedance = BALL_SOLIMP[1]
-    damping = (1.0 + float(restitution) - 0.5 * BALL_SPRING) / dt
-    return -BALL_SPRING / dt**2 * impedance, -damping * impedance
+    return -BALL_SPRING / dt**2 * impedance, -(1.0 + float(restitution)) / dt * impedance
 
 
 @dataclass
