@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from arena_newton.errors import InputError
+from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 
 __all__ = [
     "ByRules",
@@ -396,6 +397,51 @@ def _range_text(ranges: PoseRange | CylinderRange) -> str:
     return ", ".join(parts)
 
 
+def _departures() -> list[tuple[str, str, str]]:
+    """Rows (item, here, in the original) in which both rule sets differ from the original, and on purpose."""
+    own, original = TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+    leg = "hip pitch, roll, yaw, knee, ankle pitch, roll"
+
+    def six(values: tuple[float, ...]) -> str:
+        return "/".join(num(v) for v in values[:6])
+
+    return [
+        (
+            "TWIST2's drive",
+            f"TWIST2's own gains, {leg} {six(own.kp)} N·m/rad, efforts {six(own.effort)} N·m; official checkpoints "
+            "take the original's under `--rules released` or `--drive humanoidarena`",
+            f"{six(original.kp)} N·m/rad, efforts {six(original.effort)} N·m",
+        ),
+        (
+            "physics rate",
+            "the checkpoint's: official TWIST2 1 ms × 20, our weights and SONIC 5 ms × 4 (a run prints its own)",
+            "1 ms × 20 under TWIST2, 5 ms × 4 under SONIC",
+        ),
+        (
+            "finger drive",
+            f"stiffness {num(own.finger_kp)} N·m/rad, damping {num(own.finger_kd)} N·m·s/rad, effort "
+            f"{num(own.finger_effort)} N·m: the soft drive that grasped and released in trials",
+            "100, 10, 300",
+        ),
+        ("rotor inertia of the joints", "0.0036 to 0.025 kg·m², Unitree's public model", "0"),
+        ("soft joint limits", "none beside the joints' own", "0.9 of the range"),
+        (
+            "football's friction",
+            "0.7 in every contact of the ball",
+            "0.5 static, 0.4 dynamic; a contact takes the larger of two: 0.7 on the pitch, 1.0 at a foot",
+        ),
+        (
+            "door",
+            "handle spring 2.5 N·m/rad, leaf damping 1.5 N·m·s/rad and friction 0.5 N·m; the latch releases at 20° of "
+            "the handle",
+            "drive 5, damping 20, at most 5 once released; the same angle",
+        ),
+        ("visual mode's light", "a point of the sky: hard shadows", "15° wide"),
+        ("heights of sofa cartons", "0.21 m above the sample, which is their base", "the asset's origin is not known"),
+        ("heights of VisNavi's blocks", "the sample is their base", "the asset's origin is not known"),
+    ]
+
+
 def markdown() -> str:
     """The documentation page `docs/rules.md`."""
     from arena_newton import tasks
@@ -415,6 +461,12 @@ def markdown() -> str:
         cells = [item, first, "the same" if first == second else second]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     lines += [
+        "",
+        "## Where both sets depart from the original",
+        "",
+        "| item | here | in the original |",
+        "|---|---|---|",
+        *("| " + " | ".join(row) + " |" for row in _departures()),
         "",
         "## Where objects are put",
         "",
