@@ -222,6 +222,7 @@ def build(options: TrainOptions) -> TrackerRunner:
     Raises:
         InputError: An option does not fit.
     """
+    check(options)
     import torch
 
     from arena_newton.trackers import networks
@@ -232,7 +233,6 @@ def build(options: TrainOptions) -> TrackerRunner:
 
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
-    check(options)
     unknown = sorted(set(options.rewards) - set(REWARDS))
     if unknown:
         raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
