@@ -398,7 +398,7 @@ def test_time_limit_lets_the_training_settle(env):
 def test_two_processes_train_one_network(library, tmp_path):
     """Torchrun on the CPU: both processes end after the same iteration with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
-    flags = ["--device", "cpu", "--worlds", "4", "--steps", "4", "--iterations", "2", "--no-mirror"]
+    flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "2", "--no-mirror"]
     flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
     script = tmp_path / "train.py"
     script.write_text(
@@ -420,7 +420,7 @@ def test_two_processes_train_one_network(library, tmp_path):
     for name, value in one.items():
         assert torch.equal(value, two[name]), name
     row = json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[0])
-    assert row["samples"] == 2 * 4 * 4
+    assert row["samples"] == 2 * 2 * 4
 
 
 def test_curves(env, tmp_path, capsys):
