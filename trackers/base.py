@@ -145,10 +145,8 @@ def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
         raise InputError(f"--tracker {spec}: unknown tracker; known are {', '.join(names())}")
     if spec in _BUILT_IN and spec in _entry_points():
         point = _entry_points()[spec]
-        package = f"package {point.dist.name}" if point.dist else point.value
-        raise InputError(
-            f"--tracker {spec}: {package} offers a tracker of that name, which is built in; rename one there"
-        )
+        theirs = point.dist.name if point.dist else point.value
+        raise InputError(f"--tracker {spec}: is built in, but {theirs} offers another of that name: rename it there")
     if path is not None and not all(Path(part).exists() for part in str(path).split(",")) and not path.exists():
         raise InputError(f"--checkpoint {path}: no such file")
     if spec in _registered:
