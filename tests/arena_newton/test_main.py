@@ -14,13 +14,13 @@ SCRIPT = Path(sys.executable).with_name("arena-newton")
 
 
 def test_every_program_of_the_package_has_a_command():
-    """What `python -m` runs is reachable under the one name; builders and the front doors themselves aside."""
+    """What `python -m` runs has a command; builders, examples and the front doors themselves aside."""
     doors = {"arena_newton/__main__.py", "trackers/__main__.py", "usd_scenes/g1/build.py"}
     programs = set()
     for folder in ("arena_newton", "kernels", "trackers", "policies", "eval", "usd_scenes"):
         for path in (ROOT / folder).rglob("*.py"):
             name = path.resolve().relative_to(ROOT).as_posix()
-            if 'if __name__ == "__main__":' in path.read_text() and name not in doors:
+            if 'if __name__ == "__main__":' in path.read_text() and name not in doors and "example" not in name:
                 programs.add("arena_newton." + name.removeprefix("arena_newton/")[:-3].replace("/", "."))
     assert programs <= {command.module for command in COMMANDS}
 
