@@ -1,37 +1,116 @@
-"""``python -m arena_newton``: the doctor, and where the other commands are."""
+"""Every command under one name: ``arena-newton eval``, or ``python -m arena_newton eval``, which is the same.
 
-import sys
-from collections.abc import Sequence
-
-from arena_newton import __version__
-
-__all__ = ["main"]
-
-USAGE = """usage: python -m arena_newton doctor
-
-commands:
-  python -m arena_newton doctor              versions, devices, engines, kernel cache, and what to mend
-  python -m arena_newton.eval --help         evaluate a policy
-  python -m arena_newton.usd_scenes --help   build, validate, list and preview scenes
+A command is a module that is imported when it is called, so that the overview answers at once. Modules are named here
+and not imported at the top: this is the front door of all floors, and no floor knows those above it.
 """
 
+from __future__ import annotations
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if arguments == ["doctor"]:
-        from arena_newton import doctor
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-        return doctor.main()
-    if arguments and arguments[0] in ("-h", "--help"):
-        print(USAGE, end="")
-        return 0
+from arena_newton import __version__
+from arena_newton.command_line import exit_code
+from arena_newton.errors import InputError
+
+__all__ = ["COMMANDS", "Command", "main"]
+
+PROG = "arena-newton"
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command, with flags and subcommands of its own."""
+
+    words: str
+    """What is typed, such as `trackers evaluate`."""
+    module: str
+    """Module whose `main` takes the arguments and returns the exit code."""
+    purpose: str
+    """One line of the overview."""
+
+
+COMMANDS = (
+    Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to mend"),
+    Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
+    Command("eval oracle", "arena_newton.eval.oracle", "official TWIST2 here beside its own MJCF in plain MuJoCo"),
+    Command("rules", "arena_newton.rules", "print both rule sets"),
+    Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list or preview USD scenes"),
+    Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
+    Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
+    Command("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
+    Command("trackers motions", "arena_newton.trackers.motions.__main__", "convert, inspect, render, generate motions"),
+)
+
+
+def _overview(within: str) -> str:
+    shown = [c for c in COMMANDS if f"{c.words} ".startswith(f"{within} ".lstrip())]
+    width = max(len(c.words) for c in shown)
+    lines = [f"  {PROG} {c.words:<{width}}  {c.purpose}" for c in shown]
+    words = f"{within} COMMAND".strip()
+    return "\n".join(
+        [
+            f"usage: {PROG} {words} [flags], or: python -m arena_newton {words} [flags]",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "Each explains its flags with --help.",
+            "",
+        ]
+    )
+
+
+def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(__version__)
         return 0
-    problem = f"unknown command {' '.join(arguments)!r}" if arguments else "name a command"
-    print(f"error: {problem}; known is: doctor (see python -m arena_newton --help)", file=sys.stderr)
-    return 2
+    found = [c for c in COMMANDS if arguments[: len(c.words.split())] == c.words.split()]
+    if found:
+        command = max(found, key=lambda c: len(c.words))
+        rest = arguments[len(command.words.split()) :]
+        return _rules(rest) if command.words == "rules" else importlib.import_module(command.module).main(rest)
+    wants_help = bool(arguments) and arguments[-1] in ("-h", "--help")
+    group = " ".join(arguments[:-1] if wants_help else arguments)
+    if group and not any(c.words.startswith(f"{group} ") for c in COMMANDS):
+        raise InputError(f"{group}: no such command; {PROG} --help lists them")
+    print(_overview(group), end="", file=sys.stdout if wants_help else sys.stderr)
+    return 0 if wants_help else 2
+
+
+def _rules(arguments: list[str]) -> int:
+    if arguments:
+        raise InputError(f"rules {arguments[0]}: takes no arguments; it prints both rule sets as Markdown")
+    from arena_newton import rules
+
+    print(rules.markdown(), end="")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments; those of the process by default.
+
+    Returns:
+        Exit code of the command: 0 done, 1 failed, 2 bad input, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    code = 0
+
+    def work() -> None:
+        nonlocal code
+        code = _run(arguments)
+
+    try:
+        return exit_code(work) or code
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 if __name__ == "__main__":

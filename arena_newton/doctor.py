@@ -7,11 +7,16 @@ import os
 import platform
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 __all__ = ["Finding", "examine", "main", "versions"]
 
+USAGE = """usage: arena-newton doctor
+
+Examines packages, devices, engines, kernel cache, disk and scenes, and says what to do about what is missing.
+Exit code 0: a run can start; 1: something in the way must be mended first."""
 _REQUIRED = {
     "newton": "physics, scenes and cameras",
     "warp-lang": "kernels",
@@ -189,12 +194,19 @@ def examine() -> list[Finding]:
     return [*findings, *_devices(), *_engines(), *_storage(), *_scenes()]
 
 
-def main() -> int:
+def main(argv: Sequence[str] = ()) -> int:
     """Print the findings.
+
+    Args:
+        argv: Arguments; there are none but ``--help``.
 
     Returns:
         Exit code: 0 when a run can start, 1 when something in the way must be mended first.
     """
+    if argv:
+        helps = argv[0] in ("-h", "--help")
+        print(USAGE if helps else f"error: doctor {argv[0]}: takes no arguments", file=None if helps else sys.stderr)
+        return 0 if helps else 2
     findings = examine()
     width = max(len(finding.subject) for finding in findings)
     for finding in findings:

@@ -99,7 +99,13 @@ class Tracker:
 
 
 def register(name: str, factory: Callable[[Path | None], Tracker]) -> None:
-    """Offer a tracker under `name` in this process; `factory` takes the checkpoint's path or None."""
+    """Offer a tracker under `name` in this process; `factory` takes the checkpoint's path or None.
+
+    Raises:
+        InputError: A built-in tracker has that name.
+    """
+    if name in _BUILT_IN:
+        raise InputError(f"tracker {name!r}: is built in; register yours under another name")
     _registered[name] = factory
 
 
@@ -137,6 +143,10 @@ def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
     path = None if checkpoint is None else Path(checkpoint)
     if spec not in names():
         raise InputError(f"--tracker {spec}: unknown tracker; known are {', '.join(names())}")
+    if spec in _BUILT_IN and spec in _entry_points():
+        point = _entry_points()[spec]
+        theirs = point.dist.name if point.dist else point.value
+        raise InputError(f"--tracker {spec}: is built in, but {theirs} offers another of that name: rename it there")
     if path is not None and not all(Path(part).exists() for part in str(path).split(",")) and not path.exists():
         raise InputError(f"--checkpoint {path}: no such file")
     if spec in _registered:

@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--film", action="store_true", help="write film strips of a walk, a kick, a squat and a sit")
     add("--no-bench", dest="bench", action="store_false", help="leave out the inference times")
     add("--list", dest="show", action="store_true", help="print the cells and stop")
-    add("--out", type=Path, default=None, metavar="DIR", help="write evaluation.{md,json,csv} and films here")
+    add("--out", type=Path, default=None, metavar="DIR", help="write evaluation.{md,json,csv,png} and films here")
     return parser
 
 
@@ -154,7 +154,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         entry.make()  # complains about files before anything is built
 
     from arena_newton.physics import resolve_engine
-    from arena_newton.trackers.evaluation import report
+    from arena_newton.trackers.evaluation import chart, report
     from arena_newton.trackers.evaluation.bench import inference
     from arena_newton.trackers.evaluation.figures import Result
     from arena_newton.trackers.evaluation.film import film
@@ -191,6 +191,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.out is not None:
         for path in report.write(results, resolved, args.out):
             print(path, file=sys.stderr)
+        picture = args.out / "evaluation.png"
+        print(f"{picture}: {chart.missing()}" if chart.missing() else chart.chart(results, picture), file=sys.stderr)
         if args.film:
             for entry in args.trackers:
                 for path in film(entry.make(), entry.label, args.out, seed=args.seed, **options):

@@ -1,10 +1,13 @@
 """The package imports the same from a checkout and from a wheel, and shadows nobody."""
 
+import ast
 import subprocess
 import sys
 import tomllib
 import zipfile
 from pathlib import Path
+
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = ("kernels", "trackers", "policies", "eval", "usd_scenes")
@@ -42,6 +45,7 @@ def test_wheel_holds_one_top_level_package(tmp_path):
     for floor in FLOORS:
         assert f"arena_newton/{floor}/__init__.py" in names
     assert "arena_newton/usd_scenes/football/scene.usda" in names
+    assert "arena_newton/py.typed" in names
 
 
 def test_imports_run_one_way():
@@ -77,8 +81,43 @@ def test_imports_run_one_way():
                     assert not bad, f"{path.relative_to(ROOT)}: {text}"
 
 
-def test_every_direct_dependency_is_pinned():
-    """Direct dependencies are exact, and the resolved set stands in the constraints."""
+def test_dependencies_have_both_ends_and_a_tested_version():
+    """Direct dependencies are ranges with both ends, and the exact versions of the whole set satisfy them."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    assert all("==" in d for d in project["project"]["dependencies"])
-    assert len(project["tool"]["uv"]["constraint-dependencies"]) > 50
+    exact = {}
+    for line in project["tool"]["uv"]["constraint-dependencies"]:
+        name, _, version = line.partition("==")
+        exact[name] = version
+    assert len(exact) > 50
+    extras = [line for lines in project["project"]["optional-dependencies"].values() for line in lines]
+    for line in [*project["project"]["dependencies"], *extras]:
+        wanted = Requirement(line)
+        ends = {part.operator for part in wanted.specifier}
+        assert ends in ({">=", "<"}, {"=="}), line
+        assert wanted.specifier.contains(exact[wanted.name]), line
+
+
+def test_what_is_imported_is_a_dependency():
+    """Every package that the code imports is named as a direct dependency or extra, not left to another's."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = {Requirement(line).name for line in [*project["dependencies"], *project["optional-dependencies"]["plots"]]}
+    names = {"PIL": "pillow", "pxr": "usd-core", "warp": "warp-lang", "cv2": "opencv-python-headless"}
+    names |= {"mujoco_warp": "mujoco-warp", "rsl_rl": "rsl-rl-lib"}
+    # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
+    known = {*sys.stdlib_module_names, "arena_newton", "tensordict"}
+    for folder in ("arena_newton", *FLOORS):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+                modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                for top in {module.split(".")[0] for module in modules} - known:
+                    assert names.get(top, top) in named, f"{path.relative_to(ROOT)} imports {top}"
+
+
+def test_the_package_says_what_it_is():
+    """Types are offered to checkers, the citation names version and paper, and the console script is declared."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (ROOT / "arena_newton" / "py.typed").read_bytes() == b""
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {project['version']}" in citation and "2606.17833" in citation
+    assert project["scripts"] == {"arena-newton": "arena_newton.__main__:main"}

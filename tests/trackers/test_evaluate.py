@@ -7,10 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from arena_newton import robot as g1
+from arena_newton.errors import InputError
 from arena_newton.intervals import wilson
 from arena_newton.trackers.evaluate import main
+from arena_newton.trackers.evaluation import chart
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
 from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
@@ -18,6 +21,7 @@ from arena_newton.trackers.evaluation.measure import FEET, LINKS, Meter, Referen
 from arena_newton.trackers.evaluation.rollout import Outcome, plan, run, sill_place
 from arena_newton.trackers.evaluation.suite import Cell, Navigation
 from arena_newton.trackers.motions import primitives
+from arena_newton.trackers.train.curves import PANELS, draw
 
 RATE = g1.PhysicsRate(dt=0.005, substeps=4)
 PRIMITIVES = (
@@ -367,6 +371,31 @@ def test_command_line_writes_tables_side_by_side(tmp_path, capsys):
     assert [(r["tracker"], r["cell"], r["rollouts"]) for r in rows] == [("a", "stand", "2"), ("b", "stand", "2")]
     text = (tmp_path / "evaluation.md").read_text()
     assert "## Figures" in text and "MPJPE" in text
+    with Image.open(tmp_path / "evaluation.png") as picture:
+        assert picture.width > 800
+
+
+def test_the_chart_shows_each_verdict(tmp_path):
+    """A figure past its limit is a MISS; the picture holds bars of both colours, beyond the line and short of it."""
+    ours, theirs = _result("ours", "twist2", False, 0), _result("official", "twist2", True, 8)
+    for result in (ours, theirs):
+        for figure in figures(result, [ours, theirs]):
+            assert figure.ratio is not None or figure.met is None, figure.name
+            assert figure.ratio is None or figure.ratio <= 1.0 or figure.verdict == "MISS", figure.name
+    with Image.open(chart.chart([ours, theirs], tmp_path / "chart.png")) as picture:
+        pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    for colour in ("8fcfa5", "f0a090"):
+        assert (pixels == np.frombuffer(bytes.fromhex(colour), np.uint8)).all(1).mean() > 0.02
+
+
+def test_without_matplotlib_nothing_is_drawn(tmp_path, monkeypatch):
+    """Where the plots extra is absent, one line says what to install."""
+    monkeypatch.setattr(chart.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"chart.png: needs matplotlib: install `arena-newton\[plots\]`"):
+        chart.chart([_result("ours", "twist2", False, 0)], tmp_path / "chart.png")
+    (tmp_path / "progress.jsonl").write_text(json.dumps({name: 1 for name in ("seconds", *(p[0] for p in PANELS))}))
+    with pytest.raises(InputError, match="curves: needs matplotlib"):
+        draw([tmp_path], tmp_path / "curves.png")
 
 
 @pytest.mark.parametrize(

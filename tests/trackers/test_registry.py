@@ -112,3 +112,17 @@ def test_entry_point(monkeypatch):
     assert {"theirs", "broken"} <= set(trackers.names())
     assert trackers.get("theirs").name == "pd"
     assert "no_such_package" in message("broken")
+
+
+def test_built_in_names_are_taken(monkeypatch):
+    """Who offers a tracker under a built-in name is told so: neither of the two is taken silently."""
+    from importlib.metadata import EntryPoint
+
+    from arena_newton.trackers import base
+
+    points = [EntryPoint("twist2", "theirs:make", base.ENTRY_POINT_GROUP)]
+    monkeypatch.setattr(base.importlib.metadata, "entry_points", lambda group: points)
+    assert "theirs:make" in message("twist2") and "built in" in message("twist2")
+    assert trackers.get("pd").name == "pd"
+    with pytest.raises(InputError, match="'sonic': is built in"):
+        trackers.register("sonic", lambda checkpoint: trackers.get("pd"))

@@ -71,6 +71,20 @@ class Figure:
     """Empty without one."""
     met: bool | None
     """None where there is nothing to judge."""
+    number: float | None = None
+    """The value that `limit` is about; the verdict may ask for more, such as no fall."""
+    limit: float | None = None
+    """The bar as a number, in the unit of `number`; None without one."""
+    at_least: bool = False
+    """Whether `number` must reach `limit`; otherwise it must not pass it."""
+
+    @property
+    def ratio(self) -> float | None:
+        """Number over limit, or limit over number where more is better: up to 1 the bar is met. None without both."""
+        if self.number is None or self.limit is None:
+            return None
+        above, below = (self.limit, self.number) if self.at_least else (self.number, self.limit)
+        return above / below if below else float("inf") if above else 0.0
 
     @property
     def verdict(self) -> str:
@@ -111,10 +125,11 @@ def figures(result: Result, others: Sequence[Result] = ()) -> list[Figure]:
 def _fall_rate(result: Result) -> Figure:
     fell, count, text = _falls(result, np.ones(len(result.plan.cell), dtype=bool))
     if not result.whole:
-        return Figure("fall rate, these cells only", text, "", None)
+        return Figure("fall rate, these cells only", text, "", None, fell / max(count, 1))
     limit = {"twist2": 0.01, "sonic": 0.03}.get(result.interface)
     bar = "" if limit is None else f"≤ {100 * limit:g} %"
-    return Figure("fall rate, whole suite", text, bar, None if limit is None else fell <= limit * count)
+    met = None if limit is None else fell <= limit * count
+    return Figure("fall rate, whole suite", text, bar, met, fell / max(count, 1), limit)
 
 
 def _against_official(result: Result, others: Sequence[Result]) -> Figure | None:
@@ -124,9 +139,8 @@ def _against_official(result: Result, others: Sequence[Result]) -> Figure | None
     if result.official or not rates or not result.whole:
         return None
     own, (name, best) = float(result.outcome.measures["fell"].mean()), min(rates.items(), key=lambda item: item[1])
-    return Figure(
-        "fall rate, against official TWIST2", f"{100 * own:.1f} %", f"≤ {100 * best:.1f} % ({name})", own <= best
-    )
+    bar = f"≤ {100 * best:.1f} % ({name})"
+    return Figure("fall rate, against official TWIST2", f"{100 * own:.1f} %", bar, own <= best, own, best)
 
 
 def _walks(result: Result) -> list[Figure]:
@@ -138,14 +152,17 @@ def _walks(result: Result) -> list[Figure]:
         asked = float(np.mean(result.of("ref_x", rows)))
         # Nobody was still up when the mean speed began to count: nothing was reached.
         share = float(np.mean(result.of("speed_x", rows))) / asked if asked else 0.0
-        out.append(Figure(f"speed reached, walk {speed:g} m/s", f"{100 * share:.0f} %", "≥ 90 %", share >= 0.9))
+        name = f"speed reached, walk {speed:g} m/s"
+        out.append(Figure(name, f"{100 * share:.0f} %", "≥ 90 %", share >= 0.9, share, 0.9, at_least=True))
         rmse = float(result.of("leg_rmse", rows).mean())
-        out.append(Figure(f"leg joint RMSE, walk {speed:g} m/s", f"{rmse:.3f} rad", f"≤ {error:g} rad", rmse <= error))
+        name = f"leg joint RMSE, walk {speed:g} m/s"
+        out.append(Figure(name, f"{rmse:.3f} rad", f"≤ {error:g} rad", rmse <= error, rmse, error))
         mean = float(result.of("drift_10s", rows).mean())
         judged = result.interface == "twist2"
         bar = f"≤ {drift:.2f} m" if judged else ""
         name = f"drift per 10 s, walk {speed:g} m/s, open loop"
-        out.append(Figure(name, f"{mean:.2f} m", bar, mean <= drift if judged else None))
+        met, limit = (mean <= drift, drift) if judged else (None, None)
+        out.append(Figure(name, f"{mean:.2f} m", bar, met, mean, limit))
     return out
 
 
@@ -159,7 +176,9 @@ def _goals(result: Result) -> Figure | None:
     text = (
         f"{int(reached.sum())}/{len(reached)} (worst {place.max():.3f} m, {turn.max():.1f}°, falls {int(fell.sum())})"
     )
-    return Figure("goals reached in closed loop", text, "all within 0.08 m and 5°, no fall", bool(reached.all()))
+    bar = "all within 0.08 m and 5°, no fall"
+    share = float(reached.mean())
+    return Figure("goals reached in closed loop", text, bar, bool(reached.all()), share, 1.0, at_least=True)
 
 
 def _squat(result: Result) -> Figure | None:
@@ -169,7 +188,8 @@ def _squat(result: Result) -> Figure | None:
     fell, count, _ = _falls(result, rows)
     lowest = float(result.of("lowest", rows).mean())
     done = bool(fell == 0 and lowest <= 0.50)
-    return Figure("squat to 0.45 m and back", f"falls {fell}/{count}, lowest {lowest:.2f} m", "no fall, ≤ 0.50 m", done)
+    text = f"falls {fell}/{count}, lowest {lowest:.2f} m"
+    return Figure("squat to 0.45 m and back", text, "no fall, ≤ 0.50 m", done, lowest, 0.50)
 
 
 def _sit(result: Result) -> Figure | None:
@@ -181,7 +201,9 @@ def _sit(result: Result) -> Figure | None:
     risen = ~result.of("fell", rows) & (result.of("end_z", rows) >= RISEN)
     text = f"falls {fell}/{count}, seated {int(loaded.sum())}, risen {int(risen.sum())}"
     met = bool(fell == 0 and loaded.all() and risen.all())
-    return Figure("sit on 0.42 m (100 N for 2 s) and rise", text, "no fall, all seated and risen", met)
+    share = float((loaded & risen).mean())
+    bar = "no fall, all seated and risen"
+    return Figure("sit on 0.42 m (100 N for 2 s) and rise", text, bar, met, share, 1.0, at_least=True)
 
 
 def _sill(result: Result) -> Figure | None:
@@ -191,7 +213,8 @@ def _sill(result: Result) -> Figure | None:
     fell, count, _ = _falls(result, rows)
     over = (result.of("end_x", rows) > result.of("support_x", rows) + BEHIND) & ~result.of("fell", rows)
     text = f"falls {fell}/{count}, over {int(over.sum())}, touched {int((result.of('touch', rows) > 5).sum())}"
-    return Figure("step over a 9 cm sill", text, "no fall, all over", bool(fell == 0 and over.all()))
+    met, share = bool(fell == 0 and over.all()), float(over.mean())
+    return Figure("step over a 9 cm sill", text, "no fall, all over", met, share, 1.0, at_least=True)
 
 
 def _ball(result: Result, cell: str, share: float | None) -> Figure | None:
@@ -207,7 +230,9 @@ def _ball(result: Result, cell: str, share: float | None) -> Figure | None:
     )
     bar = "median ≥ 1.5 m/s, no fall" if share is None else f"≥ 1.5 m/s in {100 * share:g} %, no fall"
     enough = bool(np.median(peak) >= 1.5) if share is None else hit >= share
-    return Figure(f"ball speed: {cell.removeprefix('ball, ')}", text, bar, enough and fell == 0)
+    number, limit = (float(np.median(peak)), 1.5) if share is None else (hit, share)
+    name = f"ball speed: {cell.removeprefix('ball, ')}"
+    return Figure(name, text, bar, enough and fell == 0, number, limit, at_least=True)
 
 
 def _chest(result: Result) -> Figure | None:
@@ -217,7 +242,8 @@ def _chest(result: Result) -> Figure | None:
     fell, count, _ = _falls(result, rows)
     speed = float(result.of("speed_x", rows).mean())
     text = f"{speed:.2f} m/s, falls {fell}/{count}"
-    return Figure("10 N against the chest, walk 0.35 m/s", text, "≥ 0.2 m/s, no fall", speed >= 0.2 and fell == 0)
+    met = speed >= 0.2 and fell == 0
+    return Figure("10 N against the chest, walk 0.35 m/s", text, "≥ 0.2 m/s, no fall", met, speed, 0.2, at_least=True)
 
 
 def _push(result: Result) -> Figure | None:
@@ -225,7 +251,8 @@ def _push(result: Result) -> Figure | None:
     if not rows.any():
         return None
     fell, count, text = _falls(result, rows)
-    return Figure("push of 40 N·s in 0.1 s while walking, falls", text, "≤ 15 %", fell <= 0.15 * count)
+    met = fell <= 0.15 * count
+    return Figure("push of 40 N·s in 0.1 s while walking, falls", text, "≤ 15 %", met, fell / max(count, 1), 0.15)
 
 
 def _inference(result: Result) -> list[Figure]:
@@ -238,5 +265,5 @@ def _inference(result: Result) -> list[Figure]:
     for key, name, limit in bars:
         value = times(key)
         if value is not None:
-            out.append(Figure(name, f"{value:.3f} ms", f"≤ {limit:g} ms", value <= limit))
+            out.append(Figure(name, f"{value:.3f} ms", f"≤ {limit:g} ms", value <= limit, value, limit))
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -511,6 +512,12 @@ def _platform_box(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[tor
     return box, room >= 0.0
 
 
+def _drawn(family: str, number: int, seconds: float, seed: int, attempt: int) -> _Plan:
+    """A clip's plan from a generator of its own, so that it depends on no other clip and no other family."""
+    rng = np.random.default_rng([seed, zlib.crc32(family.encode()), number, attempt])
+    return _MAKERS[family](_Draw(rng), seconds)
+
+
 def random_clips(
     families: Mapping[str, int] | None = None, seconds: float = 12.0, seed: int = 0, device: Any = "cpu"
 ) -> dict[str, Any]:
@@ -538,7 +545,8 @@ def random_clips(
     Args:
         families: Clips of each family; `FAMILIES` without it.
         seconds: Length of every clip [s].
-        seed: The same seed gives the same clips.
+        seed: The same seed gives the same clips of a family, whatever families and however many clips stand beside
+            them; at least 0.
         device: Torch device; a GPU makes 2400 clips in seconds.
 
     Returns:
@@ -559,13 +567,13 @@ def random_clips(
     names = list(counts)
     family = np.repeat(np.arange(len(names)), [counts[n] for n in names])
     ticks = round(seconds / TICK)
-    draw = _Draw(np.random.default_rng(seed))
+    number = [k for n in names for k in range(counts[n])]
     result: dict[str, torch.Tensor] = {}
     missing = np.arange(len(family))
-    for _ in range(ROUNDS):
+    for attempt in range(ROUNDS):
         if not len(missing):
             break
-        plans = [_MAKERS[names[family[i]]](draw, seconds) for i in missing]
+        plans = [_drawn(names[family[i]], number[i], seconds, seed, attempt) for i in missing]
         out = _play(plans, ticks, device)
         sound = out.pop("sound")
         kind = torch.tensor([SUPPORTS.index(plan.support) for plan in plans], device=sound.device)

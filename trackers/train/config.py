@@ -82,6 +82,10 @@ class TrainOptions:
     """Weight of the difference between the action of a mirrored observation and the mirrored action."""
     save_interval: int = 200
     """Iterations between checkpoints."""
+    keep_last: int = 3
+    """Latest checkpoints that stay, 0 = all."""
+    keep_every: int = 10
+    """Of the older ones, every so many-th stays, 0 = none."""
     print_interval: int = 20
     """Iterations between lines on the screen."""
     log_interval: int = 5
@@ -118,6 +122,8 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
         "seed": options.seed,
         "num_steps_per_env": options.steps,
         "save_interval": options.save_interval,
+        "keep_last": options.keep_last,
+        "keep_every": options.keep_every,
         "print_interval": options.print_interval,
         "log_interval": options.log_interval,
         "logger": logger,

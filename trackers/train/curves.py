@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -91,6 +92,8 @@ def draw(folders: Sequence[Path], out: Path) -> Path:
     names = [folder.stem if folder.suffix == ".jsonl" else folder.resolve().name for folder in folders]
     unique = len(set(names)) == len(names)
     runs = [(name if unique else str(folder), read(folder)) for name, folder in zip(names, folders, strict=True)]
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError("curves: needs matplotlib: install `arena-newton[plots]`")
     import matplotlib as mpl
     import numpy as np
 

@@ -33,6 +33,7 @@ from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
     from arena_newton.trackers.motions.library import DeviceLibrary
+    from arena_newton.trackers.train.config import TrainOptions
 
 __all__ = ["EnvConfig", "TrackerEnv"]
 
@@ -48,24 +49,29 @@ _VALUE_CLIP = 50.0
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """What shapes the environment."""
+    """What shapes the environment; `TrainOptions` has the defaults."""
 
-    worlds: int = 8192
+    worlds: int
     """Parallel worlds."""
-    episode_s: float = 10.0
+    episode_s: float
     """Longest episode [s]."""
-    adaptive: float = 0.5
+    adaptive: float
     """Share of the episodes that start where the tracker fails, the others start anywhere."""
-    randomise: bool = True
+    randomise: bool
     """Run the events and noise of `events.py`."""
-    contacts_per_world: int = 48
+    contacts_per_world: int
     """Contact buffer."""
-    constraints_per_world: int = 160
+    constraints_per_world: int
     """Constraint buffer."""
-    graph: bool = True
+    graph: bool
     """Capture the physics of a tick on CUDA."""
-    tick_graph: bool = True
+    tick_graph: bool
     """Capture the rest of a tick on CUDA."""
+
+    @classmethod
+    def of(cls, options: TrainOptions) -> EnvConfig:
+        """The part of a training's options that the environment reads, by the same names."""
+        return cls(**{field.name: getattr(options, field.name) for field in dataclasses.fields(cls)})
 
 
 class TrackerEnv(VecEnv):

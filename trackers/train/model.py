@@ -35,9 +35,10 @@ class TrackerActor(MLPModel):
         obs_groups: dict[str, list[str]],
         obs_set: str,
         output_dim: int,
-        interface: str = "twist2",
-        network: Mapping[str, Any] | None = None,
-        init_std: float = 0.6,
+        *,
+        interface: str,
+        network: Mapping[str, Any] | None,
+        init_std: float,
         std_range: tuple[float, float] = (0.05, 2.0),
     ):
         """Make the network and the action noise.

@@ -39,17 +39,17 @@ class IterationPPO(PPO):
     highest_rate: float = 1e-3
     """Upper bound of the learning rate."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        """Take rsl-rl's arguments and `mirror_loss`.
+    def __init__(self, *args: Any, mirror_loss: float, graph: bool, **kwargs: Any):
+        """Take rsl-rl's arguments and two of our own.
 
         Args:
             args: rsl-rl's.
-            kwargs: rsl-rl's; `schedule` is `adaptive` or `fixed`, `desired_kl` the divergence aimed at. `mirror_loss`
-                weighs the squared difference between the action of a mirrored observation and the mirrored action,
-                `graph` asks for CUDA graphs.
+            mirror_loss: Weight of the squared difference between the action of a mirrored observation and the mirrored
+                action.
+            graph: Ask for CUDA graphs.
+            kwargs: rsl-rl's; `schedule` is `adaptive` or `fixed`, `desired_kl` the divergence aimed at.
         """
-        self.mirror_loss: float = kwargs.pop("mirror_loss", 0.0)
-        graph: bool = kwargs.pop("graph", True)
+        self.mirror_loss = mirror_loss
         self.mirrors: tuple[Mirror, Mirror] | None = None
         """Mirror images of the actor's observation and of the action."""
         super().__init__(*args, **kwargs)

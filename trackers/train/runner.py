@@ -5,8 +5,10 @@ Its log keeps statistics on the device and fetches them once an iteration.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import signal
 import statistics
 import threading
@@ -112,6 +114,7 @@ class TrackerRunner(OnPolicyRunner):
         self._stop = False
         self._logged: float = 0
         self._started = False
+        self._resumed: Path | None = None
 
     def _configure_multi_gpu(self) -> None:
         """As rsl-rl, which knows GPUs only; processes on the CPU talk through gloo."""
@@ -254,6 +257,7 @@ class TrackerRunner(OnPolicyRunner):
             self._settle(elapsed)
             if self._writes and (it + 1) % self.cfg["save_interval"] == 0:
                 self.save(str(Path(self.logger.log_dir or ".") / f"model_{it + 1}.pt"))
+                self._prune()
                 mark = time.monotonic()
         if self._writes:
             if self.history and self.history[-1]["iteration"] != self._logged:
@@ -261,6 +265,20 @@ class TrackerRunner(OnPolicyRunner):
             self.save(str(Path(self.logger.log_dir or ".") / "model_last.pt"))
             self.save(str(Path(self.logger.log_dir or ".") / "model_slim.pt"), slim=True)
             self.logger.stop_logging_writer()
+
+    def _prune(self) -> None:
+        """Delete older checkpoints of this training; the one that it was resumed from stays."""
+        last, every = self.cfg["keep_last"], self.cfg["keep_every"]
+        if not last:
+            return
+        folder = Path(self.logger.log_dir or ".")
+        names = [re.fullmatch(r"model_(\d+)", path.stem) for path in folder.glob("model_*.pt")]
+        saved = sorted(int(name[1]) for name in names if name)
+        for number in [n for n in saved if n <= self.current_learning_iteration][:-last]:
+            path = folder / f"model_{number}.pt"
+            if path.resolve() != self._resumed and not (every and number // self.cfg["save_interval"] % every == 0):
+                with contextlib.suppress(OSError):  # a training does not end over a file that stays
+                    path.unlink()
 
     @property
     def _writes(self) -> bool:
@@ -400,7 +418,7 @@ class TrackerRunner(OnPolicyRunner):
             raise InputError(f"{path}: its references are of the families {theirs}; these are {ours}")
         if state["network"] != self.alg.get_policy().net.config():
             raise InputError(f"{path}: a network of other widths than this training's")
-        self._started = bool(state.get("started", False))
+        self._started, self._resumed = bool(state.get("started", False)), Path(path).resolve()
         parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
         try:
             self.alg.load(state, load_cfg or parts, strict)

@@ -32,7 +32,7 @@ CEILING = 5.0
 class ClipSampler:
     """Adaptive sampling of start frames."""
 
-    def __init__(self, bank: ReferenceBank, adaptive: float = 0.5, family_weights: dict[str, float] | None = None):
+    def __init__(self, bank: ReferenceBank, adaptive: float, family_weights: dict[str, float] | None = None):
         """Cut the clips into bins.
 
         Args:

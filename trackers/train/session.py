@@ -36,19 +36,28 @@ def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveG
     Args:
         tracker: `twist2` or `sonic`.
         action_form: `auto`, `residual` or `default`.
+
+    Raises:
+        InputError: Another interface or form.
     """
     from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
     from arena_newton.trackers import sonic, twist2
     from arena_newton.trackers.front_end import residual_form
 
-    kind: type[FrontEnd] = sonic.SonicFrontEnd if tracker == "sonic" else twist2.Twist2FrontEnd
-    drive = SONIC_DRIVE if tracker == "sonic" else TWIST2_DRIVE
-    default: ActionForm = sonic.SONIC_FORM if tracker == "sonic" else twist2.OFFICIAL_FORM
+    kinds: dict[str, tuple[type[FrontEnd], DriveGains, ActionForm]] = {
+        "twist2": (twist2.Twist2FrontEnd, TWIST2_DRIVE, twist2.OFFICIAL_FORM),
+        "sonic": (sonic.SonicFrontEnd, SONIC_DRIVE, sonic.SONIC_FORM),
+    }
+    if tracker not in kinds:
+        raise InputError(f"--tracker {tracker}: no interface that is trained here; there are {', '.join(kinds)}")
+    if action_form not in ("auto", "residual", "default"):
+        raise InputError(f"--action-form {action_form}: expected auto, residual or default")
+    kind, drive, default = kinds[tracker]
     form = dataclasses.replace(default, clip=10.0) if action_form == "default" else residual_form(drive)
     return kind(form), drive, PhysicsRate(dt=0.005, substeps=4)
 
 
-def make_library(options: TrainOptions, device: str, seed: int = 0) -> MotionLibrary:
+def make_library(options: TrainOptions, device: str, seed: int) -> MotionLibrary:
     """References of a training: a library or generated ones, more files, mirror images.
 
     Raises:
@@ -141,6 +150,8 @@ def check(options: TrainOptions) -> None:
         ("--init-std", options.init_std, 1e-3, 10),
         ("--mirror-loss", options.mirror_loss, 0, math.inf),
         ("--save-interval", options.save_interval, 1, math.inf),
+        ("--keep-last", options.keep_last, 0, math.inf),
+        ("--keep-every", options.keep_every, 0, math.inf),
         ("--print-interval", options.print_interval, 1, math.inf),
         ("--log-interval", options.log_interval, 1, math.inf),
         ("--contacts-per-world", options.contacts_per_world, 1, math.inf),
@@ -222,6 +233,7 @@ def build(options: TrainOptions) -> TrackerRunner:
     Raises:
         InputError: An option does not fit.
     """
+    check(options)
     import torch
 
     from arena_newton.trackers import networks
@@ -232,7 +244,6 @@ def build(options: TrainOptions) -> TrackerRunner:
 
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
-    check(options)
     unknown = sorted(set(options.rewards) - set(REWARDS))
     if unknown:
         raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
@@ -261,16 +272,7 @@ def build(options: TrainOptions) -> TrackerRunner:
         drive,
         rate,
         library.to(device),
-        EnvConfig(
-            worlds=options.worlds,
-            episode_s=options.episode_s,
-            adaptive=options.adaptive,
-            randomise=options.randomise,
-            contacts_per_world=options.contacts_per_world,
-            constraints_per_world=options.constraints_per_world,
-            graph=options.graph,
-            tick_graph=options.tick_graph,
-        ),
+        EnvConfig.of(options),
         device,
         rewards=rewards,
         family_weights=weights,

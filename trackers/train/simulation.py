@@ -48,9 +48,9 @@ class Simulation:
         drive: DriveGains,
         rate: PhysicsRate,
         *,
-        contacts_per_world: int = 48,
-        constraints_per_world: int = 160,
-        graph: bool = True,
+        contacts_per_world: int,
+        constraints_per_world: int,
+        graph: bool,
     ):
         """Build the lab.
 

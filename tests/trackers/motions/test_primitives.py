@@ -227,6 +227,16 @@ def test_random_clips_repeat_with_their_seed():
     assert torch.equal(first, same) and not torch.equal(first, other)
 
 
+def test_a_clip_depends_on_its_seed_family_and_number_alone():
+    """The same seed gives the same squats, whatever families stand in front of them and however many there are."""
+    alone = programs.random_clips({"squat": 2}, seconds=2.0, seed=7)
+    among = programs.random_clips({"turn": 2, "walk": 1, "squat": 3, "kick": 1}, seconds=2.0, seed=7)
+    for name in ("root_pos", "root_quat", "joint_pos", "hands"):
+        assert torch.equal(alone[name], among[name][3:5]), name
+    assert not torch.equal(among["joint_pos"][3], among["joint_pos"][4])
+    assert not torch.equal(among["joint_pos"][4], among["joint_pos"][5])
+
+
 def test_official_tracker_walks_these_references(shared):
     """TWIST2's released weights, in plain MuJoCo, reach 90 % of a commanded 0.3 and 0.6 m/s and stay up."""
     from arena_newton.eval import oracle

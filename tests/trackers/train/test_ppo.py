@@ -23,12 +23,11 @@ def learner(device: str, graph: bool = False) -> IterationPPO:
     torch.manual_seed(0)
     obs = TensorDict({"actor": torch.zeros(WORLDS, 1432), "critic": torch.zeros(WORLDS, 40)}, batch_size=[WORLDS])
     groups = {"actor": ["actor"], "critic": ["critic"]}
-    actor = TrackerActor(obs, groups, "actor", 29, network={"hidden": [32]})
+    actor = TrackerActor(obs, groups, "actor", 29, interface="twist2", network={"hidden": [32]}, init_std=0.6)
     critic = TrackerCritic(obs, groups, "critic", 1, hidden_dims=[32], activation="elu", obs_normalization=True)
     storage = RolloutStorage("rl", WORLDS, STEPS, obs, [29], device)
-    return IterationPPO(
-        actor, critic, storage, entropy_coef=0.01, use_clipped_value_loss=False, device=device, graph=graph
-    )
+    settings = {"entropy_coef": 0.01, "use_clipped_value_loss": False, "mirror_loss": 0.0, "graph": graph}
+    return IterationPPO(actor, critic, storage, **settings, device=device)
 
 
 def update(ppo: IterationPPO, seed: int) -> dict[str, float]:
@@ -165,8 +164,13 @@ def test_a_captured_update_is_the_update():
     compare(learner("cuda:0", graph=True), learner("cuda:0"))
 
 
-@cuda
-@pytest.mark.parametrize(("source", "target"), [("cpu", "cuda:0"), ("cuda:0", "cpu"), ("cuda:0", "cuda:0")])
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        ("cpu", "cpu"),
+        *(pytest.param(*pair, marks=cuda) for pair in (("cpu", "cuda:0"), ("cuda:0", "cpu"), ("cuda:0", "cuda:0"))),
+    ],
+)
 def test_a_checkpoint_goes_on_on_another_kind_of_device(source, target):
     """Moments and rate arrive; what is learnt then differs by the shuffle, which each device draws its own way."""
     here, there = learner(source, graph=True), learner(target, graph=True)
@@ -181,5 +185,5 @@ def test_a_checkpoint_goes_on_on_another_kind_of_device(source, target):
     before = weights(here)
     for ppo in (here, there):
         update(ppo, 2)
-    moved = [(weights(ppo) - before).norm() for ppo in (here, there)]
-    assert moved[0] == pytest.approx(moved[1], rel=0.2)
+    moved = [float((weights(ppo) - before).norm()) for ppo in (here, there)]
+    assert 0.0 < moved[0] == pytest.approx(moved[1], rel=0.2)

@@ -1,8 +1,11 @@
 """Training end to end on the CPU: 8 worlds, engine `warp`."""
 
 import dataclasses
+import importlib
+import inspect
 import json
 import os
+import pkgutil
 import signal
 import subprocess
 import sys
@@ -13,8 +16,9 @@ from PIL import Image
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import weights_file
+from arena_newton.trackers import train, weights_file
 from arena_newton.trackers.motions import frames
+from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.config import TrainOptions, runner_config
@@ -23,7 +27,7 @@ from arena_newton.trackers.train.export import ExportOptions, export
 from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, read_checkpoint
 from arena_newton.trackers.train.simulation import share_stream
-from arena_newton.trackers.twist2 import Twist2Tracker
+from arena_newton.trackers.twist2 import Twist2FrontEnd, Twist2Tracker
 
 WORLDS = 8
 
@@ -33,7 +37,7 @@ def env(library):
     """Eight worlds with all of the randomisation."""
     torch.manual_seed(0)
     front, drive, rate = session.front_end("twist2")
-    made = TrackerEnv(front, drive, rate, library.to("cpu"), EnvConfig(worlds=WORLDS), "cpu")
+    made = TrackerEnv(front, drive, rate, library.to("cpu"), EnvConfig.of(TrainOptions(worlds=WORLDS)), "cpu")
     made.library = library.to("cpu")
     return made
 
@@ -61,7 +65,7 @@ def test_a_rollout_does_not_wait_for_the_device(library):
     """Torch reports each wait as an error: from observation to action to reward there is none."""
     share_stream("cuda:0")
     front, drive, rate = session.front_end("twist2")
-    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), EnvConfig(worlds=WORLDS), "cuda:0")
+    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), EnvConfig.of(TrainOptions(worlds=WORLDS)), "cuda:0")
     algorithm = make_runner(env).alg
     obs = env.get_observations()
     try:
@@ -163,7 +167,7 @@ def test_reward_improves(env):
         TWIST2_DRIVE,
         PhysicsRate(0.005, 4),
         env.library,
-        EnvConfig(worlds=WORLDS, randomise=False),
+        EnvConfig.of(TrainOptions(worlds=WORLDS, randomise=False)),
         "cpu",
         rewards={"wanted": wanted},
     )
@@ -195,6 +199,24 @@ def test_resume_goes_on_as_before(env, tmp_path):
     assert torch.equal(env.sampler.cumulative, expected["sampler"]["cumulative"])
     second.learn(1)
     assert second.current_learning_iteration == 3 and second.history[-1]["iteration"] == 3
+
+
+def test_old_checkpoints_are_deleted(env, tmp_path):
+    """The last K and every Nth stay, with the last of all and the one that was resumed from; 0 keeps everything."""
+
+    def files() -> set[str]:
+        return {path.name.removeprefix("model_").removesuffix(".pt") for path in tmp_path.glob("model_*.pt")}
+
+    make_runner(env, str(tmp_path), save_interval=1, keep_last=1, keep_every=2).learn(3)
+    assert files() == {"2", "3", "last", "slim"}
+    again = make_runner(env, str(tmp_path), save_interval=1, keep_last=1, keep_every=0)
+    again.load(str(tmp_path / "model_2.pt"))
+    again.learn(2)
+    assert files() == {"2", "4", "last", "slim"}
+    kept = make_runner(env, str(tmp_path), save_interval=1, keep_last=0)
+    kept.load(str(tmp_path / "model_2.pt"))
+    kept.learn(1)
+    assert files() == {"2", "3", "4", "last", "slim"}
 
 
 def test_export_is_what_was_trained(env, tmp_path):
@@ -376,7 +398,7 @@ def test_time_limit_lets_the_training_settle(env):
 def test_two_processes_train_one_network(library, tmp_path):
     """Torchrun on the CPU: both processes end after the same iteration with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
-    flags = ["--device", "cpu", "--worlds", "4", "--steps", "4", "--iterations", "2", "--no-mirror"]
+    flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "2", "--no-mirror"]
     flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
     script = tmp_path / "train.py"
     script.write_text(
@@ -398,7 +420,7 @@ def test_two_processes_train_one_network(library, tmp_path):
     for name, value in one.items():
         assert torch.equal(value, two[name]), name
     row = json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[0])
-    assert row["samples"] == 2 * 4 * 4
+    assert row["samples"] == 2 * 2 * 4
 
 
 def test_curves(env, tmp_path, capsys):
@@ -470,13 +492,41 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
     with pytest.raises(InputError, match="pass one of the two"):
-        session.make_library(TrainOptions(library=tmp_path / "a.npz", families={"walk": 1}), "cpu")
+        session.make_library(TrainOptions(library=tmp_path / "a.npz", families={"walk": 1}), "cpu", 0)
+
+
+def test_what_is_no_interface_is_refused():
+    """A tracker or an action form that training does not know is named, not taken for another."""
+    with pytest.raises(InputError, match="--tracker nosuch: .*there are twist2, sonic"):
+        session.front_end("nosuch")
+    with pytest.raises(InputError, match="--action-form nosuch: expected auto, residual or default"):
+        session.front_end("sonic", "nosuch")
+    for name, kind in (("twist2", Twist2FrontEnd), ("sonic", SonicFrontEnd)):
+        assert type(session.front_end(name)[0]) is kind and type(session.front_end(name, "default")[0]) is kind
+
+
+def test_training_options_have_one_default():
+    """No other part of a training has a default for a number or a switch of its options: only `TrainOptions` does."""
+    plain = {f.name for f in dataclasses.fields(TrainOptions) if isinstance(f.default, int | float)} - {"minutes"}
+    found = []
+    for module in pkgutil.iter_modules(train.__path__, f"{train.__name__}."):
+        parts = vars(importlib.import_module(module.name)).values()
+        own = [p for p in parts if getattr(p, "__module__", "") == module.name and p is not TrainOptions]
+        methods = [m for p in own if inspect.isclass(p) for m in vars(p).values()]
+        for function in filter(inspect.isfunction, [*own, *methods]):
+            given = inspect.signature(function).parameters.values()
+            found += [f"{module.name}: {p.name}" for p in given if p.name in plain and p.default is not p.empty]
+    assert not found
+    assert EnvConfig.of(TrainOptions()).adaptive == TrainOptions().adaptive
+    with pytest.raises(TypeError, match="missing"):
+        EnvConfig(worlds=8)
 
 
 @pytest.mark.parametrize(
     "flags",
     [
         ["--worlds", "0"],
+        ["--keep-last", "-1"],
         ["--iterations", "0"],
         ["--minutes", "-1"],
         ["--minibatches", "1000"],

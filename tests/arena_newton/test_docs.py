@@ -1,0 +1,68 @@
+"""What the documentation shows runs, and what it names exists."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+
+
+def test_the_index_names_every_page():
+    """Every page of docs/ is linked from the index."""
+    linked = set(re.findall(r"\]\(([\w.]+\.md)", (ROOT / "docs" / "index.md").read_text()))
+    assert linked >= {page.name for page in DOCS} - {"index.md"}
+
+
+def anchors(page: Path) -> set[str]:
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", ["index.md", "scope.md", "api.md", "training.md", "trackers.md", "motions.md"])
+def test_links_lead_somewhere(name):
+    """Files and headings that a page links to are there."""
+    page = ROOT / "docs" / name
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if not target.startswith("http"):
+            file, _, heading = target.partition("#")
+            other = (page.parent / file).resolve() if file else page
+            assert other.exists(), target
+            assert not heading or heading in anchors(other), target
+
+
+def test_commands_of_the_index_exist():
+    """The index lists every command of the one command line, and no other."""
+    from arena_newton.__main__ import COMMANDS
+
+    table = (ROOT / "docs" / "index.md").read_text().split("## Commands")[1].split("## ")[0]
+    first = "\n".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
+    listed = re.findall(r"`([^`]+)`", first)
+    for command in COMMANDS:
+        assert any(f"{words} ".startswith(f"{command.words} ") for words in listed), command.words
+    known = {word for command in COMMANDS for word in command.words.split()}
+    assert {words.split()[0] for words in listed} <= known | {"validate", "list", "preview"}
+
+
+def test_the_world_from_python():
+    """Every block of docs/api.md runs, one after the other, and gives what the page says."""
+    blocks = re.findall(
+        r"^```python\n(.*?)^```$", (ROOT / "docs" / "api.md").read_text(), flags=re.DOTALL | re.MULTILINE
+    )
+    world: dict = {"__name__": "docs_api"}
+    for number, block in enumerate(blocks, start=1):
+        exec(compile(block, f"docs/api.md, block {number}", "exec"), world)
+    observation, env = world["observation"], world["env"]
+    assert observation.state.shape == (2, 64) and observation.image.shape == (2, 64, 64, 3)
+    assert observation.image.dtype == torch.uint8 and observation.image.float().std() > 5.0
+    assert observation.instruction == "Kick the soccer ball into the goal."
+    assert world["picture"].shape == (2, 64, 64, 3) and world["picture"].float().std() > 5.0
+    assert [(r.episode.episode_seed, r.outcome, r.steps) for r in world["results"]] == [
+        (seed, "timeout", 8) for seed in (1, 2, 3)
+    ]
+    assert world["other"].startup_ticks == 0 and not world["other"].active.any() and not env.active.any()
+    step, ball = world["plan"].grad[:, :2], world["where"].grad[:, world["judge"].ball]
+    assert step.isfinite().all() and step.abs().max() > 0.0
+    assert ball.isfinite().all() and ball.norm(dim=1).min() > 0.5

@@ -1,0 +1,86 @@
+"""One command line for everything: it finds each command, answers at once and keeps exit codes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from arena_newton.__main__ import COMMANDS, main
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = Path(sys.executable).with_name("arena-newton")
+
+
+def test_every_program_of_the_package_has_a_command():
+    """What `python -m` runs has a command; builders, examples and the front doors themselves aside."""
+    doors = {"arena_newton/__main__.py", "trackers/__main__.py", "usd_scenes/g1/build.py"}
+    programs = set()
+    for folder in ("arena_newton", "kernels", "trackers", "policies", "eval", "usd_scenes"):
+        for path in (ROOT / folder).rglob("*.py"):
+            name = path.resolve().relative_to(ROOT).as_posix()
+            if 'if __name__ == "__main__":' in path.read_text() and name not in doors and "example" not in name:
+                programs.add("arena_newton." + name.removeprefix("arena_newton/")[:-3].replace("/", "."))
+    assert programs <= {command.module for command in COMMANDS}
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.words)
+def test_every_command_explains_itself(command, capsys):
+    """`--help` behind each command's words is the command's own and ends with 0."""
+    if command.words == "rules":
+        assert main(["rules"]) == 0 and "| `paper` | `released` |" in capsys.readouterr().out
+        return
+    try:
+        code = main([*command.words.split(), "--help"])
+    except SystemExit as stop:  # of argparse and tyro
+        code = stop.code
+    assert code == 0
+    assert capsys.readouterr().out.count("\n") > 1
+
+
+def test_arguments_and_exit_codes_pass(tmp_path, capsys):
+    """A command gets what stands behind its words, and its exit code is the answer."""
+    assert main(["eval", "list", "--task", "boxing", "--seeds", "4", "--repeats", "2", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert [(row["task"], row["repeat"]) for row in plan] == [("boxing", 0), ("boxing", 1)]
+    assert main(["scenes", "validate", str(tmp_path / "none.usda")]) == 2
+    assert main(["trackers", "evaluate"]) == 2
+    assert main(["trackers", "motions", "inspect", str(tmp_path / "none.npz")]) == 2
+    assert main(["train", "--worlds", "0", "--device", "cpu"]) == 2
+
+
+def test_what_is_no_command_is_named(capsys):
+    """Unknown words and surplus arguments are one line and 2; groups and nothing at all show the overview."""
+    for arguments in (["evl"], ["trackers", "nothing"], ["evl", "--help"], ["rules", "x"], ["doctor", "--x"]):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and error.count("\n") == 1 and arguments[0] in error
+    assert main([]) == main(["trackers"]) == 2
+    shown = capsys.readouterr()
+    assert not shown.out and all(shown.err.count(f"arena-newton {c.words} ") for c in COMMANDS)
+    assert main(["trackers", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "trackers motions" in out and "doctor" not in out
+
+
+def test_the_overview_imports_nothing_heavy():
+    """The overview and the listing of trackers' commands come from the standard library alone."""
+    code = (
+        "import sys; from arena_newton.__main__ import main; main(['--help']); main(['trackers', '--help'])\n"
+        "heavy = {'numpy', 'torch', 'warp', 'newton', 'tyro', 'mujoco', 'pxr', 'lerobot'} & set(sys.modules)\n"
+        "print('heavy:', sorted(heavy))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert done.returncode == 0 and done.stdout.endswith("heavy: []\n")
+
+
+@pytest.mark.parametrize(
+    "start", [[str(SCRIPT)], [sys.executable, "-m", "arena_newton"], [sys.executable, "-m", "arena_newton.trackers"]]
+)
+def test_installed_commands_run_from_any_folder(start, tmp_path):
+    """Console script and modules answer from another folder; output that nobody reads on is no error."""
+    done = subprocess.run([*start, "--help"], capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert done.returncode == 0 and "arena-newton trackers train" in done.stdout and not done.stderr
+    wrong = subprocess.run([*start, "nothing"], capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
