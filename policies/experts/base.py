@@ -100,7 +100,7 @@ class Expert:
         self.sight = sight
 
     def begin(self, mask: Tensor) -> None:
-        """Episodes begin in the worlds of `mask`: the robot stands, objects lie where they fell."""
+        """Episodes begin in the worlds of `mask`: the robot stands; dropped objects may still roll."""
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """The command of the next chunk.

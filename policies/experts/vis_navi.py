@@ -1,4 +1,7 @@
-"""VisNavi's expert: plan around the obstacles where they came to rest, walk, stand in the marked area."""
+"""VisNavi's expert: plan around the obstacles where they lie, walk, stand in the marked area.
+
+Some still roll when the episode begins; one that moves on asks for a new plan, as one does that the robot pushes.
+"""
 
 from __future__ import annotations
 
