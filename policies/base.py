@@ -39,6 +39,10 @@ class PolicyError(ArenaError):
         self.message = message
 
 
+class PolicyUnavailable(ArenaError):
+    """The policy cannot go on at all (its server is gone); the run stops and its unfinished episodes stay unplayed."""
+
+
 class Policy:
     """Base of all policies; a subclass writes `act` and, where it has a memory, `reset`."""
 
@@ -50,6 +54,9 @@ class Policy:
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
     chunk_size: int = 1
     """Actions a chunk, where the policy knows it beforehand."""
+    depends_on_worlds: bool = False
+    """Whether an episode may depend on how many worlds ask at once; the number then belongs to what a run is known by.
+    Final after `check`."""
 
     def check(self) -> None:
         """Look, before the first episode, whether the policy can work at all.
