@@ -484,12 +484,20 @@ def _digest(root: Path, files: Sequence[Path], digest: Callable[[Path], str]) ->
 
 
 def own_code(part: Any) -> str | None:
-    """Hash of the module that a part from another package was written in; None for the package's own parts."""
+    """Hash of the package, or the single module, that a tracker or policy of others was written in.
+
+    Returns:
+        None for the parts of this package, whose code is hashed as a whole.
+    """
     module = sys.modules.get(type(part).__module__)
-    file = getattr(module, "__file__", None)
-    if module is None or file is None or module.__name__.partition(".")[0] == "arena_newton":
+    name = module.__name__.partition(".")[0] if module is not None else ""
+    top = sys.modules.get(name)
+    if top is None or getattr(top, "__file__", None) is None or name in {"arena_newton", *sys.stdlib_module_names}:
         return None
-    return hash_path(Path(file))
+    file = Path(str(top.__file__)).resolve()
+    if not hasattr(top, "__path__"):
+        return hash_path(file)
+    return _digest(file.parent, [f for f in _files(file.parent) if f.suffix == ".py"], hash_path)
 
 
 def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:

@@ -74,7 +74,8 @@ class Progress:
         self._stream = stream or sys.stderr
         self._clock = clock
         self._name = ""
-        self._first_done = self._line_done = done
+        self._first_done = self._line_done = self._over = done
+        self._running = 0
         self._line_at = clock()
         self._last: float | None = None
         self._stepping = self._ticks = 0.0
@@ -110,7 +111,8 @@ class Progress:
             self._ticks += active
             self._window[0] += active
             self._window[1] += passed
-            self._advance(active)
+            self._running += active
+            self._advance()
             if self._window[1] >= 1.0:
                 self._rate = self._window[0] / self._window[1]
                 self._window = [0.0, 0.0]
@@ -119,10 +121,17 @@ class Progress:
             self._line(now)
         self._last = now
 
-    def episode(self, unused: int) -> None:
-        """An episode is over and leaves so many ticks of its budget."""
+    def episode(self, budget: int, used: int) -> None:
+        """An episode is over.
+
+        Args:
+            budget: Its planned ticks, all of which are done now.
+            used: Ticks that it took, its start-up included.
+        """
         self.finished += 1
-        self._advance(unused)
+        self._over += budget
+        self._running = max(0, self._running - used) if self.finished < self.planned else 0
+        self._advance()
         self._describe()
 
     def say(self, text: str) -> None:
@@ -140,9 +149,9 @@ class Progress:
             self.say(self._text())
         self._line_done = self.done
 
-    def _advance(self, ticks: int) -> None:
+    def _advance(self) -> None:
         before = self.done
-        self.done = max(before, min(self.budget, before + ticks))
+        self.done = max(before, min(self.budget, self._over + self._running))
         if self._bar is not None:
             self._bar.update(self.done - before)
 

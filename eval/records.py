@@ -387,4 +387,4 @@ def _of(value: Any, hint: Any) -> bool:
 
 
 def _type_name(hint: Any) -> str:
-    return getattr(hint, "__name__", None) if isinstance(hint, type) else str(hint).replace("typing.", "")
+    return hint.__name__ if type(hint) is type else str(hint).replace("typing.", "")

@@ -403,7 +403,10 @@ class _Run:
                 raise
             except OSError as error:
                 self._keep_trace()
-                raise _stopped(self.folder, f"{task} {mode}", error) from None
+                if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                    where = plain_text(error.filename or self.folder)
+                    raise StorageError(f"{where}: disk full; {self.kept()}, what was running is not") from None
+                raise RunStopped(_failed(task, mode, error)) from None
             except Exception as error:
                 self._keep_trace()
                 # The next episode starts as soon as a world is free, so these are what was running.
@@ -415,7 +418,7 @@ class _Run:
                 for episode in running:
                     self.journal.append(_error_record(self.config, episode, message, self._hashes))
                     del left[episode.index]
-                    self.progress.episode(episode.max_steps)
+                    self.progress.episode(episode.max_steps, 0)
 
     def _play_in_one(self, task: str, mode: str, episodes: list[Episode], left: dict[int, Episode]) -> None:
         """Run episodes in one environment; those that end are taken out of ``left``."""
@@ -449,7 +452,7 @@ class _Run:
                 media = _media(self.folder, recorder.label(result.episode)) if recorder is not None else {}
                 self.journal.append(_record(c, result, media, self._hashes))
                 left.pop(result.episode.index, None)
-                self.progress.episode(result.episode.max_steps - result.steps)
+                self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK_S))
 
             self._built = True
             env.run_episodes(
@@ -509,15 +512,11 @@ def _broken(task: str, mode: str, message: str, running: Sequence[Episode]) -> s
     return f"{text}; trace in {BREAK_FILE}"
 
 
-def _stopped(folder: Path, group: str, error: OSError) -> ArenaError:
+def _failed(task: str, mode: str, error: OSError) -> str:
     """What is said of a file that could not be written or a connection that broke."""
-    where = error.filename or folder
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return StorageError(f"{plain_text(where)}: disk full; running episodes stay unplayed")
-    reason = plain_text(error.strerror or error)
-    named = f"{plain_text(error.filename)}: {reason}" if error.filename else reason
-    left = f"running episodes stay unplayed; trace in {BREAK_FILE}"
-    return RunStopped(f"{group}: {type(error).__name__}: {named}; {left}")
+    cause = plain_text(error.strerror or error)
+    named = f"{plain_text(error.filename)}: {cause}" if error.filename else cause
+    return f"{task} {mode}: {type(error).__name__}: {named}; running episodes stay unplayed; trace in {BREAK_FILE}"
 
 
 def _comparable(facts: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from arena_newton.errors import InputError
 from arena_newton.eval import journal as module
 from arena_newton.eval.journal import Journal, StorageError, read_journal, write_atomic
 
-
 ROWS = episodes("football", (1, 0, 0))
 
 
