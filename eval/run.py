@@ -31,6 +31,8 @@ from arena_newton.policies.base import PolicyUnavailable
 
 __all__ = ["Factories", "RunStopped", "execute", "new_folder", "stored_options"]
 
+Versions = dict[str, str | None]
+
 TICK_S = 0.02
 """Length of a tick [s]."""
 BREAK_FILE = "break.txt"
@@ -95,9 +97,12 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
         RunStopped: simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
     factories = factories or Factories()
+    from arena_newton.doctor import versions
+
     config = configs.resolve(options)
+    installed = versions()
     folder = Path(options.out).expanduser() if options.out else new_folder()
-    _check_folder(folder, config, options)
+    _check_folder(folder, config, options, installed)
     episodes = configs.episodes(config)
     config, policy = _check_parts(config, episodes, factories)
     began = time.perf_counter()
@@ -105,8 +110,9 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
     try:
         _make_folder(folder)
         with Journal(folder / records.JOURNAL_FILE) as journal:
-            document = _settle(folder, options, config, len(episodes))
+            document = _settle(folder, options, config, len(episodes), installed)
             run = _Run(options, config, folder, episodes, journal, factories, policy, document)
+            run.hashes["versions"] = configs.config_hash(configs.moving_versions(installed))
             try:
                 run.play()
             except KeyboardInterrupt:
@@ -164,10 +170,9 @@ def _shown(value: Any) -> str:
     return "-" if value is None else str(value)
 
 
-def _document(options: RunOptions, config: RunConfig, planned: int) -> dict[str, Any]:
+def _document(options: RunOptions, config: RunConfig, planned: int, installed: Versions) -> dict[str, Any]:
     """Content of config.json; what the environments say of themselves is added when they are built."""
     from arena_newton import rules, tasks
-    from arena_newton.doctor import versions
 
     return {
         "config_hash": config.hash,
@@ -175,7 +180,7 @@ def _document(options: RunOptions, config: RunConfig, planned: int) -> dict[str,
         "rule_set": dict(rules.get(config.rules).table()),
         "gym_ids": {name: tasks.get(name).gym_id for name in config.tasks},
         "options": json.loads(json.dumps(dataclasses.asdict(configs.explicit(options, config)))),
-        "versions": versions(),
+        "versions": installed,
         "planned": planned,
         "environments": {},
     } | _variant_changes(config)
@@ -191,14 +196,12 @@ def _variant_changes(config: RunConfig) -> dict[str, list[str]]:
     return {} if differences is None else {"variant_changes": differences(config.variant, config.tasks[0])}
 
 
-def _check_folder(folder: Path, config: RunConfig, options: RunOptions) -> dict[str, Any] | None:
+def _check_folder(folder: Path, config: RunConfig, options: RunOptions, installed: Versions) -> dict[str, Any] | None:
     """Refuse a folder of another configuration or of other libraries, or one that holds something else.
 
     Returns:
         The stored config.json; None in a new folder.
     """
-    from arena_newton.doctor import versions
-
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: is a file")
     if not (folder / records.CONFIG_FILE).exists():
@@ -218,7 +221,7 @@ def _check_folder(folder: Path, config: RunConfig, options: RunOptions) -> dict[
             "choose another --out"
         )
     known = [configs.moving_versions(v) for v in (stored.get("versions", {}), *stored.get("later_versions", ()))]
-    now = configs.moving_versions(versions())
+    now = configs.moving_versions(installed)
     if now not in known and not options.accept_versions:
         library, was, is_now = configs.differing_key(known[-1], now) or ("versions", None, None)
         raise InputError(
@@ -235,21 +238,18 @@ def _make_folder(folder: Path) -> None:
         raise InputError(f"--out {folder}: cannot be created ({error.strerror})") from None
 
 
-def _settle(folder: Path, options: RunOptions, config: RunConfig, planned: int) -> dict[str, Any]:
+def _settle(folder: Path, options: RunOptions, config: RunConfig, planned: int, installed: Versions) -> dict[str, Any]:
     """Write config.json into a new folder, or hold the run to the one that is there; the journal's lock is held.
 
     Returns:
         Content of config.json.
     """
-    from arena_newton.doctor import versions
-
     path = folder / records.CONFIG_FILE
-    stored = _check_folder(folder, config, options)
-    document = _document(options, config, planned) if stored is None else stored
-    now = versions()
-    sets = [document["versions"], *document.get("later_versions", ())] if stored is not None else [now]
-    if configs.moving_versions(now) not in map(configs.moving_versions, sets):
-        document["later_versions"] = [*sets[1:], now]
+    stored = _check_folder(folder, config, options, installed)
+    document = _document(options, config, planned, installed) if stored is None else stored
+    sets = [document.get("versions", {}), *document.get("later_versions", ())]
+    if configs.moving_versions(installed) not in map(configs.moving_versions, sets):
+        document["later_versions"] = [*sets[1:], installed]
     elif stored is not None:
         return document
     write_atomic(path, json.dumps(document, indent=2) + "\n")
@@ -313,7 +313,7 @@ class _Run:
     progress: Progress = dataclasses.field(init=False)
     _built: bool = False
     """Whether the environment stands, so that a break is one of its episodes."""
-    _hashes: dict[str, str] = dataclasses.field(default_factory=dict)
+    hashes: dict[str, str] = dataclasses.field(default_factory=dict)
     """Of the environment and of the libraries' versions."""
 
     def kept(self) -> str:
@@ -416,7 +416,7 @@ class _Run:
                     raise RunStopped(_broken(task, mode, message, running if self._built else [])) from None
                 self.progress.say(f"  {task} {mode}: {message}; {counted(len(running), 'episode')} end as errors")
                 for episode in running:
-                    self.journal.append(_error_record(self.config, episode, message, self._hashes))
+                    self.journal.append(_error_record(self.config, episode, message, self.hashes))
                     del left[episode.index]
                     self.progress.episode(episode.max_steps, 0)
 
@@ -450,7 +450,7 @@ class _Run:
                     assert env is not None
                     actor.write(result, env.spec.gym_id)
                 media = _media(self.folder, recorder.label(result.episode)) if recorder is not None else {}
-                self.journal.append(_record(c, result, media, self._hashes))
+                self.journal.append(_record(c, result, media, self.hashes))
                 left.pop(result.episode.index, None)
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK_S))
 
@@ -489,12 +489,7 @@ class _Run:
         else:
             known[group] = facts
             write_atomic(self.folder / records.CONFIG_FILE, json.dumps(self.document, indent=2) + "\n")
-        from arena_newton.doctor import versions
-
-        self._hashes = {
-            "environment": configs.config_hash(_comparable(facts)),
-            "versions": configs.config_hash(configs.moving_versions(versions())),
-        }
+        self.hashes["environment"] = configs.config_hash(_comparable(facts))
 
     def _keep_trace(self) -> None:
         with contextlib.suppress(ArenaError, ValueError):
