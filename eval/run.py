@@ -439,7 +439,7 @@ class _Run:
                 variant_file=str(c.variant) if c.variant else None,
                 fast_physics=c.fast_physics,
                 camera=_policy_camera(self.policy),
-                **({} if c.drive == "auto" else {"drive": c.drive}),
+                drive=_drive(c.drive),
             )
             self._register(f"{task} {mode}", env)
             recorder = _recorder(c, self.folder)
@@ -466,6 +466,8 @@ class _Run:
         finally:
             if recorder is not None and hasattr(recorder, "close"):
                 recorder.close()
+            if env is not None:
+                env.close()
             env = recorder = None
             gc.collect()
 
@@ -475,8 +477,7 @@ class _Run:
         Raises:
             InputError: Earlier episodes of this task and mode were run in an environment that differs.
         """
-        describe = getattr(env, "describe", None)
-        facts = _plain(describe()) if describe is not None else {}
+        facts = _plain(env.describe())
         known = self.document.setdefault("environments", {})
         if group in known:
             difference = configs.differing_key(_comparable(known[group]), _comparable(facts))
@@ -512,6 +513,13 @@ def _failed(task: str, mode: str, error: OSError) -> str:
     cause = plain_text(error.strerror or error)
     named = f"{plain_text(error.filename)}: {cause}" if error.filename else cause
     return f"{task} {mode}: {type(error).__name__}: {named}; running episodes stay unplayed; trace in {BREAK_FILE}"
+
+
+def _drive(name: str) -> Any:
+    """Drive gains of --drive; None for those that tracker and rule set ask for."""
+    from arena_newton import robot
+
+    return {"twist2": robot.TWIST2_DRIVE, "humanoidarena": robot.TWIST2_HUMANOIDARENA_DRIVE}.get(name)
 
 
 def _comparable(facts: dict[str, Any]) -> dict[str, Any]:

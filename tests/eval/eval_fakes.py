@@ -31,6 +31,9 @@ class FakeEnv:
         """What the real one says of itself."""
         return {"engine": self.options["engine"], "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
 
+    def close(self):
+        """Nothing to let go of."""
+
     def run_episodes(self, policy, episodes, on_finish=None, on_tick=None, recorder=None, max_steps=None):
         """Tick until all episodes have ended."""
         waiting, running = list(episodes), {}

@@ -283,6 +283,21 @@ def test_environments_stand_in_configuration_and_journal(uninterrupted):
     assert len({h["environment"] for h in hashes}) == len({h["versions"] for h in hashes}) == 1
 
 
+def test_drive_reaches_the_environment(tmp_path):
+    """--drive names the gains that the environment is built with; without it tracker and rule set decide."""
+    built = []
+
+    class Notes(FakeEnv):
+        def __init__(self, task, *, drive=None, **options):
+            super().__init__(task, **options)
+            built.append(drive.name if drive is not None else None)
+
+    for number, flags in enumerate(([], ["--drive", "twist2"], ["--drive", "humanoidarena"])):
+        short = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "1"]
+        assert main([*short, *flags, "--out", str(tmp_path / str(number))], factories(env=Notes)) == 0
+    assert built == [None, "twist2", "twist2-humanoidarena"]
+
+
 def test_another_environment_is_refused(tmp_path, uninterrupted, capsys):
     """A resume whose world runs at another physics rate is refused by name before its first episode."""
     folder = tmp_path / "half"
