@@ -69,9 +69,10 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
     except ArenaError as error:
         from arena_newton.eval.journal import StorageError
         from arena_newton.eval.run import RunStopped
+        from arena_newton.policies.base import PolicyUnavailable
 
         print(f"error: {_one_line(error)}", file=sys.stderr)
-        return 2 if isinstance(error, (StorageError, RunStopped)) else 1
+        return 2 if isinstance(error, (StorageError, RunStopped, PolicyUnavailable)) else 1
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
         return INTERRUPTED
@@ -142,7 +143,7 @@ def _show_expert(options: RunOptions, folder: Path, factories: Factories | None)
         options, task=("vis_navi",), policy="expert", seeds=(0,), repeats=1, worlds=1, strip=True, out=str(folder)
     )
     code = execute(one, factories)
-    for strip in sorted((folder / "strips").glob("*__world.png")):
+    for strip in sorted((folder / "strips").glob("*__world.*")):
         print(f"see it: {strip}")
     return code
 

@@ -303,6 +303,10 @@ def resolve(options: RunOptions) -> RunConfig:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
     if options.video_episodes is not None and options.video_episodes < 1:
         raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
+    pictures = {"video_episodes": options.video_episodes, "video_size": options.video_size, "follow": options.follow}
+    for name, given in pictures.items():
+        if given and not (options.video or options.strip):
+            raise InputError(f"--{name.replace('_', '-')}: belongs to --video or --strip, neither is given")
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: stands alone, name either all or single tasks")
     tasks = task_specs.names() if tuple(options.task) in ((), ("all",)) else tuple(options.task)

@@ -112,7 +112,7 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     )
     rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
     began = time.perf_counter()
-    with tqdm(total=len(rollouts), desc=engine, unit="rollout") as bar:
+    with tqdm(total=len(rollouts), desc=engine, unit="rollout", disable=None) as bar:  # none in a log file
         results = env.run_episodes(
             policy,
             rollouts,

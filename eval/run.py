@@ -319,7 +319,7 @@ class _Run:
     def kept(self) -> str:
         """How many of the planned episodes are in the journal, in words."""
         finished = len({record["index"] for record in self.journal.records})
-        return f"{finished} of {counted(len(self.episodes), 'episode')} are kept"
+        return f"{finished} of {counted(len(self.episodes), 'episode')} kept"
 
     def play(self) -> None:
         """Run what is missing, task by task and mode by mode."""
@@ -377,7 +377,8 @@ class _Run:
         ticks = sum(episode.max_steps for episode in waiting)
         size = ", ".join(filter(None, (counted(len(self.episodes), "episode"), size)))
         simulated = f"at most {ticks:,} world-ticks ({duration(ticks * TICK_S)} simulated)"
-        print(f"  {size}, {counted(c.worlds, 'world')} at once, {simulated} -> {self.folder}", flush=True)
+        worlds = min(c.worlds, max(map(len, _groups(waiting).values()), default=1))
+        print(f"  {size}, {counted(worlds, 'world')} at once, {simulated} -> {self.folder}", flush=True)
         if c.worlds_matter and c.worlds > 1:
             print(
                 f"  the policy does not declare that it honours seeds: if it draws random numbers, results depend on "
@@ -449,7 +450,7 @@ class _Run:
                 if isinstance(actor, RecordingPolicy):
                     assert env is not None
                     actor.write(result, env.spec.gym_id)
-                media = _media(self.folder, recorder.label(result.episode)) if recorder is not None else {}
+                media = _media(self.folder, recorder, result.episode)
                 self.journal.append(_record(c, result, media, self.hashes))
                 left.pop(result.episode.index, None)
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK_S))
@@ -490,6 +491,9 @@ class _Run:
         else:
             known[group] = facts
             write_atomic(self.folder / records.CONFIG_FILE, json.dumps(self.document, indent=2) + "\n")
+        if self.options.verbose:
+            told = ", ".join(f"{key} {_shown(value)}" for key, value in facts.items() if key != "tracker")
+            self.progress.say(f"  {group}: {told}, tracker {_shown(facts.get('tracker'))}")
         self.hashes["environment"] = configs.config_hash(_comparable(facts))
 
     def _keep_trace(self) -> None:
@@ -556,9 +560,13 @@ def _policy_camera(policy: Any) -> Any:
     return CameraConfig()
 
 
-def _media(folder: Path, label: str) -> dict[str, str]:
+def _media(folder: Path, recorder: Any, episode: Any) -> dict[str, str]:
     """Recordings of an episode that lie in the results folder, by name."""
-    found = {}
+    if recorder is None:
+        return {}
+    if hasattr(recorder, "media"):
+        return recorder.media(episode)
+    found, label = {}, recorder.label(episode)
     for kind, suffix in (("videos", "mp4"), ("strips", "png")):
         for camera in ("ego", "world"):
             path = Path(kind) / f"{label}__{camera}.{suffix}"

@@ -42,10 +42,12 @@ def test_configuration_is_two_lines(tmp_path, capsys):
     assert re.match(
         r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy stand, rules paper, ", brief[0]
     )
-    assert "  1 episode, 20 worlds at once, at most 1,300 world-ticks (26 s simulated) -> " in brief[1]
-    assert main([*SHORT, "-v", "--out", str(tmp_path / "a")], factories()) == 0
-    full = capsys.readouterr().out.split("\n\n")[0].splitlines()
+    assert "  1 episode, 1 world at once, at most 1,300 world-ticks (26 s simulated) -> " in brief[1]
+    assert main([*SHORT, "-v", "--out", str(tmp_path / "b")], factories()) == 0
+    captured = capsys.readouterr()
+    full = captured.out.split("\n\n")[0].splitlines()
     assert {"rules_hash", "code", "tracker_facts", "drive"} <= {line.split()[0] for line in full}
+    assert "  football base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
 
 
 def test_a_log_file_gets_lines(tmp_path):
@@ -92,7 +94,7 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["--worlds", "0"], "--worlds 0"),
         (["--max-steps", "0"], "--max-steps 0"),
         (["--drive", "stiff"], "--drive stiff: .*humanoidarena"),
-        (["--video-size", "big"], "--video-size big"),
+        (["--strip", "--video-size", "big"], "--video-size big"),
         (["bench", "--what", "all", "nosuch"], "--what nosuch: known are help"),
         (["engines", "--engines", "mujoco", "bullet"], "--engine bullet"),
         (["engines", "--seed", "-1"], "--seed -1"),

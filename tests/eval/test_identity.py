@@ -10,6 +10,7 @@ import pytest
 
 from arena_newton.errors import InputError
 from arena_newton.eval import config
+from arena_newton.rules import get
 
 TASKS = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
 
@@ -135,6 +136,16 @@ def test_identity_names_what_changes_results():
     assert dataclasses.replace(one, **same).hash == one.hash
 
 
+def test_rules_of_other_tasks_do_not_count():
+    """The rules' hash is of the tasks that a run uses: another task's rules leave it alone."""
+    rules = get("paper")
+    if not hasattr(rules, "hash_for"):
+        pytest.skip("this rule set is hashed as a whole")
+    fewer = dataclasses.replace(rules, tasks=tuple(t for t in rules.tasks if t.task in ("football", "boxing")))
+    assert config._rules_hash("paper", ("football",)) == fewer.hash_for(("football",))
+    assert config._rules_hash("paper", ("football",)) != config._rules_hash("paper", ("football", "boxing"))
+
+
 def test_difference_is_told_to_the_key():
     """Of a table within an identity the key that differs is named."""
     stored = {"a": 1, "facts": {"drive": "soft", "dt": 0.001}}
@@ -151,8 +162,12 @@ def test_difference_is_told_to_the_key():
     ("options", "message"),
     [
         ({"drive": "stiff"}, "--drive stiff: unknown, choose from auto, twist2, humanoidarena"),
-        ({"video_size": "960"}, "--video-size 960"),
-        ({"video_size": "960x99999"}, "--video-size 960x99999: expected width x height, such as 960x540"),
+        ({"video": True, "video_size": "960"}, "--video-size 960"),
+        ({"follow": True}, "--follow: belongs to --video or --strip"),
+        (
+            {"strip": True, "video_size": "960x99999"},
+            "--video-size 960x99999: expected width x height, such as 960x540",
+        ),
         ({"video_episodes": 0}, "--video-episodes 0"),
         ({"policy": "remote:\x1b[2J"}, "--policy remote:: has control characters"),
         ({"repeats": 10**9}, "--repeats 1000000000: makes 3,000,000,000 episodes, at most 200,000"),
@@ -168,6 +183,6 @@ def test_unfit_options_are_named(options, message):
 
 def test_video_size_is_two_numbers():
     """--video-size becomes width and height."""
-    options = config.RunOptions(task=("football",), video_size="960x540", video_episodes=3, follow=True)
+    options = config.RunOptions(task=("football",), strip=True, video_size="960x540", video_episodes=3, follow=True)
     resolved = config.resolve(options)
     assert (resolved.video_size, resolved.video_episodes, resolved.follow) == ((960, 540), 3, True)

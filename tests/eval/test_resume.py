@@ -181,7 +181,7 @@ def test_a_break_stops_the_run_and_leaves_episodes_unplayed(tmp_path, uninterrup
     breaks = type("Breaks", (BreaksOnce,), {"error": error})
     assert main(["run", *FLAGS, "--worlds", "3", "--out", str(folder)], factories(env=breaks)) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert says in line and "26 of 48 episodes are kept" in line and f"resume {folder}" in line
+    assert says in line and "26 of 48 episodes kept" in line and f"resume {folder}" in line
     assert "\x1b" not in line
     records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
     assert len(records) == 26 and all(r["outcome"] != "error" for r in records)
