@@ -557,8 +557,7 @@ class ArenaEnv:
                     finish(w, "error", "policy", message)
                 if policy_errors:
                     assign(list(policy_errors))
-                    if not self.active.any():
-                        break
+                    continue  # without a start-up the new episodes ask before this tick
             acting = self.active & (self.tick >= 0)
             index = torch.from_numpy(np.where(acting, np.minimum(cursor, chunk.shape[1] - 1), 0)).to(self.torch_device)
             status = self.step(chunk[rows, index])

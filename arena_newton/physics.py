@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.scene import set_restitution
 
 if TYPE_CHECKING:
     from arena_newton.robot import PhysicsRate
@@ -95,9 +96,11 @@ class Physics:
 
     @staticmethod
     def _own_model(scene: Scene, rate: PhysicsRate) -> Any:
-        """A copy of the scene's MuJoCo model whose time step is the rate's."""
+        """A copy of the scene's MuJoCo model for this time step, on which a ball's bounce depends too."""
         model = copy.copy(scene.mj_model)
         model.opt.timestep = rate.dt
+        if scene.ball_restitution is not None:
+            set_restitution(scene, scene.ball_restitution, rate.dt, model)
         return model
 
     def watch_pair(self, geoms_a: list[int], geoms_b: list[int]) -> None:
@@ -377,7 +380,14 @@ class WarpPhysics(Physics):
         model, data = scene.solver.mjw_model, scene.solver.mjw_data
         timestep = _cloned(model.opt.timestep)
         timestep.fill_(rate.dt)
-        model = dataclasses.replace(model, opt=dataclasses.replace(model.opt, timestep=timestep, warn_overflow=0))
+        model = dataclasses.replace(
+            model,
+            opt=dataclasses.replace(model.opt, timestep=timestep, warn_overflow=0),
+            geom_solref=_cloned(model.geom_solref),
+            geom_solimp=_cloned(model.geom_solimp),
+        )
+        if scene.ball_restitution is not None:
+            set_restitution(scene, scene.ball_restitution, rate.dt, model)
         if scene.batch_taken:
             data = _cloned(data)
         scene.batch_taken = True

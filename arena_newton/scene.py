@@ -19,13 +19,26 @@ from arena_newton.errors import InputError
 if TYPE_CHECKING:
     from arena_newton.rules import RuleSet
 
-__all__ = ["Frame", "Latch", "Marker", "RobotHandles", "Scene", "ball_solref", "load_scene", "scene_path"]
+__all__ = [
+    "Frame",
+    "Latch",
+    "Marker",
+    "RobotHandles",
+    "Scene",
+    "ball_solref",
+    "load_scene",
+    "scene_path",
+    "set_restitution",
+]
 
 SCENES = Path(__file__).resolve().parent / "usd_scenes"
 ROBOT = "/World/Robot"
-BALL_STIFFNESS = 10000.0
-"""Contact stiffness of the ball [1/s²·kg-normalised, MuJoCo direct solref], measured: the stated bounce at 5 ms."""
-
+BALL = "/World/Ball"
+BALL_SPRING = 0.025
+"""Part of a ball's penetration that the spring of its contact undoes in one physics step: the bounce grows by up to as
+much with the depth at which a step finds the ball, and a sunk ball at rest rises within some 1/BALL_SPRING steps."""
+BALL_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
+"""Constraint impedance of the ball: constant and near 1, so that the contact does what its solref says."""
 
 LATCH = "arena:latch"
 """Label of the equality constraint that is the latch."""
@@ -54,6 +67,8 @@ class Marker(Frame):
 
     half: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Half extents [m]."""
+    round: bool = False
+    """It marks the upright cylinder inscribed in the box (`arena:round`), for rules that tell the two apart."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +123,21 @@ def scene_path(task_or_path: str | Path) -> Path:
     raise InputError(f"{task_or_path}: no such scene file (expected a task name or an existing .usda file)")
 
 
-def ball_solref(restitution: float) -> tuple[float, float]:
+def ball_solref(restitution: float, dt: float) -> tuple[float, float]:
     """MuJoCo direct-form solref (−stiffness, −damping) of a contact with the given coefficient of restitution.
 
-    A unit-mass spring–damper with damping ratio ζ = −ln e / sqrt(π² + ln² e) leaves with e times its speed.
+    The contact turns the velocity round within the physics step that finds it, as the original's engine does: a damper
+    of (1 + e)/dt takes the approach u away and adds e·u. It then does not pull the ball back, since a contact only
+    pushes; the closed form of a spring with damping, which pulls too, bounces 0.25 where 0.1 is asked. The weak spring
+    lifts the ball out; it adds at most BALL_SPRING·u. MuJoCo divides the stiffness by the impedance's square and the
+    damping by the impedance, and multiplies the stiffness by it.
+
+    Args:
+        restitution: Speed of parting over speed of approach, 0 to 1.
+        dt: Physics step [s].
     """
-    e = max(float(restitution), 1e-3)
-    zeta = -np.log(e) / np.sqrt(np.pi**2 + np.log(e) ** 2)
-    return -BALL_STIFFNESS, float(-2.0 * zeta * np.sqrt(BALL_STIFFNESS))
+    impedance = BALL_SOLIMP[1]
+    return -BALL_SPRING / dt**2 * impedance, -(1.0 + float(restitution)) / dt * impedance
 
 
 @dataclass
@@ -144,6 +166,8 @@ class Scene:
     """The door's latch, where the stage has one."""
     batch_taken: bool = False
     """A physics of engine `warp` steps the solver's own batch; the next one copies it."""
+    ball_restitution: float | None = None
+    """Coefficient of restitution of `/World/Ball`; None: no ball, or no rule set that says so."""
     _robot: RobotHandles | None = field(default=None, repr=False)
 
     def body_id(self, prim_path: str) -> int:
@@ -220,7 +244,7 @@ class Scene:
             raise InputError(f"{self.path}: marker {prim_path} has no attribute arena:size")
         body, pos, quat = self._local_pose(prim)
         x, y, z = (0.5 * float(v) for v in size)
-        return Marker(body, pos, quat, (x, y, z))
+        return Marker(body, pos, quat, (x, y, z), bool(prim.GetAttribute("arena:round").Get()))
 
     def _find(self, name_or_path: str) -> Any:
         prim = self.stage.GetPrimAtPath(name_or_path) if name_or_path.startswith("/") else None
@@ -485,8 +509,9 @@ def load_scene(
     )
     if latch is not None:
         scene.latch = _find_latch(scene, *latch)
-    if rules is not None and scene.has_body("/World/Ball"):
-        _set_restitution(scene, rules.ball_restitution)
+    if rules is not None and scene.has_body(BALL):
+        scene.ball_restitution = rules.ball_restitution
+        set_restitution(scene, rules.ball_restitution, float(m.opt.timestep))
     return scene
 
 
@@ -501,12 +526,25 @@ def _collide_boxes_as_mujoco(warp_model: Any) -> None:
     warp_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
 
 
-def _set_restitution(scene: Scene, restitution: float) -> None:
-    geoms = scene.geom_ids("/World/Ball")
-    solref = ball_solref(restitution)
-    scene.mj_model.geom_solref[geoms] = solref
-    warp_model = getattr(scene.solver, "mjw_model", None)
-    if warp_model is not None:
-        batch = warp_model.geom_solref.numpy()
-        batch[..., geoms, :] = solref
-        warp_model.geom_solref.assign(batch)
+def set_restitution(scene: Scene, restitution: float, dt: float, *models: Any) -> None:
+    """Give the ball's contacts a coefficient of restitution at a physics step.
+
+    Args:
+        scene: Scene with a `/World/Ball`.
+        restitution: Speed of parting over speed of approach, 0 to 1.
+        dt: Physics step of the engine that will step the models [s].
+        models: MuJoCo or mujoco_warp models of this scene to change; the scene's own when none is named.
+
+    Raises:
+        InputError: The ball has no collision geometry.
+    """
+    geoms = scene.geom_ids(BALL)
+    for model in models or (scene.mj_model, getattr(scene.solver, "mjw_model", None)):
+        for name, value in (("geom_solref", ball_solref(restitution, dt)), ("geom_solimp", BALL_SOLIMP)):
+            array = getattr(model, name, None)
+            if isinstance(array, np.ndarray):
+                array[geoms] = value
+            elif array is not None:
+                batch = array.numpy()
+                batch[..., geoms, :] = value
+                array.assign(batch)

@@ -44,7 +44,7 @@ __all__ = [
     "scene_files",
 ]
 
-POLICY_PATH_SCHEMES = ("replay", "lerobot")
+POLICY_PATH_SCHEMES = ("replay",)
 DRIVES = ("auto", "twist2", "humanoidarena")
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
 
@@ -73,6 +73,7 @@ UNVERSIONED = ("arena-newton", "av", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
 MIN_VIDEO, MAX_VIDEO = 16, 4096
 """Bounds of --video-size [px]; H.264 encoders end at 4096."""
+
 
 QUICK_SEEDS = (0,)
 QUICK_REPEATS = 4
@@ -143,6 +144,14 @@ class RunOptions:
     Without it such a break stops the run and leaves them unplayed."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
+    remote_timeout: float = 60.0
+    """For --policy remote: deadline of a request with all its attempts [s]."""
+    remote_retries: int = 4
+    """For --policy remote: repeated attempts after a connection error, with pauses of 0.25, 0.5, 1 ... s."""
+    remote_sequential: bool = False
+    """For --policy remote: ask for one world after the other, in their order."""
+    remote_insecure: bool = False
+    """For --policy remote: do not check the certificate of an https server."""
 
 
 @dataclass(frozen=True)
@@ -288,6 +297,8 @@ def resolve(options: RunOptions) -> RunConfig:
     Raises:
         InputError: a flag names something unknown or absent; the message says what is known.
     """
+    from arena_newton import policies
+    from arena_newton import rules as rule_sets
     from arena_newton import tasks as task_specs
     from arena_newton.eval import plan
     from arena_newton.physics import resolve_engine
@@ -317,6 +328,7 @@ def resolve(options: RunOptions) -> RunConfig:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
     repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else plan.PROTOCOL_REPEATS)
     checkpoint, checkpoint_hash = _checkpoint(options)
+    policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
     variant = _existing("--variant", options.variant)
@@ -335,7 +347,7 @@ def resolve(options: RunOptions) -> RunConfig:
         policy=options.policy,
         policy_hash=hash_path(policy_path) if policy_path else None,
         rules=options.rules,
-        rules_hash=_rules_hash(options.rules, tasks),
+        rules_hash=rule_sets.get(options.rules).hash_for(tasks),
         seeds=seeds,
         repeats=repeats,
         max_steps=QUICK_MAX_STEPS if quick else options.max_steps,
@@ -348,6 +360,7 @@ def resolve(options: RunOptions) -> RunConfig:
         video=options.video,
         strip=options.strip,
         actions=options.actions,
+        policy_options=_policy_options(options),
         drive=options.drive,
         video_episodes=options.video_episodes,
         video_size=_size(options.video_size),
@@ -417,14 +430,6 @@ def _hash_scene(path: Path) -> str:
     from arena_newton.usd_scenes import validate
 
     return config_hash(sorted(hash_path(file) for file in validate.layers(path)))
-
-
-def _rules_hash(name: str, tasks: Sequence[str]) -> str:
-    """Hash of what a rule set says about the tasks of a run."""
-    from arena_newton import rules
-
-    rule_set: Any = rules.get(name)
-    return rule_set.hash_for(tasks) if hasattr(rule_set, "hash_for") else rule_set.hash
 
 
 def _size(given: str | None) -> tuple[int, int] | None:
@@ -519,6 +524,22 @@ def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:
     path = Path(",".join(str(file.resolve()) for file in files))
     hashes = [hash_path(file) for file in files]
     return path, hashes[0] if len(hashes) == 1 else config_hash(hashes)
+
+
+def _policy_options(options: RunOptions) -> dict[str, Any]:
+    """What --policy remote is made with; the flags are refused with another policy."""
+    if options.policy.partition(":")[0] == "remote":
+        return {
+            "timeout": options.remote_timeout,
+            "retries": options.remote_retries,
+            "sequential": options.remote_sequential,
+            "verify_ssl": not options.remote_insecure,
+        }
+    for field in dataclasses.fields(options):
+        if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
+            flag = f"--{field.name.replace('_', '-')}"
+            raise InputError(f"{flag}: belongs to --policy remote:<url>, not {options.policy}")
+    return {}
 
 
 def _existing(flag: str, given: str | None) -> Path | None:

@@ -212,7 +212,7 @@ def _check_folder(folder: Path, config: RunConfig, options: RunOptions, installe
         return None
     records.check_folder(folder)
     stored = records.read_document(folder)
-    unknown = () if config.tracker_facts is not None else ("tracker_facts", "policy_facts")
+    unknown = () if config.tracker_facts is not None else ("tracker_facts", "policy_facts", "worlds")
     difference = configs.differing_key(stored["config"], config.identity(), unknown)
     if difference is not None:
         key, was, now = difference
@@ -381,8 +381,8 @@ class _Run:
         print(f"  {size}, {counted(worlds, 'world')} at once, {simulated} -> {self.folder}", flush=True)
         if c.worlds_matter and c.worlds > 1:
             print(
-                f"  the policy does not declare that it honours seeds: if it draws random numbers, results depend on "
-                f"--worlds {c.worlds} and on timing; --worlds 1 is reproducible"
+                f"  the policy server does not declare that it honours seeds: if it draws random numbers, results "
+                f"depend on --worlds {c.worlds} and on timing; --worlds 1 is reproducible"
             )
         if c.tracker == "pd":
             print("  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2")

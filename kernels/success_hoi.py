@@ -16,7 +16,7 @@ from arena_newton.kernels.boxes import (
     world_half,
 )
 from arena_newton.kernels.launching import launch_again
-from arena_newton.kernels.rotations import load_quat3, load_vec3
+from arena_newton.kernels.rotations import load_vec3
 
 __all__ = [
     "launch_double_desk_paper",
@@ -243,9 +243,11 @@ def pp_box_paper_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
     qvel: wp.array2d[float],
-    box: int,
     box_qvel_adr: int,
-    box_half: wp.vec3,
+    box_body: wp.array[int],
+    box_pos: wp.array[wp.vec3],
+    box_quat: wp.array[wp.vec4],
+    box_half: wp.array[wp.vec3],
     deck_body: wp.array[int],
     deck_pos: wp.array[wp.vec3],
     deck_quat: wp.array[wp.vec4],
@@ -260,8 +262,8 @@ def pp_box_paper_kernel(
 ):
     """One thread a world."""
     w = wp.tid()
-    p = load_vec3(xpos, w, box)
-    bottom = p[2] - world_half(load_quat3(xquat, w, box), box_half)[2]
+    p = box_centre(xpos, xquat, box_body, box_pos, w, 0)
+    bottom = p[2] - world_half(box_rotation(xquat, box_body, box_quat, w, 0), box_half[0])[2]
     best = best_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, height_tolerance)
     m = slack_on_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, best, height_tolerance)
     v = wp.vec3(qvel[w, box_qvel_adr], qvel[w, box_qvel_adr + 1], qvel[w, box_qvel_adr + 2])
@@ -278,9 +280,8 @@ def launch_pp_box_paper(
     xquat: wp.array,
     qvel: wp.array,
     *,
-    box_body: int,
+    box: Boxes,
     box_qvel_adr: int,
-    box_half: wp.vec3,
     decks: Boxes,
     height_tolerance: float,
     max_speed: float,
@@ -299,9 +300,8 @@ def launch_pp_box_paper(
         xpos: Body positions [m], shape [worlds, nbody, 3].
         xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
         qvel: Velocities, MuJoCo layout, shape [worlds, nv].
-        box_body: The box, its origin at its centre.
+        box: One box, the one to move.
         box_qvel_adr: Address of its free joint in `qvel`.
-        box_half: Half extents of the box [m].
         decks: Boxes whose top faces are the decks' surfaces, at least one.
         height_tolerance: Largest distance of bottom and deck [m], 0.06.
         max_speed: Largest speed [m/s], 0.05.
@@ -318,9 +318,8 @@ def launch_pp_box_paper(
             xpos,
             xquat,
             qvel,
-            box_body,
             box_qvel_adr,
-            box_half,
+            *box.arrays,
             *decks.arrays,
             height_tolerance,
             max_speed,
@@ -336,25 +335,28 @@ def launch_pp_box_paper(
 def pp_box_released_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
-    box: int,
-    box_half: wp.vec3,
+    box_body: wp.array[int],
+    box_pos: wp.array[wp.vec3],
+    box_quat: wp.array[wp.vec4],
+    box_half: wp.array[wp.vec3],
     deck_body: wp.array[int],
     deck_pos: wp.array[wp.vec3],
     deck_quat: wp.array[wp.vec4],
     deck_half: wp.array[wp.vec3],
     deck: int,
-    plane_z: float,
+    plane_below: float,
     height_tolerance: float,
     success: wp.array[int],
     margin: wp.array[float],
 ):
     """One thread a world."""
     w = wp.tid()
-    p = load_vec3(xpos, w, box)
+    p = box_centre(xpos, xquat, box_body, box_pos, w, 0)
+    half = box_half[0]
     h = world_half(box_rotation(xquat, deck_body, deck_quat, w, deck), deck_half[deck])
     offset = p - box_centre(xpos, xquat, deck_body, deck_pos, w, deck)
-    m = slack_xy(offset, wp.vec3(h[0] - box_half[0], h[1] - box_half[1], h[2]))
-    m = wp.min(m, height_tolerance - wp.abs(p[2] - box_half[2] - plane_z))
+    m = slack_xy(offset, wp.vec3(h[0] - half[0], h[1] - half[1], h[2]))
+    m = wp.min(m, height_tolerance - wp.abs(offset[2] - half[2] - (h[2] - plane_below)))
     margin[w] = m
     success[w] = holds(m)
 
@@ -363,11 +365,10 @@ def launch_pp_box_released(
     xpos: wp.array,
     xquat: wp.array,
     *,
-    box_body: int,
-    box_half: wp.vec3,
+    box: Boxes,
     decks: Boxes,
     deck: int,
-    plane_z: float,
+    plane_below: float,
     height_tolerance: float,
     success: wp.array,
     margin: wp.array,
@@ -377,11 +378,10 @@ def launch_pp_box_released(
     Args:
         xpos: Body positions [m], shape [worlds, nbody, 3].
         xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        box_body: The box, its origin at its centre.
-        box_half: Half extents of the box [m]; its xy shrink the span, its z is taken off the centre's height.
+        box: One box, the one to move; half its xy extents shrink the span, half its z is taken off its centre's height.
         decks: The shelf's decks.
         deck: Which of them is the target.
-        plane_z: Height of the target plane [m], about 0.648.
+        plane_below: How far the target plane lies below that deck's upper face [m].
         height_tolerance: Largest distance to the plane [m], 0.06.
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].
@@ -389,7 +389,7 @@ def launch_pp_box_released(
     launch_again(
         pp_box_released_kernel,
         dim=success.shape[0],
-        inputs=[xpos, xquat, box_body, box_half, *decks.arrays, deck, plane_z, height_tolerance],
+        inputs=[xpos, xquat, *box.arrays, *decks.arrays, deck, plane_below, height_tolerance],
         outputs=[success, margin],
         device=success.device,
     )

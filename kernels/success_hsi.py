@@ -351,7 +351,7 @@ def launch_sit_sofa_released(
         xpos: Body positions [m], shape [worlds, nbody, 3].
         xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
         contact_force: Norm of the net contact force on each body [N], shape [worlds, nbody].
-        bodies: Pelvis, hips, waist and torso, at least one, int32, shape [k].
+        bodies: Bodies that count, at least one, int32, shape [k]; one that is listed twice counts as two.
         seat: One box; its world-axis box is the seat.
         below: How far below the seat's bottom a body still counts [m], 0.10.
         above: How far above the seat's top a body still counts [m], 0.35.
@@ -468,21 +468,38 @@ def launch_boxing(
 
 @wp.func
 def foot_slack(
-    xpos: wp.array3d[float], feet: wp.array[int], centre: wp.vec3, q: wp.quat, half: wp.vec3, world: int, foot: int
+    xpos: wp.array3d[float],
+    feet: wp.array[int],
+    centre: wp.vec3,
+    q: wp.quat,
+    half: wp.vec3,
+    round_zone: int,
+    world: int,
+    foot: int,
 ) -> float:
-    """Slack [m] of one foot link's origin in the zone, seen from above."""
-    return slack_xy(wp.quat_rotate_inv(q, load_vec3(xpos, world, feet[foot]) - centre), half)
+    """Slack [m] of one foot link's origin in the zone, seen from above: the box, or the disc inscribed in it."""
+    v = wp.quat_rotate_inv(q, load_vec3(xpos, world, feet[foot]) - centre)
+    s = slack_xy(v, half)
+    if round_zone != 0:
+        s = wp.min(half[0], half[1]) - wp.sqrt(v[0] * v[0] + v[1] * v[1] + 1.0e-12)
+    return s
 
 
 @wp.func
 def worst_foot(
-    xpos: wp.array3d[float], feet: wp.array[int], centre: wp.vec3, q: wp.quat, half: wp.vec3, world: int
+    xpos: wp.array3d[float],
+    feet: wp.array[int],
+    centre: wp.vec3,
+    q: wp.quat,
+    half: wp.vec3,
+    round_zone: int,
+    world: int,
 ) -> int:
     """The foot with the smallest slack. A function of its own: backward, a kernel does not run its loops anew."""
     worst = int(0)
     worst_slack = float(FAR)
     for k in range(feet.shape[0]):
-        s = foot_slack(xpos, feet, centre, q, half, world, k)
+        s = foot_slack(xpos, feet, centre, q, half, round_zone, world, k)
         if s < worst_slack:
             worst_slack = s
             worst = k
@@ -500,6 +517,7 @@ def vis_navi_kernel(
     zone_pos: wp.array[wp.vec3],
     zone_quat: wp.array[wp.vec4],
     zone_half: wp.array[wp.vec3],
+    round_zone: int,
     stand_height: float,
     stand_up: float,
     success: wp.array[int],
@@ -509,8 +527,8 @@ def vis_navi_kernel(
     w = wp.tid()
     q = box_rotation(xquat, zone_body, zone_quat, w, 0)
     c = box_centre(xpos, xquat, zone_body, zone_pos, w, 0)
-    worst = worst_foot(xpos, feet, c, q, zone_half[0], w)
-    m = foot_slack(xpos, feet, c, q, zone_half[0], w, worst)
+    worst = worst_foot(xpos, feet, c, q, zone_half[0], round_zone, w)
+    m = foot_slack(xpos, feet, c, q, zone_half[0], round_zone, w, worst)
     m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
     margin[w] = m
     success[w] = holds(m)
@@ -524,6 +542,7 @@ def launch_vis_navi(
     root_qpos_adr: int,
     feet: wp.array,
     zone: Boxes,
+    round_zone: bool = False,
     stand_height: float,
     stand_up: float,
     success: wp.array,
@@ -538,6 +557,7 @@ def launch_vis_navi(
         root_qpos_adr: Address of the robot's free joint in `qpos`.
         feet: Ankle links, int32, shape [k].
         zone: One box.
+        round_zone: Whether the zone is the upright cylinder inscribed in the box, its diameter the smaller extent.
         stand_height: Smallest root height of a standing robot [m], 0.45.
         stand_up: Smallest up-axis z of a standing robot, 0.60.
         success: Output, int32, shape [worlds].
@@ -546,7 +566,7 @@ def launch_vis_navi(
     launch_again(
         vis_navi_kernel,
         dim=success.shape[0],
-        inputs=[xpos, xquat, qpos, root_qpos_adr, feet, *zone.arrays, stand_height, stand_up],
+        inputs=[xpos, xquat, qpos, root_qpos_adr, feet, *zone.arrays, int(round_zone), stand_height, stand_up],
         outputs=[success, margin],
         device=success.device,
     )

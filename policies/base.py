@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import inspect
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,18 @@ from arena_newton.interfaces import Chunk, Observation
 if TYPE_CHECKING:
     from arena_newton.camera import CameraConfig
 
-__all__ = ["Chunk", "Observation", "Policy", "PolicyError", "get", "names", "register", "world_mask"]
+__all__ = [
+    "Chunk",
+    "Observation",
+    "Policy",
+    "PolicyError",
+    "PolicyUnavailable",
+    "check_spec",
+    "get",
+    "names",
+    "register",
+    "world_mask",
+]
 
 ENTRY_POINT_GROUP = "arena_newton.policies"
 """Other packages offer policies under this entry point group: a callable of the text after the colon (or None)."""
@@ -26,7 +38,7 @@ _BUILT_IN = {
     "replay": "arena_newton.policies.replay:from_spec",
     "stand": "arena_newton.policies.stand:from_spec",
 }
-_registered: dict[str, Callable[[str | None], Policy]] = {}
+_registered: dict[str, Callable[..., Policy]] = {}
 
 
 class PolicyError(ArenaError):
@@ -117,39 +129,87 @@ def world_mask(mask: Any, worlds: int) -> np.ndarray:
     return np.asarray(mask).astype(bool).reshape(worlds)
 
 
-def register(name: str, factory: Callable[[str | None], Policy]) -> None:
-    """Offer a policy under `name` in this process; `factory` takes the text after the colon, or None."""
+def register(name: str, factory: Callable[..., Policy]) -> None:
+    """Offer a policy under `name` in this process.
+
+    Args:
+        name: What stands before the colon of a spec.
+        factory: Takes the text after the colon, or None; and the options of `get` as keywords, if it knows any.
+    """
     _registered[name] = factory
 
 
-def _entry_points() -> dict[str, importlib.metadata.EntryPoint]:
-    return {e.name: e for e in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)}
+def _entry_points() -> list[importlib.metadata.EntryPoint]:
+    return list(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP))
 
 
 def names() -> tuple[str, ...]:
     """Names of all policies that `get` knows, sorted."""
-    return tuple(sorted({*_BUILT_IN, *_registered, *_entry_points()}))
+    return tuple(sorted({*_BUILT_IN, *_registered, *(point.name for point in _entry_points())}))
 
 
-def get(spec: str) -> Policy:
+def check_spec(spec: str) -> None:
+    """Look at a spec without making the policy; what a results folder may not hold is refused and not printed.
+
+    Args:
+        spec: As for `get`.
+
+    Raises:
+        InputError: Unknown name, a name that is offered twice, or an address with a user name or password in it.
+    """
+    name, _, argument = spec.partition(":")
+    if "@" in argument and (name == "remote" or "://" in argument):
+        raise InputError(
+            f"--policy {name}: the address holds a user name or a password (an @), which results would publish; "
+            "give a token in the environment variable ARENA_POLICY_TOKEN instead"
+        )
+    points = [point for point in _entry_points() if point.name == name]
+    if name not in _BUILT_IN and name not in _registered and not points:
+        raise InputError(f"--policy {name}: unknown policy; known are {', '.join(names())}")
+    offers = [*(["this package"] if name in _BUILT_IN else []), *(_package(point) for point in points)]
+    if len(offers) > 1 and name not in _registered:
+        raise InputError(f"--policy {name}: offered by {' and by '.join(offers)}; uninstall or rename all but one")
+
+
+def get(spec: str, **options: Any) -> Policy:
     """Make a policy from `name` or `name:argument`, such as `stand`, `replay:clip.pkl` or `remote:http://host:8443`.
+
+    Args:
+        spec: Name and argument.
+        options: Keywords for a policy that takes some, such as `timeout` of `remote`.
 
     Raises:
         InputError: Unknown name, or an argument that is missing or unfit.
     """
+    check_spec(spec)
     name, colon, rest = spec.partition(":")
     argument = rest if colon else None
     if name in _registered:
-        return _registered[name](argument)
+        return _made(name, _registered[name], argument, options)
     if name in _BUILT_IN:
         module, _, attribute = _BUILT_IN[name].partition(":")
-        return getattr(importlib.import_module(module), attribute)(argument)
-    points = _entry_points()
-    if name not in points:
-        raise InputError(f"--policy {spec}: unknown policy; known are {', '.join(names())}")
+        return getattr(importlib.import_module(module), attribute)(argument, **options)
+    point = next(point for point in _entry_points() if point.name == name)
     try:
-        factory = points[name].load()
+        factory = point.load()
     except Exception as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"--policy {spec}: its package does not load ({type(error).__name__}: {reason})") from error
-    return factory(argument)
+        raise InputError(f"--policy {name}: its package does not load ({type(error).__name__}: {reason})") from error
+    return _made(name, factory, argument, options)
+
+
+def _made(name: str, factory: Callable[..., Policy], argument: str | None, options: dict[str, Any]) -> Policy:
+    try:
+        inspect.signature(factory).bind(argument, **options)
+    except TypeError as error:
+        raise InputError(f"--policy {name}: its factory does not take what it is given ({error})") from None
+    except ValueError:  # some of those written in C have no signature
+        pass
+    policy = factory(argument, **options)
+    if not isinstance(policy, Policy):
+        raise InputError(f"--policy {name}: its factory makes a {type(policy).__name__}, not a Policy")
+    return policy
+
+
+def _package(point: importlib.metadata.EntryPoint) -> str:
+    return f"package {point.dist.name}" if point.dist else "another package"

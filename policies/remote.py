@@ -1,8 +1,11 @@
-"""The policy that runs elsewhere: a client of the original benchmark's HTTP protocol.
+"""The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policies.md).
 
-`POST /reset {"seed": int}` begins an episode, `POST /infer` sends image and state and returns a chunk of actions. A
-server of that protocol knows one robot only, so every world that asks is one request. A world whose request fails ends
-as `error`; the others go on.
+`POST /reset` begins an episode, `POST /infer` sends image and state and returns a chunk of actions. A server of that
+protocol knows one robot only, so every world that asks is one request. A world whose request fails ends as `error`; the
+others go on. A server that is gone, or that answers nothing usable to anybody, stops the run.
+
+Every request carries the episode's seed and the step, so that a server which draws its noise from these two gives an
+episode the same actions whatever runs beside it. A server says so with `"seeded": true` in its replies to `/reset`.
 """
 
 from __future__ import annotations
@@ -10,11 +13,15 @@ from __future__ import annotations
 import base64
 import http.client
 import json
+import math
+import os
+import re
+import select
 import socket
 import ssl
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,66 +31,98 @@ import numpy as np
 from arena_newton.camera import CameraConfig
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.policies.base import Chunk, Observation, Policy, PolicyError, world_mask
+from arena_newton.policies.base import Chunk, Observation, Policy, PolicyUnavailable, world_mask
 
-__all__ = ["ROBOT_TYPE", "RemotePolicy", "from_spec"]
+__all__ = ["MAX_FAILURES", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
 
 ROBOT_TYPE = "unitree_g1_refpose_v3_1"
 """Robot type that the original's server checks: action schema v3.1."""
-MAX_REPLY = 32 * 2**20
+TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
+"""Environment variable with the token that is sent as `Authorization: Bearer`; it is neither printed nor stored."""
+MAX_REPLY = 4 * 2**20
 """Longest reply that is read [bytes]."""
+MAX_CHUNK = 4096
+"""Longest chunk that is taken [actions]."""
 MAX_CONNECTIONS = 32
+MAX_FAILURES = 10
+"""Requests in a row, over all worlds, without a usable answer to any, after which the run stops."""
 _RETRY_STATUS = (502, 503, 504)
 _TRANSIENT = (ConnectionError, http.client.RemoteDisconnected, http.client.BadStatusLine, socket.gaierror)
+_ESCAPES = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|.)?", re.DOTALL)
+"""What a terminal takes for a command (ECMA-48: CSI and OSC sequences, and ESC with one more)."""
 
 
 class _RemoteError(ArenaError):
     """One request got no usable reply; the message names the address and what is wrong."""
 
+    def __init__(self, message: str, *, silent: bool = False):
+        """Say what is wrong; `silent`: there was no whole HTTP reply, or it was a gateway's."""
+        super().__init__(message)
+        self.silent = silent
+
 
 class _Connection:
     """One kept-alive connection; `abort` may be called from another thread."""
 
-    def __init__(self, url: str, context: ssl.SSLContext | None):
+    def __init__(self, url: str, context: ssl.SSLContext | None, headers: dict[str, str]):
         parts = urlsplit(url)
-        self._url, self._path = url, parts.path.rstrip("/")
+        self._url, self._path, self._headers = url, parts.path.rstrip("/"), headers
         self._host, self._port, self._context = parts.hostname or "", parts.port, context
         self._http: http.client.HTTPConnection | None = None
-        self._aborted = False
+        self._busy = self._aborted = False
 
-    def post(self, route: str, body: bytes, *, timeout: float, retries: int, backoff: float) -> dict[str, Any]:
-        """Send JSON, return the JSON object of the reply.
+    def post(self, route: str, body: bytes, *, timeout: float, retries: int, backoff: float) -> tuple[int, bytes]:
+        """Send JSON, return status and content of the reply.
 
         Raises:
-            _RemoteError: No usable reply within `timeout` seconds and `retries` repeated attempts.
+            _RemoteError: No whole reply within `timeout` seconds and `retries` repeated attempts.
         """
-        self._aborted = False
+        self._aborted, self._busy = False, True
+        try:
+            return self._attempts(route, body, timeout, retries, backoff)
+        finally:
+            self._busy = False
+
+    def _attempts(self, route: str, body: bytes, timeout: float, retries: int, backoff: float) -> tuple[int, bytes]:
         end = time.monotonic() + timeout
         for attempt in range(retries + 1):
             try:
-                status, data = self._exchange(route, body, end)
+                status, data = self._exchange("POST", route, body, end)
                 if status not in _RETRY_STATUS or attempt == retries:
-                    return self._decode(route, status, data)
+                    return status, data
                 reason = f"it answers with status {status}"
             except TimeoutError as error:
                 self.close()
-                raise _RemoteError(f"{self._url}{route}: no reply within {timeout:g} s") from error
+                raise _RemoteError(f"{self._url}{route}: no reply within {timeout:g} s", silent=True) from error
             except _TRANSIENT as error:
                 self.close()
                 reason = _cause(error)
             except (OSError, http.client.HTTPException, ValueError) as error:
                 self.close()
                 if self._aborted:
-                    raise _RemoteError(f"{self._url}{route}: no reply within {timeout:g} s") from error
-                raise _RemoteError(f"{self._url}{route}: {_cause(error)}") from error
+                    raise _RemoteError(f"{self._url}{route}: no reply within {timeout:g} s", silent=True) from error
+                raise _RemoteError(f"{self._url}{route}: {_cause(error)}", silent=True) from error
             pause = backoff * 2**attempt
             if self._aborted or time.monotonic() + pause >= end:
-                raise _RemoteError(f"{self._url}{route}: no reply within {timeout:g} s, last: {reason}")
+                message = f"{self._url}{route}: no reply within {timeout:g} s, last: {reason}"
+                raise _RemoteError(message, silent=True)
             if attempt < retries:
                 time.sleep(pause)
-        raise _RemoteError(f"{self._url}{route}: {reason} (tried {retries + 1} times)")
+        raise _RemoteError(f"{self._url}{route}: {reason} (tried {retries + 1} times)", silent=True)
 
-    def _exchange(self, route: str, body: bytes, end: float) -> tuple[int, bytes]:
+    def alive(self, timeout: float) -> bool:
+        """Whether the server answers a request that changes nothing; any answer counts but a gateway's."""
+        try:
+            status, _ = self._exchange("GET", "/health", None, time.monotonic() + timeout)
+        except (OSError, http.client.HTTPException, ValueError):
+            return False
+        finally:
+            self.close()
+        return status not in _RETRY_STATUS
+
+    def _exchange(self, method: str, route: str, body: bytes | None, end: float) -> tuple[int, bytes]:
+        if self._http is not None and self._dropped():
+            self.close()
         if self._http is None:
             left = max(end - time.monotonic(), 0.001)
             if self._context is not None:
@@ -93,13 +132,13 @@ class _Connection:
             self._http.connect()
             self._http.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._limit(end)
-        headers = {"Content-Type": "application/json", "Accept": "application/json"}
-        self._http.request("POST", self._path + route, body, headers)
+        headers = {"Content-Type": "application/json", "Accept": "application/json", **self._headers}
+        self._http.request(method, self._path + route, body, headers)
         reply = self._http.getresponse()
         data = bytearray()
         while True:
             self._limit(end)
-            piece = reply.read1(1 << 20)
+            piece = reply.read1(1 << 16)
             if not piece:
                 break
             data += piece
@@ -112,6 +151,14 @@ class _Connection:
             self.close()
         return reply.status, bytes(data)
 
+    def _dropped(self) -> bool:
+        """Whether the server has closed the kept connection, or sent what nobody asked for."""
+        if self._http is None or self._http.sock is None:
+            return True
+        poll = select.poll()
+        poll.register(self._http.sock, select.POLLIN)
+        return bool(poll.poll(0))
+
     def _limit(self, end: float) -> None:
         left = end - time.monotonic()
         if left <= 0:
@@ -119,24 +166,11 @@ class _Connection:
         if self._http is not None and self._http.sock is not None:
             self._http.sock.settimeout(left)
 
-    def _decode(self, route: str, status: int, data: bytes) -> dict[str, Any]:
-        where = f"{self._url}{route}"
-        try:
-            content = json.loads(data)
-        except (ValueError, RecursionError) as error:
-            if status != 200:
-                raise _RemoteError(f"{where}: status {status}") from error
-            raise _RemoteError(f"{where}: the reply is no JSON") from error
-        if status != 200 or (isinstance(content, dict) and "error" in content):
-            message = content.get("error") if isinstance(content, dict) else None
-            raise _RemoteError(f"{where}: status {status}" + (f", {_one_line(message)}" if message else ""))
-        if not isinstance(content, dict):
-            raise _RemoteError(f"{where}: the reply is no JSON object")
-        return content
-
     def abort(self) -> None:
-        """Break off the exchange that another thread waits for."""
+        """Break off the exchange that another thread waits for, or close a connection that nobody uses."""
         self._aborted = True
+        if not self._busy:
+            self.close()
         connection = self._http
         if connection is not None and connection.sock is not None:
             try:
@@ -180,88 +214,132 @@ class RemotePolicy(Policy):
             verify_ssl: Check the certificate of an https server.
 
         Raises:
-            InputError: The address is none.
+            InputError: The address is none, holds a user name or password, or the token has characters that no HTTP
+                header carries.
         """
-        try:
-            parts = urlsplit(url)
-            port = parts.port
-        except ValueError as error:
-            raise InputError(f"--policy remote:{url}: not an address ({error})") from error
-        if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
-            raise InputError(f"--policy remote:{url}: expected http://host:port or https://host:port")
+        host, port, secure = _address(url)
+        if not (math.isfinite(timeout) and 0.0 < timeout <= 86400.0):
+            raise InputError(f"--remote-timeout {timeout:g}: expected seconds above 0 and up to a day")
+        if retries < 0:
+            raise InputError(f"--remote-retries {retries}: expected at least 0")
         self.url = url.rstrip("/")
         self.timeout, self.retries, self.backoff, self.sequential = timeout, retries, backoff, sequential
-        self._address = (parts.hostname, port or (443 if parts.scheme == "https" else 80))
+        self._address = (host, port)
         self._context = None
-        if parts.scheme == "https":
+        if secure:
             self._context = ssl.create_default_context() if verify_ssl else ssl._create_unverified_context()
+        self._token = _token()
+        self._headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
         self._connections: dict[int, _Connection] = {}
         self._pool: ThreadPoolExecutor | None = None
-        self._lock = threading.Lock()
+        self._lock, self._reading = threading.Lock(), threading.Lock()
+        self._seeded = False
+        self._served = ""
+        self._failures = 0
+        # Rows of worlds that run an episode: its seed, actions received so far, those not handed over yet.
+        self._seeds: dict[int, int] = {}
+        self._steps: dict[int, int] = {}
+        self._queues: dict[int, np.ndarray] = {}
         self._failed_resets: dict[int, str] = {}
-        self._length: int | None = None
+
+    @property
+    def depends_on_worlds(self) -> bool:  # type: ignore[override]
+        """Whether an episode may depend on what runs beside it: the server did not declare that it honours seeds."""
+        return not self._seeded
 
     def check(self) -> None:
-        """Try to reach the server.
+        """Reach the server, begin an episode there, and learn whether it honours seeds.
 
         Raises:
-            InputError: Nobody listens at the address.
+            InputError: Nobody listens at the address, or what does is no policy server.
         """
         reason = ""
         for attempt in range(self.retries + 1):
             try:
                 socket.create_connection(self._address, timeout=min(self.timeout, 5.0)).close()
-                return
-            except OSError as error:
+                break
+            except (OSError, ValueError) as error:
                 reason = _cause(error)
                 if attempt < self.retries:
                     time.sleep(self.backoff * 2**attempt)
-        raise InputError(f"--policy remote:{self.url}: no server answers there ({reason})")
+        else:
+            raise InputError(f"--policy remote:{self.url}: no server answers there ({reason})")
+        replies, errors = self._gather("/reset", {0: json.dumps({"seed": 0, "world": 0}).encode()}, dict)
+        if errors:
+            message = str(errors[0])
+            if "CERTIFICATE_VERIFY_FAILED" in message:
+                message += "; --remote-insecure does without the check"
+            elif re.search(r"status 40[13]", message):
+                message += f"; a token is taken from the environment variable {TOKEN_VARIABLE}"
+            raise InputError(f"--policy remote: no policy server: {message}")
+        self._seeded = replies[0].get("seeded") is True
+        served = replies[0].get("policy")
+        self._served = self._one_line(served) if isinstance(served, str) else ""
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
-        """Send the seed of each beginning episode; a world whose reset fails gets that error at its next `act`."""
-        worlds = np.flatnonzero(world_mask(mask, len(seeds)))
-        for world in worlds:
-            self._failed_resets.pop(int(world), None)
-        bodies = {int(w): json.dumps({"seed": int(seeds[w])}).encode() for w in worlds}
-        # Always one after the other: the server has one random generator, and the last seed wins.
-        _, errors = self._ask("/reset", bodies, sequential=True)
+        """Send the seed of each beginning episode; a world whose reset fails gets that error at its next `act`.
+
+        Raises:
+            PolicyUnavailable: The server is gone.
+        """
+        bodies = {}
+        for world in (int(w) for w in np.flatnonzero(world_mask(mask, len(seeds)))):
+            self._seeds[world], self._steps[world] = int(seeds[world]), 0
+            self._queues.pop(world, None)
+            self._failed_resets.pop(world, None)
+            bodies[world] = json.dumps({"seed": int(seeds[world]), "world": world, "task": tasks[world]}).encode()
+        # Always one after the other: with a server of one random generator the last seed wins.
+        _, errors = self._ask("/reset", bodies, dict, sequential=True)
         self._failed_resets.update(errors)
 
     def act(self, observation: Observation) -> Chunk:
-        """Chunks of the worlds that ask; worlds without a usable reply are named in `errors`."""
+        """Actions of the worlds that ask; worlds without a usable reply are named in `errors`.
+
+        Only worlds whose last chunk is used up are asked for. Where chunks differ in length, all worlds get as many
+        actions as the shortest has left, and the rest at their next `act`.
+
+        Raises:
+            PolicyUnavailable: The server is gone, or `MAX_FAILURES` requests in a row brought nothing.
+        """
         state = _host(observation.state)
-        asking = np.flatnonzero(world_mask(observation.mask, len(state)))
-        errors = {int(w): self._failed_resets.pop(int(w)) for w in asking if int(w) in self._failed_resets}
+        asking = [int(w) for w in np.flatnonzero(world_mask(observation.mask, len(state)))]
+        errors = {w: self._failed_resets.pop(w) for w in asking if w in self._failed_resets}
         image = None if observation.image is None else _host(observation.image)
-        bodies = {int(w): self._body(observation, state, image, int(w)) for w in asking if int(w) not in errors}
-        replies, failed = self._ask("/infer", bodies, sequential=self.sequential)
+        empty = [w for w in asking if w not in errors and not len(self._queues.get(w, ()))]
+        bodies = {w: self._body(observation, state, image, w) for w in empty}
+        chunks, failed = self._ask("/infer", bodies, self._actions, sequential=self.sequential)
         errors.update(failed)
-        chunks: dict[int, np.ndarray] = {}
-        for world in sorted(replies):
-            try:
-                chunks[world] = self._actions(world, replies[world])
-            except PolicyError as error:
-                errors[world] = error.message
-        length = self._length or 1
+        for world, chunk in chunks.items():
+            self._queues[world] = chunk
+            self._steps[world] = self._steps.get(world, 0) + len(chunk)
+        answered = [w for w in asking if w not in errors]
+        length = min((len(self._queues[w]) for w in answered), default=1)
         actions = np.zeros((len(state), length, ACTION_WIDTH), dtype=np.float32)
         actions[..., [3, 6]] = 1.0  # filler rows are valid rotations
-        for world, chunk in chunks.items():
-            actions[world] = chunk
+        for world in answered:
+            actions[world] = self._queues[world][:length]
+            self._queues[world] = self._queues[world][length:]
         return Chunk(actions, errors)
 
     def describe(self) -> dict[str, Any]:
-        """Name and address."""
-        return {"name": self.name, "url": self.url, "sequential": self.sequential}
+        """Address, order of the requests, and what the server says of itself; complete after `check`."""
+        return {
+            "name": self.name,
+            "url": self.url,
+            "server": self._served,
+            "sequential": self.sequential,
+            "seeding": "per_request" if self._seeded else "undeclared",
+            "worlds_matter": self.depends_on_worlds,
+        }
 
     def close(self) -> None:
-        """Close all connections."""
+        """Close all connections; requests that are under way are broken off."""
         for connection in self._connections.values():
-            connection.close()
-        self._connections.clear()
+            connection.abort()
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
             self._pool = None
+        self._connections.clear()
 
     def _body(self, observation: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
         seen: dict[str, Any] = {"state": [float(v) for v in state[world, :STATE_WIDTH]]}
@@ -269,55 +347,102 @@ class RemotePolicy(Policy):
             picture = np.ascontiguousarray(image[world], dtype=np.uint8)
             data = base64.b64encode(picture.tobytes()).decode("ascii")
             seen["images"] = {"front": {"shape": list(picture.shape), "dtype": "uint8", "data_b64": data}}
-        return json.dumps(
-            {"observation": seen, "robot_type": ROBOT_TYPE, "return_chunk": True, "task": observation.gym_id}
-        ).encode()
+        body = {
+            "observation": seen,
+            "robot_type": ROBOT_TYPE,
+            "return_chunk": True,
+            "task": observation.gym_id,
+            # What the original's client does not send, and its server does not read.
+            "instruction": observation.instruction,
+            "world": world,
+            "step": self._steps.get(world, 0),
+        }
+        if world in self._seeds:
+            body["seed"] = self._seeds[world]
+        return json.dumps(body).encode()
 
-    def _actions(self, world: int, reply: dict[str, Any]) -> np.ndarray:
+    def _actions(self, reply: dict[str, Any]) -> np.ndarray:
         where = f"{self.url}/infer"
         rows = reply.get("action_chunk")
         if rows is None and "action" in reply:
             rows = [reply["action"]]
         if not isinstance(rows, list) or not rows or not all(isinstance(r, list) for r in rows):
-            raise PolicyError(world, f"{where}: the reply holds neither action_chunk nor action as lists of numbers")
+            raise _RemoteError(f"{where}: the reply holds neither action_chunk nor action as lists of numbers")
+        if len(rows) > MAX_CHUNK:
+            raise _RemoteError(f"{where}: a chunk of {len(rows)} actions, expected at most {MAX_CHUNK}")
         for row in rows:
             if len(row) != ACTION_WIDTH:
-                raise PolicyError(world, f"{where}: an action of {len(row)} numbers, expected {ACTION_WIDTH}")
+                raise _RemoteError(f"{where}: an action of {len(row)} numbers, expected {ACTION_WIDTH}")
             if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in row):
-                raise PolicyError(world, f"{where}: an action holds something that is no number")
+                raise _RemoteError(f"{where}: an action holds something that is no number")
         try:
-            chunk = validate_action(rows, where)
-        except (InputError, OverflowError) as error:
-            raise PolicyError(world, str(error)) from error
-        if self._length is None:
-            self._length = len(chunk)
-        if len(chunk) != self._length:
-            raise PolicyError(world, f"{where}: a chunk of {len(chunk)} actions, but the first had {self._length}")
-        return chunk
+            return validate_action(rows, where)
+        except InputError as error:
+            raise _RemoteError(str(error)) from error
+        except OverflowError as error:
+            raise _RemoteError(f"{where}: an action holds a number that is too large") from error
 
-    def _ask(
-        self, route: str, bodies: dict[int, bytes], *, sequential: bool
-    ) -> tuple[dict[int, dict[str, Any]], dict[int, str]]:
-        """Send one request a world; replies and errors by world. No request outlives its deadline."""
-        replies: dict[int, dict[str, Any]] = {}
+    def _ask[T](
+        self, route: str, bodies: dict[int, bytes], read: Callable[[dict[str, Any]], T], *, sequential: bool
+    ) -> tuple[dict[int, T], dict[int, str]]:
+        """Send one request a world; what was read of the replies, and errors, by world.
+
+        Raises:
+            PolicyUnavailable: The server is gone.
+        """
+        replies: dict[int, T] = {}
         errors: dict[int, str] = {}
-        if sequential:
-            for world, body in bodies.items():
-                self._gather({world: body}, route, replies, errors)
-        else:
-            self._gather(bodies, route, replies, errors)
+        for batch in [{w: body} for w, body in bodies.items()] if sequential else [bodies]:
+            got, failed = self._gather(route, batch, read)
+            self._judge(route, len(got), failed)
+            replies.update(got)
+            errors.update({w: str(error) for w, error in failed.items()})
         return replies, errors
 
-    def _gather(self, bodies: dict[int, bytes], route: str, replies: dict, errors: dict) -> None:
-        if not bodies:
+    def _judge(self, route: str, usable: int, failed: dict[int, _RemoteError]) -> None:
+        """Stop the run where failures are the server's and not one world's."""
+        if usable and route == "/infer":
+            self._failures = 0
+        if not failed:
             return
+        last = list(failed.values())[-1]
+        if any(error.silent for error in failed.values()) and not self._alive():
+            raise PolicyUnavailable(f"--policy remote: the server is gone: {last}")
+        if not usable:
+            self._failures += len(failed)
+        if self._failures >= MAX_FAILURES:
+            raise PolicyUnavailable(
+                f"--policy remote: {self._failures} requests in a row brought no usable answer, last: {last}"
+            )
+
+    def _alive(self) -> bool:
+        """Whether the server answers at all, asked over a fresh connection."""
+        connection = _Connection(self.url, self._context, self._headers)
+        answer = self._threads().submit(connection.alive, self.timeout)
+        try:
+            return answer.result(self.timeout + 0.05)
+        except TimeoutError:
+            connection.abort()
+            return False
+
+    def _threads(self) -> ThreadPoolExecutor:
         if self._pool is None:
             self._pool = ThreadPoolExecutor(MAX_CONNECTIONS, thread_name_prefix="remote-policy")
+        return self._pool
+
+    def _gather[T](
+        self, route: str, bodies: dict[int, bytes], read: Callable[[dict[str, Any]], T]
+    ) -> tuple[dict[int, T], dict[int, _RemoteError]]:
+        """Send requests at the same time; none outlives its deadline."""
+        replies: dict[int, T] = {}
+        errors: dict[int, _RemoteError] = {}
         started: dict[int, float] = {}
         pending: dict[Future, int] = {}
         for world, body in bodies.items():
-            connection = self._connections.setdefault(world, _Connection(self.url, self._context))
-            pending[self._pool.submit(self._send, world, connection, route, body, started)] = world
+            connection = self._connections.get(world)
+            if connection is None:
+                connection = self._connections[world] = _Connection(self.url, self._context, self._headers)
+            pending[self._threads().submit(self._send, world, connection, route, body, read, started)] = world
         while pending:
             with self._lock:
                 ends = [started[w] + self.timeout for w in pending.values() if w in started]
@@ -329,20 +454,79 @@ class RemotePolicy(Policy):
                 try:
                     replies[world] = future.result()
                 except _RemoteError as error:
-                    errors[world] = str(error)
+                    errors[world] = error
             now = time.monotonic()
             for future, world in list(pending.items()):
                 with self._lock:
                     late = world in started and now > started[world] + self.timeout
                 if late:
                     self._connections.pop(world).abort()
-                    errors[world] = f"{self.url}{route}: no reply within {self.timeout:g} s"
+                    errors[world] = _RemoteError(f"{self.url}{route}: no reply within {self.timeout:g} s", silent=True)
                     del pending[future]
+        return dict(sorted(replies.items())), dict(sorted(errors.items()))
 
-    def _send(self, world: int, connection: _Connection, route: str, body: bytes, started: dict) -> dict[str, Any]:
+    def _send[T](
+        self,
+        world: int,
+        connection: _Connection,
+        route: str,
+        body: bytes,
+        read: Callable[[dict[str, Any]], T],
+        started: dict[int, float],
+    ) -> T:
         with self._lock:
             started[world] = time.monotonic()
-        return connection.post(route, body, timeout=self.timeout, retries=self.retries, backoff=self.backoff)
+        status, data = connection.post(route, body, timeout=self.timeout, retries=self.retries, backoff=self.backoff)
+        with self._reading:  # one reply at a time is taken apart: as Python objects it is many times as large
+            return read(self._decode(route, status, data))
+
+    def _decode(self, route: str, status: int, data: bytes) -> dict[str, Any]:
+        where, silent = f"{self.url}{route}", status in _RETRY_STATUS
+        try:
+            content = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            if status != 200:
+                raise _RemoteError(f"{where}: status {status}", silent=silent) from error
+            raise _RemoteError(f"{where}: the reply is no JSON") from error
+        if status != 200 or (isinstance(content, dict) and "error" in content):
+            message = content.get("error") if isinstance(content, dict) else None
+            said = f", {self._one_line(message)}" if isinstance(message, str) and message else ""
+            raise _RemoteError(f"{where}: status {status}{said}", silent=silent)
+        if not isinstance(content, dict):
+            raise _RemoteError(f"{where}: the reply is no JSON object")
+        return content
+
+    def _one_line(self, said: str) -> str:
+        """What a server said, without the token."""
+        return _one_line(said.replace(self._token, "***") if self._token else said)
+
+
+def _address(url: str) -> tuple[str, int, bool]:
+    """Host, port and whether it is https; an address that may hold a secret is refused and not printed."""
+    if "@" in url:
+        raise InputError(
+            "--policy remote: the address holds a user name or a password (an @), which results would publish; "
+            f"give a token in the environment variable {TOKEN_VARIABLE} instead"
+        )
+    shown = _one_line(re.split(r"[?#]", url)[0])
+    if any(c <= " " or c == "\x7f" for c in url):
+        raise InputError(f"--policy remote:{shown}: the address holds white space or control characters")
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError as error:
+        raise InputError(f"--policy remote:{shown}: not an address ({_one_line(error)})") from None
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
+        raise InputError(f"--policy remote:{shown}: expected http://host:port or https://host:port and nothing more")
+    return parts.hostname, port or (443 if parts.scheme == "https" else 80), parts.scheme == "https"
+
+
+def _token() -> str:
+    """The token of the environment, or an empty text; one that no header carries is refused and not printed."""
+    token = os.environ.get(TOKEN_VARIABLE, "")
+    if not re.fullmatch(r"[!-~]*", token):
+        raise InputError(f"{TOKEN_VARIABLE}: holds a space, a line end or another character that no token has")
+    return token
 
 
 def _host(values: Any) -> np.ndarray:
@@ -350,7 +534,9 @@ def _host(values: Any) -> np.ndarray:
 
 
 def _one_line(text: Any) -> str:
-    return " ".join(str(text).split())[:200]
+    """Printable characters of a text that came from elsewhere, at most 200, on one line."""
+    plain = _ESCAPES.sub("", str(text)[:4000])
+    return " ".join("".join(c if c.isprintable() else " " for c in plain).split())[:200]
 
 
 def _cause(error: BaseException) -> str:
@@ -358,12 +544,16 @@ def _cause(error: BaseException) -> str:
     return _one_line(text)
 
 
-def from_spec(argument: str | None) -> RemotePolicy:
+def from_spec(argument: str | None, **options: Any) -> RemotePolicy:
     """Make the policy for `--policy remote:<url>`.
+
+    Args:
+        argument: The address.
+        options: Keywords of `RemotePolicy`.
 
     Raises:
         InputError: No address was given, or it is none.
     """
     if not argument:
         raise InputError("--policy remote: needs an address, as in remote:http://localhost:8443")
-    return RemotePolicy(argument)
+    return RemotePolicy(argument, **options)

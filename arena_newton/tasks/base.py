@@ -21,6 +21,7 @@ from arena_newton.rules import (
     ObjectRule,
     PoseRange,
     RuleSet,
+    SuccessRule,
     TaskRules,
 )
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from arena_newton.physics import Physics
     from arena_newton.scene import Scene
 
-__all__ = ["DISTANT_LIGHT", "Draws", "Judge", "LightDraw", "ObjectSpec", "Pose", "TaskSpec", "widened"]
+__all__ = ["DISTANT_LIGHT", "Draws", "Judge", "LightDraw", "ObjectSpec", "Overlap", "Pose", "TaskSpec", "widened"]
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -103,13 +104,17 @@ class ObjectSpec:
     placement: ByRules[str] = field(default_factory=lambda: ByRules.same("absolute"))
     execution_void: bool = False
     """The original's execution range has no effect there (its placement scales it away)."""
+    paper_execution: PoseRange | None = None
+    """Execution range of `paper` where the common way to widen one does not do; None: the common way."""
     lift: float = 0.0
     """Height of our prim's origin above the original's [m]."""
 
     def rule(self, rules_name: str) -> ObjectRule:
         """What a rule set says about this object."""
         execution = self.execution
-        if rules_name == "paper" and isinstance(self.base, PoseRange) and isinstance(self.execution, PoseRange):
+        if rules_name == "paper" and self.paper_execution is not None:
+            execution = self.paper_execution
+        elif rules_name == "paper" and isinstance(self.base, PoseRange) and isinstance(self.execution, PoseRange):
             execution = paper_execution(self.base, self.execution, self.execution_void)
         return ObjectRule(self.record, self.placement.of(rules_name), self.base, execution)
 
@@ -210,6 +215,28 @@ def draw_light(episode_seed: int, ranges: LightRange) -> LightDraw:
     return LightDraw(light_direction(yaw, pitch, roll), intensity, (red, green, blue), pitch, roll, yaw)
 
 
+@dataclass(frozen=True)
+class Overlap:
+    """Two things that some episodes start more than 1 cm inside each other, as the original's ranges do.
+
+    Nothing reads these but the documentation, and a test that measures them again.
+    """
+
+    first: str
+    """Prim path."""
+    second: str
+    """Prim path."""
+    rules: tuple[str, ...]
+    """Names of the rule sets."""
+    modes: tuple[str, ...]
+    episodes: int
+    """How many of the 60 episodes of each of these modes."""
+    depth: float
+    """The deepest of them [m]: the shortest way that parts the two."""
+    why: str
+    """Which of the original's ranges meet."""
+
+
 class Judge:
     """Success of every world, judged on the device once a tick.
 
@@ -277,11 +304,13 @@ class TaskSpec:
     objects: tuple[ObjectSpec, ...]
     steps: ByRules[int]
     """Step budget [50 Hz ticks]."""
-    success: ByRules[Any]
-    """Numbers of the predicate, a frozen dataclass per rule set."""
+    success: ByRules[SuccessRule]
+    """The predicate's numbers and its sentence, one per rule set."""
     make_judge: Callable[[Scene, RuleSet], Judge]
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
+    overlaps: tuple[Overlap, ...] = ()
+    """Episodes that start with things inside each other."""
     semantic_variant: ByRules[str] = field(default_factory=lambda: ByRules.same("semantic"))
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from arena_newton import seeding
-from arena_newton.rules import ByRules, CylinderRange, RuleSet, TaskRules
+from arena_newton.rules import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, Sample, TaskSpec, draw_uniform, object_range
 
 if TYPE_CHECKING:
@@ -21,13 +21,19 @@ PALMS = ("left_hand_palm_link", "right_hand_palm_link")
 
 
 @dataclass(frozen=True)
-class BoxingRule:
+class BoxingRule(SuccessRule):
     """Numbers of the predicate; the target's bounding radius comes from the marker `Target/Frame/Bounds`."""
 
     min_radius: float
     """A target with a smaller bounding radius counts as this large [m]."""
     hand_radius: float = 0.08
     """[m]."""
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        known = "target's bounding radius"
+        radius = f"max(bounding radius, {num(self.min_radius)} m)" if self.min_radius > 0.0 else known
+        return f"a palm within ({radius} + {num(self.hand_radius)} m) of the target's centre"
 
 
 class BoxingJudge(Judge):

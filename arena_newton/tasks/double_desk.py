@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.errors import InputError
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, Judge, ObjectSpec, TaskSpec
 
 if TYPE_CHECKING:
@@ -19,13 +20,31 @@ BASKET = "/World/Basket"
 
 
 @dataclass(frozen=True)
-class DoubleDeskRule:
+class DoubleDeskRule(SuccessRule):
     """Numbers of the predicate; the crate's box is the marker `Basket/Frame/Inside` of the stage."""
 
     crate_frame: bool
     """True: the box turns with the crate. False: the world-axis box around the turned crate."""
     min_z: float | None
-    """Lowest height of the hammer's centre of mass that still counts [m]; None: no such test."""
+    """Lowest height of the hammer's centre of mass that still counts [m]; None, with `crate_frame`: no such test."""
+
+    def __post_init__(self):
+        """Refuse numbers that no predicate reads.
+
+        Raises:
+            InputError: A height together with the crate's frame, or neither.
+        """
+        if self.crate_frame == (self.min_z is not None):
+            raise InputError(
+                f"double_desk: crate_frame {self.crate_frame} with min_z {self.min_z}; the box in the crate's frame "
+                "has no lowest height, the world-axis box needs one"
+            )
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        if self.min_z is None:
+            return "hammer's centre of mass inside the crate's box in the crate's own frame"
+        return f"hammer's centre of mass inside the crate's world-axis box, and z ≥ {num(self.min_z)} m"
 
 
 class DoubleDeskJudge(Judge):
@@ -46,7 +65,7 @@ class DoubleDeskJudge(Judge):
 
         state = (physics.xpos, physics.xquat, physics.xipos)
         common = {"hammer_body": self.hammer, "inside": self.inside, **self.outputs()}
-        if self.rule.crate_frame or self.rule.min_z is None:
+        if self.rule.min_z is None:
             success.launch_double_desk_paper(*state, **common)
         else:
             success.launch_double_desk_released(*state, min_z=self.rule.min_z, **common)

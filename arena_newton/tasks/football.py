@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ PITCH = "/World/Pitch"
 
 
 @dataclass(frozen=True)
-class FootballRule:
+class FootballRule(SuccessRule):
     """Numbers of the predicate; the goal's box itself is the marker `Goal/Volume` of the stage."""
 
     rear_bound: bool
@@ -28,12 +28,25 @@ class FootballRule:
     ball_out: bool
     """Whether leaving the field ends the episode."""
     ball_restitution: float
-    goal_x: tuple[float, float] = (-2.5, 2.6)
-    """Goal's box as the original states it, which the stage's marker must equal (a test compares) [m]."""
-    goal_y: tuple[float, float] = (3.03, 5.03)
-    goal_z: tuple[float, float] = (0.0, 1.85)
+    """Speed of parting over speed of approach, which the scene's ball takes at every physics rate."""
     out_z: float = -0.5
     """A ball below this height has left the field [m]."""
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        rear = "and before its rear face" if self.rear_bound else "no rear bound"
+        return f"ball centre past the goal's plane within the goal's volume (the stage's `Goal/Volume`), {rear}"
+
+    def notes(self) -> tuple[tuple[str, str], ...]:
+        """See `SuccessRule.notes`."""
+        out = (
+            "beyond the backdrop walls (the stage's `Pitch`) or "
+            f"z < {num(self.out_z)} m: ends, outcome `timeout` with reason `ball_out`"
+        )
+        return (
+            ("football, ball leaves the field", out if self.ball_out else "never ends"),
+            ("ball restitution", num(self.ball_restitution)),
+        )
 
 
 class FootballJudge(Judge):

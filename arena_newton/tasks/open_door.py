@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ DOOR = "/World/Door"
 
 
 @dataclass(frozen=True)
-class DoorPassedRule:
+class DoorPassedRule(SuccessRule):
     """The root is through the frame's plane and the robot stands."""
 
     half_width: float = 0.55
@@ -27,13 +27,24 @@ class DoorPassedRule:
     min_y: float = 0.02
     """Smallest y of the root in the door's frame [m]."""
 
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return (
+            f"root through the frame plane: |x_local| ≤ {num(self.half_width)} m, y_local > {num(self.min_y)} m in the "
+            "door's frame, standing"
+        )
+
 
 @dataclass(frozen=True)
-class DoorOpenRule:
+class DoorOpenRule(SuccessRule):
     """The latch is released, the leaf is open and the robot stands."""
 
     min_leaf_deg: float = 60.0
     """[deg]."""
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return f"latch released, leaf ≥ {num(self.min_leaf_deg)}°, standing"
 
 
 class OpenDoorJudge(Judge):

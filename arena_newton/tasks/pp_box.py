@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from arena_newton.errors import InputError
 from arena_newton.robot import TICK
-from arena_newton.rules import ByRules, PoseRange, RuleSet
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, Judge, ObjectSpec, TaskSpec
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.scene import Marker, Scene
 
 __all__ = ["TASK", "PPBoxAnyDeckRule", "PPBoxJudge", "PPBoxOneDeckRule"]
 
@@ -21,7 +25,7 @@ DECKS = tuple(f"{SHELF}/Frame/{name}" for name in ("Deck_0", "Deck_1", "Deck_2",
 
 
 @dataclass(frozen=True)
-class PPBoxAnyDeckRule:
+class PPBoxAnyDeckRule(SuccessRule):
     """The box rests on any deck."""
 
     height_tolerance: float = 0.06
@@ -30,17 +34,58 @@ class PPBoxAnyDeckRule:
     """[m/s]."""
     confirm_ticks: int = 10
 
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return (
+            f"box centre above any shelf deck within its span, bottom within {num(self.height_tolerance)} m of the "
+            f"deck, slower than {num(self.max_speed)} m/s for {self.confirm_ticks} ticks"
+        )
+
 
 @dataclass(frozen=True)
-class PPBoxOneDeckRule:
+class PPBoxOneDeckRule(SuccessRule):
     """The box is near the one layer that the original's code accepts, at any speed."""
 
-    plane_z: float = 0.6477
-    """[m]."""
+    plane_below: float = 0.0223
+    """How far the accepted plane lies below the deck's surface [m]: the original's is 0.6477 m, its deck at 0.67 m."""
     height_tolerance: float = 0.06
     """[m]."""
     deck: int = 1
     """Index of that layer in `DECKS`."""
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return (
+            f"box centre over deck {self.deck} of the stage within its span less half the box, bottom within "
+            f"{num(self.height_tolerance)} m of the plane {num(self.plane_below)} m below its surface, no speed test"
+        )
+
+
+def collider(scene: Scene, prim: str) -> Marker:
+    """The box around all collision geometry of a rigid prim, along the axes of its body.
+
+    Raises:
+        InputError: The prim is no rigid body or holds no collision geometry.
+    """
+    import mujoco
+
+    from arena_newton.scene import Marker
+
+    m, body = scene.mj_model, scene.body_id(prim)
+    corners = []
+    for geom in scene.geom_ids(prim):
+        if m.geom_bodyid[geom] != body or not (m.geom_contype[geom] or m.geom_conaffinity[geom]):
+            continue
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, m.geom_quat[geom])
+        centre, half = m.geom_aabb[geom, :3], m.geom_aabb[geom, 3:]
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        corners.append(m.geom_pos[geom] + (centre + signs * half) @ turn.reshape(3, 3).T)
+    if not corners:
+        raise InputError(f"{scene.path}: prim {prim} holds no collision geometry")
+    points = np.concatenate(corners)
+    low, high = points.min(axis=0), points.max(axis=0)
+    return Marker(body, tuple(0.5 * (low + high)), (1.0, 0.0, 0.0, 0.0), tuple(0.5 * (high - low)))
 
 
 class PPBoxJudge(Judge):
@@ -48,43 +93,23 @@ class PPBoxJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind box and decks."""
-        import warp as wp
-
         from arena_newton.kernels.success import Boxes
 
         super().__init__(scene)
         self.rule: PPBoxAnyDeckRule | PPBoxOneDeckRule = rules.task("pp_box").success
-        self.box = scene.body_id(BOX)
+        self.box = Boxes.upload([collider(scene, BOX)], self.device)
         self.box_qvel = scene.joint_qvel(BOX)
-        self.box_half = wp.vec3(*(float(v) for v in scene.mj_model.geom_aabb[scene.geom_ids(BOX)[0], 3:]))
         self.decks = Boxes.upload([scene.marker(path) for path in DECKS], self.device)
         self.slow = self.counter()
-        centred = float(abs(scene.mj_model.body_ipos[self.box]).max()) < 1e-6
-        self._centres = (
-            None if centred else wp.zeros((self.worlds, scene.mj_model.nbody, 3), dtype=wp.float32, device=self.device)
-        )
-        """Body positions with the box's centre of mass in place of its origin, which lies at its base."""
-
-    def positions(self, physics: Physics) -> Any:
-        """Body positions in which the box stands for its centre, shape [worlds, nbody, 3]."""
-        import warp as wp
-
-        if self._centres is None:
-            return physics.xpos
-        wp.copy(self._centres, physics.xpos)
-        row = slice(self.box, self.box + 1)
-        wp.copy(self._centres[:, row], physics.xipos[:, row])
-        return self._centres
 
     def evaluate(self, physics: Physics) -> None:
         """See `Judge.evaluate`."""
         from arena_newton.kernels import success
 
-        positions = self.positions(physics)
-        common = {"box_body": self.box, "box_half": self.box_half, "decks": self.decks, **self.outputs()}
+        common = {"box": self.box, "decks": self.decks, **self.outputs()}
         if isinstance(self.rule, PPBoxAnyDeckRule):
             success.launch_pp_box_paper(
-                positions,
+                physics.xpos,
                 physics.xquat,
                 physics.qvel,
                 box_qvel_adr=self.box_qvel,
@@ -97,10 +122,10 @@ class PPBoxJudge(Judge):
             )
         else:
             success.launch_pp_box_released(
-                positions,
+                physics.xpos,
                 physics.xquat,
                 deck=self.rule.deck,
-                plane_z=self.rule.plane_z,
+                plane_below=self.rule.plane_below,
                 height_tolerance=self.rule.height_tolerance,
                 **common,
             )

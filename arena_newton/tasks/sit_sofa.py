@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from arena_newton.rules import ByRules, PoseRange, RuleSet
-from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, TaskSpec
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
+from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, Overlap, TaskSpec, widened
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
@@ -20,12 +20,15 @@ CUSHION = "/World/Sofa/SeatCushion"
 _HIPS = tuple(f"{side}_hip_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll", "yaw"))
 PRESSING_LINKS = ("pelvis", *_HIPS)
 """Pelvis, hip and thigh (hip_yaw) links."""
-TOUCHING_LINKS = (*PRESSING_LINKS, "waist_yaw_link", "waist_roll_link", "torso_link")
-"""Links that the original's code accepts on the seat."""
+TOUCHING_LINKS = (*PRESSING_LINKS, "pelvis", "waist_yaw_link", "waist_roll_link", "torso_link")
+"""Links that the original's code accepts on the seat.
+
+It lists `pelvis_contour` too, which the public G1 models carry as a body of its own in the pelvis's place; here that
+body is part of the pelvis, which therefore stands twice. It also lists `imu`: sensor frames, no bodies here."""
 
 
 @dataclass(frozen=True)
-class SeatPressedRule:
+class SeatPressedRule(SuccessRule):
     """Pelvis, hips and thighs together press the seat for a while, and the root is low."""
 
     min_force: float = 50.0
@@ -34,9 +37,16 @@ class SeatPressedRule:
     max_root_z: float = 0.62
     """[m]."""
 
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return (
+            f"pelvis, hip and thigh links together press the seat with ≥ {num(self.min_force)} N for "
+            f"{self.confirm_ticks} consecutive ticks, root z < {num(self.max_root_z)} m"
+        )
+
 
 @dataclass(frozen=True)
-class SeatTouchedRule:
+class SeatTouchedRule(SuccessRule):
     """One link in the seat volume with contact, or two without, in a single tick."""
 
     min_force: float = 5.0
@@ -45,6 +55,14 @@ class SeatTouchedRule:
     """The volume begins this far below the seat's box [m]."""
     above: float = 0.35
     """The volume ends this far above the seat's box [m]."""
+
+    def sentence(self) -> str:
+        """See `SuccessRule.sentence`."""
+        return (
+            f"one tick of ≥ {num(self.min_force)} N on a pelvis, hip, waist or torso link in the seat volume "
+            f"(from {num(self.below)} m below to {num(self.above)} m above the seat), or two of them in it without "
+            "contact (the pelvis counts as two, with its contour)"
+        )
 
 
 class SitSofaJudge(Judge):
@@ -108,6 +126,9 @@ class SitSofaJudge(Judge):
             )
 
 
+CARTONS = ("/World/Carton_1", "/World/Carton_2")
+_NEAR = "carton_obstacle_01 begins at y 0.6 m, carton_obstacle_02 ends at y 0.4 m, and both are 0.42 m wide"
+
 TASK = TaskSpec(
     name="sit_sofa",
     gym_id="Isaac-Move-Sit-Sofa-G129-Dex3-Wholebody",
@@ -117,15 +138,18 @@ TASK = TaskSpec(
     objects=(
         ObjectSpec(
             record="carton_obstacle_01",
-            prim="/World/Carton_1",
+            prim=CARTONS[0],
             base=PoseRange(x=(-2.1, -1.7), y=(0.6, 0.8), z=(0.1, 0.1)),
             execution=PoseRange(x=(-2.6, -1.7), y=(0.75, 0.95), z=(0.1, 0.1)),
+            # The original shifts y, and behind the coffee table x may grow by so much. Where y is not shifted, x grows
+            # no farther than to the table's edge.
+            paper_execution=PoseRange(x=(-2.33, -1.7), y=widened((0.6, 0.8)), z=(0.1, 0.1)),
             # The original's cube has its origin at its base and drops 0.1 m; ours has it at its centre.
             lift=0.21,
         ),
         ObjectSpec(
             record="carton_obstacle_02",
-            prim="/World/Carton_2",
+            prim=CARTONS[1],
             base=PoseRange(x=(-2.3, -1.7), y=(-0.1, 0.4), z=(0.1, 0.1)),
             execution=PoseRange(x=(-2.4, -1.7), y=(-0.4, 0.2), z=(0.1, 0.1)),
             lift=0.21,
@@ -134,5 +158,18 @@ TASK = TaskSpec(
     steps=ByRules(paper=1050, released=2000),
     success=ByRules(paper=SeatPressedRule(), released=SeatTouchedRule()),
     make_judge=SitSofaJudge,
+    overlaps=(
+        Overlap(*CARTONS, ("paper", "released"), ("base", "semantic", "visual"), 14, 0.187, _NEAR),
+        Overlap(*CARTONS, ("paper",), ("execution",), 13, 0.235, _NEAR),
+        Overlap(
+            CARTONS[1],
+            "/World/CoffeeTable",
+            ("paper", "released"),
+            ("execution",),
+            4,
+            0.065,
+            "carton_obstacle_02 begins at x −2.4 m, its side at −2.61 m, and the table ends at −2.54 m",
+        ),
+    ),
     needs_forces=True,
 )

@@ -128,7 +128,6 @@ def _cases(twin, device):
     """Each predicate: launch, fixed arguments, names of its float arrays."""
     ids = [wp.array(v, dtype=wp.int32, device=device) for v in ([1, 2], [2, 6, 1], [1, 2, 6, 5])]
     offsets = wp.array([(0.1, 0.02, 0.0), (0.05, 0.0, 0.03)], dtype=wp.vec3, device=device)
-    half = wp.vec3(0.105, 0.1, 0.11)
     decks = success.Boxes.upload(
         [twin.Marker(3, (0, 0, z), (0.95, 0.02, 0.03, 0.2), (0.5, 0.4, 0.05)) for z in (-0.4, 0.0, 0.4)], device
     )
@@ -137,7 +136,8 @@ def _cases(twin, device):
     football = {"ball_body": 1, "goal": _box(twin, device, 3, (0.9, 0.8, 0.7)), "min_z": -9.0, "judge_out": True}
     football["pitch"] = _box(twin, device, 0, (5, 5, 5))
     desk = {"hammer_body": 2, "inside": _box(twin, device, 3, (0.4, 0.3, 0.2))}
-    box = {"box_body": 5, "box_half": half, "decks": decks, "height_tolerance": 0.06}
+    cube = _box(twin, device, 5, (0.105, 0.1, 0.11))
+    box = {"box": cube, "decks": decks, "height_tolerance": 0.06}
     paper_box = {"box_qvel_adr": 2, "max_speed": 0.05, "confirm_ticks": 10, "tick": 0.02}
     root = {"root_qpos_adr": 1}
     seat = {"bodies": ids[1], "seat": _box(twin, device, 3, (0.5, 0.4, 0.2)), "below": 0.1, "above": 0.35}
@@ -151,7 +151,7 @@ def _cases(twin, device):
         "double_desk paper": (success.launch_double_desk_paper, desk, (*poses, "xipos")),
         "double_desk released": (success.launch_double_desk_released, desk | {"min_z": -0.2}, (*poses, "xipos")),
         "pp_box paper": (success.launch_pp_box_paper, box | paper_box, (*poses, "qvel")),
-        "pp_box released": (success.launch_pp_box_released, box | {"deck": 1, "plane_z": -0.1}, poses),
+        "pp_box released": (success.launch_pp_box_released, box | {"deck": 1, "plane_below": 0.15}, poses),
         "open_door paper": (success.launch_open_door_paper, door | root | STAND, (*poses, "qpos")),
         "open_door released": (
             success.launch_open_door_released,
@@ -166,6 +166,7 @@ def _cases(twin, device):
         ),
         "boxing": (success.launch_boxing, punch | {"min_radius": 0.1, "pad": 0.08}, poses),
         "vis_navi": (success.launch_vis_navi, zone | root | STAND, (*poses, "qpos")),
+        "vis_navi ring": (success.launch_vis_navi, zone | root | STAND | {"round_zone": True}, (*poses, "qpos")),
     }
 
 
@@ -181,6 +182,7 @@ CASES = (
     "sit_sofa paper",
     "sit_sofa released",
     "boxing",
+    "vis_navi ring",
     "vis_navi",
 )
 

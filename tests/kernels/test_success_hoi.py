@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 from arena_newton.kernels import success
 
@@ -141,15 +140,17 @@ def test_double_desk_released_has_a_floor(device, twin):
     np.testing.assert_allclose(margin, [-0.001, 0.001], atol=2e-6)
 
 
-BOX_HALF = wp.vec3(0.105, 0.105, 0.105)
 PAPER_BOX = {
-    "box_body": 5,
     "box_qvel_adr": 4,
-    "box_half": BOX_HALF,
     "height_tolerance": 0.06,
     "max_speed": 0.05,
     "tick": 0.02,
 }
+
+
+def _box(stage, twin):
+    """The box to move: body 5, its origin at its centre."""
+    return stage.boxes(twin.Marker(5, (0, 0, 0), UPRIGHT, (0.105, 0.105, 0.105)))
 
 
 def _decks(twin, body=3):
@@ -172,6 +173,7 @@ def test_pp_box_paper_random(device, twin):
         stage.xpos,
         stage.xquat,
         qvel,
+        box=_box(stage, twin),
         decks=stage.boxes(*decks),
         confirm_ticks=1,
         outputs=("success", "margin", "counter"),
@@ -222,6 +224,7 @@ def test_pp_box_paper_thresholds(device, twin, centre, speed, good):
             stage.xpos,
             stage.xquat,
             qvel,
+            box=_box(stage, twin),
             decks=stage.boxes(*_decks(twin)),
             confirm_ticks=10,
             outputs=("success", "margin", "counter"),
@@ -243,6 +246,7 @@ def test_pp_box_paper_counter_restarts(device, twin):
             stage.xpos,
             stage.xquat,
             qvel,
+            box=_box(stage, twin),
             decks=stage.boxes(*_decks(twin)),
             confirm_ticks=10,
             outputs=("success", "margin", "counter"),
@@ -252,7 +256,7 @@ def test_pp_box_paper_counter_restarts(device, twin):
 
 
 def test_pp_box_released_random(device, twin):
-    """The margin is taken in the target deck's world-axis span less 0.105 m and at the plane's height alone."""
+    """The margin is taken in the target deck's world-axis span less 0.105 m, at the plane so far below its top."""
     stage = twin.Stage(device, spread=0.8, quats=twin.random_quats(np.random.default_rng(4), WORLDS, BODIES, tilt=0.1))
     stage.xpos[:, 5, 2] = 0.753 + stage.rng.uniform(-0.08, 0.08, WORLDS)
     decks = _decks(twin)
@@ -260,17 +264,16 @@ def test_pp_box_released_random(device, twin):
         success.launch_pp_box_released,
         stage.xpos,
         stage.xquat,
-        box_body=5,
-        box_half=BOX_HALF,
+        box=_box(stage, twin),
         decks=stage.boxes(*decks),
         deck=1,
-        plane_z=0.648,
+        plane_below=0.02,
         height_tolerance=0.06,
     )
     low, high = twin.world_box(*twin.box_pose(decks[1], stage.xpos, stage.xquat), decks[1].half)
     p = stage.xpos[:, 5].astype(np.float64)
     span = twin.inside(p[:, :2], low[:, :2] + 0.105, high[:, :2] - 0.105)
-    twin.check(ok, margin, np.minimum(span, 0.06 - np.abs(p[:, 2] - 0.105 - 0.648)))
+    twin.check(ok, margin, np.minimum(span, 0.06 - np.abs(p[:, 2] - 0.105 - (high[:, 2] - 0.02))))
 
 
 @pytest.mark.parametrize(
@@ -291,16 +294,44 @@ def test_pp_box_released_thresholds(device, twin, centre, good):
     """One layer, 0.06 m about it, the span shrunk by the box's half."""
     stage = twin.Stage(device, worlds=1)
     stage.xpos[0, 3], stage.xpos[0, 5] = 0, centre
-    decks = [twin.Marker(3, (0, 0, h), UPRIGHT, (0.95, 0.3, 0.02)) for h in (0.15, 0.628, 1.16)]
+    decks = [twin.Marker(3, (0, 0, h), UPRIGHT, (0.95, 0.3, 0.02)) for h in (0.15, 0.648, 1.16)]
     ok, _ = stage.judge(
         success.launch_pp_box_released,
         stage.xpos,
         stage.xquat,
-        box_body=5,
-        box_half=BOX_HALF,
+        box=_box(stage, twin),
         decks=stage.boxes(*decks),
         deck=1,
-        plane_z=0.648,
+        plane_below=0.02,
         height_tolerance=0.06,
     )
     assert ok[0] == good
+
+
+def test_pp_box_of_another_origin_and_turn(device, twin):
+    """The box is judged by its own centre and half sizes in its body, wherever the body's origin lies."""
+    stage = twin.Stage(device, quats=twin.random_quats(np.random.default_rng(9), WORLDS, BODIES, tilt=0.2))
+    stage.xquat[:, 3], stage.xpos[:, 3] = UPRIGHT, 0
+    stage.xpos[:, 5, 2] = 0.75 + stage.rng.uniform(-0.1, 0.1, WORLDS)
+    decks, box = _decks(twin), twin.Marker(5, (0.02, -0.03, 0.1), (0.95, 0.1, 0, 0.2), (0.2, 0.1, 0.06))
+    ok, margin, _ = stage.judge(
+        success.launch_pp_box_paper,
+        stage.xpos,
+        stage.xquat,
+        np.zeros((WORLDS, 10), np.float32),
+        box=stage.boxes(box),
+        decks=stage.boxes(*decks),
+        confirm_ticks=1,
+        outputs=("success", "margin", "counter"),
+        **PAPER_BOX | {"tick": 9.0},
+    )
+    centre, turn = twin.box_pose(box, stage.xpos, stage.xquat)
+    bottom = twin.world_box(centre, turn, box.half)[0][:, 2]
+    slacks = []
+    for deck in decks:
+        c, r = twin.box_pose(deck, stage.xpos, stage.xquat)
+        local = np.einsum("wij,wi->wj", r, centre - c)[:, :2]
+        half = np.float64(np.float32(deck.half))
+        span = twin.inside(local, -half[:2], half[:2])
+        slacks.append(np.minimum(span, 0.06 - np.abs(bottom - c[:, 2] - half[2])))
+    twin.check(ok, margin, np.max(slacks, 0))

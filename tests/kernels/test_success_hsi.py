@@ -258,8 +258,9 @@ def test_boxing_thresholds(device, twin, distance, paper, released, palm):
         assert ok[0] == expected
 
 
-def test_vis_navi_random(device, twin):
-    """The margin is the smallest slack of the four feet in the zone's frame and of standing; height does not matter."""
+@pytest.mark.parametrize("ring", [False, True])
+def test_vis_navi_random(device, twin, ring):
+    """The margin is the smallest slack of the four feet in the zone's square or disc and of standing, at any height."""
     quats = twin.random_quats(np.random.default_rng(8), WORLDS, BODIES, tilt=1e-3)
     stage = twin.Stage(device, spread=0.35, quats=quats)
     _lean(stage, twin, tilt=0.9)
@@ -275,12 +276,14 @@ def test_vis_navi_random(device, twin):
         root_qpos_adr=3,
         feet=stage.up(feet, wp.int32),
         zone=stage.boxes(zone),
+        round_zone=ring,
         **STAND,
     )
     centre, r = twin.box_pose(zone, stage.xpos, quats)
     local = np.einsum("wij,wfi->wfj", r, stage.xpos[:, feet] - centre[:, None])[..., :2]
     half = np.float64(np.float32(zone.half[:2]))
-    expected = np.minimum(twin.inside(local, -half, half).min(1), _stand(stage, twin))
+    slack = half.min() - np.linalg.norm(local, axis=2) if ring else twin.inside(local, -half, half)
+    expected = np.minimum(slack.min(1), _stand(stage, twin))
     np.testing.assert_allclose(margin, expected, atol=4e-6)  # feet up to 7 m above the zone
     assert np.array_equal(ok, (margin >= 0).astype(int)) and 0.02 < ok.mean() < 0.98
 
@@ -303,3 +306,24 @@ def test_vis_navi_needs_every_foot(device, twin, foot):
         **STAND,
     )
     assert ok.tolist() == [1, 0, 1, 0]
+
+
+@pytest.mark.parametrize(("x", "y", "box", "disc"), [(0.45, 0.0, 1, 1), (0.36, 0.36, 1, 0), (0.33, 0.33, 1, 1)])
+def test_vis_navi_ring_is_the_disc_in_the_box(device, twin, x, y, box, disc):
+    """A foot in the box's corner is outside the ring whose diameter is the smaller side."""
+    stage = twin.Stage(device, worlds=1)
+    stage.xpos[:, 1:5] = 0.1
+    stage.xpos[0, 3, :2] = x, y
+    for ring, good in ((False, box), (True, disc)):
+        ok, _ = stage.judge(
+            success.launch_vis_navi,
+            stage.xpos,
+            stage.xquat,
+            stage.qpos,
+            root_qpos_adr=3,
+            feet=stage.up([1, 2, 3, 4], wp.int32),
+            zone=stage.boxes(twin.Marker(0, (0, 0, 1), UPRIGHT, (0.6, 0.485, 1))),
+            round_zone=ring,
+            **STAND,
+        )
+        assert ok[0] == good

@@ -2,6 +2,10 @@
 
 import base64
 import json
+import shutil
+import socket
+import ssl
+import subprocess
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -10,9 +14,10 @@ import numpy as np
 import pytest
 import torch
 
+from arena_newton import policies
 from arena_newton.errors import InputError
-from arena_newton.policies import Observation
-from arena_newton.policies.remote import RemotePolicy
+from arena_newton.policies import Observation, PolicyUnavailable
+from arena_newton.policies.remote import MAX_CHUNK, MAX_FAILURES, TOKEN_VARIABLE, RemotePolicy
 
 CHUNK = 4
 
@@ -33,10 +38,12 @@ class Handler(BaseHTTPRequestHandler):
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         with server.lock:
             server.seen.append((self.path, body, self.client_address))
+            server.tokens.append(self.headers["Authorization"])
             server.count += 1
             count = server.count
         if self.path.endswith("/reset"):
-            self.answer(200 if body["seed"] >= 0 else 500, {"ok": True} if body["seed"] >= 0 else {"error": "bad seed"})
+            good = body["seed"] >= 0 and "reset" not in server.behave
+            self.answer(200 if good else 500, {"ok": True, **server.says} if good else {"error": "bad seed"})
             return
         tag = body["observation"]["state"][0]
         kind = server.behave.get(tag, "good")
@@ -57,6 +64,20 @@ class Handler(BaseHTTPRequestHandler):
         if kind == "hangs up" or (kind == "hangs up once" and count == server.count_at_start + 1):
             self.close_connection = True
             return
+        if kind == "dies":
+            server.shutdown()
+            server.server_close()
+            self.close_connection = True
+            return
+        if kind == "echo":
+            self.answer(500, {"error": f"no access with {self.headers['Authorization']}"})
+            return
+        if kind == "escapes":
+            self.answer(500, {"error": "\x1b[31mred\x1b[0m\x1b]0;title\x07\a\u202eback\ud800\x9b2J" + "x" * 5000})
+            return
+        if kind == "gateway":
+            self.answer(502, {"error": "no upstream"})
+            return
         if kind == "busy once" and count == server.count_at_start + 1:
             self.answer(503, {"error": "starting"})
             return
@@ -75,6 +96,8 @@ class Handler(BaseHTTPRequestHandler):
             rows[1][5] = "left"
         if kind == "short":
             rows = rows[:2]
+        if kind == "long":
+            rows = rows * (MAX_CHUNK // CHUNK + 1)
         reply = {"action": rows[0], "action_chunk": rows, "chunk_size": len(rows)}
         if kind == "empty":
             reply = {"action_chunk": []}
@@ -89,6 +112,11 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         self.wfile.write(data)
+        if self.server.drops:  # as servers do that keep no idle connection
+            self.close_connection = True
+
+    def do_GET(self):  # noqa: N802 (the name that http.server calls)
+        self.answer(502 if "gateway" in self.server.behave.values() else 404, {"error": "no such route"})
 
     def log_message(self, *_):
         pass
@@ -100,12 +128,14 @@ def server():
     running.daemon_threads = True
     running.lock, running.release = threading.Lock(), threading.Event()
     running.seen, running.behave, running.count, running.count_at_start = [], {}, 0, 0
+    running.tokens, running.says, running.drops = [], {}, False
     thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     running.url = f"http://127.0.0.1:{running.server_port}"
     yield running
     running.release.set()
-    running.shutdown()
+    if thread.is_alive():
+        running.shutdown()
     running.server_close()
 
 
@@ -130,8 +160,13 @@ def observation(worlds: int, mask=None, image: bool = False) -> Observation:
 def test_protocol(server, policy):
     """Requests carry seed, image, state, robot type and gym id as the original's client sends them."""
     policy.check()
+    assert [(path, body) for path, body, _ in server.seen] == [("/reset", {"seed": 0, "world": 0})]
+    server.seen.clear()
     policy.reset([7, 8, 9], ["Isaac-Football"] * 3, np.array([True, False, True]))
-    assert [body for path, body, _ in server.seen if path == "/reset"] == [{"seed": 7}, {"seed": 9}]
+    assert [body for _, body, _ in server.seen] == [
+        {"seed": 7, "world": 0, "task": "Isaac-Football"},
+        {"seed": 9, "world": 2, "task": "Isaac-Football"},
+    ]
     server.seen.clear()
     chunk = policy.act(observation(3, np.array([True, True, False]), image=True))
     assert chunk.errors == {} and chunk.actions.shape == (3, CHUNK, 40) and chunk.actions.dtype == np.float32
@@ -140,7 +175,8 @@ def test_protocol(server, policy):
     assert set(bodies) == {0.0, 1.0}
     path, body = bodies[1.0]
     assert path == "/infer" and body["robot_type"] == "unitree_g1_refpose_v3_1" and body["return_chunk"] is True
-    assert body["task"] == "Isaac-Football" and len(body["observation"]["state"]) == 64
+    assert body["task"] == "Isaac-Football" and body["instruction"] == "Kick the ball."
+    assert len(body["observation"]["state"]) == 64
     front = body["observation"]["images"]["front"]
     assert front["shape"] == [6, 8, 3] and front["dtype"] == "uint8"
     pixels = np.frombuffer(base64.b64decode(front["data_b64"]), np.uint8).reshape(front["shape"])
@@ -169,7 +205,8 @@ def test_single_action(server, policy):
         ("500", "status 500, CUDA out of memory"),
         ("text", "no JSON"),
         ("empty", "neither action_chunk nor action"),
-        ("short", "a chunk of 2 actions, but the first had 4"),
+        ("long", "a chunk of 4100 actions, expected at most 4096"),
+        ("escapes", "/infer: status 500, red back "),
         ("hangs up", "tried 3 times"),
     ],
 )
@@ -218,13 +255,301 @@ def test_failed_reset_ends_its_world(server, policy):
 
 
 def test_nobody_there(server):
-    """An address where nobody listens is told before the first episode, and is an error of every world later."""
+    """An address where nobody listens is told before the first episode, and stops a run that is under way."""
     server.shutdown()
     server.server_close()
     policy = RemotePolicy(server.url, timeout=2.0, retries=1, backoff=0.01)
     with pytest.raises(InputError, match="no server answers there") as caught:
         policy.check()
     assert server.url in str(caught.value)
-    chunk = policy.act(observation(2))
-    assert set(chunk.errors) == {0, 1} and "tried 2 times" in chunk.errors[0]
+    with pytest.raises(PolicyUnavailable, match=r"the server is gone: .*tried 2 times"):
+        policy.act(observation(2))
+    with pytest.raises(PolicyUnavailable, match="the server is gone"):
+        policy.reset([1, 2], ["Isaac-Football"] * 2)
+    policy.close()
+
+
+def test_seed_and_step_go_with_each_request(server, policy):
+    """Every request names the episode's seed and the ticks since its first action."""
+    policy.reset([7, 8], ["Isaac-Football"] * 2)
+    for _ in range(3):
+        policy.act(observation(2))
+    policy.reset([0, 9], ["Isaac-Football"] * 2, np.array([False, True]))
+    policy.act(observation(2))
+    asked = [(b["world"], b["seed"], b["step"]) for path, b, _ in server.seen if path == "/infer"]
+    assert sorted(asked[:6]) == [(0, 7, 0), (0, 7, 4), (0, 7, 8), (1, 8, 0), (1, 8, 4), (1, 8, 8)]
+    assert sorted(asked[6:]) == [(0, 7, 12), (1, 9, 0)]
+
+
+@pytest.mark.parametrize("declares", [False, True])
+def test_server_declares_that_it_honours_seeds(server, policy, declares):
+    """Without the declaration the number of worlds counts; what the server calls itself is kept as one plain line."""
+    server.says = {"seeded": True, "policy": "pi\x1b[31m0.5\n20k"} if declares else {"seeded": "yes", "policy": 5}
+    assert policy.depends_on_worlds
+    policy.check()
+    assert policy.depends_on_worlds is not declares
+    assert policy.describe() == {
+        "name": "remote",
+        "url": server.url,
+        "server": "pi0.5 20k" if declares else "",
+        "sequential": False,
+        "seeding": "per_request" if declares else "undeclared",
+        "worlds_matter": not declares,
+    }
+
+
+def test_chunks_of_different_length_are_queued(server, policy):
+    """Chunks of any length are played to their end; a world is asked for when its own chunk is used up."""
+    server.behave = {1.0: "short", 2.0: "single"}
+    played = {0: [], 1: [], 2: []}
+    for number in range(6):
+        chunk = policy.act(observation(3))
+        assert chunk.errors == {}
+        for world, rows in played.items():
+            rows.extend(chunk.actions[world, :, 38])
+        if number == 1:
+            server.behave = {1.0: "short"}
+    assert all(len(rows) == len(played[0]) and set(rows) == {float(w)} for w, rows in played.items())
+    ticks = len(played[0])
+    asked = [(b["world"], b["step"]) for _, b, _ in server.seen]
+    assert [s for w, s in asked if w == 0] == list(range(0, ticks, 4))
+    assert [s for w, s in asked if w == 1] == list(range(0, ticks, 2))
+    assert [s for w, s in asked if w == 2] == [0, 1, *range(2, ticks, 4)]
+    policy.reset([1, 2, 3], ["Isaac-Football"] * 3)
+    server.seen.clear()
+    policy.act(observation(3))
+    assert len(server.seen) == 3  # nothing of the episode before is left
+
+
+def test_kept_connections_that_the_server_closed(server):
+    """A server that closes idle connections costs no attempt."""
+    server.drops = True
+    policy = RemotePolicy(server.url, timeout=5.0, retries=0)
+    for _ in range(3):
+        assert policy.act(observation(1)).errors == {}
+        end = time.monotonic() + 5.0
+        while not policy._connections[0]._dropped() and time.monotonic() < end:
+            time.sleep(0.01)
+    policy.close()
+
+
+@pytest.mark.parametrize("sequential", [False, True])
+def test_server_that_dies_in_a_batch_stops_the_run(server, sequential):
+    """When the server dies while it answers a batch, no world of it is called an error."""
+    policy = RemotePolicy(server.url, timeout=2.0, retries=1, backoff=0.01, sequential=sequential)
+    assert policy.act(observation(4)).errors == {}
+    server.behave = {1.0: "dies"}
+    with pytest.raises(PolicyUnavailable, match="the server is gone"):
+        policy.act(observation(4))
+    policy.close()
+
+
+def test_gateway_without_a_server_stops_the_run(server, policy):
+    """A gateway that answers for a dead server is no answer."""
+    server.behave = {1.0: "gateway"}
+    with pytest.raises(PolicyUnavailable, match="the server is gone: .*status 502, no upstream"):
+        policy.act(observation(2))
+
+
+@pytest.mark.parametrize("call", ["act", "reset", "check"])
+def test_server_that_hangs_stops_the_run(call):
+    """A server that takes connections and never answers costs two deadlines, however many worlds wait."""
+    with socket.create_server(("127.0.0.1", 0), backlog=64) as listening:
+        policy = RemotePolicy(f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=0.4, retries=3, backoff=0.01)
+        start = time.monotonic()
+        with pytest.raises(InputError if call == "check" else PolicyUnavailable, match="no reply within 0.4 s"):
+            if call == "act":
+                policy.act(observation(20))
+            elif call == "reset":
+                policy.reset(range(20), ["Isaac-Football"] * 20)
+            else:
+                policy.check()
+        assert time.monotonic() - start < 4.0  # 20 deadlines would be 8 s
+        policy.close()
+
+
+@pytest.mark.parametrize("worlds", [1, 4, 20])
+@pytest.mark.parametrize("kind", ["500", "nan", "hangs up"])
+def test_server_without_a_usable_answer_stops_the_run(server, policy, worlds, kind):
+    """A server that serves nobody stops the run after at most `MAX_FAILURES` worlds with an error."""
+    server.behave = dict.fromkeys(map(float, range(worlds)), kind)
+    errors = 0
+    with pytest.raises(PolicyUnavailable, match="requests in a row brought no usable answer"):
+        for _ in range(100):
+            errors += len(policy.act(observation(worlds)).errors)
+    assert errors < MAX_FAILURES
+
+
+def test_failures_in_a_row(server, policy):
+    """An answer in between starts the count again; failed resets count as well."""
+    for _ in range(3):
+        server.behave = {0.0: "500"}
+        for _ in range(MAX_FAILURES - 1):
+            assert set(policy.act(observation(1)).errors) == {0}
+        server.behave = {}
+        assert policy.act(observation(1)).errors == {}
+    server.behave = {"reset": ""}
+    with pytest.raises(PolicyUnavailable, match="/reset: status 500"):
+        policy.reset(range(20), ["Isaac-Football"] * 20)
+
+
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "/reset: status 404"),
+        (b"HTTP/1.1 401 No\r\nContent-Length: 0\r\n\r\n", f"status 401; a token .* variable {TOKEN_VARIABLE}"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 6\r\n\r\n<html>", "the reply is no JSON"),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", "SSH-2.0"),
+    ],
+)
+def test_check_refuses_what_is_no_policy_server(answer, text):
+    """Something else at the address is told before the first episode."""
+
+    def serve(listening):
+        while True:
+            try:
+                connection, _ = listening.accept()
+            except OSError:
+                return
+            with connection:
+                connection.settimeout(1.0)
+                if connection.recv(65536):
+                    connection.sendall(answer)
+
+    listening = socket.create_server(("127.0.0.1", 0))
+    threading.Thread(target=serve, args=(listening,), daemon=True).start()
+    policy = RemotePolicy(f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=2.0, retries=1, backoff=0.01)
+    with pytest.raises(InputError, match=text):
+        policy.check()
+    policy.close()
+    listening.shutdown(socket.SHUT_RDWR)
+    listening.close()
+
+
+def test_token_is_sent_and_never_told(server, monkeypatch):
+    """The token of the environment goes with every request, and into no message or description."""
+    monkeypatch.setenv(TOKEN_VARIABLE, "s3kret-token")
+    server.behave = {0.0: "echo"}
+    server.says = {"policy": "for s3kret-token"}
+    policy = RemotePolicy(server.url, timeout=5.0, retries=0)
+    policy.check()
+    policy.reset([1], ["Isaac-Football"])
+    chunk = policy.act(observation(1))
+    assert server.tokens == ["Bearer s3kret-token"] * 3
+    assert chunk.errors[0].endswith("status 500, no access with Bearer ***")
+    assert policy.describe()["server"] == "for ***" and "s3kret" not in str(policy.describe())
+    policy.close()
+    monkeypatch.delenv(TOKEN_VARIABLE)
+    policy = RemotePolicy(server.url, timeout=5.0, retries=0)
+    policy.check()
+    assert server.tokens[-1] is None
+    policy.close()
+
+
+@pytest.mark.parametrize("token", ["a\nHost: other", "a b", "\x00", "t\u00e9l\u00e9", "a\x7f"])
+def test_unfit_tokens_are_refused(monkeypatch, token):
+    """A token with characters that no header carries is refused without being printed."""
+    monkeypatch.setattr("os.environ", {TOKEN_VARIABLE: token})
+    with pytest.raises(InputError, match=f"^{TOKEN_VARIABLE}: holds a space") as caught:
+        RemotePolicy("http://localhost:8443")
+    assert token not in str(caught.value).removeprefix(TOKEN_VARIABLE)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://user:sekret@host:8443",
+        "https://sekret@host",
+        "HTTP://:sekret@host/",
+        "user:sekret@host:8443",
+        "http:/user:sekret@host",
+        "http:///user:sekret@host",
+        "http://user:sekret@[bad",
+        "http://user:se/kret@host",
+        "http://user:se?sekret@host",
+        "http://user:se#sekret@host",
+        "http://host/?token=sekret",
+        "http://host/#sekret",
+        "http://host:bad/?token=sekret",
+        "http://user:sekret%40@host",
+        "http://user\n:sekret@host",
+    ],
+)
+def test_secrets_in_the_address_are_refused(url):
+    """A password in the address is refused in one line that does not print it."""
+    with pytest.raises(InputError) as caught:
+        policies.get(f"remote:{url}")
+    message = str(caught.value)
+    assert message.startswith("--policy remote") and "kret" not in message and "\n" not in message
+    if "@" in url:
+        assert TOKEN_VARIABLE in message
+    with pytest.raises(InputError) as caught:
+        RemotePolicy(url)
+    assert "kret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("url", "options", "text"),
+    [
+        ("http://host\n:80", {}, "white space or control"),
+        ("http://ho st", {}, "white space or control"),
+        ("http://host:99999", {}, "not an address"),
+        ("http://[::1", {}, "not an address"),
+        ("http://host", {"timeout": 0.0}, "--remote-timeout 0"),
+        ("http://host", {"timeout": float("nan")}, "--remote-timeout nan"),
+        ("http://host", {"timeout": float("inf")}, "--remote-timeout inf"),
+        ("http://host", {"retries": -1}, "--remote-retries -1"),
+    ],
+)
+def test_unfit_addresses_and_options(url, options, text):
+    """Addresses and options that cannot work are refused in one line."""
+    with pytest.raises(InputError, match=text) as caught:
+        policies.get(f"remote:{url}", **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("host", ["a" * 64 + ".invalid", "nobody.invalid", "..", "m\u00fcller.invalid"])
+def test_names_that_do_not_resolve(host):
+    """A host that does not exist is one line before the first episode."""
+    policy = RemotePolicy(f"http://{host}:8443", timeout=5.0, retries=0)
+    with pytest.raises(InputError, match="no server answers there"):
+        policy.check()
+    policy.close()
+
+
+def test_close_breaks_off_what_waits(server):
+    """Closing does not wait for the deadline of requests that are under way."""
+    server.behave = {0.0: "slow"}
+    policy = RemotePolicy(server.url, timeout=15.0, retries=4, backoff=0.01)
+    asking = threading.Thread(target=lambda: policy.act(observation(1)), daemon=True)
+    asking.start()
+    while not server.seen:
+        time.sleep(0.01)
+    policy.close()
+    asking.join(3.0)
+    assert not asking.is_alive()
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate, and it is not here")
+def test_https(server, tmp_path):
+    """A certificate that nobody vouches for is refused before the first episode, or taken on request."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    make = "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -keyout"
+    subprocess.run([*make.split(), str(key), "-out", str(certificate)], check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    server.socket = context.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
+    url = server.url.replace("http:", "https:")
+    policy = RemotePolicy(url, timeout=5.0, retries=0)
+    with pytest.raises(InputError, match="--remote-insecure does without"):
+        policy.check()
+    policy.close()
+    server.behave = {1.0: "slow"}
+    policy = RemotePolicy(url, timeout=1.0, retries=0, verify_ssl=False)
+    policy.check()
+    for _ in range(2):
+        start = time.monotonic()
+        chunk = policy.act(observation(3))
+        assert set(chunk.errors) == {1} and chunk.actions[2, 0, 38] == 2.0
+        assert time.monotonic() - start < 4.0
     policy.close()

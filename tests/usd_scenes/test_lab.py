@@ -105,17 +105,25 @@ def test_each_support_carries_the_robot_at_the_height_it_is_posed(engine):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_ball_lies_where_it_is_put_and_is_pushed_by_a_foot(engine):
-    """The ball rests on the floor, and a robot dropped with its toes in it sends it off."""
+def test_ball_lies_where_it_is_put_and_bounces_off_a_foot(engine):
+    """The ball rests on the floor, and one that flies at a robot's toes is sent back."""
     scene, physics = start(engine, {}, (0, 0, g1.SPAWN_HEIGHT), ball=(0.6, 0.0, BALL_RADIUS))
     at = scene.joint_qpos("/World/Ball")
     for _ in range(10):
         physics.step()
     assert physics.qpos.numpy()[:, at : at + 3] == pytest.approx(np.tile([0.6, 0.0, BALL_RADIUS], (2, 1)), abs=2e-3)
-    scene, physics = start(engine, {}, (0, 0, g1.SPAWN_HEIGHT), ball=(0.2, 0.118, BALL_RADIUS))
+    scene, physics = start(engine, {}, (0, 0, g1.SPAWN_HEIGHT), ball=(0.35, 0.118, BALL_RADIUS))
+    speed = np.zeros((physics.worlds, physics.nv), np.float32)
+    speed[:, scene.joint_qvel("/World/Ball")] = -2.0
+    if engine == "mujoco":
+        for data, row in zip(physics._data, speed, strict=True):
+            data.qvel[:] = row
+    else:
+        physics.qvel.assign(speed)
     for _ in range(10):
         physics.step()
-    assert np.all(physics.qpos.numpy()[:, at] > 0.25)
+    assert np.all(physics.qpos.numpy()[:, at] > 0.2)
+    assert np.all(physics.qvel.numpy()[:, scene.joint_qvel("/World/Ball")] > 0.02)
 
 
 def test_engines_agree_on_the_first_tenth_of_a_second():

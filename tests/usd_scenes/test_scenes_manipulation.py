@@ -192,14 +192,17 @@ def test_box_rests_on_a_deck_of_the_posed_shelf(height):
     assert data.xipos[body][2] == pytest.approx(height + 0.105, abs=0.003)
 
 
-def test_deck_markers_lie_under_the_decks_surfaces():
-    """The top face of each deck marker is the deck's measured height, its span the shelf's between the uprights."""
+def test_deck_markers_are_the_decks():
+    """Each deck marker is its plate, and its top face the deck's measured height."""
     built = scene("pp_box")
     names = ("Deck_0", "Deck_1", "Deck_2", "Deck_3", "Top")
     markers = [built.marker(f"/World/Shelf/Frame/{name}") for name in names]
     heights = [m.pos[2] + m.half[2] for m in markers]
     np.testing.assert_allclose(heights, (0.17, 0.67, 1.18, 1.68, 2.15), atol=1e-6)
-    assert all(m.half[0] == pytest.approx(0.925) and m.half[1] == pytest.approx(0.30) for m in markers)
+    for name, marker in zip(names, markers, strict=True):
+        (plate,) = built.geom_ids(f"/World/Shelf/Frame/{name}_Plate")
+        assert marker.half == pytest.approx(built.mj_model.geom_size[plate]) == (0.98, 0.295, 0.015)
+        assert marker.pos == pytest.approx(built.mj_model.geom_pos[plate])
 
 
 def test_stocked_decks_leave_the_second_one_empty():

@@ -193,9 +193,9 @@ def test_cartons_drop_and_rest():
         assert np.abs(d.qvel[scene.joint_qvel(name) :][:6]).max() < 0.01
 
 
-@pytest.mark.parametrize(("variant", "edge"), [("base", 0.10), ("semantic", 0.08)])
+@pytest.mark.parametrize(("variant", "edge"), [("base", 0.10), ("semantic", 0.10)])
 def test_boxing_target_bounds_follow_the_look(variant, edge):
-    """The bounds are the sphere's, or the cube's in the semantic variant; the target cannot be touched."""
+    """The bounds are the sphere's or the cube's, of equal extent (paper); the target cannot be touched."""
     scene = scene_of("boxing", variant=variant)
     bounds = scene.marker("/World/Target/Frame/Bounds")
     assert bounds.half == pytest.approx((edge / 2,) * 3)
@@ -227,6 +227,8 @@ def test_zone_is_the_outline():
     zone = scene.marker("/World/TargetSign/Frame/Zone")
     assert zone.pos[:2] == pytest.approx((-0.05, -0.06)) and zone.half[:2] == pytest.approx((0.485, 0.485))
     assert scene.mocap_id("/World/TargetSign") >= 0 and len(scene.geom_ids("/World/TargetSign")) == 1
+    ring = scene_of("vis_navi", variant="semantic").marker("/World/TargetSign/Frame/Zone")
+    assert (zone.round, ring.round) == (False, True) and ring.half == zone.half
 
 
 @pytest.mark.parametrize("task", TASKS)

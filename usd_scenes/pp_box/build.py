@@ -75,11 +75,9 @@ def shelf(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
         )
     for index, height in enumerate((*DECKS, TOP)):
         name = f"Deck_{index}" if index < len(DECKS) else "Top"
-        author.box(
-            stage, f"{frame}/{name}_Plate", (hx - 0.005, hy - 0.005, DECK / 2), (0, 0, height - DECK / 2), look=black
-        )
-        # Usable span: between the uprights' outer ends, over the whole depth.
-        author.marker(stage, f"{frame}/{name}", (2 * (hx - 2 * POST), 2 * hy, DECK), (0, 0, height - DECK / 2))
+        plate, centre = (hx - 0.005, hy - 0.005, DECK / 2), (0, 0, height - DECK / 2)
+        author.box(stage, f"{frame}/{name}_Plate", plate, centre, look=black)
+        author.marker(stage, f"{frame}/{name}", tuple(2 * h for h in plate), centre)
     lattice = Solids()
     for sx in (-1, 1):
         for low in (0.25, 0.75, 1.25, 1.75):

@@ -1,12 +1,15 @@
 """Author VisNavi: walk between dropped beams and blocks into the yellow outline by the wet-floor sign.
 
 Sizes of beams, blocks, outline and the poses before the first draw: spec of the original (measured on its clips).
-Masses are our choice, the original's are not published: light crates that a robot can shove, not lift.
+Masses are our choice, the original's are not published: light crates that a robot can shove, not lift. So is where the
+origins lie, a beam's at its centre and a block's at the middle of its underside: then the heights from which the
+original drops them form a ladder on which hardly any two touch (centred blocks overlap in 46 of 60 layouts).
 """
 
 from pathlib import Path
 
 import numpy as np
+from pxr import Sdf
 
 from arena_newton.robot import SPAWN_HEIGHT
 from arena_newton.usd_scenes import author, rooms, warehouse
@@ -35,11 +38,12 @@ OBSTACLES = {
 }
 
 
-def _obstacle(stage, name: str, position, size, mass: float, look, rough) -> None:
+def _obstacle(stage, name: str, position, size, mass: float, look, rough, *, on_base: bool) -> None:
     half = 0.5 * np.asarray(size)
     inertia = mass / 3.0 * (np.sum(half**2) - half**2)
-    author.rigid_body(stage, f"/World/{name}", position, mass=mass, inertia=inertia)
-    author.box(stage, f"/World/{name}/Geom", half, look=look, surface=rough)
+    centre = (0.0, 0.0, half[2] if on_base else 0.0)
+    author.rigid_body(stage, f"/World/{name}", position, mass=mass, inertia=inertia, com=centre)
+    author.box(stage, f"/World/{name}/Geom", half, centre, look=look, surface=rough)
 
 
 def _folding_sign(stage, parent: str) -> None:
@@ -81,12 +85,13 @@ def _outline(stage, parent: str) -> None:
 
 
 def _ring_sign(stage, parent: str) -> None:
-    """The semantic stand-in: a painted ring of the same diameter and a round plate on a post."""
+    """The semantic stand-in: a ring of the same diameter, painted in the instruction's yellow, and a round plate."""
+    yellow = author.material(stage, "/World/Looks/OutlineYellow", YELLOW)
     orange = author.material(stage, "/World/Looks/SignOrange", (0.95, 0.36, 0.03))
     white = author.material(stage, "/World/Looks/SignWhite", (0.92, 0.92, 0.92))
     cx, cy = OUTLINE_CENTRE
     Solids().ring(OUTLINE / 2 - 1.4 * OUTLINE_STRIPE, OUTLINE / 2, (cx, cy, 0.003)).write(
-        stage, f"{parent}/Ring", look=orange
+        stage, f"{parent}/Ring", look=yellow
     )
     y, r = cy + OUTLINE / 2 - 0.02, float(np.sqrt(0.5))
     author.box(stage, f"{parent}/Post", (0.02, 0.02, 0.25), (-0.05, y + 0.02, 0.25), collide=False, look=white)
@@ -116,7 +121,7 @@ def build(folder: Path) -> None:
     for name, position in OBSTACLES.items():
         beam = name.startswith("Beam")
         size, mass = (BEAM_SIZE, BEAM_MASS) if beam else (BLOCK_SIZE, BLOCK_MASS)
-        _obstacle(stage, name, position, size, mass, pink, rough)
+        _obstacle(stage, name, position, size, mass, pink, rough, on_base=not beam)
 
     author.fixture(stage, "/World/TargetSign", SIGN_POSITION)
     frame = "/World/TargetSign/Frame"
@@ -129,4 +134,5 @@ def build(folder: Path) -> None:
             _outline(stage, frame)
         else:
             _ring_sign(stage, frame)
+            author.attribute(stage.GetPrimAtPath(f"{frame}/Zone"), "arena:round", True, Sdf.ValueTypeNames.Bool)
     warehouse.save(stage, folder)

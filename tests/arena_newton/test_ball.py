@@ -1,0 +1,125 @@
+"""Football's ball bounces as the rule set says, at both physics rates and on both engines."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from arena_newton import rules
+from arena_newton.physics import make_physics
+from arena_newton.robot import PhysicsRate
+from arena_newton.scene import BALL, ball_solref, load_scene, set_restitution
+
+HEIGHTS = np.array([0.3, 1.0, 3.0])
+"""[m]."""
+PHASES = np.array([0.05, 0.35, 0.65, 0.95])
+"""Where within a physics step the ball meets the ground."""
+RADIUS, GRAVITY = 0.11, 9.81
+RATES = {0.001: PhysicsRate(0.001, 1), 0.005: PhysicsRate(0.005, 1)}
+
+
+@cache
+def one_world(rule_set: str):
+    """One world for native MuJoCo."""
+    return load_scene("football", device="cpu", native=True, rules=rules.get(rule_set))
+
+
+@pytest.fixture(scope="module", params=["mujoco", "warp"])
+def drops(request):
+    """Engine and a scene with one world for each height and phase."""
+    worlds = len(HEIGHTS) * len(PHASES)
+    built = load_scene(
+        "football", worlds=worlds, device="cpu", native=request.param == "mujoco", rules=rules.get("paper")
+    )
+    return request.param, built
+
+
+def bounce(drops, restitution: float, dt: float, steps: int) -> np.ndarray:
+    """Speed of parting over speed of approach, shape [heights, phases]."""
+    engine, built = drops
+    built = dataclasses.replace(built, ball_restitution=restitution)
+    physics = make_physics(built, RATES[dt], engine, 1)
+    speed = np.repeat(np.sqrt(2 * GRAVITY * HEIGHTS), len(PHASES))
+    phase = np.tile(PHASES, len(HEIGHTS))
+    q, v = built.joint_qpos(BALL), built.joint_qvel(BALL)
+    qpos, worlds = physics.qpos0.copy(), np.arange(physics.worlds)
+    qpos[:, built.robot.root_qpos] += 50.0
+    # After one free step the ball is a part of a step's way above the ground, after the next one in it.
+    drop = speed * dt * (2.0 - phase)
+    qpos[:, q : q + 3] = np.stack([np.full_like(drop, 3.5), np.full_like(drop, -4.0), RADIUS + drop], axis=1)
+    none = np.zeros((physics.worlds, 0, 3)), np.zeros((physics.worlds, 0, 4))
+    physics.reset_worlds(worlds, qpos, *none)
+    if engine == "mujoco":
+        for w in worlds:
+            physics._data[w].qvel[v + 2] = -speed[w]
+    else:
+        qvel = physics.qvel.numpy()
+        qvel[:, v + 2] = -speed
+        physics.qvel.assign(qvel)
+    fastest, slowest = np.full(physics.worlds, -np.inf), np.zeros(physics.worlds)
+    for _ in range(steps):
+        physics.bare_step()
+        vertical = physics.qvel.numpy()[:, v + 2]
+        fastest, slowest = np.maximum(fastest, vertical), np.minimum(slowest, vertical)
+    return (fastest / -slowest).reshape(len(HEIGHTS), len(PHASES))
+
+
+@pytest.mark.parametrize("rate", [0.001, 0.005])
+@pytest.mark.parametrize("rule_set", ["paper", "released"])
+def test_the_ball_bounces_as_the_rule_says(drops, rule_set, rate):
+    """Dropped from 0.3, 1 and 3 m it leaves with the stated part of its speed ± 0.03, wherever in a step it lands."""
+    restitution = rules.get(rule_set).ball_restitution
+    assert bounce(drops, restitution, rate, 8) == pytest.approx(restitution, abs=0.03)
+
+
+@pytest.mark.parametrize("rate", [0.001, 0.005])
+@pytest.mark.parametrize("rule_set", ["paper", "released"])
+def test_the_ball_rises_by_the_square_of_its_restitution(rule_set, rate):
+    """Dropped from rest it rises to e² of each height: the root of their ratio is e ± 0.03."""
+    import mujoco
+
+    built = one_world(rule_set)
+    set_restitution(built, built.ball_restitution, rate)
+    model, data = built.mj_model, mujoco.MjData(built.mj_model)
+    model.opt.timestep = rate
+    q, v = built.joint_qpos(BALL), built.joint_qvel(BALL)
+    for height in HEIGHTS:
+        mujoco.mj_resetData(model, data)
+        data.qpos[built.robot.root_qpos] += 50.0
+        data.qpos[q : q + 3] = (3.5, -4.0, RADIUS + height)
+        while data.qpos[q + 2] > RADIUS:
+            mujoco.mj_step(model, data)
+        mujoco.mj_step(model, data)
+        while data.qvel[v + 2] > 0.0:
+            mujoco.mj_step(model, data)
+        rise = np.sqrt(max(data.qpos[q + 2] - RADIUS, 0.0) / height)
+        assert rise == pytest.approx(built.ball_restitution, abs=0.03), height
+
+
+@pytest.mark.parametrize("rule_set", ["paper", "released"])
+def test_a_bouncing_ball_also_rolls_and_rests(rule_set):
+    """The contact that bounces takes no speed from a rolling ball and keeps a resting one on the grass."""
+    import mujoco
+
+    built = one_world(rule_set)
+    model, q, v = built.mj_model, built.joint_qpos(BALL), built.joint_qvel(BALL)
+    for rate in RATES:
+        set_restitution(built, built.ball_restitution, rate)
+        model.opt.timestep = rate
+        data = mujoco.MjData(model)
+        data.qpos[built.robot.root_qpos] += 50.0
+        data.qpos[q : q + 3] = (3.5, -4.0, RADIUS)
+        data.qvel[v : v + 6] = (0, 0.9, 0, -0.9 / RADIUS, 0, 0)
+        mujoco.mj_step(model, data, round(2.0 / rate))
+        assert data.qvel[v + 1] == pytest.approx(0.9, abs=0.01)
+        assert data.qpos[q + 2] == pytest.approx(RADIUS, abs=5e-4)
+
+
+def test_scene_keeps_the_rule_sets_restitution():
+    """A scene is built with the contact of its rule set at its model's own step, and says which it is."""
+    built = load_scene("football", device="cpu", native=True, rules=rules.get("released"))
+    (geom,) = built.geom_ids(BALL)
+    assert built.ball_restitution == 0.75
+    assert built.mj_model.geom_solref[geom] == pytest.approx(ball_solref(0.75, built.mj_model.opt.timestep))
+    assert load_scene("football", device="cpu", native=True).ball_restitution is None

@@ -1,0 +1,146 @@
+"""Stochastic policy servers: what of their results is the same for any number of worlds, and what is not."""
+
+import json
+import random
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from arena_newton import trackers
+from arena_newton.env import STAND_ACTION, ArenaEnv
+from arena_newton.policies import Observation
+from arena_newton.policies.remote import RemotePolicy
+
+CHUNK = 4
+STEPS = 10
+SEEDS = tuple(1000 + 7 * i for i in range(20))
+
+
+class Handler(BaseHTTPRequestHandler):
+    """A policy that looks at the state and adds noise, from the request's seed and step or from one generator."""
+
+    protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
+
+    def do_POST(self):  # noqa: N802 (the name that http.server calls)
+        server = self.server
+        asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        with server.lock:
+            server.count += 1
+            if server.drop_every and server.count % server.drop_every == 0:
+                self.close_connection = True
+                return
+            if self.path == "/reset":
+                server.rng = np.random.default_rng(asked["seed"])
+                reply = {"ok": True, "seeded": server.seeded}
+            else:
+                rng = np.random.default_rng([asked["seed"], asked["step"]]) if server.seeded else server.rng
+                state = np.array(asked["observation"]["state"])
+                actions = np.tile(STAND_ACTION, (CHUNK, 1))
+                actions[:, 9:38] += 0.05 * np.sin(10.0 * state[6:35]) + 0.05 * rng.standard_normal((CHUNK, 29))
+                reply = {"action_chunk": actions.tolist()}
+                server.seen[asked["seed"], asked["step"]] = tuple(asked["observation"]["state"])
+        data = json.dumps(reply).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server():
+    running = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    running.daemon_threads = True
+    running.lock, running.rng = threading.Lock(), np.random.default_rng(0)
+    running.seeded, running.seen, running.count, running.drop_every = True, {}, 0, 0
+    threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+    yield running
+    running.shutdown()
+    running.server_close()
+
+
+def observe(states, asks):
+    return Observation(states.copy(), None, asks, "boxing", "Isaac-Boxing", "Strike.")
+
+
+def play(policy, seeds, worlds):
+    """Episodes of bodies that follow the actions, each as long as its seed says, so that worlds are out of step."""
+    states, tick, end = np.zeros((worlds, 64), np.float32), np.zeros(worlds, int), np.zeros(worlds, int)
+    queues, running = [[] for _ in range(worlds)], [0] * worlds
+    waiting, ends = list(seeds), {}
+    while True:
+        free = [w for w in range(worlds) if tick[w] == end[w]]
+        for w in free:
+            if running[w]:
+                ends[running[w]] = states[w].tobytes()
+            running[w] = waiting.pop(0) if waiting else 0
+            states[w] = np.random.default_rng(running[w]).standard_normal(64)
+            queues[w], tick[w], end[w] = [], 0, 5 + running[w] % 11 if running[w] else -1
+        begin = np.isin(np.arange(worlds), free) & (np.array(running) > 0)
+        if begin.any():
+            policy.reset(running, ["Isaac-Boxing"] * worlds, begin)
+        if not any(running):
+            return ends
+        asks = np.array([bool(running[w]) and not queues[w] for w in range(worlds)])
+        if asks.any():
+            chunk = policy.act(observe(states, asks))
+            assert chunk.errors == {}
+            for w in np.flatnonzero(asks):
+                queues[w] = list(chunk.actions[w])
+        for w in np.flatnonzero(running):
+            states[w, 6:35] += 0.1 * (queues[w].pop(0)[9:38] - states[w, 6:35])
+            tick[w] += 1
+
+
+def run(server, worlds, seeds=SEEDS, loop=play, **options):
+    """How the episodes end, by seed, and all that the server saw, by seed and step, to the last bit."""
+    server.seen = {}
+    policy = RemotePolicy(f"http://127.0.0.1:{server.server_port}", timeout=20.0, retries=3, backoff=0.01, **options)
+    policy.needs_image = False
+    policy.check()
+    ends = loop(policy, seeds, worlds)
+    policy.close()
+    return ends, server.seen
+
+
+def simulate(policy, seeds, worlds):
+    """The same with the simulator."""
+    env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", device="cpu")
+    results = env.run_episodes(policy, [SimpleNamespace(episode_seed=s) for s in seeds], max_steps=STEPS)
+    return {r.episode.episode_seed: (r.outcome, r.steps, r.margin, r.error) for r in results}
+
+
+def test_seeded_server_gives_the_same_for_any_batch(server):
+    """A server whose noise follows from seed and step gives every episode the same bits, whatever runs beside it."""
+    ends, seen = run(server, 1)
+    assert len(set(ends.values())) == 20 and {step for _, step in seen} == {0, 4, 8, 12}
+    shuffled = list(SEEDS)
+    random.Random(1).shuffle(shuffled)
+    assert run(server, 3) == (ends, seen)
+    assert run(server, 20) == (ends, seen)
+    assert run(server, 3, SEEDS[::-1]) == (ends, seen)
+    assert run(server, 7, shuffled, sequential=True) == (ends, seen)
+    server.drop_every = 5  # requests that are asked again get the same answer
+    assert run(server, 20, shuffled) == (ends, seen)
+
+
+def test_seeded_server_in_the_simulator(server):
+    """The same with the simulator: one world and three end with the same bits."""
+    ends, seen = run(server, 1, SEEDS[:3], simulate)
+    assert {error for *_, error in ends.values()} == {None} and {step for _, step in seen} == {0, 4, 8}
+    assert run(server, 3, SEEDS[2::-1], simulate) == (ends, seen)
+
+
+def test_server_of_one_generator_needs_one_world(server):
+    """With one generator for all, one world gives the same bits in any order; several in sequence the same twice."""
+    server.seeded = False
+    alone = run(server, 1)
+    assert run(server, 1, SEEDS[::-1]) == alone
+    together = run(server, 3, sequential=True)
+    assert run(server, 3, sequential=True) == together
+    assert together != alone and run(server, 2, sequential=True) != together
