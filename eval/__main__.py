@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import re
 import signal
@@ -16,10 +17,12 @@ from typing import TYPE_CHECKING, Any
 from arena_newton.errors import ArenaError, InputError
 
 if TYPE_CHECKING:
+    from arena_newton.eval.config import RunOptions
     from arena_newton.eval.run import Factories
 
 __all__ = ["main"]
 
+INTERRUPTED = 130
 PROG = "python -m arena_newton.eval"
 COMMANDS = ("run", "resume", "report", "bench", "engines", "list")
 OVERVIEW = f"""commands:
@@ -48,7 +51,8 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
         factories: builders of the parts of a run; the real ones by default.
 
     Returns:
-        Exit code: 0 done, 1 episodes with errors or missing, 2 bad input or no room, 130 interrupted.
+        Exit code: 0 done, 1 episodes with errors or missing, 2 bad input, no room or a run that had to stop, 130
+        interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments.pop(0) if arguments and arguments[0] in COMMANDS else "run"
@@ -64,19 +68,23 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
         return 2
     except ArenaError as error:
         from arena_newton.eval.journal import StorageError
+        from arena_newton.eval.run import RunStopped
+        from arena_newton.policies.base import PolicyUnavailable
 
         print(f"error: {_one_line(error)}", file=sys.stderr)
-        return 2 if isinstance(error, StorageError) else 1
+        return 2 if isinstance(error, (StorageError, RunStopped, PolicyUnavailable)) else 1
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
         return 0
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+    from arena_newton.eval.records import plain_text
+
+    return plain_text(error)
 
 
 def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | None = None) -> T:
@@ -116,9 +124,28 @@ def _run(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
         print(OVERVIEW)
     options = _parse(RunOptions, arguments, "run")
+    from arena_newton.eval.config import is_quick
+    from arena_newton.eval.run import execute, new_folder
+
+    if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
+        return execute(options, factories)
+    folder = Path(options.out or new_folder())
+    code = execute(dataclasses.replace(options, out=str(folder)), factories)
+    return code if code == INTERRUPTED else max(code, _show_expert(options, folder / "expert", factories))
+
+
+def _show_expert(options: RunOptions, folder: Path, factories: Factories | None) -> int:
+    """End the quick look with a policy that solves its task, and name a picture of it."""
     from arena_newton.eval.run import execute
 
-    return execute(options, factories)
+    print("\nAll of these stood still. One that solves its task:")
+    one = dataclasses.replace(
+        options, task=("vis_navi",), policy="expert", seeds=(0,), repeats=1, worlds=1, strip=True, out=str(folder)
+    )
+    code = execute(one, factories)
+    for strip in sorted((folder / "strips").glob("*__world.*")):
+        print(f"see it: {strip}")
+    return code
 
 
 def _resume(arguments: list[str], factories: Factories | None) -> int:
@@ -166,6 +193,9 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     from arena_newton.eval import config as configs
 
     config = configs.resolve(options)
+    from arena_newton.eval.progress import duration
+    from arena_newton.eval.records import counted
+
     episodes = configs.episodes(config)
     if as_json:
         import json
@@ -175,7 +205,8 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
         rows = [json.dumps(row, allow_nan=False) for row in plan.to_list_json(episodes)]
         print("[\n" + ",\n".join(rows) + "\n]")
         return 0
-    print(f"configuration {config.hash}: {len(episodes)} episodes")
+    ticks = sum(episode.max_steps for episode in episodes)
+    print(f"{counted(len(episodes), 'episode')}, at most {ticks:,} world-ticks ({duration(0.02 * ticks)} simulated)")
     for episode in episodes:
         print(
             f"{episode.index:>5} {episode.task:<12} {episode.mode:<10} seed {episode.group_seed} "

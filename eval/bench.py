@@ -75,10 +75,11 @@ def run(options: BenchOptions) -> int:
         InputError: an unknown item, or a checkpoint that cannot be read.
     """
     known = {**_ITEMS, "tests": _tests}
-    wanted = list(_ITEMS) if "all" in options.what else list(options.what)
-    for name in wanted:
-        if name not in known:
+    for name in options.what:
+        if name not in known and name != "all":
             raise InputError(f"--what {name}: known are {' '.join(known)} all")
+    named = [name for name in options.what if name != "all"]
+    wanted = list(dict.fromkeys([*(_ITEMS if "all" in options.what else ()), *named]))
     quiet_warp()
     figures: list[Figure] = []
     for name in wanted:

@@ -5,36 +5,76 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
+import re
+import sys
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import tyro
+
+import arena_newton
 from arena_newton import __version__
 from arena_newton.errors import InputError
+from arena_newton.eval.records import is_printable, plain_text
 
 if TYPE_CHECKING:
     from arena_newton.eval.plan import Episode
 
 __all__ = [
+    "DRIVES",
     "QUICK_MAX_STEPS",
     "QUICK_REPEATS",
     "RunConfig",
     "RunOptions",
+    "code_files",
+    "code_hash",
     "config_hash",
     "differing_key",
     "episodes",
     "explicit",
     "hash_path",
+    "is_quick",
+    "moving_versions",
+    "own_code",
     "policy_label",
     "resolve",
+    "scene_files",
 ]
 
 POLICY_PATH_SCHEMES = ("replay",)
+DRIVES = ("auto", "twist2", "humanoidarena")
+"""Drive gains of --drive; `auto` is what rule set and tracker ask for."""
 
-PROTOCOL_SEEDS = (0, 1, 2)
-"""Group seeds of the benchmark's protocol (original benchmark: 3 seeds)."""
-PROTOCOL_REPEATS = 20
-"""Repeats per group seed of the benchmark's protocol."""
+PACKAGE = Path(arena_newton.__file__).resolve().parent
+UNHASHED = (
+    "eval/__main__.py",
+    "eval/bench.py",
+    "eval/config.py",
+    "eval/engines.py",
+    "eval/html_report.py",
+    "eval/journal.py",
+    "eval/oracle.py",
+    "eval/oracle_references.py",
+    "eval/original_format.py",
+    "eval/progress.py",
+    "eval/records.py",
+    "eval/report.py",
+    "eval/stats.py",
+    "trackers/evaluate.py",
+    "trackers/evaluation",
+    "trackers/train",
+)
+"""Code that prepares, tells or measures but moves and judges no episode of a run. All other code counts, whatever is
+added to the package."""
+UNVERSIONED = ("arena-newton", "av", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
+"""Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
+MIN_VIDEO, MAX_VIDEO = 16, 4096
+"""Bounds of --video-size [px]; H.264 encoders end at 4096."""
+
+
 QUICK_SEEDS = (0,)
 QUICK_REPEATS = 4
 """Repeats of the default look at all seven tasks, sized to end within two minutes on a bare CPU."""
@@ -63,6 +103,8 @@ class RunOptions:
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
     """Rule set: paper or released."""
+    drive: str = "auto"
+    """Gains of the joints' drives: auto (what rule set and tracker ask for), twist2, humanoidarena."""
     seeds: tuple[int, ...] = ()
     """Group seeds; the protocol's are 0 1 2."""
     repeats: int | None = None
@@ -83,10 +125,23 @@ class RunOptions:
     """Write ego and world videos (H.264 MP4), one pair per episode."""
     strip: bool = False
     """Write the 10-frame picture strip of each episode."""
+    video_episodes: int | None = None
+    """Record only the first so many episodes of each task and mode; all when not given."""
+    video_size: str | None = None
+    """Size of the world camera's pictures, such as 960x540 [px]."""
+    follow: bool = False
+    """Let the world camera follow the robot."""
     actions: bool = False
     """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
+    verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
+    """Print the whole configuration."""
+    accept_versions: bool = False
+    """Continue a folder that was begun with other versions of the libraries; the journal then names both."""
+    skip_broken: bool = False
+    """When simulator or tracker break down as a whole, end the episodes that were running as errors and go on.
+    Without it such a break stops the run and leaves them unplayed."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
     remote_timeout: float = 60.0
@@ -124,6 +179,10 @@ class RunConfig:
     video: bool
     strip: bool
     actions: bool
+    drive: str = "auto"
+    video_episodes: int | None = None
+    video_size: tuple[int, int] | None = None
+    follow: bool = False
     scenes_hash: str = ""
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str = ""
@@ -132,12 +191,17 @@ class RunConfig:
     """What the policy is made with beside its spec."""
     worlds_matter: bool = False
     """Whether the policy depends on how many worlds ask at once; known when it was made and checked."""
+    tracker_facts: dict[str, Any] | None = None
+    """`Tracker.describe()`, once the tracker is made."""
+    policy_facts: dict[str, Any] | None = None
+    """`Policy.describe()`, once the policy is made."""
 
     def identity(self) -> dict[str, Any]:
         """What the results depend on, by flag name; two runs with equal identity may share a results folder.
 
         Videos and the folder are absent: they do not change an episode. So is the number of worlds, but for a policy
-        that depends on it. Files count by content.
+        that depends on it. Files count by content. What each environment was built with and the libraries' versions
+        stand beside it in config.json.
         """
         return {
             "version": __version__,
@@ -157,8 +221,11 @@ class RunConfig:
             "device": self.device.split(":")[0],
             "variant": self.variant_hash,
             "fast_physics": self.fast_physics,
+            "drive": self.drive,
             "scenes": self.scenes_hash,
             "code": self.code_hash,
+            "tracker_facts": self.tracker_facts,
+            "policy_facts": self.policy_facts,
         }
 
     @property
@@ -175,6 +242,8 @@ def config_hash(value: Any) -> str:
 
 def hash_path(path: Path) -> str:
     """First 12 hex digits of the SHA-256 of a file, or of names and contents of all files in a folder."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is no regular file")
     digest = hashlib.sha256()
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     for file in files:
@@ -189,12 +258,37 @@ def hash_path(path: Path) -> str:
     return digest.hexdigest()[:12]
 
 
-def differing_key(stored: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
-    """First key whose value differs between two identities, with both values; None when they are equal."""
+def differing_key(
+    stored: dict[str, Any], wanted: dict[str, Any], ignored: Collection[str] = ()
+) -> tuple[str, Any, Any] | None:
+    """First key whose value differs between two identities, with both values; None when they are equal.
+
+    Of values that are tables themselves the key within is told, such as `tracker.drive`.
+    """
     for key in [*wanted, *(k for k in stored if k not in wanted)]:
-        if stored.get(key) != wanted.get(key):
-            return key, stored.get(key), wanted.get(key)
+        was, now = stored.get(key), wanted.get(key)
+        if key in ignored or was == now:
+            continue
+        if isinstance(was, dict) and isinstance(now, dict):
+            inner = differing_key(was, now)
+            if inner is not None:
+                return f"{key}.{inner[0]}", inner[1], inner[2]
+        return key, was, now
     return None
+
+
+def moving_versions(versions: dict[str, str | None]) -> dict[str, str | None]:
+    """Of all versions those that an episode may depend on; of Python's the first two numbers."""
+    kept = {name: version for name, version in versions.items() if name not in UNVERSIONED}
+    if kept.get("python"):
+        kept["python"] = ".".join(str(kept["python"]).split(".")[:2])
+    return kept
+
+
+def is_quick(options: RunOptions) -> bool:
+    """Whether the flags leave the plan open: a quick look at all tasks."""
+    named = options.task or options.mode or options.seeds
+    return not named and (options.repeats, options.max_steps) == (None, None)
 
 
 def resolve(options: RunOptions) -> RunConfig:
@@ -206,19 +300,33 @@ def resolve(options: RunOptions) -> RunConfig:
     from arena_newton import policies
     from arena_newton import rules as rule_sets
     from arena_newton import tasks as task_specs
+    from arena_newton.eval import plan
     from arena_newton.physics import resolve_engine
     from arena_newton.quiet import quiet_warp
 
-    quick = not (options.task or options.mode or options.seeds) and (options.repeats, options.max_steps) == (None, None)
+    quick = is_quick(options)
+    for field in dataclasses.fields(options):
+        given = getattr(options, field.name)
+        for text in given if isinstance(given, tuple) else (given,):
+            if isinstance(text, str) and not is_printable(text):
+                raise InputError(f"--{field.name.replace('_', '-')} {plain_text(text)}: has control characters in it")
+    if options.drive not in DRIVES:
+        raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
+    if options.video_episodes is not None and options.video_episodes < 1:
+        raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
+    pictures = {"video_episodes": options.video_episodes, "video_size": options.video_size, "follow": options.follow}
+    for name, given in pictures.items():
+        if given and not (options.video or options.strip):
+            raise InputError(f"--{name.replace('_', '-')}: belongs to --video or --strip, neither is given")
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: stands alone, name either all or single tasks")
     tasks = task_specs.names() if tuple(options.task) in ((), ("all",)) else tuple(options.task)
-    seeds = tuple(options.seeds) or (QUICK_SEEDS if quick else PROTOCOL_SEEDS)
+    seeds = tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS)
     if min(seeds) < 0:
         raise InputError(f"--seeds {min(seeds)}: expected numbers of at least 0")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
-    repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else PROTOCOL_REPEATS)
+    repeats = options.repeats if options.repeats is not None else (QUICK_REPEATS if quick else plan.PROTOCOL_REPEATS)
     checkpoint, checkpoint_hash = _checkpoint(options)
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
@@ -226,11 +334,12 @@ def resolve(options: RunOptions) -> RunConfig:
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
-    scenes_hash, code_hash = _hash_package(tasks)
+    for name in tasks:
+        task_specs.get(name)
     config = RunConfig(
         tasks=tasks,
-        scenes_hash=scenes_hash,
-        code_hash=code_hash,
+        scenes_hash=_digest(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names()), hash_path),
+        code_hash=code_hash(),
         modes=tuple(options.mode) or ("base",),
         tracker=options.tracker,
         checkpoint=checkpoint,
@@ -238,7 +347,7 @@ def resolve(options: RunOptions) -> RunConfig:
         policy=options.policy,
         policy_hash=hash_path(policy_path) if policy_path else None,
         rules=options.rules,
-        rules_hash=rule_sets.get(options.rules).hash,
+        rules_hash=rule_sets.get(options.rules).hash_for(tasks),
         seeds=seeds,
         repeats=repeats,
         max_steps=QUICK_MAX_STEPS if quick else options.max_steps,
@@ -252,6 +361,10 @@ def resolve(options: RunOptions) -> RunConfig:
         strip=options.strip,
         actions=options.actions,
         policy_options=_policy_options(options),
+        drive=options.drive,
+        video_episodes=options.video_episodes,
+        video_size=_size(options.video_size),
+        follow=options.follow,
     )
     episodes(config)  # names and numbers are wrong at once, before Warp starts
     quiet_warp()
@@ -297,6 +410,9 @@ def explicit(options: RunOptions, config: RunConfig) -> RunOptions:
         variant=str(config.variant) if config.variant else None,
         policy=f"{scheme}:{Path(target).expanduser().resolve()}" if local else options.policy,
         retry_errors=False,
+        accept_versions=False,
+        skip_broken=False,
+        verbose=False,
     )
 
 
@@ -316,19 +432,81 @@ def _hash_scene(path: Path) -> str:
     return config_hash(sorted(hash_path(file) for file in validate.layers(path)))
 
 
-def _hash_package(tasks: tuple[str, ...]) -> tuple[str, str]:
-    """Hashes of the built-in scenes of some tasks (robot and textures included) and of the package's own code."""
-    root = Path(__file__).resolve().parent.parent / "arena_newton"
-    root = root if root.is_dir() else Path(__file__).resolve().parent.parent
+def _size(given: str | None) -> tuple[int, int] | None:
+    """Width and height of --video-size."""
+    if given is None:
+        return None
+    numbers = re.fullmatch(r"(\d{1,5})[x×](\d{1,5})", given)
+    size = (int(numbers[1]), int(numbers[2])) if numbers else (0, 0)
+    if not MIN_VIDEO <= min(size) <= max(size) <= MAX_VIDEO:
+        raise InputError(
+            f"--video-size {given}: expected width x height, such as 960x540, each from {MIN_VIDEO} to {MAX_VIDEO}"
+        )
+    return size
+
+
+def _files(root: Path) -> list[Path]:
+    """All files below a folder, sorted; linked folders, as in a checkout, are entered, caches are not."""
+    found = []
+    for folder, names, files in os.walk(root, followlinks=True):
+        names[:] = sorted(name for name in names if name != "__pycache__" and not name.startswith("."))
+        found += [Path(folder) / name for name in files]
+    return sorted(found)
+
+
+def code_files(root: Path = PACKAGE) -> list[Path]:
+    """Modules of a package folder whose change may change a result: all but `UNHASHED`."""
+
+    def counts(file: Path) -> bool:
+        name = file.relative_to(root)
+        return file.suffix == ".py" and not any(part.as_posix() in UNHASHED for part in (name, *name.parents))
+
+    return [file for file in _files(root) if counts(file)]
+
+
+def code_hash(root: Path = PACKAGE, digest: Callable[[Path], str] = hash_path) -> str:
+    """Hash of the code that a run executes, by names and contents.
+
+    Args:
+        root: Package folder.
+        digest: Hash of one file.
+    """
+    return _digest(root, code_files(root), digest)
+
+
+def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> list[Path]:
+    """Layers, textures and what else lies beside the built-in scenes of a run's tasks.
+
+    Args:
+        root: Package folder.
+        tasks: Tasks of the run.
+        known: All tasks; the folders of those that the run lacks do not count, nor does the trackers' `lab`.
+    """
+    others = {"lab", *known} - set(tasks)
     scenes = root / "usd_scenes"
-    layers = [f for part in ("g1", "textures", *tasks) for f in sorted((scenes / part).rglob("*")) if f.suffix != ".py"]
-    parts = ("", "tasks", "kernels", "trackers", "trackers/motions", "policies", "policies/experts")
-    code = [f for part in parts for f in sorted((root / part).glob("*.py"))]
+    found = [file for file in _files(scenes) if file.suffix not in (".py", ".pyc")]
+    return [file for file in found if file.relative_to(scenes).parts[0] not in others]
 
-    def digest(files: list[Path]) -> str:
-        return config_hash([[f.relative_to(root).as_posix(), hash_path(f)] for f in files if f.is_file()])
 
-    return digest(layers), digest(code)
+def _digest(root: Path, files: Sequence[Path], digest: Callable[[Path], str]) -> str:
+    return config_hash([[file.relative_to(root).as_posix(), digest(file)] for file in files])
+
+
+def own_code(part: Any) -> str | None:
+    """Hash of the package, or the single module, that a tracker or policy of others was written in.
+
+    Returns:
+        None for the parts of this package, whose code is hashed as a whole.
+    """
+    module = sys.modules.get(type(part).__module__)
+    name = module.__name__.partition(".")[0] if module is not None else ""
+    top = sys.modules.get(name)
+    if top is None or getattr(top, "__file__", None) is None or name in {"arena_newton", *sys.stdlib_module_names}:
+        return None
+    file = Path(str(top.__file__)).resolve()
+    if not hasattr(top, "__path__"):
+        return hash_path(file)
+    return _digest(file.parent, [f for f in _files(file.parent) if f.suffix == ".py"], hash_path)
 
 
 def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:
@@ -372,4 +550,6 @@ def _existing(flag: str, given: str | None) -> Path | None:
         raise InputError(f"{flag} {given}: no such file")
     if path.is_dir() and flag != "--policy":
         raise InputError(f"{flag} {given}: is a folder, expected a file")
+    if not (path.is_file() or path.is_dir()):
+        raise InputError(f"{flag} {given}: is no regular file")
     return path.resolve()

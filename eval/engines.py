@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.eval.journal import write_atomic
+from arena_newton.eval.records import MAX_CONFIG_BYTES, check_types, parse, plain_text, read_regular
 from arena_newton.intervals import wilson
 from arena_newton.quiet import quiet_warp
 
@@ -110,7 +112,7 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     )
     rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
     began = time.perf_counter()
-    with tqdm(total=len(rollouts), desc=engine, unit="rollout") as bar:
+    with tqdm(total=len(rollouts), desc=engine, unit="rollout", disable=None) as bar:  # none in a log file
         results = env.run_episodes(
             policy,
             rollouts,
@@ -160,20 +162,26 @@ def run(options: EngineOptions) -> int:
         Exit code 0.
 
     Raises:
-        InputError: Unfit numbers, or a file to compare with that cannot be read.
+        InputError: Unfit numbers or names, or a file to compare with that cannot be read.
+        StorageError: The rates cannot be written; they were printed.
     """
-    for flag, value, least in (("--rollouts", options.rollouts, 1), ("--worlds", options.worlds, 1)):
+    bounds = [("--rollouts", options.rollouts, 1), ("--worlds", options.worlds, 1), ("--seed", options.seed, 0)]
+    bounds += [("--max-steps", options.max_steps, 1)] if options.max_steps is not None else []
+    for flag, value, least in bounds:
         if value < least:
             raise InputError(f"{flag} {value}: must be at least {least}")
     if not (math.isfinite(options.noise) and options.noise >= 0.0):
         raise InputError(f"--noise {options.noise}: must be a distance of 0 or more [m]")
     from arena_newton import policies
+    from arena_newton.physics import resolve_engine
 
     policy = policies.get(options.policy)
     policy.check()
     policy.check_task(options.task)
     earlier = _earlier(options.against)
     quiet_warp()
+    for engine in options.engines:  # an unknown one is told before the first rollout
+        resolve_engine(engine, None)
     rates = [*earlier]
     for engine in options.engines:
         rates.append(measure(options, engine, policy))
@@ -186,7 +194,7 @@ def run(options: EngineOptions) -> int:
             names = f"{other.engine} ({other.device}) against {one.engine} ({one.device})"
             print(f"{names}: p = {p:.3f} falls, {q:.3f} successes")
     if options.out is not None:
-        Path(options.out).write_text(json.dumps([asdict(one) for one in rates], indent=2) + "\n")
+        write_atomic(Path(options.out).expanduser(), json.dumps([asdict(one) for one in rates], indent=2) + "\n")
     return 0
 
 
@@ -194,6 +202,11 @@ def _earlier(path: str | None) -> list[Rates]:
     if path is None:
         return []
     try:
-        return [Rates(**row) for row in json.loads(Path(path).read_text())]
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"--against {path}: not a file that --out of this command wrote ({error})") from error
+        rows = parse(read_regular(Path(path), MAX_CONFIG_BYTES))
+        rates = [Rates(**check_types(path, row, Rates)) for row in rows]
+        if any(min(one.falls, one.successes) < 0 or max(one.falls, one.successes) > one.rollouts for one in rates):
+            raise ValueError("counts beyond the number of rollouts")
+    except (OSError, ValueError, TypeError, AttributeError, InputError) as error:
+        reason = plain_text(error, 200)
+        raise InputError(f"--against {path}: not a file that --out of this command wrote ({reason})") from error
+    return rates

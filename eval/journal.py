@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
 import os
+import stat
 from pathlib import Path
 from typing import Any
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval.records import MAX_JOURNAL_BYTES, check_record, counted, parse, read_regular
 
 __all__ = ["Journal", "StorageError", "read_journal", "write_atomic"]
 
@@ -32,14 +35,12 @@ def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
         end, as ``kill -9`` or a full disk leaves it, is no part of it.
 
     Raises:
-        InputError: a line other than the last is no JSON object.
+        InputError: a line other than the last is no JSON object, or a line is no record of an episode.
     """
     try:
-        data = path.read_bytes()
+        data = read_regular(path, MAX_JOURNAL_BYTES)
     except FileNotFoundError:
         return [], 0
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     records: list[dict[str, Any]] = []
     start = 0
     number = 0
@@ -49,14 +50,14 @@ def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
         if end < 0:
             break
         try:
-            record = json.loads(data[start:end])
+            record = parse(data[start:end])
             if not isinstance(record, dict):
                 raise ValueError
         except ValueError:
             if end + 1 == len(data):
                 break
             raise InputError(f"{path}: line {number} is no JSON object; the journal was changed by hand") from None
-        records.append(record)
+        records.append(check_record(f"{path}: line {number}", record))
         start = end + 1
     return records, start
 
@@ -77,9 +78,14 @@ class Journal:
         """
         self.path = path
         try:
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
         except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise InputError(f"{path}: is a link; a run writes inside its own folder only") from None
             raise _explain(error, path, "nothing was run") from None
+        if not stat.S_ISREG(os.fstat(self._file).st_mode):
+            os.close(self._file)
+            raise InputError(f"{path}: is no regular file")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -111,7 +117,8 @@ class Journal:
                 os.ftruncate(self._file, self._size)
             except OSError:
                 pass  # the torn line is cut by the next opening
-            raise _explain(error, self.path, f"the {len(self.records)} episodes before are kept") from None
+            kept = len({record["index"] for record in self.records})
+            raise _explain(error, self.path, f"kept: {counted(kept, 'episode')}") from None
         self._size += len(line)
         self.records.append(record)
 
@@ -131,15 +138,18 @@ class Journal:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text file so that a reader sees the old content or the new, never a part."""
+    """Write a text file so that a reader sees the old content or the new, never a part; links are not followed."""
     temporary = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("w", encoding="utf-8", newline="") as handle:
-            handle.write(text)
-            handle.flush()
-            os.fsync(handle.fileno())
+        temporary.unlink(missing_ok=True)
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+        with open(handle, "w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise _explain(error, path, "the journal is kept") from None

@@ -7,6 +7,7 @@ with ``episodes/*.json``, ``summary.csv``, ``summary.jsonl``, ``summary.json`` a
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -16,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from arena_newton.errors import InputError
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.stats import population_std, seed_rates
 
@@ -52,9 +54,16 @@ REWARD_SCALE = 0.02
 """The original's reward manager multiplies a reward by the control step [s]."""
 
 
+MAX_LABEL = 120
+"""Characters of a label; with seed, repeat and episode a file name stays below 255."""
+
+
 def label(policy: str) -> str:
-    """Model label as part of a file name."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", policy).strip("_") or "policy"
+    """Model label as part of a file name; a long one is cut and ends with its hash."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "_", policy).strip("_") or "policy"
+    if len(name) <= MAX_LABEL:
+        return name
+    return f"{name[: MAX_LABEL - 9]}_{hashlib.sha256(policy.encode()).hexdigest()[:8]}"
 
 
 def _reason(record: dict[str, Any]) -> str:
@@ -193,7 +202,18 @@ def write_original(
     seeds: Sequence[int],
     repeats: int,
 ) -> None:
-    """Write the original's files for every task, tracker and mode among ``records`` (sorted by plan order)."""
+    """Write the original's files for every task, tracker and mode among ``records`` (sorted by plan order).
+
+    Raises:
+        InputError: a record's names would lead out of ``folder``, or a folder inside is a link to another place.
+    """
+    inside = folder.parent.resolve() / folder.name
+
+    def write(path: Path, text: str) -> None:
+        if not path.resolve().is_relative_to(inside):
+            raise InputError(f"{path}: lies outside {folder}; nothing is written there")
+        write_atomic(path, text)
+
     for task, tracker, mode in dict.fromkeys((r["task"], r["tracker"], r["mode"]) for r in records):
         own = [r for r in records if (r["task"], r["tracker"], r["mode"]) == (task, tracker, mode)]
         run = folder / f"{task}__{label(tracker)}__{mode}"
@@ -204,8 +224,8 @@ def write_original(
                 f"{content['model_label']}__seed_{content['seed']}__repeat_{content['repeat_idx']}"
                 f"__episode_{content['episode_index']}.json"
             )
-            write_atomic(run / "episodes" / name, json.dumps(content, indent=2) + "\n")
-        write_atomic(run / "summary.csv", _csv(rows, SUMMARY_COLUMNS))
-        write_atomic(run / "summary.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
-        write_atomic(run / "summary.json", json.dumps(summary_json(own, repeats), indent=2) + "\n")
-        write_atomic(run / "final.csv", final_csv(own))
+            write(run / "episodes" / name, json.dumps(content, indent=2) + "\n")
+        write(run / "summary.csv", _csv(rows, SUMMARY_COLUMNS))
+        write(run / "summary.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        write(run / "summary.json", json.dumps(summary_json(own, repeats), indent=2) + "\n")
+        write(run / "final.csv", final_csv(own))

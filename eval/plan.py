@@ -11,7 +11,14 @@ from arena_newton import rules as rule_sets
 from arena_newton import seeding, tasks
 from arena_newton.errors import InputError
 
-__all__ = ["Episode", "expand", "to_list_json"]
+__all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "to_list_json"]
+
+PROTOCOL_SEEDS = (0, 1, 2)
+"""Group seeds of the benchmark's protocol (original benchmark: 3 seeds)."""
+PROTOCOL_REPEATS = 20
+"""Repeats per group seed of the benchmark's protocol."""
+MAX_EPISODES = 200_000
+"""Episodes of one plan; the benchmark's largest has 1,680."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +55,8 @@ def expand(
     modes: Sequence[str] = ("base",),
     rules: str = "paper",
     engine: str = "mujoco",
-    seeds: Sequence[int] = (0, 1, 2),
-    repeats: int = 20,
+    seeds: Sequence[int] = PROTOCOL_SEEDS,
+    repeats: int = PROTOCOL_REPEATS,
     max_steps: int | None = None,
 ) -> list[Episode]:
     """Episodes of a run: tasks × modes × group seeds × repeats, in this order.
@@ -83,6 +90,9 @@ def expand(
         raise InputError(f"--repeats {repeats}: expected at least 1")
     if max_steps is not None and max_steps < 1:
         raise InputError(f"--max-steps {max_steps}: expected at least 1")
+    total = len(names) * len(modes) * len(seeds) * repeats
+    if total > MAX_EPISODES:
+        raise InputError(f"--repeats {repeats}: makes {total:,} episodes, at most {MAX_EPISODES:,} are planned at once")
     episodes: list[Episode] = []
     for name in names:
         spec = tasks.get(name)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arena_newton.errors import InputError
 from arena_newton.eval.journal import read_journal, write_atomic
 from arena_newton.eval.original_format import write_original
-from arena_newton.eval.stats import aggregate
+from arena_newton.eval.records import check_plan, counted, read_document
+from arena_newton.eval.stats import aggregate, outside_suites
 
 __all__ = ["RunRecord", "load_run", "notes", "results_json", "table", "write_reports"]
 
@@ -81,16 +81,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: the folder holds no run.
     """
-    path = folder / CONFIG_FILE
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if not all(key in document for key in ("config", "config_hash", "options", "planned", "gym_ids", "rule_set")):
-            raise ValueError
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no results folder (it has no {CONFIG_FILE})") from None
-    except (OSError, ValueError, TypeError):
-        raise InputError(f"{path}: cannot be read as the configuration of a run") from None
-    return document
+    return read_document(folder)
 
 
 def in_plan_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -103,6 +94,7 @@ def load_run(folder: Path) -> RunRecord:
     """Read a results folder."""
     document = read_config(folder)
     records, _ = read_journal(folder / JOURNAL_FILE)
+    check_plan(folder / JOURNAL_FILE, records, document)
     return RunRecord(folder, document, in_plan_order(records))
 
 
@@ -197,10 +189,13 @@ def notes(results: dict[str, Any]) -> list[str]:
         found.append(f"Incomplete: {results['finished']} of {results['planned']} episodes are finished.")
     errors = sum(cell["errors"] for cell in results["cells"])
     if errors:
-        found.append(f"{errors} episodes ended with an error. They count as episodes without success.")
+        found.append(f"{counted(errors, 'episode')} ended with an error. They count as episodes without success.")
     overflows = sum(cell["overflows"] for cell in results["cells"])
     if overflows:
-        found.append(f"In {overflows} episodes a contact or constraint buffer overflowed.")
+        found.append(f"In {counted(overflows, 'episode')} a contact or constraint buffer overflowed.")
+    outside = outside_suites(cell["task"] for cell in results["cells"])
+    if outside:
+        found.append(f"The averages are those of the paper's seven tasks; not in them: {' '.join(outside)}.")
     cap = results["config"]["max_steps"]
     if cap is not None:
         found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * 0.02:g} s): no benchmark result.")

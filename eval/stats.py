@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from arena_newton import intervals
+from arena_newton.eval.records import plain_text
 
-__all__ = ["SUITES", "aggregate", "cell", "pooled", "population_std", "wilson"]
+__all__ = [
+    "SUITES",
+    "aggregate",
+    "cell",
+    "error_reasons",
+    "outside_suites",
+    "pooled",
+    "population_std",
+    "seed_rates",
+    "wilson",
+]
 
 SUITES: dict[str, tuple[str, ...]] = {
     "HOI_AVG": ("football", "double_desk", "pp_box"),
     "HSI_AVG": ("open_door", "sit_sofa", "boxing", "vis_navi"),
     "ALL_AVG": ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"),
 }
-"""Task groups of the paper's tables: human-object and human-scene interaction."""
+"""Task groups of the paper's tables: human-object and human-scene interaction; `outside_suites` names other tasks."""
 
 
 def population_std(values: Sequence[float]) -> float | None:
@@ -32,6 +44,26 @@ def wilson(successes: int, episodes: int) -> list[float] | None:
     Wilson, E. B. (1927): Probable inference, the law of succession, and statistical inference.
     """
     return list(intervals.wilson(successes, episodes)) if episodes else None
+
+
+def outside_suites(tasks: Iterable[str]) -> list[str]:
+    """Tasks that no average of the paper's tables counts, such as one that was added to its seven."""
+    return [task for task in dict.fromkeys(tasks) if task not in SUITES["ALL_AVG"]]
+
+
+def error_reasons(records: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Why episodes ended as errors, the most frequent cause first.
+
+    Returns:
+        One object per cause: ``reason``, ``message`` (one line without terminal escapes) and ``count``.
+    """
+    counts: Counter[tuple[str, str]] = Counter(
+        (plain_text(record.get("reason") or "error", 80), plain_text(record.get("error") or "no message", 400))
+        for record in records
+        if record["outcome"] == "error"
+    )
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    return [{"reason": reason, "message": message, "count": count} for (reason, message), count in ordered]
 
 
 def seed_rates(records: Iterable[dict[str, Any]]) -> dict[int, float]:

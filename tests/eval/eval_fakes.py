@@ -27,6 +27,13 @@ class FakeEnv:
         """Take what the real one takes."""
         self.task, self.worlds, self.mode, self.options = task, worlds, mode, options
 
+    def describe(self):
+        """What the real one says of itself."""
+        return {"engine": self.options["engine"], "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
+
+    def close(self):
+        """Nothing to let go of."""
+
     def run_episodes(self, policy, episodes, on_finish=None, on_tick=None, recorder=None, max_steps=None):
         """Tick until all episodes have ended."""
         waiting, running = list(episodes), {}
@@ -64,7 +71,7 @@ def fake_tracker(spec, checkpoint):
     """Knows the two that the tests name."""
     if spec not in ("pd", "twist2"):
         raise InputError(f"--tracker {spec}: unknown tracker; known are pd, twist2")
-    return SimpleNamespace(name=spec)
+    return SimpleNamespace(name=spec, describe=lambda: {"name": spec, "drive": "none"})
 
 
 def fake_policy(spec, **options):
@@ -75,6 +82,7 @@ def fake_policy(spec, **options):
         depends_on_worlds=False,
         check=lambda: None,
         check_task=lambda *episodes: None,
+        describe=lambda: {"name": spec},
         close=lambda: None,
     )
 

@@ -30,6 +30,35 @@ def test_default_run(tmp_path, capsys, monkeypatch):
     results = json.loads((Path(report).parent / "results.json").read_text())
     assert [cell["task"] for cell in results["cells"]] == TASKS
     assert [suite["suite"] for suite in results["suites"]] == ["HOI_AVG", "HSI_AVG", "ALL_AVG"]
+    (expert,) = json.loads((Path(report).parent / "expert" / "results.json").read_text())["cells"]
+    assert (expert["task"], expert["policy"], expert["episodes"]) == ("vis_navi", "expert", 1)
+
+
+def test_configuration_is_two_lines(tmp_path, capsys):
+    """A run opens with two lines; -v prints all that the results depend on."""
+    assert main([*SHORT, "--out", str(tmp_path / "a")], factories()) == 0
+    brief = capsys.readouterr().out.split("\n\n")[0].splitlines()
+    assert len(brief) == 2
+    assert re.match(
+        r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy stand, rules paper, ", brief[0]
+    )
+    assert "  1 episode, 1 world at once, at most 1,300 world-ticks (26 s simulated) -> " in brief[1]
+    assert main([*SHORT, "-v", "--out", str(tmp_path / "b")], factories()) == 0
+    captured = capsys.readouterr()
+    full = captured.out.split("\n\n")[0].splitlines()
+    assert {"rules_hash", "code", "tracker_facts", "drive"} <= {line.split()[0] for line in full}
+    assert "  football base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
+
+
+def test_a_log_file_gets_lines(tmp_path):
+    """Where no terminal is, nothing is drawn over: no carriage return, and few lines."""
+    script = Path(__file__).parent / "eval_fakes.py"
+    command = [sys.executable, str(script), "--task", "football", "boxing", "--engine", "mujoco", "--out", "o"]
+    environment = os.environ | {"FAKE_TICK_S": "0.002"}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, env=environment, check=True)
+    assert b"\r" not in done.stderr and b"\r" not in done.stdout
+    assert 1 <= done.stderr.count(b"\n") < 10
+    assert b"boxing base: 120 of 120 episodes, 100% of the tick budget" in done.stderr
 
 
 def test_protocol_is_the_default_of_a_named_task(tmp_path):
@@ -64,6 +93,11 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["--repeats", "0"], "--repeats 0"),
         (["--worlds", "0"], "--worlds 0"),
         (["--max-steps", "0"], "--max-steps 0"),
+        (["--drive", "stiff"], "--drive stiff: .*humanoidarena"),
+        (["--strip", "--video-size", "big"], "--video-size big"),
+        (["bench", "--what", "all", "nosuch"], "--what nosuch: known are help"),
+        (["engines", "--engines", "mujoco", "bullet"], "--engine bullet"),
+        (["engines", "--seed", "-1"], "--seed -1"),
         (["--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--seeds", "-1"], "seeds"),
         (["--repeats", "two"], "repeats"),
@@ -195,6 +229,7 @@ def test_identity_covers_scenes_and_code():
 
     identity = config.resolve(config.RunOptions(task=("football",))).identity()
     assert len(identity["code"]) == len(identity["scenes"]) == 12
+    assert identity["tracker_facts"] is None  # known when the tracker is made
     other = config.resolve(config.RunOptions(task=("boxing",))).identity()
     assert identity["scenes"] != other["scenes"] and identity["code"] == other["code"]
 

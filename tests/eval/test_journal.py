@@ -5,17 +5,26 @@ import json
 import os
 
 import pytest
+from test_report import full
+from test_stats import episodes
 
 from arena_newton.errors import InputError
 from arena_newton.eval import journal as module
 from arena_newton.eval.journal import Journal, StorageError, read_journal, write_atomic
+
+ROWS = episodes("football", (1, 0, 0))
+
+
+def record(number, **changes):
+    """A journal record."""
+    return full(ROWS[number] | changes)
 
 
 def fill(path, n):
     """A journal of n records."""
     with Journal(path) as journal:
         for i in range(n):
-            journal.append({"index": i})
+            journal.append(record(i))
 
 
 @pytest.mark.parametrize("tail", [b'{"index": 2, "out', b'{"index": 2}', b"{", b"\x00\x00\n"])
@@ -28,7 +37,7 @@ def test_torn_last_line_is_cut(tmp_path, tail):
     with Journal(path) as journal:
         assert journal.torn_bytes == len(tail)
         assert [r["index"] for r in journal.records] == [0, 1]
-        journal.append({"index": 2})
+        journal.append(record(2))
     assert [json.loads(line)["index"] for line in path.read_text().splitlines()] == [0, 1, 2]
 
 
@@ -47,7 +56,9 @@ def test_any_cut_leaves_whole_lines(tmp_path):
 def test_damage_in_the_middle_is_named(tmp_path):
     """A broken line that is not the last is no torn tail: it is refused by number."""
     path = tmp_path / "episodes.jsonl"
-    path.write_text('{"index":0}\nnonsense\n{"index":2}\n')
+    fill(path, 3)
+    first, _, last = path.read_text().splitlines(keepends=True)
+    path.write_text(first + "nonsense\n" + last)
     with pytest.raises(InputError, match="line 2"):
         Journal(path)
 
@@ -66,32 +77,95 @@ def test_full_disk_keeps_the_lines_before(tmp_path, monkeypatch):
     path = tmp_path / "episodes.jsonl"
     write = os.pwrite
 
-    def full(file, data, offset):
-        if offset > 30:
+    def full_disk(file, data, offset):
+        if offset > size + 30:
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(file, data[:20], offset)
 
     with Journal(path) as journal:
-        journal.append({"index": 0})
-        monkeypatch.setattr(module.os, "pwrite", full)
-        with pytest.raises(StorageError, match="disk full; the 1 episodes before are kept"):
-            journal.append({"index": 1, "text": "x" * 50})
+        journal.append(record(0))
+        before = path.read_bytes()
+        size = len(before)
+        monkeypatch.setattr(module.os, "pwrite", full_disk)
+        with pytest.raises(StorageError, match="disk full; kept: 1 episode$"):
+            journal.append(record(1))
         monkeypatch.undo()
-        assert path.read_text() == '{"index":0}\n'
-        journal.append({"index": 1})
+        assert path.read_bytes() == before
+        journal.append(record(1))
     assert len(read_journal(path)[0]) == 2
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_atomic_write_onto_a_full_disk(tmp_path):
+def test_atomic_write_onto_a_full_disk(tmp_path, monkeypatch):
     """A report that finds no room leaves the old one and says so in one line."""
     target = tmp_path / "report.md"
     target.write_text("old")
-    (tmp_path / "report.md.part").symlink_to("/dev/full")
+
+    def no_room(file):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(module.os, "fsync", no_room)
     with pytest.raises(StorageError, match="disk full"):
         write_atomic(target, "new" * 10000)
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["report.md"]
+
+
+def test_atomic_write_where_nothing_can_be_written(tmp_path):
+    """Where even the partial file cannot be removed, the first cause is told."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        write_atomic(tmp_path / "file" / "report.md", "new")
+
+
+def test_writing_follows_no_link(tmp_path):
+    """A link that a foreign folder brings as partial file, as target or as journal leads nowhere."""
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "report.md.part").symlink_to(victim)
+    (folder / "report.md").symlink_to(victim)
+    (folder / "episodes.jsonl").symlink_to(victim)
+    write_atomic(folder / "report.md", "new")
+    assert (folder / "report.md").read_text() == "new" and not (folder / "report.md").is_symlink()
+    with pytest.raises(InputError, match="is a link"):
+        Journal(folder / "episodes.jsonl")
+    with pytest.raises(InputError, match="is a link"):
+        read_journal(folder / "episodes.jsonl")
+    assert victim.read_text() == "mine"
+
+
+def test_a_pipe_is_no_journal(tmp_path):
+    """What is no regular file is refused at once instead of waiting for a writer."""
+    os.mkfifo(tmp_path / "episodes.jsonl")
+    for read in (Journal, read_journal):
+        with pytest.raises(InputError, match="no regular file"):
+            read(tmp_path / "episodes.jsonl")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("steps", "many", "steps is .many., expected a number of ticks"),
+        ("steps", True, "steps is true"),
+        ("task", "golf", "task is .golf., known are football"),
+        ("task", "../../escape", "task is"),
+        ("task", ["football"], "task is"),
+        ("mode", "night", "mode is .night., known are base"),
+        ("outcome", "won", "outcome is .won., expected success fall timeout error"),
+        ("index", -1, "index is -1"),
+        ("tracker", "a\x1b[2J", "tracker is"),
+        ("policy", "", "policy is"),
+        ("margin", "near", "margin is"),
+        ("media", {"ego": 1}, "media is"),
+    ],
+)
+def test_unfit_record_is_named(tmp_path, key, value, message):
+    """A record with an unknown name or a value of another kind is refused with line and key."""
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(json.dumps(record(0)) + "\n" + json.dumps(record(1, **{key: value})) + "\n")
+    with pytest.raises(InputError, match=f"line 2: {message}"):
+        read_journal(path)
 
 
 def test_nan_never_enters(tmp_path):

@@ -3,10 +3,12 @@
 import csv
 import json
 
+import pytest
 from test_report import full
 from test_stats import episodes
 
-from arena_newton.eval.original_format import SUMMARY_COLUMNS, final_csv, write_original
+from arena_newton.errors import InputError
+from arena_newton.eval.original_format import SUMMARY_COLUMNS, final_csv, label, write_original
 
 GYM = {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"}
 
@@ -52,6 +54,26 @@ def test_episode_files(tmp_path):
     assert set(keys.split()) == set(episode)
     assert (episode["failure_reason"], episode["error"]) == ("sim_error", "NaN in the action")
     assert episode["task"] == GYM["football"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("task", "../../escape"), ("task", "/tmp/escape"), ("mode", "x/../../../y")]
+)
+def test_nothing_is_written_outside(tmp_path, key, value):
+    """Names that lead out of the folder are refused, and nothing appears there."""
+    folder = tmp_path / "a" / "original"
+    rows = [full(row) | {key: value} for row in episodes("football", (1, 0, 0))]
+    with pytest.raises(InputError, match="lies outside"):
+        write_original(folder, rows, gym_ids={"football": "G", value: "G"}, seeds=(0, 1, 2), repeats=20)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_long_names_are_cut(tmp_path):
+    """A policy with a long address gets file names that every file system takes, and its own."""
+    one, other = (label(f"remote:http://host/{'x' * 300}{end}") for end in "ab")
+    assert len(one) == len(other) == 120 and one != other
+    rows = [row | {"policy": f"remote:http://host/{'x' * 300}"} for row in episodes("football", (1, 0, 0))]
+    assert len(list((written(tmp_path, rows) / "episodes").iterdir())) == 60
 
 
 def test_final_csv():

@@ -29,6 +29,18 @@ def recorded(tmp_path_factory):
     return out
 
 
+def test_what_ran_stands_with_the_results(recorded):
+    """Engine, physics rate, drive, start-up, tracker and what runs its network stand in config.json."""
+    document = json.loads((recorded / "config.json").read_text())
+    facts = document["environments"]["boxing base"]
+    assert {"engine", "device", "physics_dt", "substeps", "drive", "startup_ticks", "history"} <= set(facts)
+    assert facts["engine"] == "mujoco" and facts["startup_ticks"] == 50
+    assert facts["tracker"]["name"] == "twist2" and facts["tracker"]["inference"]
+    assert document["config"]["policy_facts"]["name"] == "expert"
+    hashes = {json.dumps(row["hashes"], sort_keys=True) for row in journal(recorded)}
+    assert len(hashes) == 1 and '"environment": "' in hashes.pop()
+
+
 def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path):
     """Open loop, the same tracker comes to the same end, margin included, with other worlds beside it."""
     files = sorted(p.name for p in (recorded / "actions").iterdir())

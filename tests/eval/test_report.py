@@ -82,7 +82,7 @@ def test_notes_tell_what_the_table_hides(tmp_path):
     rows[4] |= {"overflow": True}
     run = report.load_run(folder_with(tmp_path / "a", rows, 60, max_steps=50))
     text = " ".join(report.notes(report.results_json(run)))
-    for words in ("30 of 60", "1 episodes ended with an error", "overflowed", "50 ticks"):
+    for words in ("30 of 60", "1 episode ended with an error", "overflowed", "50 ticks"):
         assert words in text
 
 

@@ -3,19 +3,24 @@
 import errno
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 from eval_fakes import FakeEnv, factories
 
+from arena_newton import doctor
 from arena_newton.eval import journal as journal_module
 from arena_newton.eval.__main__ import main
+from arena_newton.policies.base import PolicyUnavailable
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
@@ -150,27 +155,235 @@ def test_resume_stays_in_its_folder(tmp_path, uninterrupted, capsys):
 class BreaksOnce(FakeEnv):
     """Breaks after two episodes of boxing."""
 
+    error: Exception = RuntimeError("device lost")
+
     def run_episodes(self, policy, episodes, on_finish=None, **options):
         """Two episodes, then the simulator dies."""
         if self.task != "boxing":
             return super().run_episodes(policy, episodes, on_finish=on_finish, **options)
         super().run_episodes(policy, episodes[:2], on_finish=on_finish, **options)
-        raise RuntimeError("device lost")
+        raise self.error
 
 
-def test_broken_environment_is_an_error_of_its_episodes(tmp_path, uninterrupted, capsys):
-    """When a world breaks, its episodes end as errors, the others run, the code is 1, and --retry-errors mends it."""
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (RuntimeError("device lost"), "boxing base: RuntimeError: device lost; running were s0/r2 s0/r3 s1/r0"),
+        (RuntimeError("CUDA out of memory"), "fewer --worlds"),
+        (OSError(errno.ENOSPC, "No space left on device", "v.mp4.part"), "v.mp4.part: disk full"),
+        (ConnectionResetError("peer left"), "boxing base: ConnectionResetError: peer left"),
+        (PolicyUnavailable("http://host:1 does not\x1b[2J answer"), "http://host:1 does not answer"),
+    ],
+)
+def test_a_break_stops_the_run_and_leaves_episodes_unplayed(tmp_path, uninterrupted, capsys, error, says):
+    """What breaks as a whole is no episode's error: one line, code 2, nothing lost; resume ends in the same bytes."""
     folder = tmp_path / "d"
-    assert main(["run", *FLAGS, "--out", str(folder)], factories(env=BreaksOnce)) == 1
-    cells = json.loads((folder / "results.json").read_text())["cells"]
-    assert [(cell["task"], cell["errors"]) for cell in cells] == [
-        ("football", 0),
-        ("football", 0),
-        ("boxing", 10),
-        ("boxing", 10),
-    ]
+    breaks = type("Breaks", (BreaksOnce,), {"error": error})
+    assert main(["run", *FLAGS, "--worlds", "3", "--out", str(folder)], factories(env=breaks)) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert says in line and "26 of 48 episodes kept" in line and f"resume {folder}" in line
+    assert "\x1b" not in line
     records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
-    assert {r["error"] for r in records if r["outcome"] == "error"} == {"RuntimeError: device lost"}
+    assert len(records) == 26 and all(r["outcome"] != "error" for r in records)
+    assert main(["resume", str(folder)], factories()) == 0
+    assert tables(folder) == tables(uninterrupted)
+
+
+class Poison(FakeEnv):
+    """Breaks whenever one certain episode of boxing has started."""
+
+    def run_episodes(self, policy, episodes, on_finish=None, **options):
+        """Episodes one after the other, in the plan's order."""
+        for episode in episodes:
+            if (self.task, self.mode, episode.group_seed, episode.repeat) == ("boxing", "base", 1, 1):
+                raise RuntimeError("always here")
+            super().run_episodes(policy, [episode], on_finish=on_finish, **options)
+
+
+def test_an_episode_that_always_breaks_can_be_passed(tmp_path, uninterrupted, capsys):
+    """--skip-broken ends what was running as errors and goes on; --retry-errors runs it again later."""
+    folder = tmp_path / "d"
+    for _ in range(2):
+        command = ["resume", str(folder)] if folder.exists() else ["run", *FLAGS, "--worlds", "3", "--out", str(folder)]
+        assert main(command, factories(env=Poison)) == 2
+        assert "--skip-broken" in capsys.readouterr().err
+    assert main(["resume", str(folder), "--worlds", "1", "--skip-broken"], factories(env=Poison)) == 1
+    output = capsys.readouterr().out
+    assert "   1 x environment: RuntimeError: always here" in output
+    assert f"resume {folder} --retry-errors" in output
+    records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert len(records) == 48
+    broken = [(r["task"], r["mode"], r["group_seed"], r["repeat"]) for r in records if r["outcome"] == "error"]
+    assert broken == [("boxing", "base", 1, 1)]
     assert main(["resume", str(folder)], factories()) == 1
     assert main(["resume", str(folder), "--retry-errors"], factories()) == 0
     assert tables(folder) == tables(uninterrupted)
+
+
+def test_an_environment_that_cannot_be_built_is_no_error_of_episodes(tmp_path, capsys):
+    """--skip-broken does not turn a machine without room for one world into a journal of errors."""
+
+    def no_memory(task, **options):
+        raise MemoryError("no room")
+
+    folder = tmp_path / "d"
+    assert main(["run", *FLAGS, "--skip-broken", "--out", str(folder)], factories(env=no_memory)) == 2
+    assert "football base: MemoryError: no room (fewer --worlds need less); trace in" in capsys.readouterr().err
+    assert "no_memory" in (folder / "break.txt").read_text()
+    assert lines(folder) == 0
+
+
+def test_errors_are_told_with_reasons(tmp_path, capsys):
+    """Terminal and counts name why episodes ended as errors, without what a server put between, and how to go on."""
+    said = ["policy: HTTP 500\x1b[31m busy", "policy: HTTP 500 busy", "no answer"]
+
+    class Failing(FakeEnv):
+        def run_episodes(self, policy, episodes, on_finish=None, **options):
+            def failed(result):
+                if result.episode.repeat < 3:
+                    result.outcome, result.reason, result.error = "error", "policy", said[result.episode.repeat]
+                on_finish(result)
+
+            super().run_episodes(policy, episodes, on_finish=failed, **options)
+
+    folder = tmp_path / "e"
+    flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "1", "--repeats", "4", "--out", str(folder)]
+    assert main(flags, factories(env=Failing)) == 1
+    captured = capsys.readouterr()
+    told = [line for line in captured.out.splitlines() if " x " in line]
+    assert told == ["     4 x policy: policy: HTTP 500 busy", "     2 x policy: no answer"]
+    assert f"resume {folder} --retry-errors" in captured.out
+    assert "\\u001b" not in (folder / "episodes.jsonl").read_text()
+
+
+def test_partial_recordings_are_swept_away(tmp_path):
+    """What an interrupted recording left is gone when a run ends, however it ends."""
+    folder = tmp_path / "s"
+
+    class Leaves(FakeEnv):
+        def run_episodes(self, policy, episodes, **options):
+            for part in ("videos/a.mp4.part", "strips/a.png.part", "actions/a.npz.partial"):
+                (folder / part).parent.mkdir(exist_ok=True)
+                (folder / part).write_text("half")
+            raise KeyboardInterrupt
+
+    assert main(["run", *FLAGS, "--out", str(folder)], factories(env=Leaves)) == 130
+    assert sorted(path.name for path in folder.rglob("*") if path.is_file()) == ["config.json", "episodes.jsonl"]
+
+
+def test_environments_stand_in_configuration_and_journal(uninterrupted):
+    """What each task and mode was built with stands once in config.json; every journal line carries its hash."""
+    document = json.loads((uninterrupted / "config.json").read_text())
+    assert list(document["environments"]) == [f"{t} {m}" for t in ("football", "boxing") for m in ("base", "execution")]
+    facts = {"engine": "mujoco", "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
+    assert all(value == facts for value in document["environments"].values())
+    assert document["config"]["tracker_facts"] == {"name": "twist2", "drive": "none"}
+    assert document["config"]["policy_facts"] == {"name": "stand"}
+    hashes = [json.loads(line)["hashes"] for line in (uninterrupted / "episodes.jsonl").read_text().splitlines()]
+    assert len({h["environment"] for h in hashes}) == len({h["versions"] for h in hashes}) == 1
+
+
+def test_drive_reaches_the_environment(tmp_path):
+    """--drive names the gains that the environment is built with; without it tracker and rule set decide."""
+    built = []
+
+    class Notes(FakeEnv):
+        def __init__(self, task, *, drive=None, **options):
+            super().__init__(task, **options)
+            built.append(drive.name if drive is not None else None)
+
+    for number, flags in enumerate(([], ["--drive", "twist2"], ["--drive", "humanoidarena"])):
+        short = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "1"]
+        assert main([*short, *flags, "--out", str(tmp_path / str(number))], factories(env=Notes)) == 0
+    assert built == [None, "twist2", "twist2-humanoidarena"]
+
+
+def test_another_environment_is_refused(tmp_path, uninterrupted, capsys):
+    """A resume whose world runs at another physics rate is refused by name before its first episode."""
+    folder = tmp_path / "half"
+    shutil.copytree(uninterrupted, folder)
+    kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
+    (folder / "episodes.jsonl").write_text("".join(kept))
+
+    class Faster(FakeEnv):
+        def describe(self):
+            return super().describe() | {"physics_dt": 0.005}
+
+    assert main(["resume", str(folder)], factories(env=Faster)) == 2
+    assert "was run with physics_dt 0.001, now it is 0.005" in capsys.readouterr().err
+    assert (folder / "episodes.jsonl").read_text() == "".join(kept)
+    other = factories(tracker=lambda *_: SimpleNamespace(describe=lambda: {"name": "twist2", "drive": "stiff"}))
+    assert main(["resume", str(folder)], other) == 2
+    assert "tracker_facts.drive was none, now stiff" in capsys.readouterr().err
+    assert main(["resume", str(folder)], factories()) == 0
+    assert tables(folder) == tables(uninterrupted)
+
+
+def test_other_versions_are_refused_unless_accepted(tmp_path, uninterrupted, capsys, monkeypatch):
+    """Other libraries are named and refused; accepted ones are added to config.json and told apart in the journal."""
+    folder = tmp_path / "half"
+    shutil.copytree(uninterrupted, folder)
+    kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
+    (folder / "episodes.jsonl").write_text("".join(kept))
+    installed = doctor.versions()
+    monkeypatch.setattr(doctor, "versions", lambda: installed | {"tqdm": "9.9"})
+    assert (
+        main(["resume", str(folder), "--worlds", "1", "--task", "football", "boxing", "--seeds", "9"], factories()) == 2
+    )
+    assert "seeds was 0 1 2, now 9" in capsys.readouterr().err  # a progress bar changes nothing
+    monkeypatch.setattr(doctor, "versions", lambda: installed | {"torch": "9.9"})
+    assert main(["resume", str(folder)], factories()) == 2
+    assert f"torch {installed['torch']}, installed is 9.9" in capsys.readouterr().err
+    for _ in range(2):
+        assert main(["resume", str(folder), "--accept-versions"], factories()) == 0
+    document = json.loads((folder / "config.json").read_text())
+    assert document["versions"] == installed and [v["torch"] for v in document["later_versions"]] == ["9.9"]
+    hashes = [json.loads(line)["hashes"]["versions"] for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert len(set(hashes[:30])) == len(set(hashes[30:])) == 1 and hashes[0] != hashes[-1]
+    assert tables(folder) == tables(uninterrupted)
+
+
+def test_a_killed_beginning_can_be_begun_again(tmp_path):
+    """A folder with an empty journal and no configuration holds nothing: the run begins in it."""
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / "episodes.jsonl").touch()
+    flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "1", "--out", str(folder)]
+    assert main(flags, factories()) == 0
+
+
+def test_linked_folders_are_refused(tmp_path, uninterrupted, capsys):
+    """A results folder whose own folders lead elsewhere is neither continued nor reported."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("original", "videos"):
+        folder = tmp_path / name
+        shutil.copytree(uninterrupted, folder)
+        shutil.rmtree(folder / "original")
+        (folder / name).symlink_to(elsewhere)
+        assert main(["resume", str(folder)], factories()) == 2
+        assert "is a link" in capsys.readouterr().err
+        if name == "original":
+            assert main(["report", str(folder)]) == 2
+            assert "lies outside" in capsys.readouterr().err
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_a_journal_of_another_plan_is_refused(tmp_path, uninterrupted, capsys):
+    """A record that the plan has elsewhere, or not at all, is named by report and resume."""
+    folder = tmp_path / "x"
+    shutil.copytree(uninterrupted, folder)
+    rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    changes = (
+        {"repeat": 4},
+        {"group_seed": 3},
+        {"index": 48},
+        {"task": "pp_box"},
+        {"repeat": 1 + rows[3]["repeat"] % 3},
+    )
+    for change in changes:
+        changed = [row | change if number == 3 else row for number, row in enumerate(rows)]
+        (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in changed))
+        for command in ("report", "resume"):
+            assert main([command, str(folder)], factories()) == 2, (command, change)
+            assert re.fullmatch(r"error: .*episodes\.jsonl: episode .*\n", capsys.readouterr().err)

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton.eval.stats import SUITES, aggregate, cell, pooled, population_std, wilson
+from arena_newton.eval.stats import (
+    SUITES,
+    aggregate,
+    cell,
+    error_reasons,
+    outside_suites,
+    pooled,
+    population_std,
+    wilson,
+)
 
 PAPER = Path(__file__).resolve().parents[2] / ".." / "shared" / "paper" / "in_gmt.csv"
 
@@ -66,6 +75,24 @@ def test_suite_needs_all_its_tasks():
     rows = episodes("football", (1, 2, 3))
     assert aggregate(rows)["suites"] == []
     assert pooled({"football": rows}, SUITES["HOI_AVG"]) is None
+
+
+def test_a_task_outside_the_averages_is_named():
+    """A task that the paper's averages lack is told; its seven are not."""
+    assert outside_suites(SUITES["ALL_AVG"]) == []
+    assert outside_suites(["football", "golf", "golf"]) == ["golf"]
+
+
+def test_reasons_of_errors_are_counted():
+    """Equal causes are counted together, the most frequent first, in one line without terminal escapes."""
+    rows = episodes("football", (20, 20, 20))
+    for number, message in enumerate(("a\x1b[31mb\nc", "a b c", "\x1b]0;title\x07late", None, "a\u202eb c" * 200)):
+        rows[number] |= {"outcome": "error", "reason": "policy", "error": message}
+    first, *others = error_reasons(rows)
+    assert first == {"reason": "policy", "message": "a b c", "count": 2}
+    assert [other["message"][:8] for other in others] == ["ab cab c", "late", "no messa"]
+    assert max(len(other["message"]) for other in others) == 400
+    assert error_reasons(rows[10:]) == []
 
 
 def _seed_counts(mean, std):

@@ -1,0 +1,171 @@
+"""Results folders of strangers: whatever stands in journal and configuration, the answer is a report or one line."""
+
+import functools
+import json
+import random
+import re
+import resource
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from eval_fakes import factories
+
+from arena_newton import doctor
+from arena_newton.eval import config
+from arena_newton.eval.__main__ import main
+
+COUNT = 240
+"""Mutated files a reader."""
+FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "2"]
+VALUES = (
+    *("null", "true", "-1", "0", "1", "3", "1e308", "1e999", "-1e999", "NaN", "Infinity", "1" + "0" * 30, "9" * 5000),
+    *('""', '"x"', '"football"', '"base"', '"error"', '"../../../escape"', '"/tmp/arena_newton_escape"', '".."', '"."'),
+    *('"\\u001b[2J"', '"\\ud800"', '"\\u0000"', '"a\\nb"', '"\\u202e"', '"<script>alert(1)</script>"', '"/dev/zero"'),
+    *('"%s"' % ("y" * 100_000), "[]", "{}", "[0, 0]", '["football", "football"]', '{"a": {"b": [1]}}', '{"": 0}'),
+    *("[" * 60 + "]" * 60, "[" * 100_000, '{"a":' * 50_000, '"C:\\\\x"', '"remote:http://u:p@h"', "0.5", "-0.0"),
+)
+"""Hostile values, as they stand in a file."""
+
+
+def places(value, path=()):
+    """Paths to all values within a JSON value."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in items:
+        yield from places(part, (*path, key))
+
+
+def with_raw(value, path, raw):
+    """JSON text of a value with the part at a path replaced by text."""
+    mark = "@@here@@"
+    copy = json.loads(json.dumps(value))
+    at = copy
+    for key in path[:-1]:
+        at = at[key]
+    if not path:
+        return raw
+    at[path[-1]] = mark
+    return json.dumps(copy).replace(f'"{mark}"', raw)
+
+
+def mutated(value, rng):
+    """JSON text of an object with one change: another value, a lost or a renamed key, or changed bytes."""
+    kind = rng.randrange(8)
+    if kind < 5:
+        return with_raw(value, rng.choice(list(places(value))[1:]), rng.choice(VALUES)).encode()
+    if kind == 5:
+        return json.dumps({key: part for key, part in value.items() if key != rng.choice(list(value))}).encode()
+    if kind == 6:
+        key = rng.choice(list(value))
+        return json.dumps(
+            {rng.choice(("", "x", "../x", key + "\x1b")) if k == key else k: p for k, p in value.items()}
+        ).encode()
+    return spoiled(json.dumps(value).encode(), rng)
+
+
+def spoiled(data, rng):
+    """Bytes with some of them flipped, cut out, cut off or put in."""
+    data = bytearray(data)
+    for _ in range(rng.randrange(1, 4)):
+        at, size = rng.randrange(len(data)), rng.choice((1, 1, 2, 40))
+        change = rng.randrange(4)
+        if change == 0:
+            data[at] = rng.randrange(256)
+        elif change == 1:
+            del data[at : at + size]
+        elif change == 2:
+            del data[at:]
+        else:
+            data[at:at] = rng.choice((b"\x00" * size, b"\xff\xfe", b"\n", b"}{", b'"', b"\\", rng.randbytes(size)))
+        if not data:
+            break
+    return bytes(data)
+
+
+@pytest.fixture
+def base(tmp_path, monkeypatch):
+    """A small results folder two floors down, and files beside it that must not change."""
+    installed = doctor.versions()
+    monkeypatch.setattr(doctor, "versions", lambda: installed)
+    monkeypatch.setattr(config, "code_hash", lambda: "0" * 12)
+    monkeypatch.setattr(config, "hash_path", functools.cache(config.hash_path))
+    monkeypatch.setattr("os.fsync", lambda file: None)
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "outer" / "inner" / "run"
+    folder.parent.mkdir(parents=True)
+    (tmp_path / "outer" / "victim").write_text("mine")
+    assert main([*FLAGS, "--out", str(folder)], factories()) == 0
+    for path in folder.iterdir():
+        if path.name not in ("config.json", "episodes.jsonl"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return folder
+
+
+def check(folder, mutants, write, capsys, commands):
+    """Give each mutant to one of the commands."""
+    root = folder.parents[2]
+    kept = folder.parent / "kept"
+    shutil.copytree(folder, kept)
+    counts = {"accepted": 0, "refused": 0}
+    capsys.readouterr()
+    for number, mutant in enumerate(mutants):
+        command = commands[number % len(commands)]
+        shutil.rmtree(folder)
+        shutil.copytree(kept, folder)
+        write(mutant)
+        code = main([*command, str(folder)], factories())
+        captured = capsys.readouterr()
+        complaints = [line for line in captured.err.splitlines() if not re.match(r"  |[a-z_]+ [a-z]+: \d", line)]
+        if code == 2:
+            counts["refused"] += 1
+            assert len(complaints) == 1 and complaints[0].startswith("error: "), (number, captured.err)
+            assert len(complaints[0]) < 2500 and str(folder) in complaints[0] or "--" in complaints[0]
+        else:
+            counts["accepted"] += 1
+            assert code in (0, 1) and not complaints, (number, code, captured.err)
+        assert "\x1b" not in captured.err + captured.out, (number, mutant[:200])
+        inside = {str(path.relative_to(root)) for path in root.rglob("*") if folder not in (path, *path.parents)}
+        inside = {path for path in inside if not path.startswith("outer/inner/kept/")}
+        assert inside == {"outer", "outer/inner", "outer/inner/kept", "outer/victim"}, (number, inside)
+        assert not Path("/tmp/arena_newton_escape").exists()
+        assert (root / "outer" / "victim").read_text() == "mine"
+    assert counts["refused"] > len(mutants) // 2 and counts["accepted"] > 0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2 << 20  # KiB; torch and Warp are most of it
+    print(f"{len(mutants)} mutants: {counts}")
+
+
+def test_mutated_journals(base, capsys):
+    """A journal changed anywhere gives a report or one line with code 2, and nothing is written elsewhere."""
+    rng = random.Random(1)
+    path = base / "episodes.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    mutants = []
+    for number in range(COUNT):
+        at = rng.randrange(len(lines))
+        if number % 5 == 4:
+            mutants.append(spoiled(b"".join(lines), rng))
+        else:
+            line = mutated(json.loads(lines[at]), rng)
+            mutants.append(b"".join([*lines[:at], line + b"\n", *lines[at + 1 :]]))
+    check(base, mutants, path.write_bytes, capsys, (["report"], ["report"], ["resume"]))
+
+
+def test_mutated_configurations(base, capsys):
+    """A config.json changed anywhere gives a report, a continued run or one line with code 2."""
+    rng = random.Random(2)
+    path = base / "config.json"
+    document = json.loads(path.read_bytes())
+    mutants = []
+    for number in range(COUNT):
+        part = ("options", "config", None)[number % 3]  # most of a document's values are versions and rules
+        if part is None:
+            mutants.append(mutated(document, rng))
+        else:
+            mutants.append(
+                with_raw(document, (part,), mutated(document[part], rng).decode("latin-1")).encode("latin-1")
+            )
+    check(base, mutants, path.write_bytes, capsys, (["resume"], ["report"]))
