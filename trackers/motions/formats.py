@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.foreign import numbers, read_arrays
 from arena_newton.robot import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions.library import FORMAT, UNKNOWN, MotionLibrary
 from arena_newton.trackers.motions.load import (
@@ -248,20 +248,15 @@ def _quat_order(quat: np.ndarray, path: Path) -> str:
 
 
 def _npz(path: Path, options: ReadOptions) -> Reading:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            names = set(file.files)
-            wanted = ("fps", "joint_pos", "body_pos_w", "body_quat_w")
-            beyond = "body_pos_w" in names and "format" not in names
-            if beyond:
-                missing = [name for name in wanted if name not in names]
-                if missing:
-                    raise InputError(f"{path}: array {missing[0]} is missing")
-                arrays = {name: np.asarray(file[name], dtype=np.float64) for name in wanted}
-    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError, MemoryError) as error:
-        raise InputError(f"{path}: not a readable NPZ file ({type(error).__name__})") from error
-    if beyond:
-        return _beyond_mimic(path, arrays, options)
+    names = set(read_arrays(path, ()))
+    if "body_pos_w" in names and "format" not in names:
+        wanted = ("fps", "joint_pos", "body_pos_w", "body_quat_w")
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise InputError(f"{path}: array {missing[0]} is missing")
+        arrays = read_arrays(path, wanted)
+        checked = {name: numbers(arrays[name], f"{path}: array {name}", np.float64) for name in wanted}
+        return _beyond_mimic(path, checked, options)
     if "format" in names:
         library = MotionLibrary.load(path)
         seconds = float(library.seconds.sum())
