@@ -29,6 +29,7 @@ __all__ = [
     "SCENE_PIXELS",
     "SCENE_POINTS",
     "TABLE_BYTES",
+    "TEXT_BYTES",
     "TEXT_LINES",
     "TEXT_NUMBERS",
 ]
@@ -45,6 +46,8 @@ NESTING = 100
 """Deepest prim: USD and the importer call themselves once a level."""
 ARC_DEPTH = 100
 """Longest chain of references."""
+TEXT_BYTES = 64 * MIB
+"""Size of a `.usda` layer."""
 TEXT_LINES = 500_000
 """Lines of a `.usda` layer: a line can be a prim or an attribute, and USD keeps 400 bytes of one."""
 TEXT_NUMBERS = 4_000_000
