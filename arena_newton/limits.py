@@ -40,8 +40,8 @@ MIB = 2**20
 LAYERS = 256
 """Layers and images of a scene. The project's own consist of 10; each is opened twice."""
 PRIMS = 50_000
-"""Prims of a scene, counted through every reference before USD composes them: 30 files of 100 bytes that name each other
-twice make 2^30. The project's own scenes count 1,000; USD needs some 10 kB a prim, and Newton more."""
+"""Prims of a scene, counted through every reference before USD composes them: 30 small files that name each other twice
+make 2^30. The project's own scenes count 1,000; USD needs some 10 kB a prim, and Newton more."""
 NESTING = 100
 """Deepest prim: USD and the importer call themselves once a level."""
 ARC_DEPTH = 100
@@ -59,7 +59,7 @@ CRATE_MEMORY = 512 * MIB
 CRATE_SECONDS = 20.0
 """Time that a binary layer may take to be read [s]; 100 MiB take one."""
 MESH_POINTS = 500_000
-"""Points, and corners of faces, of one mesh: convex hull, normals and ray tree are made from them, 600 bytes a point."""
+"""Points, and corners of faces, of one mesh: hull, normals and ray tree take 600 bytes a point."""
 SCENE_POINTS = 1_000_000
 """Points of all meshes of a scene."""
 IMAGE_BYTES = 64 * MIB

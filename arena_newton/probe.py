@@ -31,7 +31,12 @@ def faults(kind: str, paths: Sequence[str], *, memory: int, seconds: float) -> l
     # One thread, since each file is opened by a fork.
     environment = os.environ | {"PXR_WORK_THREAD_LIMIT": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        child, input="\n".join(paths), capture_output=True, text=True, env=environment, timeout=60 + seconds * len(paths)
+        child,
+        input="\n".join(paths),
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=60 + seconds * len(paths),
     )
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     return answers + [CRASHED] * (len(paths) - len(answers))

@@ -11,12 +11,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, walk
+from arena_newton.usd_scenes.differences import differences
+from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults
+from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, search_context, walk
 
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["REQUIRED", "Problem", "Required", "check", "check_files", "layers", "task_of", "validate"]
+__all__ = [
+    "REQUIRED",
+    "Problem",
+    "Required",
+    "check",
+    "check_files",
+    "differences",
+    "layers",
+    "task_of",
+    "validate",
+]
 
 
 @dataclass(frozen=True)
@@ -143,7 +155,7 @@ def _validate(file: Path, task: str | None) -> list[Problem]:
         problems.append(
             Problem(str(file), "", f"cannot tell the task from the folders; pass --task ({', '.join(REQUIRED)})")
         )
-    stage = Usd.Stage.Open(str(found.files[0]))
+    stage = Usd.Stage.Open(str(found.files[0]), search_context())
     problems += [*_units(stage, file), *_composition(stage, file)]
     world = stage.GetPrimAtPath("/World")
     if not world:
@@ -171,7 +183,8 @@ def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem
                 for item in (*COMMON, *(REQUIRED[task] if task else ()))
                 if not (item.variants and name not in item.variants)
             ]
-            for prim, message in [*(fault for fault in faults if fault), *_masses(stage), *_selections(stage)]:
+            named = [*(fault for fault in faults if fault), *_masses(stage), *_selections(stage)]
+            for prim, message in [*named, *mesh_faults(stage), *shape_faults(stage)]:
                 # A fault of every variant is told once; a variant's own fault names the variant.
                 if (prim, message) not in seen:
                     yield Problem(str(file), prim, message + ("" if name == names[0] else f" (variant {name})"))

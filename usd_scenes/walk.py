@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,6 +49,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 """Folder in which `PACKAGE` is looked up: the checkout, or an installation's `site-packages`."""
 _CRATE = b"PXR-USDC"
 _FORMATS = ("PNG", "JPEG", "BMP", "TGA")
+_SHADER = ("inputs:", "outputs:")
 _SCHEME = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+:")
 _DRIVE = re.compile(r"^[A-Za-z]:")
 _PACKAGED = re.compile(r"^(.*\.usdz)\[([^\[\]]+)\]$", re.IGNORECASE)
@@ -417,6 +418,8 @@ def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
                 faults.append((where, "has relocates: expected plain prims"))
         elif isinstance(spec, Sdf.AttributeSpec):
             values = [spec.default, *(layer.QueryTimeSample(path, t) for t in layer.ListTimeSamplesForPath(path))]
+            if _names_file(spec):
+                faults.append((where, f"is a {spec.typeName} that names a file: expected an asset (@...@)"))
             if spec.HasSpline():
                 faults.append((where, "has a spline: expected a plain value"))
             for value in values:
@@ -430,6 +433,15 @@ def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
     if deep:
         raise _Unreadable(f"{_printable(deep[0].name)}: prims are nested deeper than {limits.NESTING}")
     return contents, list(dict.fromkeys(faults))
+
+
+def _names_file(spec: "Sdf.AttributeSpec") -> bool:
+    """Whether text stands where a shader looks for a texture; the importer would open it, URLs too, unchecked."""
+    if str(spec.typeName).removesuffix("[]") not in ("string", "token") or not spec.name.startswith(_SHADER):
+        return False
+    value = spec.default
+    texts = [value] if isinstance(value, str) else list(value or ())
+    return any("/" in text or "\\" in text or "." in text for text in texts) or any(map(_SCHEME.match, texts))
 
 
 def _not_finite(value: object) -> float | None:
