@@ -17,7 +17,7 @@ import numpy as np
 from arena_newton import limits
 from arena_newton.errors import InputError
 
-__all__ = ["numbers", "read_arrays", "read_bytes"]
+__all__ = ["check_size", "numbers", "read_arrays", "read_bytes"]
 _DAMAGE = (
     OSError,
     ValueError,
@@ -43,6 +43,25 @@ _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dt
 }
 
 
+def check_size(path: str | Path, most: int, *, where: str = "") -> None:
+    """Refuse what is no regular file, or larger than `most` bytes; nothing is opened.
+
+    Raises:
+        InputError: The file is absent, no regular file, unreadable or larger; it is named as `where`, or by its path.
+    """
+    where = where or str(path)
+    try:
+        about = os.stat(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    # A folder is refused by whoever opens it, in words of its own.
+    if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
+        raise InputError(f"{where}: is no regular file")
+    if stat.S_ISREG(about.st_mode) and about.st_size > most:
+        size, allowed = about.st_size / limits.MIB, most // limits.MIB
+        raise InputError(f"{where}: has {size:.0f} MiB, expected at most {allowed}")
+
+
 def read_bytes(path: str | Path, most: int, *, where: str = "") -> bytes:
     """The content of a regular file.
 
@@ -55,16 +74,11 @@ def read_bytes(path: str | Path, most: int, *, where: str = "") -> bytes:
         InputError: The file is absent, no regular file, unreadable or larger.
     """
     where = where or str(path)
+    check_size(path, most, where=where)
     try:
-        about = os.stat(path)
-        if stat.S_ISREG(about.st_mode) and about.st_size > most:
-            size, allowed = about.st_size / limits.MIB, most // limits.MIB
-            raise InputError(f"{where}: has {size:.0f} MiB, expected at most {allowed}")
-        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
-            raise InputError(f"{where}: is no regular file")
         return Path(path).read_bytes()
-    except (OSError, ValueError) as error:
-        raise InputError(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
 
 
 def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where: str = "") -> dict[str, np.ndarray]:
@@ -85,10 +99,9 @@ def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where:
     where = where or str(path)
     chosen = None if wanted is None else set(wanted)
     try:
-        about = os.stat(path)
-        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
-            raise InputError(f"{where}: is no regular file")
-        allowed = max(limits.ARRAY_BYTES, limits.ARRAY_GROWTH * about.st_size)
+        size = os.stat(path).st_size
+        check_size(path, max(size, 1), where=where)
+        allowed = max(limits.ARRAY_BYTES, limits.ARRAY_GROWTH * size)
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             if len(members) > limits.ARCHIVE_MEMBERS:
@@ -100,8 +113,7 @@ def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where:
                     arrays[name] = np.empty(0)
                     continue
                 with archive.open(member) as file:
-                    size = _size(file, member, f"{where}: not a readable NPZ file: array {name}")
-                total += size
+                    total += _size(file, member, f"{where}: not a readable NPZ file: array {name}")
                 if total > allowed:
                     raise InputError(
                         f"{where}: array {name} would make its arrays {total / limits.MIB:.0f} MiB, expected at most "

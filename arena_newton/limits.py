@@ -21,8 +21,10 @@ __all__ = [
     "NESTING",
     "NETWORK_BYTES",
     "NETWORK_LAYERS",
+    "NETWORK_MEMORY",
     "NETWORK_NODES",
     "NETWORK_NUMBERS",
+    "NETWORK_SECONDS",
     "PENETRATION",
     "PICKLE_BYTES",
     "PRIMS",
@@ -92,6 +94,10 @@ NETWORK_BYTES = 512 * MIB
 """Size of a weights file; the official trackers have 3 to 60 MB."""
 NETWORK_LAYERS = 64
 """Layers of a network of our own; they have 4."""
+NETWORK_MEMORY = 1024 * MIB
+"""Memory that a network may take in onnxruntime beyond the library, its weights twice included."""
+NETWORK_SECONDS = 20.0
+"""Time that it may take to load and to answer two rows [s]; the official ones take 0.2."""
 NETWORK_NODES = 10_000
 """Nodes of an ONNX graph; the official trackers have 200."""
 NETWORK_NUMBERS = 2**26

@@ -105,7 +105,9 @@ def _main() -> None:
     kind, memory, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
     work = (_crate, _network)[_KINDS.index(kind)]
     if kind == "crate":
-        import pxr.Sdf  # noqa: F401  (once, before the forks)
+        from pxr import Sdf
+
+        Sdf.Layer.CreateAnonymous(".usdc")  # loads the plugins once, before the forks
     else:
         import onnxruntime  # noqa: F401
     errors = os.dup(2)

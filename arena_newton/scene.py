@@ -186,6 +186,17 @@ class Scene:
             raise InputError(f"{self.path}: prim {prim_path} holds no collision geometry")
         return found
 
+    def lowest(self, prim_path: str) -> float:
+        """Height of the lowest point of an upright body's geoms in the body's frame [m], by their bounding boxes."""
+        m = self.mj_model
+        lowest = np.inf
+        for geom in self.geom_ids(prim_path):
+            w, x, y, z = m.geom_quat[geom]
+            upward = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+            centre, half = m.geom_aabb[geom, :3], m.geom_aabb[geom, 3:]
+            lowest = min(lowest, m.geom_pos[geom, 2] + upward @ centre - np.abs(upward) @ half)
+        return float(lowest)
+
     def frame(self, name_or_path: str) -> Frame:
         """A frame prim by path, or by its name under the robot, as a pose in the body that carries it."""
         return Frame(*self._local_pose(self._find(name_or_path)))
