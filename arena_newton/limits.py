@@ -34,6 +34,7 @@ __all__ = [
     "TEXT_BYTES",
     "TEXT_LINES",
     "TEXT_NUMBERS",
+    "VARIANTS",
 ]
 
 MIB = 2**20
@@ -64,6 +65,8 @@ MESH_POINTS = 500_000
 """Points, and corners of faces, of one mesh: hull, normals and ray tree take 600 bytes a point."""
 SCENE_POINTS = 1_000_000
 """Points of all meshes of a scene."""
+VARIANTS = 32
+"""Variants of the set `semantics`: each is composed and judged. The project's own scenes have 2 or 3."""
 IMAGE_BYTES = 64 * MIB
 """Size of an image file."""
 IMAGE_PIXELS = 4096 * 4096

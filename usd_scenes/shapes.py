@@ -1,5 +1,6 @@
 """Faults of a composed scene's geometry: what would crash or exhaust the importer, and what is no geometry at all."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from arena_newton.usd_scenes.walk import check_files, reason, search_context
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["check_buildable", "mesh_faults", "open_stage", "shape_faults"]
+__all__ = ["check_buildable", "mesh_faults", "open_stage", "shape_faults", "type_faults"]
 
 _KINDS = ("Mesh", "Cube", "Sphere", "Capsule", "Cylinder", "Cone", "Plane")
 """Geometry that a scene may consist of; the importer makes other things of other kinds."""
@@ -62,8 +63,38 @@ def check_buildable(stage: "Usd.Stage", path: str | Path) -> None:
     Raises:
         InputError: One line that names the file, the prim and the first fault.
     """
-    for prim, message in mesh_faults(stage):
+    for prim, message in itertools.chain(type_faults(stage), mesh_faults(stage)):
         raise InputError(f"{path}: {prim}: {message}")
+
+
+def type_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+    """Attributes whose value is not of their schema's type, as (prim path, message); USD hands them on as they are."""
+    from pxr import Usd
+
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
+        schema = prim.GetPrimDefinition()
+        for attribute in prim.GetAuthoredAttributes():
+            name, value = attribute.GetName(), attribute.Get()
+            defined = schema.GetAttributeDefinition(name)
+            if value is None or not (defined or name.startswith("xformOp:")):
+                continue
+            given = type(value).__name__
+            if defined:
+                expected = defined.GetTypeName()
+                fits = _family(given) == _family(type(expected.defaultValue).__name__)
+            else:
+                expected = "a vector, a quaternion, a matrix or a number"
+                fits = _family(given) in ("number", "Vec3", "Quat", "Matrix4")
+            if not fits:
+                yield str(prim.GetPath()), f"{name} holds a value of type {given}: expected {expected}"
+
+
+def _family(name: str) -> str:
+    """Types that stand for each other: single and double precision, whole and other numbers."""
+    if name in ("int", "float", "bool"):
+        return "number"
+    plain = name.removesuffix("Array")
+    return name.replace(plain, plain[:-1], 1) if plain.startswith(("Vec", "Quat", "Matrix")) else name
 
 
 def mesh_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:

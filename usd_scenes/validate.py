@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.differences import differences
-from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults
+from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
 from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, search_context, walk
 
 if TYPE_CHECKING:
@@ -175,20 +176,32 @@ def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         choice = stage.GetPrimAtPath("/World").GetVariantSets().GetVariantSet("semantics")
         names = sorted(choice.GetVariantNames(), key=lambda name: name != "base") or ["base"]
+        if len(names) > limits.VARIANTS:
+            yield Problem(str(file), "/World", f"has {len(names)} variants of semantics: expected {limits.VARIANTS}")
+            return
         for name in names:
             if len(names) > 1:
                 choice.SetVariantSelection(name)
-            faults = [
-                _fault(stage, item)
-                for item in (*COMMON, *(REQUIRED[task] if task else ()))
-                if not (item.variants and name not in item.variants)
-            ]
-            named = [*(fault for fault in faults if fault), *_masses(stage), *_selections(stage)]
-            for prim, message in [*named, *mesh_faults(stage), *shape_faults(stage)]:
+            for prim, message in _faults(stage, task, name):
                 # A fault of every variant is told once; a variant's own fault names the variant.
                 if (prim, message) not in seen:
                     yield Problem(str(file), prim, message + ("" if name == names[0] else f" (variant {name})"))
                 seen.add((prim, message))
+
+
+def _faults(stage: "Usd.Stage", task: str | None, variant: str) -> list[tuple[str, str]]:
+    """Faults of the prims as they are selected now, as (prim path, message)."""
+    wrong = list(type_faults(stage))
+    if wrong:
+        # The other tests read attributes as what they should be.
+        return wrong
+    required = (_fault(stage, item) for item in (*COMMON, *(REQUIRED[task] if task else ())) if _wanted(item, variant))
+    missing = [fault for fault in required if fault]
+    return [*missing, *_masses(stage), *_selections(stage), *mesh_faults(stage), *shape_faults(stage)]
+
+
+def _wanted(item: Required, variant: str) -> bool:
+    return not item.variants or variant in item.variants
 
 
 def _selections(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:

@@ -11,7 +11,7 @@ import posixpath
 import re
 import stat
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +34,7 @@ __all__ = [
     "Walk",
     "check_files",
     "layers",
+    "probe_layers",
     "reason",
     "search_context",
     "walk",
@@ -247,14 +248,27 @@ _CRATE_FAULTS: dict[tuple[str, int, int, int], str | None] = {}
 """What was found in binary layers, by name, file, size and time: a scene is walked more than once."""
 
 
-def _crate_fault(place: Place) -> str | None:
+def _known_as(place: Place) -> tuple[str, int, int, int]:
     about = os.stat(place.file)
-    key = (str(place), about.st_ino, about.st_size, about.st_mtime_ns)
+    return str(place), about.st_ino, about.st_size, about.st_mtime_ns
+
+
+def _crate_fault(place: Place) -> str | None:
+    key = _known_as(place)
     if key not in _CRATE_FAULTS:
-        _CRATE_FAULTS[key] = probe.faults(
-            "crate", [str(place)], memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS
-        )[0]
+        _probe([place])
     return _CRATE_FAULTS[key]
+
+
+def _probe(places: list[Place]) -> None:
+    names = [str(place) for place in places]
+    faults = probe.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
+    _CRATE_FAULTS.update({_known_as(place): fault for place, fault in zip(places, faults, strict=True)})
+
+
+def probe_layers(paths: Sequence[Path]) -> None:
+    """Open many binary layers in one process of their own at once; a walk through each then asks no more."""
+    _probe([Place(Path(os.path.abspath(path))) for path in paths])
 
 
 def _read(place: Place, most: int) -> bytes | bytearray:
