@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+import arena_newton
 from arena_newton import limits, probe
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
@@ -46,7 +47,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """What an asset attribute (a texture) may name; Newton reads textures with Pillow."""
 PACKAGE = "arena_newton/usd_scenes/"
 """What an asset path begins with that names a scene of this package, wherever the naming file lies."""
-_ROOT = Path(__file__).resolve().parent.parent
+_ROOT = Path(arena_newton.__file__).resolve().parent.parent
 """Folder in which `PACKAGE` is looked up: the checkout, or an installation's `site-packages`."""
 _CRATE = b"PXR-USDC"
 _FORMATS = ("PNG", "JPEG", "BMP", "TGA")
@@ -305,6 +306,8 @@ def _read_image(place: Place, pixels: int) -> int:
                 return width * height
     except _Unreadable:
         raise
+    except Image.DecompressionBombError:
+        raise _Unreadable(f"has too many pixels, expected at most {limits.IMAGE_PIXELS} for an image") from None
     except Exception:  # a damaged image raises nearly anything
         raise _Unreadable(f"not a readable image: expected one of {', '.join(IMAGES)}") from None
 
@@ -413,7 +416,7 @@ def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
         if isinstance(spec, Sdf.VariantSpec):
             spec = spec.primSpec
         where = str(path.StripAllVariantSelections())
-        if isinstance(spec, Sdf.PrimSpec):
+        if isinstance(spec, Sdf.PrimSpec) and not path.IsAbsoluteRootPath():
             contents.prims.append(where)
             if where.count("/") > limits.NESTING:
                 deep[:] = [path]
