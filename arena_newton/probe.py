@@ -95,9 +95,9 @@ def _limited(work: Callable[[str], None], path: str, memory: int, seconds: float
     os.close(writing)
     with os.fdopen(reading, "rb") as pipe:
         text = pipe.read().decode("utf-8", "backslashreplace")
-    status = os.waitpid(child, 0)[1]
-    if os.WIFSIGNALED(status):
-        return TOO_LONG if os.WTERMSIG(status) == signal.SIGALRM else CRASHED
+    ended = os.waitpid(child, 0)[1]
+    if os.WIFSIGNALED(ended):
+        return TOO_LONG if os.WTERMSIG(ended) == signal.SIGALRM else CRASHED
     return text or None
 
 
