@@ -111,6 +111,7 @@ class ArenaEnv:
         self.physics = make_physics(self.scene, self.rate, self.engine, threads)
         self.device = self.physics.device
         self.torch_device = wp.device_to_torch(self.device)
+        self._raised = {o.prim: o.raised(self.scene) for o in self.spec.objects}
         self.judge = self.spec.judge(self.scene, self.rules)
         self.judge.bind(self.physics)
 
@@ -260,6 +261,7 @@ class ArenaEnv:
                 else:
                     address = self.scene.joint_qpos(prim)
                     qpos[k, address : address + 3] = pose.pos
+                    qpos[k, address + 2] += self._raised[prim]
                     qpos[k, address + 3 : address + 7] = pose.quat
             if self.lights is not None:
                 self.lights.set(int(w), draws.light)

@@ -5,8 +5,10 @@ Handles (bodies, joints, geoms, markers, frames) are found by prim path; nothing
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -228,6 +230,17 @@ class Scene:
             raise InputError(f"{self.path}: prim {prim_path} holds no collision geometry")
         return found
 
+    def lowest(self, prim_path: str) -> float:
+        """Height of the lowest point of an upright body's geoms in the body's frame [m], by their bounding boxes."""
+        m = self.mj_model
+        lowest = np.inf
+        for geom in self.geom_ids(prim_path):
+            w, x, y, z = m.geom_quat[geom]
+            upward = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+            centre, half = m.geom_aabb[geom, :3], m.geom_aabb[geom, 3:]
+            lowest = min(lowest, m.geom_pos[geom, 2] + upward @ centre - np.abs(upward) @ half)
+        return float(lowest)
+
     def frame(self, name_or_path: str) -> Frame:
         """A frame prim by path, or by its name under the robot, as a pose in the body that carries it."""
         return Frame(*self._local_pose(self._find(name_or_path)))
@@ -314,13 +327,27 @@ class Scene:
         )
 
 
-def _open_stage(path: Path, variant: str | None, hands: str) -> Any:
-    from pxr import Tf, Usd
+def _is_own(path: Path) -> bool:
+    """Whether a scene is the project's own: what others made is looked at before it is built."""
+    return path.resolve().is_relative_to(SCENES.resolve())
 
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put what the importer says about somebody's scene into one line that names it."""
     try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise InputError(f"{path}: not a readable USD layer ({str(error).splitlines()[0]})") from None
+        yield
+    except Exception as error:  # Newton and MuJoCo raise nearly anything
+        if _is_own(path) or isinstance(error, InputError):
+            raise
+        reason = " ".join(str(error).split())[:200] or "no reason given"
+        raise InputError(f"{path}: cannot be built ({type(error).__name__}: {reason})") from error
+
+
+def _open_stage(path: Path, variant: str | None, hands: str) -> Any:
+    from arena_newton.usd_scenes.shapes import open_stage
+
+    stage = open_stage(path, checked=not _is_own(path))
     stage.SetEditTarget(stage.GetSessionLayer())
     robot_prim = stage.GetPrimAtPath(ROBOT)
     if not robot_prim:
@@ -442,13 +469,17 @@ def load_scene(
     import warp as wp
 
     import arena_newton.kernels  # noqa: F401  (quiets Warp's module log)
+    from arena_newton.usd_scenes.shapes import check_buildable
 
     path = scene_path(variant_file or task)
     stage = _open_stage(path, variant, hands)
     template = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(template)
     template.rigid_gap = 0.0
-    template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False)
+    if not _is_own(path):
+        check_buildable(stage, path)
+    with _naming(path):
+        template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False)
     _set_drives(template, drive)
     _free_fixtures(template)
     latch = _add_latch(template, stage)
@@ -460,7 +491,7 @@ def load_scene(
         builder.replicate(template, count)
         return builder.finalize(device=device)
 
-    with wp.ScopedDevice(device), warnings.catch_warnings():
+    with _naming(path), wp.ScopedDevice(device), warnings.catch_warnings():
         # Fixtures hang on the world by one fixed joint each, on purpose.
         warnings.filterwarnings("ignore", message=".*outside articulations as standalone world roots.*")
         model = finalize(worlds)

@@ -11,6 +11,7 @@ import numpy as np
 
 from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.errors import InputError
+from arena_newton.foreign import read_arrays
 from arena_newton.policies.base import Chunk, Observation, Policy, world_mask
 from arena_newton.trackers.motions import load_actions, load_clip
 from arena_newton.trackers.motions.playback import clip_actions, startup_actions
@@ -124,10 +125,10 @@ class ReplayEpisodes(Policy):
             raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; run --actions writes them")
         for file in files:
             actions = load_actions(file)
+            arrays = read_arrays(file, ("task", "mode", "episode_seed"), where=f"--policy replay:{file}")
             try:
-                with np.load(file, allow_pickle=False) as arrays:
-                    episode = str(arrays["task"]), str(arrays["mode"]), int(arrays["episode_seed"])
-            except (KeyError, TypeError, ValueError):
+                episode = str(arrays["task"]), str(arrays["mode"]), int(arrays["episode_seed"])
+            except (KeyError, TypeError, ValueError, OverflowError):
                 where = f"--policy replay:{file}"
                 raise InputError(f"{where}: episode_seed, task and mode are missing or unfit") from None
             if episode in self._episodes:

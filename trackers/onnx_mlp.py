@@ -17,7 +17,9 @@ from typing import Any
 import torch
 from torch.nn import functional
 
+from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.foreign import read_bytes
 
 __all__ = ["OnnxNetwork", "load"]
 
@@ -124,10 +126,12 @@ class OnnxNetwork(torch.nn.Module):
 class _Graph:
     """One ONNX graph with its probe values, and the list of modules made from it."""
 
-    def __init__(self, model: Any):
+    def __init__(self, model: Any, in_width: int):
         import onnx
 
         graph = model.graph
+        if len(graph.node) > limits.NETWORK_NODES:
+            raise _Unfit(f"it has {len(graph.node)} nodes, expected at most {limits.NETWORK_NODES}")
         constants = {i.name: onnx.numpy_helper.to_array(i) for i in graph.initializer}
         self.constants = {name: torch.from_numpy(value.copy()) for name, value in constants.items()}
         inputs = [i for i in graph.input if i.name not in self.constants]
@@ -136,7 +140,9 @@ class _Graph:
         dims = inputs[0].type.tensor_type.shape.dim
         if len(dims) != 2 or dims[1].dim_value < 1:
             raise _Unfit("its input is not of shape [rows, width]")
-        self.input, self.output, self.in_width = inputs[0].name, graph.output[0].name, dims[1].dim_value
+        if dims[1].dim_value != in_width:
+            raise _Unfit(f"it takes {dims[1].dim_value} numbers, expected {in_width}")
+        self.input, self.output, self.in_width = inputs[0].name, graph.output[0].name, in_width
         self.nodes = [(n.op_type, list(n.input), list(n.output), _attributes(n)) for n in graph.node]
         self.producer = {out: node for node in self.nodes for out in node[2]}
         self.probe: dict[str, torch.Tensor] = {}
@@ -150,8 +156,12 @@ class _Graph:
         values.update(self.constants)
         values[self.input] = x
         dynamic.add(self.input)
+        made = 0
         for op, inputs, outputs, attributes in self.nodes:
             arguments = [values[name] if name else None for name in inputs]
+            made += _size(op, arguments, attributes)
+            if made > limits.NETWORK_NUMBERS:
+                raise _Unfit(f"operator {op} makes more than {limits.NETWORK_NUMBERS} numbers of {len(x)} rows")
             values[outputs[0]] = _evaluate(op, arguments, attributes)
             if op != "Shape" and dynamic.intersection(inputs):
                 dynamic.add(outputs[0])
@@ -256,7 +266,7 @@ class _Graph:
     def _convolution(self, inputs, static, attributes, shape) -> torch.nn.Module:
         in_shape = tuple(self.probe[inputs[0]].shape)[1:]
         size = math.prod(in_shape)
-        if size * math.prod(shape[1:]) > _CONV_MATRIX_LIMIT:
+        if size * max(size, math.prod(shape[1:])) > _CONV_MATRIX_LIMIT:
             return _Call(lambda *x: _evaluate("Conv", list(x), attributes), static)
         basis = torch.eye(size).reshape(size, *in_shape)
         matrix = _evaluate("Conv", [basis, static[1], None], attributes).flatten(1)
@@ -302,6 +312,27 @@ def _slices(shape: torch.Size, static: dict[int, torch.Tensor]) -> tuple[slice, 
             raise _Unfit("a Slice runs backwards")
         slices[axis] = slice(start, min(end, 2**62), step)
     return tuple(slices)
+
+
+def _size(op: str, x: list[Any], attributes: dict[str, Any]) -> int:
+    """Numbers that an operator makes, known before it makes them; those not named here make no more than they get."""
+    given = [value for value in x if value is not None]
+    if op == "MatMul" or op == "Gemm":
+        a, b = x[0].shape, x[1].shape
+        if len(a) < 2 or len(b) < 2:
+            return x[0].numel() + x[1].numel()
+        rows = a[1] if op == "Gemm" and attributes.get("transA", 0) else a[-2]
+        columns = b[0] if op == "Gemm" and attributes.get("transB", 0) else b[-1]
+        return 2 * math.prod(torch.broadcast_shapes(a[:-2], b[:-2])) * rows * columns
+    if op in _BINARY:
+        return math.prod(torch.broadcast_shapes(x[0].shape, x[1].shape))
+    if op == "Gather":
+        return x[0].numel() // max(x[0].shape[attributes.get("axis", 0)], 1) * x[1].numel()
+    if op == "Conv":
+        # Padded input, and every output: as many places as the padded input at most, for each filter.
+        padded = x[0].numel() // max(x[0].shape[-1], 1) * (x[0].shape[-1] + sum(map(abs, attributes.get("pads", [0]))))
+        return padded + padded // max(x[0].shape[1], 1) * x[1].shape[0]
+    return sum(value.numel() for value in given)
 
 
 def _evaluate(op: str, x: list[Any], attributes: dict[str, Any]) -> torch.Tensor:
@@ -386,10 +417,7 @@ def load(path: str | Path, *, in_width: int, out_width: int, flag: str = "--chec
     import onnx
 
     where = f"{flag} {path}"
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+    data = read_bytes(path, limits.NETWORK_BYTES, where=where)
     try:
         model = onnx.load_model_from_string(data)
         if not model.graph.output:
@@ -399,7 +427,7 @@ def load(path: str | Path, *, in_width: int, out_width: int, flag: str = "--chec
         width = [d.dim_value for i in model.graph.input for d in i.type.tensor_type.shape.dim][-1:]
         if width and width[0] not in (0, in_width):
             raise InputError(f"{where}: the network takes {width[0]} numbers, expected {in_width}")
-        graph = _Graph(model)
+        graph = _Graph(model, in_width)
         network = OnnxNetwork(graph).eval()
         x = _probe(_CHECK_ROWS, graph.in_width)
         got, expected = network(x), graph.evaluate(x, {})

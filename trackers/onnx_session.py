@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from arena_newton import limits, probe
 from arena_newton.errors import InputError
+from arena_newton.foreign import check_size
 from arena_newton.trackers import onnx_mlp
 
 __all__ = ["OnnxSession", "load_any"]
@@ -42,6 +44,13 @@ class OnnxSession(torch.nn.Module):
         import onnxruntime
 
         where = f"{flag} {path}"
+        check_size(path, limits.NETWORK_BYTES, where=where)
+        # Its compiled reader takes a file on trust, and some operators make any number of numbers of none.
+        (fault,) = probe.faults(
+            "network", [f"{path}\t{in_width}"], memory=limits.NETWORK_MEMORY, seconds=limits.NETWORK_SECONDS
+        )
+        if fault:
+            raise InputError(f"{where}: not a usable ONNX file ({' '.join(fault.split())[:160]})")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4

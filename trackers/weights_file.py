@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,9 @@ from typing import Any
 
 import torch
 
+from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.foreign import read_bytes
 from arena_newton.robot import TICK, DriveGains, PhysicsRate
 from arena_newton.trackers import base, networks
 from arena_newton.trackers.front_end import JOINTS, ActionForm
@@ -131,15 +134,12 @@ def load(path: str | Path, interface: str | None = None, *, flag: str = "--check
     from safetensors.torch import load as decode
 
     where = f"{flag} {path}"
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+    data = read_bytes(path, limits.NETWORK_BYTES, where=where)
     try:
         tensors = decode(data)
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
         text = header.get("__metadata__", {}).get(METADATA_KEY)
-    except (SafetensorError, ValueError, KeyError, AttributeError) as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise InputError(f"{where}: not a readable safetensors file ({_line(error)})") from error
     if text is None:
         raise InputError(
@@ -154,7 +154,7 @@ def load(path: str | Path, interface: str | None = None, *, flag: str = "--check
             raise InputError(
                 f"{where}: weights of interface {meta['interface']!r}: use them with --tracker {meta['interface']}"
             )
-        network = networks.make(meta["interface"], meta["hidden"])
+        network = _network(meta["interface"], meta["hidden"], tensors, where)
         weights = Weights(
             interface=meta["interface"],
             network=network,
@@ -167,9 +167,10 @@ def load(path: str | Path, interface: str | None = None, *, flag: str = "--check
         )
     except InputError as error:
         raise error if str(error).startswith(flag) else InputError(f"{where}: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         raise InputError(f"{where}: its metadata is incomplete or wrong ({_line(error)})") from error
-    _fill(network, tensors, where)
+    network.load_state_dict(dict(tensors), strict=False)
+    network.eval()
     return weights
 
 
@@ -178,8 +179,20 @@ def _tensors(network: torch.nn.Module) -> dict[str, torch.Tensor]:
     return {name: t for name, t in network.state_dict().items() if not name.endswith(".count")}
 
 
-def _fill(network: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: str) -> None:
-    expected = _tensors(network)
+def _network(
+    interface: str, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor], where: str
+) -> networks.Twist2Net | networks.SonicNet:
+    """A network of the widths that a file states, once its tensors are known to be of these widths."""
+    count = sum(len(value) for value in config.values() if isinstance(value, list))
+    if count > limits.NETWORK_LAYERS:
+        raise InputError(f"{where}: states {count} layers, expected at most {limits.NETWORK_LAYERS}")
+    with torch.device("meta"):
+        sketch = networks.make(interface, config)
+    _check_tensors(_tensors(sketch), tensors, where)
+    return networks.make(interface, config)
+
+
+def _check_tensors(expected: Mapping[str, torch.Tensor], tensors: Mapping[str, torch.Tensor], where: str) -> None:
     missing, unknown = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or unknown:
         names = f"misses {missing[0]}" if missing else f"holds an unknown {unknown[0]}"
@@ -190,36 +203,43 @@ def _fill(network: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: 
             raise InputError(f"{where}: {name} is {tensor.dtype} of shape {shape}, expected float32 of shape {wanted}")
         if not torch.isfinite(tensor).all():
             raise InputError(f"{where}: {name} holds numbers that are not finite")
-    network.load_state_dict(dict(tensors), strict=False)
-    network.eval()
 
 
 def _action_form(value: Mapping[str, Any]) -> ActionForm:
-    return ActionForm(str(value["kind"]), tuple(float(v) for v in value["scale"]), float(value["clip"]))
+    scale, clip = tuple(float(v) for v in value["scale"]), float(value["clip"])
+    if not all(map(math.isfinite, (*scale, clip))):
+        raise ValueError("action_form holds numbers that are not finite")
+    return ActionForm(str(value["kind"]), scale, clip)
 
 
 def _drive(value: Mapping[str, Any]) -> DriveGains:
     def vector(name: str) -> tuple[float, ...]:
         numbers = tuple(float(v) for v in value[name])
-        if len(numbers) != JOINTS:
-            raise ValueError(f"drive {name} needs {JOINTS} numbers")
+        if len(numbers) != JOINTS or not all(math.isfinite(v) and v >= 0.0 for v in numbers):
+            raise ValueError(f"drive {name} needs {JOINTS} finite numbers of at least 0")
         return numbers
+
+    def scalar(name: str) -> float:
+        number = float(value[name])
+        if not (math.isfinite(number) and number >= 0.0):
+            raise ValueError(f"drive {name} is {number}, expected a finite number of at least 0")
+        return number
 
     return DriveGains(
         name=str(value["name"]),
         kp=vector("kp"),
         kd=vector("kd"),
         effort=vector("effort"),
-        finger_kp=float(value["finger_kp"]),
-        finger_kd=float(value["finger_kd"]),
-        finger_effort=float(value["finger_effort"]),
-        finger_armature=float(value["finger_armature"]),
+        finger_kp=scalar("finger_kp"),
+        finger_kd=scalar("finger_kd"),
+        finger_effort=scalar("finger_effort"),
+        finger_armature=scalar("finger_armature"),
     )
 
 
 def _physics(value: Mapping[str, Any]) -> PhysicsRate:
     rate = PhysicsRate(float(value["dt"]), int(value["substeps"]))
-    if rate.dt <= 0.0 or abs(rate.dt * rate.substeps - TICK) > 1e-9:
+    if not rate.dt > 0.0 or rate.substeps < 1 or not abs(rate.dt * rate.substeps - TICK) <= 1e-9:
         raise ValueError(f"physics {rate.dt} s x {rate.substeps} is not a tick of {TICK} s")
     return rate
 

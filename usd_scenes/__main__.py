@@ -1,11 +1,15 @@
-"""`python -m arena_newton.usd_scenes {build,validate,list,preview}`."""
+"""`python -m arena_newton.usd_scenes {new,build,validate,list,preview}`."""
 
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.usd_scenes.walk import Problem
 
 MODES = ("base", "semantic", "visual", "all")
 
@@ -16,6 +20,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True)
 
+    new = commands.add_parser("new", help="write the skeleton of a variant of a task's scene")
+    new.add_argument("task", metavar="TASK", help="the task")
+    new.add_argument("file", type=Path, metavar="FILE", help="the .usda file to write, anywhere")
+
     build = commands.add_parser("build", help="write textures, robot and scenes from their authors")
     build.add_argument("names", nargs="*", metavar="NAME", help="textures, g1 or a task; all by default")
     build.add_argument("--out", type=Path, default=None, help="folder to build into (default: the project's own)")
@@ -23,6 +31,12 @@ def _parser() -> argparse.ArgumentParser:
     validate = commands.add_parser("validate", help="name everything wrong with scene or variant files")
     validate.add_argument("files", nargs="*", metavar="FILE", help="USD layers or task names; all scenes by default")
     validate.add_argument("--task", default=None, help="judge the files as this task's (default: from their folders)")
+    validate.add_argument(
+        "--spawn",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="reset an episode of each mode and name what starts inside something else (default: for files of yours)",
+    )
 
     commands.add_parser("list", help="tasks, their scene files and variants")
 
@@ -42,21 +56,44 @@ def _build(args: argparse.Namespace) -> int:
     return 0
 
 
+def _new(args: argparse.Namespace) -> int:
+    from arena_newton.usd_scenes.skeleton import write
+
+    print(write(args.task, args.file))
+    return 0
+
+
 def _validate(args: argparse.Namespace) -> int:
     from arena_newton.usd_scenes.build import FOLDER
-    from arena_newton.usd_scenes.validate import REQUIRED, validate
+    from arena_newton.usd_scenes.validate import REQUIRED, differences, task_of, validate
 
     files = args.files or [name for name in REQUIRED if (FOLDER / name / "scene.usda").is_file()]
     wrong = 0
     for name in files:
         path = FOLDER / name / "scene.usda" if name in REQUIRED else Path(name)
-        problems = validate(path, args.task)
+        problems, notes = validate(path, args.task), []
+        task = args.task or (None if problems else task_of(path))
+        own = path.resolve().is_relative_to(FOLDER.resolve())
+        if not problems and task is not None:
+            if not own:
+                notes = [f"{path}: changed: {sentence}" for sentence in differences(path, task)]
+            if args.spawn or (args.spawn is None and not own):
+                problems, known = _penetrations(path, task)
+                notes += [f"{problem} (in the task's own scene too)" for problem in known]
         wrong += len(problems)
-        for problem in problems:
-            print(problem)
+        for line in (*problems, *notes):
+            print(line)
         if not problems:
             print(f"{path}: ok")
     return 2 if wrong else 0
+
+
+def _penetrations(path: Path, task: str) -> tuple[list["Problem"], list["Problem"]]:
+    from arena_newton.quiet import quiet_warp
+    from arena_newton.usd_scenes.spawn import penetrations
+
+    quiet_warp()
+    return penetrations(path, task)
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -87,7 +124,7 @@ def _preview(args: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; 0 when all is well, 2 for bad input."""
     args = _parser().parse_args(argv)
-    commands = {"build": _build, "validate": _validate, "list": _list, "preview": _preview}
+    commands = {"new": _new, "build": _build, "validate": _validate, "list": _list, "preview": _preview}
     try:
         if args.command == "preview":
             from arena_newton.quiet import quiet_warp

@@ -103,15 +103,10 @@ def _variant(target: str, mode: str) -> str:
 
 def _selected(target: str) -> str | None:
     """The variant that a scene selects by itself, None if it has none."""
-    from pxr import Tf, Usd
-
     from arena_newton.scene import scene_path
+    from arena_newton.usd_scenes.shapes import open_stage
 
-    path = scene_path(target)
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise InputError(f"{path}: not a readable USD layer ({str(error).splitlines()[0]})") from None
+    stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
     return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None
 

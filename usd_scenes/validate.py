@@ -10,13 +10,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, walk
+from arena_newton.usd_scenes.differences import differences
+from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
+from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, search_context, walk
 
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["REQUIRED", "Problem", "Required", "check", "check_files", "layers", "task_of", "validate"]
+__all__ = [
+    "REQUIRED",
+    "Problem",
+    "Required",
+    "check",
+    "check_files",
+    "differences",
+    "layers",
+    "task_of",
+    "validate",
+]
 
 
 @dataclass(frozen=True)
@@ -143,7 +156,7 @@ def _validate(file: Path, task: str | None) -> list[Problem]:
         problems.append(
             Problem(str(file), "", f"cannot tell the task from the folders; pass --task ({', '.join(REQUIRED)})")
         )
-    stage = Usd.Stage.Open(str(found.files[0]))
+    stage = Usd.Stage.Open(str(found.files[0]), search_context())
     problems += [*_units(stage, file), *_composition(stage, file)]
     world = stage.GetPrimAtPath("/World")
     if not world:
@@ -163,19 +176,32 @@ def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         choice = stage.GetPrimAtPath("/World").GetVariantSets().GetVariantSet("semantics")
         names = sorted(choice.GetVariantNames(), key=lambda name: name != "base") or ["base"]
+        if len(names) > limits.VARIANTS:
+            yield Problem(str(file), "/World", f"has {len(names)} variants of semantics: expected {limits.VARIANTS}")
+            return
         for name in names:
             if len(names) > 1:
                 choice.SetVariantSelection(name)
-            faults = [
-                _fault(stage, item)
-                for item in (*COMMON, *(REQUIRED[task] if task else ()))
-                if not (item.variants and name not in item.variants)
-            ]
-            for prim, message in [*(fault for fault in faults if fault), *_masses(stage), *_selections(stage)]:
+            for prim, message in _faults(stage, task, name):
                 # A fault of every variant is told once; a variant's own fault names the variant.
                 if (prim, message) not in seen:
                     yield Problem(str(file), prim, message + ("" if name == names[0] else f" (variant {name})"))
                 seen.add((prim, message))
+
+
+def _faults(stage: "Usd.Stage", task: str | None, variant: str) -> list[tuple[str, str]]:
+    """Faults of the prims as they are selected now, as (prim path, message)."""
+    wrong = list(type_faults(stage))
+    if wrong:
+        # The other tests read attributes as what they should be.
+        return wrong
+    required = (_fault(stage, item) for item in (*COMMON, *(REQUIRED[task] if task else ())) if _wanted(item, variant))
+    missing = [fault for fault in required if fault]
+    return [*missing, *_masses(stage), *_selections(stage), *mesh_faults(stage), *shape_faults(stage)]
+
+
+def _wanted(item: Required, variant: str) -> bool:
+    return not item.variants or variant in item.variants
 
 
 def _selections(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:

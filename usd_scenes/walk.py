@@ -1,7 +1,8 @@
 """Follow everything that a USD layer names, file by file, before anything is composed.
 
 USD opens what a layer names while it composes, a named pipe included, and composes on when that fails. The walk looks
-at every path first: only regular files of the right kind are opened.
+at every path first: only regular files of the right kind are opened, none larger than `limits` says, and the prims that
+references would make are counted.
 """
 
 import io
@@ -9,25 +10,48 @@ import os
 import posixpath
 import re
 import stat
-import zipfile
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+import arena_newton
+from arena_newton import limits, probe
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
 if TYPE_CHECKING:
-    from pxr import Sdf
+    from pxr import Ar, Sdf
 
-__all__ = ["IMAGES", "LAYERS", "Place", "Problem", "Walk", "check_files", "layers", "reason", "walk"]
+__all__ = [
+    "IMAGES",
+    "LAYERS",
+    "PACKAGE",
+    "Place",
+    "Problem",
+    "Walk",
+    "check_files",
+    "layers",
+    "probe_layers",
+    "reason",
+    "search_context",
+    "walk",
+]
 
 LAYERS = (".usda", ".usd", ".usdc", ".usdz")
 """What a sublayer, reference or payload may be."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """What an asset attribute (a texture) may name; Newton reads textures with Pillow."""
+PACKAGE = "arena_newton/usd_scenes/"
+"""What an asset path begins with that names a scene of this package, wherever the naming file lies."""
+_ROOT = Path(arena_newton.__file__).resolve().parent.parent
+"""Folder in which `PACKAGE` is looked up: the checkout, or an installation's `site-packages`."""
+_CRATE = b"PXR-USDC"
+_FORMATS = ("PNG", "JPEG", "BMP", "TGA")
+_SHADER = ("inputs:", "outputs:")
 _SCHEME = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+:")
 _DRIVE = re.compile(r"^[A-Za-z]:")
 _PACKAGED = re.compile(r"^(.*\.usdz)\[([^\[\]]+)\]$", re.IGNORECASE)
@@ -35,8 +59,6 @@ _ERROR_AT = re.compile(r"Error in '.*?' at line \d+ in file \S+ : '(.*?)'?\s*$",
 _KINDS = ((stat.S_ISDIR, "a directory"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"))
 _RULE = re.compile(r"parse error matching pxr.* at (?=')", re.DOTALL)
 """The parser names a template of its grammar where it has no better words."""
-_Named = tuple[str, str, tuple[str, ...]]
-"""Where an asset path stands, the path, and the endings it may have."""
 
 
 class _Unreadable(Exception):
@@ -82,6 +104,8 @@ class Walk:
     problems: list[Problem] = field(default_factory=list)
     fatal: bool = False
     """A file cannot be read or a number is not finite: the stage must not be composed."""
+    pixels: int = 0
+    """Pixels of all images."""
 
 
 def layers(path: str | Path) -> list[Path]:
@@ -122,77 +146,195 @@ def walk(path: Path) -> Walk:
         found.fatal = True
         return found
     queue, seen = [start], {start}
+    graph: dict[Place, Contents] = {}
     while queue:
-        place = queue.pop(0)
+        place = named_as = queue.pop(0)
         shown = str(path) if place == start else str(place)
         if place.file not in found.files:
             found.files.append(place.file)
         try:
+            if len(seen) > limits.LAYERS:
+                raise _Unreadable(f"the scene consists of more than {limits.LAYERS} files")
             if place.file.suffix.lower() == ".usdz" and not place.entry:
                 place = Place(place.file, _entries(place.file)[0])
             if str(place).rstrip("]").lower().endswith(IMAGES):
-                _read_image(place)
+                found.pixels += _read_image(place, limits.SCENE_PIXELS - found.pixels)
                 continue
-            named = _read_layer(place, shown, found, built_on=shown != str(path))
+            contents = _read_layer(place, shown, found, built_on=shown != str(path))
         except _Unreadable as error:
             found.problems.append(Problem(shown, "", str(error)))
             found.fatal = True
+            if len(seen) > limits.LAYERS:
+                break
             continue
-        for prim, asset, kinds in named:
-            target = _locate(asset, place, kinds)
+        graph[named_as] = contents
+        for named in (*contents.arcs, *contents.sublayers, *contents.images):
+            if not named.asset:
+                continue
+            target = _locate(named.asset, place, IMAGES if named in contents.images else LAYERS)
             if isinstance(target, str):
-                found.problems.append(Problem(shown, prim, target))
+                found.problems.append(Problem(shown, named.prim, target))
                 found.fatal = True
-            elif target not in seen:
+                continue
+            named.place = target
+            if target not in seen:
                 seen.add(target)
                 queue.append(target)
+    if not found.fatal:
+        fault = count_prims(graph, start)
+        if fault:
+            found.problems.append(Problem(str(path), *fault))
+            found.fatal = True
     return found
 
 
-def _read_layer(place: Place, shown: str, found: Walk, *, built_on: bool) -> list[_Named]:
+def search_context() -> "Ar.DefaultResolverContext":
+    """What a stage is opened with so that USD finds asset paths that begin with `PACKAGE`."""
+    from pxr import Ar
+
+    return Ar.DefaultResolverContext([str(_ROOT)])
+
+
+def _read_layer(place: Place, shown: str, found: Walk, *, built_on: bool) -> Contents:
     """What a layer names; faults of its units and numbers go to `found`."""
     from pxr import Sdf, Tf
 
+    _check_layer(place)
     try:
         layer = Sdf.Layer.FindOrOpen(str(place))
         if layer is None:
             raise _Unreadable("not a readable USD layer")
         if built_on:
             found.problems += _units(layer, shown)
-        named, faults = _contents(layer)
+        contents, faults = _contents(layer)
     except (Tf.ErrorException, UnicodeDecodeError, RuntimeError, MemoryError) as error:
-        text = reason(error).replace(f"<{place}>", place.file.name).replace(str(place), place.file.name)
-        raise _Unreadable(f"not a readable USD layer: {text}") from None
+        raise _Unreadable(f"not a readable USD layer: {_plain(reason(error), place)}") from None
     if faults:
         found.problems += [Problem(shown, where, message) for where, message in faults]
         found.fatal = True
-    return named
+    return contents
 
 
-def _read_image(place: Place) -> None:
+def _plain(text: str, place: Place) -> str:
+    return text.replace(f"<{place}>", place.file.name).replace(str(place), place.file.name)
+
+
+def _check_layer(place: Place) -> None:
+    """Refuse what USD would take too much memory or time to read."""
+    data = _read(place, max(limits.TEXT_BYTES, limits.CRATE_BYTES))
+    if data.startswith(_CRATE):
+        if len(data) > limits.CRATE_BYTES:
+            raise _Unreadable(_too_large(len(data), limits.CRATE_BYTES))
+        fault = _crate_fault(place)
+        if fault:
+            raise _Unreadable(f"not a readable USD layer: {_plain(reason(ValueError(fault)), place)}")
+        return
+    if len(data) > limits.TEXT_BYTES:
+        raise _Unreadable(_too_large(len(data), limits.TEXT_BYTES))
+    lines = sum(data.count(mark) for mark in (b"\n", b"\r", b";", b"{"))
+    if lines > limits.TEXT_LINES:
+        raise _Unreadable(f"has {lines} lines and more, expected at most {limits.TEXT_LINES} in a text layer")
+    numbers = data.count(b",")
+    if numbers > limits.TEXT_NUMBERS:
+        raise _Unreadable(
+            f"has {numbers} commas, expected at most {limits.TEXT_NUMBERS} in a text layer; large meshes fit .usdc"
+        )
+
+
+def _too_large(size: int, most: int) -> str:
+    return f"has {size / limits.MIB:.0f} MiB, expected at most {most // limits.MIB}"
+
+
+_CRATE_FAULTS: dict[tuple[str, int, int, int], str | None] = {}
+"""What was found in binary layers, by name, file, size and time: a scene is walked more than once."""
+
+
+def _known_as(place: Place) -> tuple[str, int, int, int]:
+    about = os.stat(place.file)
+    return str(place), about.st_ino, about.st_size, about.st_mtime_ns
+
+
+def _crate_fault(place: Place) -> str | None:
+    key = _known_as(place)
+    if key not in _CRATE_FAULTS:
+        _probe([place])
+    return _CRATE_FAULTS[key]
+
+
+def _probe(places: list[Place]) -> None:
+    names = [str(place) for place in places]
+    faults = probe.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
+    _CRATE_FAULTS.update({_known_as(place): fault for place, fault in zip(places, faults, strict=True)})
+
+
+def probe_layers(paths: Sequence[Path]) -> None:
+    """Open many binary layers in one process of their own at once; a walk through each then asks no more."""
+    _probe([Place(Path(os.path.abspath(path))) for path in paths])
+
+
+def _read(place: Place, most: int) -> bytes | bytearray:
+    """The bytes of a file or of a package's entry."""
+    if place.entry:
+        package = _open_package(place.file)
+        size = package.GetFileInfo(place.entry).size
+    else:
+        size = os.stat(place.file).st_size
+    if size > most:
+        raise _Unreadable(_too_large(size, most))
+    try:
+        return package.GetFile(place.entry) if place.entry else place.file.read_bytes()
+    except OSError as error:
+        raise _Unreadable(f"cannot be read ({error.strerror})") from None
+
+
+def _read_image(place: Place, pixels: int) -> int:
+    """Read an image of at most so many pixels, and count them."""
     from PIL import Image
 
+    data = _read(place, limits.IMAGE_BYTES)
     try:
-        source: Any = place.file
-        if place.entry:
-            with zipfile.ZipFile(place.file) as package:
-                source = io.BytesIO(package.read(place.entry))
-        with Image.open(source) as image:
-            image.load()
-    except (OSError, SyntaxError, ValueError, zipfile.BadZipFile, Image.DecompressionBombError):
+        with warnings.catch_warnings():
+            # Pillow warns of large images; here they are refused by name.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+                width, height = image.size
+                if width * height > min(pixels, limits.IMAGE_PIXELS):
+                    most = limits.IMAGE_PIXELS if width * height > limits.IMAGE_PIXELS else limits.SCENE_PIXELS
+                    whose = "an image" if most == limits.IMAGE_PIXELS else "all images of a scene together"
+                    raise _Unreadable(f"has {width} x {height} pixels, expected at most {most} for {whose}")
+                image.load()
+                return width * height
+    except _Unreadable:
+        raise
+    except Image.DecompressionBombError:
+        raise _Unreadable(f"has too many pixels, expected at most {limits.IMAGE_PIXELS} for an image") from None
+    except Exception:  # a damaged image raises nearly anything
         raise _Unreadable(f"not a readable image: expected one of {', '.join(IMAGES)}") from None
+
+
+def _open_package(file: Path) -> "Sdf.ZipFile":
+    """A .usdz package as USD reads it."""
+    from pxr import Sdf, Tf
+
+    try:
+        package = Sdf.ZipFile.Open(str(file))
+        names = package.GetFileNames() if package else []
+    except (Tf.ErrorException, UnicodeDecodeError, RuntimeError, MemoryError):
+        names = []
+    if not names or not names[0].lower().endswith(LAYERS[:3]):
+        raise _Unreadable("not a readable USD layer: expected a package whose first entry is a layer")
+    if len(names) > limits.ARCHIVE_MEMBERS:
+        raise _Unreadable(f"holds {len(names)} entries, expected at most {limits.ARCHIVE_MEMBERS}")
+    for name in names:
+        entry = package.GetFileInfo(name)
+        if entry.compressionMethod or entry.encrypted or entry.size != entry.uncompressedSize:
+            raise _Unreadable(f"entry {_printable(name)} is compressed or encrypted: expected stored entries")
+    return package
 
 
 def _entries(package: Path) -> list[str]:
     """Names in a .usdz package; the first is its root layer."""
-    try:
-        with zipfile.ZipFile(package) as file:
-            names = file.namelist()
-    except (OSError, ValueError, zipfile.BadZipFile):
-        names = []
-    if not names or not names[0].lower().endswith(LAYERS[:3]):
-        raise _Unreadable("not a readable USD layer: expected a package whose first entry is a layer")
-    return names
+    return list(_open_package(package).GetFileNames())
 
 
 def _locate(asset: str, at: Place, kinds: tuple[str, ...]) -> Place | str:
@@ -216,6 +358,10 @@ def _locate(asset: str, at: Place, kinds: tuple[str, ...]) -> Place | str:
         return unfit or Place(at.file, inside)
     target = Path(os.path.abspath(at.file.parent / outer))
     message = _file_fault(target)
+    if message == "no such file" and outer.startswith(PACKAGE) and ".." not in outer.split("/"):
+        # As USD does it with `search_context`: beside the naming file first, then among the package's own scenes.
+        target = Path(os.path.abspath(_ROOT / outer))
+        message = _file_fault(target)
     if message:
         lost = f"does not exist: expected {target}" if message == "no such file" else f"{message} ({target})"
         return f"asset @{asset}@ {lost}"
@@ -250,36 +396,69 @@ def _suffix_fault(name: str, kinds: tuple[str, ...], ending: str | None = None) 
     return None if good else f"{name if ending else 'file'} is not {wanted}: expected one of {', '.join(kinds)}"
 
 
-def _contents(layer: "Sdf.Layer") -> tuple[list[_Named], list[tuple[str, str]]]:
-    """Every asset path a layer names, and every number in it that is not finite, as (where, message)."""
+def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
+    """Every prim and asset path of a layer, and what must not be in it, as (where, message)."""
     from pxr import Sdf
 
-    named: list[_Named] = [("", asset, LAYERS) for asset in layer.subLayerPaths]
+    contents = Contents(layer.defaultPrim, sublayers=[Arc("", asset) for asset in layer.subLayerPaths if asset])
     faults: list[tuple[str, str]] = []
+    if layer.pseudoRoot.HasInfo("relocates"):
+        faults.append(("", "has relocates: expected plain prims"))
+
+    deep: list[Sdf.Path] = []
 
     def visit(path: "Sdf.Path") -> None:
+        # Asked before anything else is: text of a path takes as long as the path is deep.
+        if path.pathElementCount > 2 * limits.NESTING:
+            deep[:] = [path]
+            return
         spec = layer.GetObjectAtPath(path)
         if isinstance(spec, Sdf.VariantSpec):
             spec = spec.primSpec
         where = str(path.StripAllVariantSelections())
-        if isinstance(spec, Sdf.PrimSpec):
+        if isinstance(spec, Sdf.PrimSpec) and not path.IsAbsoluteRootPath():
+            contents.prims.append(where)
+            if where.count("/") > limits.NESTING:
+                deep[:] = [path]
             for arcs in (spec.referenceList, spec.payloadList):
-                named.extend((where, item.assetPath, LAYERS) for item in arcs.GetAddedOrExplicitItems())
+                contents.arcs += [
+                    Arc(where, item.assetPath, str(item.primPath)) for item in arcs.GetAddedOrExplicitItems()
+                ]
+            for paths in (spec.inheritPathList, spec.specializesList):
+                for target in paths.GetAddedOrExplicitItems():
+                    contents.arcs.append(Arc(where, "", str(target), of_class=True))
+                    if not target.IsRootPrimPath():
+                        faults.append((where, f"inherits <{target}>: expected a class at the root of the layer"))
             if spec.HasInfo("clips"):
                 faults.append((where, "has value clips: expected plain values"))
+            if spec.HasInfo("relocates"):
+                faults.append((where, "has relocates: expected plain prims"))
         elif isinstance(spec, Sdf.AttributeSpec):
             values = [spec.default, *(layer.QueryTimeSample(path, t) for t in layer.ListTimeSamplesForPath(path))]
+            if _names_file(spec):
+                faults.append((where, f"is a {spec.typeName} that names a file: expected an asset (@...@)"))
             if spec.HasSpline():
                 faults.append((where, "has a spline: expected a plain value"))
             for value in values:
-                named.extend((where, asset, IMAGES) for asset in _assets_in(value))
+                contents.images += [Arc(where, asset) for asset in _assets_in(value) if asset]
                 bad = _not_finite(value)
                 if bad is not None:
                     faults.append((where, f"holds {bad:g}: expected finite numbers (single precision)"))
                     break
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return [entry for entry in named if entry[1]], list(dict.fromkeys(faults))
+    if deep:
+        raise _Unreadable(f"{_printable(deep[0].name)}: prims are nested deeper than {limits.NESTING}")
+    return contents, list(dict.fromkeys(faults))
+
+
+def _names_file(spec: "Sdf.AttributeSpec") -> bool:
+    """Whether text stands where a shader looks for a texture; the importer would open it, URLs too, unchecked."""
+    if str(spec.typeName).removesuffix("[]") not in ("string", "token") or not spec.name.startswith(_SHADER):
+        return False
+    value = spec.default
+    texts = [value] if isinstance(value, str) else list(value or ())
+    return any("/" in text or "\\" in text or "." in text for text in texts) or any(map(_SCHEME.match, texts))
 
 
 def _not_finite(value: object) -> float | None:
@@ -329,5 +508,8 @@ def reason(error: Exception) -> str:
     inner = _ERROR_AT.search(text)
     text = _RULE.sub("not understood: ", inner.group(1) if inner else text)
     lines = (line.strip() for line in text.splitlines())
-    line = next((line for line in lines if line), "unknown error")
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)[:300]
+    return _printable(next((line for line in lines if line), "unknown error"))[:300]
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -48,6 +48,10 @@ DISTANT_LIGHT = FixedLight()
 """The distant light that two of the original's scenes carry in every mode."""
 
 
+SAME_HEIGHT = 1e-5
+"""Difference of heights [m] that single precision makes."""
+
+
 @dataclass(frozen=True)
 class Pose:
     """A world pose."""
@@ -108,6 +112,16 @@ class ObjectSpec:
     """Execution range of `paper` where the common way to widen one does not do; None: the common way."""
     lift: float = 0.0
     """Height of our prim's origin above the original's [m]."""
+    stands: float | None = None
+    """Height [m] of the origin above the lowest point of the object's geoms in our own scene; where a variant's geoms
+    reach lower, the object starts that much higher. None: the height is the sample's alone."""
+
+    def raised(self, scene: Scene) -> float:
+        """What a scene's own geoms add to the height of a sample [m]; 0 in our own scene."""
+        if self.stands is None:
+            return 0.0
+        added = -scene.lowest(self.prim) - self.stands
+        return added if abs(added) > SAME_HEIGHT else 0.0
 
     def rule(self, rules_name: str) -> ObjectRule:
         """What a rule set says about this object."""

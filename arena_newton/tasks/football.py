@@ -92,6 +92,7 @@ TASK = TaskSpec(
             prim=BALL,
             base=PoseRange(x=(-1.2, 1.2), y=(-1.2, 1.2), z=(0.11, 0.11)),
             execution=PoseRange(x=(-1.45, 1.45), y=(-1.45, 1.45), z=(0.11, 0.11)),
+            stands=0.11,
         ),
     ),
     steps=ByRules(paper=1300, released=2000),

@@ -1,6 +1,7 @@
 """Motion clips are read without running what a pickle may hold."""
 
 import pickle
+import resource
 import sys
 import types
 from pathlib import Path
@@ -226,3 +227,44 @@ def test_actions(tmp_path):
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(InputError, match="not a readable NPZ"):
         load_actions(tmp_path / "text.npz")
+
+
+def doubled(levels: int) -> list:
+    """Lists that each hold the next one a hundred times: a few bytes in a pickle, 100^levels numbers as an array."""
+    value: list = [0.0] * 100
+    for _ in range(levels - 1):
+        value = [value] * 100
+    return value
+
+
+def repeated(count: int) -> bytes:
+    """A pickle that encodes one text of 1 MiB again and again."""
+    text = pickle.dumps("x" * 2**20, 2)[2:-3]
+    one = b"c_codecs\nencode\n" + b"h\x00X\x06\x00\x00\x00latin1\x86R"
+    return b"\x80\x02" + text + b"q\x000](" + one * count + b"e."
+
+
+BOMBS = {
+    "array without numbers": b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n"
+    b"cnumpy\nndarray\nJ\x00\x00\x00\x40\x85U\x01b\x87R.",
+    "call of ndarray": b"\x80\x02cnumpy\nndarray\nJ\x00\x00\x00\x40\x85\x85R.",
+    "scalar without bytes": b"\x80\x02cnumpy.core.multiarray\nscalar\ncnumpy\ndtype\nU\x0bV2147483640\x85R\x85R.",
+    "bytearray": b"\x80\x05\x96" + (2**33).to_bytes(8, "little") + b"abc.",
+    "frame": b"\x80\x04\x95" + (2**60).to_bytes(8, "little") + b"N.",
+    "bytes": b"\x80\x04\x8e" + (2**60).to_bytes(8, "little") + b"abc.",
+    "memo": pickle.dumps({"fps": 30, "root_pos": doubled(6)}, 4),
+    "repeated": repeated(300),
+    "nested": b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b".",
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_pickles_that_would_take_memory(tmp_path, name):
+    """Instructions that invent, repeat or unfold arrays are refused in one line before the memory is taken."""
+    path = tmp_path / "bomb.pkl"
+    path.write_bytes(BOMBS[name])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=r"bomb\.pkl: ") as caught:
+        load_clip(path)
+    assert "\n" not in str(caught.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 600_000

@@ -1,5 +1,6 @@
 """The torch module made from an ONNX file computes what ONNX Runtime computes."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from onnx_files import Builder, twist2_like
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
-from arena_newton.trackers import onnx_mlp
+from arena_newton.trackers import onnx_mlp, onnx_session
 
 OFFICIAL = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2"
 
@@ -86,3 +87,59 @@ def test_weights_elsewhere(tmp_path):
     onnx.save(model, str(tmp_path / "b.onnx"), save_as_external_data=True, size_threshold=16, location="b.bin")
     with pytest.raises(InputError, match="another file"):
         trackers.get("twist2", tmp_path / "b.onnx")
+
+
+def outer(b: Builder) -> None:
+    """A column and a row make a table of 3.6e9 numbers."""
+    table = b.add("Add", b.weight(60_000, 1), b.weight(1, 60_000))
+    x = b.add("MatMul", "input", b.weight(12, 4))
+    b.add("Add", x, b.add("ReduceMean", table, axes=[0, 1], keepdims=0), output="output")
+
+
+def doubled(b: Builder) -> None:
+    """Rows joined to themselves thirty times."""
+    x = "input"
+    for _ in range(30):
+        x = b.add("Concat", x, x, axis=1)
+    b.add("MatMul", b.columns(x, 0, 12), b.weight(12, 4), output="output")
+
+
+def gathered(b: Builder) -> None:
+    """One row taken a million times, twice."""
+    index = b.constant(np.zeros(1_000_000, dtype=np.int64))
+    x = b.add("Gather", b.add("Gather", "input", index, axis=1), index, axis=0)
+    b.add("MatMul", b.columns(x, 0, 12), b.weight(12, 4), output="output")
+
+
+def padded(b: Builder) -> None:
+    """A convolution that is padded to 2^40 places."""
+    x = b.add("Unsqueeze", "input", axes=[1])
+    x = b.add("Conv", x, b.weight(1, 1, 3), pads=[2**39, 2**39], kernel_shape=[3])
+    b.add("MatMul", b.columns(b.add("Flatten", x), 0, 12), b.weight(12, 4), output="output")
+
+
+@pytest.mark.parametrize("graph", [outer, doubled, gathered, padded])
+def test_graphs_that_would_take_memory(tmp_path, graph):
+    """What an operator makes is known before it makes it: a small file cannot ask for gigabytes."""
+    b = Builder()
+    graph(b)
+    path = b.save(tmp_path / "bomb.onnx", 12, 4)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=r"bomb\.onnx: .* makes more than 67108864 numbers of 7 rows"):
+        onnx_mlp.load(path, in_width=12, out_width=4)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 600_000
+
+
+def test_a_runtime_is_probed_first(tmp_path):
+    """What only onnxruntime could run is opened by another process first: its memory is not ours."""
+    b = Builder()
+    zeros = b.add("ConstantOfShape", b.constant(np.array([2**33])))
+    x = b.add("Add", b.add("MatMul", "input", b.weight(12, 4)), b.add("ReduceMean", zeros, axes=[0], keepdims=0))
+    b.add("Selu", x, output="output")
+    path = b.save(tmp_path / "bomb.onnx", 12, 4)
+    with pytest.raises(InputError, match=r"bomb\.onnx: not a usable ONNX file"):
+        onnx_session.OnnxSession(path, in_width=12, out_width=4)
+    b = Builder()
+    b.add("Selu", b.add("MatMul", "input", b.weight(12, 4)), output="output")
+    session = onnx_session.load_any(b.save(tmp_path / "good.onnx", 12, 4), in_width=12, out_width=4)
+    assert session(torch.zeros(3, 12)).shape == (3, 4)

@@ -151,6 +151,13 @@ CHANGES = {
     "interface": (lambda t, m: m.update(interface="falcon"), "falcon"),
     "tensor": (lambda t, m: t.pop("norm.mean"), "norm.mean"),
     "extra": (lambda t, m: t.update(more=torch.zeros(1)), "more"),
+    "many_layers": (lambda t, m: m["hidden"].update(hidden=[8] * 1000), "1000 layers, expected at most 64"),
+    "wide_layers": (lambda t, m: m["hidden"].update(hidden=[8192] * 60), "misses|shape|unknown"),
+    "gain_nan": (lambda t, m: m["drive"].update(kp=[float("nan")] * 29), "finite"),
+    "finger": (lambda t, m: m["drive"].update(finger_kp=-1.0), "finger_kp"),
+    "scale_inf": (lambda t, m: m["action_form"].update(scale=[float("inf")] * 29), "finite"),
+    "substeps_inf": (lambda t, m: m["physics"].update(substeps=float("inf")), "metadata"),
+    "nested": (lambda t, m: m.update(card=json.loads("[" * 900 + "]" * 900)), "metadata"),
     "nan": (lambda t, m: t["norm.mean"].fill_(float("nan")), "finite"),
 }
 

@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-import zipfile
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.foreign import numbers, read_arrays, read_bytes
 from arena_newton.robot import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions.library import FORMAT, UNKNOWN, MotionLibrary
 from arena_newton.trackers.motions.load import (
@@ -118,7 +120,11 @@ def read_library(
     """
     parts, reports, taken = [], [], set()
     for path in paths:
-        reading = read_file(path, options)
+        try:
+            reading = read_file(path, options)
+        except InputError as error:
+            others = f"; nothing is made of the other {_count(len(paths) - 1, 'file')}" if len(paths) > 1 else ""
+            raise InputError(f"{error}{others}") from error
         reports.append(reading.report)
         if reading.library is not None:
             parts.append(reading.library)
@@ -197,29 +203,31 @@ def _padding(widths: set[int]) -> list[str]:
 
 def _table(path: Path, options: ReadOptions) -> Reading:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_bytes(path, limits.TABLE_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a readable table ({type(error).__name__})") from error
-    # A line of column names may stand above the numbers.
-    first = 1 if lines and not _is_number(lines[0].split(",")[0]) else 0
-    rows = [(number, line.split(",")) for number, line in enumerate(lines[first:], first + 1) if line.strip()]
+    widths = (7 + len(MUJOCO_JOINTS), 7 + len(JOINTS_23))
+    rows: list[np.ndarray] = []
+    for number, line in enumerate(io.StringIO(text), 1):
+        # A line of column names may stand above the numbers.
+        if not line.strip() or (number == 1 and not _is_number(line.partition(",")[0])):
+            continue
+        # Counted before it is split: a single line can be as long as the file.
+        width = line.count(",") + 1
+        if not rows and width not in widths:
+            raise InputError(
+                f"{path}: has {width} columns, expected {widths[0]} (root x, y, z, quaternion, 29 joints) or "
+                f"{widths[1]} (23 joints)"
+            )
+        row = line.split(",") if not rows or width == len(rows[0]) else []
+        if not row or not all(map(_is_number, row)):
+            raise InputError(f"{path}: line {number} does not hold {len(rows[0]) if rows else width} numbers")
+        rows.append(np.array([float(value) for value in row]))
+        if not np.isfinite(rows[-1]).all():
+            raise InputError(f"{path}: line {number} holds NaN or infinity")
     if not rows:
         raise InputError(f"{path}: holds no frame")
-    widths = (7 + len(MUJOCO_JOINTS), 7 + len(JOINTS_23))
-    width = len(rows[0][1])
-    if width not in widths:
-        raise InputError(
-            f"{path}: has {width} columns, expected {widths[0]} (root x, y, z, quaternion, 29 joints) or {widths[1]} "
-            "(23 joints)"
-        )
-    for number, row in rows:
-        if len(row) != width or not all(map(_is_number, row)):
-            raise InputError(f"{path}: line {number} does not hold {width} numbers")
-    table = np.array([[float(value) for value in row] for _, row in rows])
-    if not np.isfinite(table).all():
-        raise InputError(
-            f"{path}: line {rows[int(np.argmin(np.isfinite(table).all(axis=1)))][0]} holds NaN or infinity"
-        )
+    table, width = np.array(rows), len(rows[0])
     order = options.quat_order if options.quat_order != "auto" else _quat_order(table[:, 3:7], path)
     fps = CSV_FPS if options.fps is None else options.fps
     clip = checked_clip(
@@ -248,20 +256,15 @@ def _quat_order(quat: np.ndarray, path: Path) -> str:
 
 
 def _npz(path: Path, options: ReadOptions) -> Reading:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            names = set(file.files)
-            wanted = ("fps", "joint_pos", "body_pos_w", "body_quat_w")
-            beyond = "body_pos_w" in names and "format" not in names
-            if beyond:
-                missing = [name for name in wanted if name not in names]
-                if missing:
-                    raise InputError(f"{path}: array {missing[0]} is missing")
-                arrays = {name: np.asarray(file[name], dtype=np.float64) for name in wanted}
-    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError, MemoryError) as error:
-        raise InputError(f"{path}: not a readable NPZ file ({type(error).__name__})") from error
-    if beyond:
-        return _beyond_mimic(path, arrays, options)
+    names = set(read_arrays(path, ()))
+    if "body_pos_w" in names and "format" not in names:
+        wanted = ("fps", "joint_pos", "body_pos_w", "body_quat_w")
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise InputError(f"{path}: array {missing[0]} is missing")
+        arrays = read_arrays(path, wanted)
+        checked = {name: numbers(arrays[name], f"{path}: array {name}", np.float64) for name in wanted}
+        return _beyond_mimic(path, checked, options)
     if "format" in names:
         library = MotionLibrary.load(path)
         seconds = float(library.seconds.sum())

@@ -7,7 +7,6 @@ evaluation read: torch tensors with velocities and mimic commands for every fram
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.foreign import numbers, read_arrays
 from arena_newton.robot import MUJOCO_JOINTS, TICK
 from arena_newton.usd_scenes.g1.links import LINKS
 
@@ -361,23 +361,18 @@ class MotionLibrary:
         Raises:
             InputError: The file is absent, damaged, or no motion library.
         """
+        file = read_arrays(path, ("format", "fps", *_ARRAYS))
+        if "format" not in file or str(file["format"]) != FORMAT:
+            raise InputError(f"{path}: not a motion library (array format is not {FORMAT})")
+        missing = [name for name in _ARRAYS if name not in file]
+        if missing:
+            raise InputError(f"{path}: array {missing[0]} is missing")
+        fps = numbers(file.get("fps", np.array(FPS)), f"{path}: array fps", np.float64)
+        if fps.size != 1 or fps.item() != FPS:
+            given = f"{fps.item():g}" if fps.size == 1 else "several numbers of"
+            raise InputError(f"{path}: has {given} frames a second, expected {FPS}; convert it again")
         try:
-            with np.load(path, allow_pickle=False) as file:
-                if "format" not in file.files or str(file["format"]) != FORMAT:
-                    raise InputError(f"{path}: not a motion library (array format is not {FORMAT})")
-                missing = [name for name in _ARRAYS if name not in file.files]
-                if missing:
-                    raise InputError(f"{path}: array {missing[0]} is missing")
-                fps = float(file["fps"]) if "fps" in file.files else FPS
-                arrays = {name: file[name] for name in _ARRAYS}
-        except FileNotFoundError as error:
-            raise InputError(f"{path}: no such file") from error
-        except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError, MemoryError) as error:
-            raise InputError(f"{path}: not a readable NPZ file ({type(error).__name__})") from error
-        if fps != FPS:
-            raise InputError(f"{path}: has {fps:g} frames a second, expected {FPS}; convert it again")
-        try:
-            return cls(**arrays)
+            return cls(**{name: file[name] for name in _ARRAYS})
         except InputError as error:
             raise InputError(str(error).replace("motion library", str(path), 1)) from None
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from arena_newton import limits
 from arena_newton.canonical import ACTION_WIDTH, validate_action
 from arena_newton.errors import InputError
+from arena_newton.foreign import numbers, read_arrays, read_bytes
 
 __all__ = [
     "JOINTS_23",
@@ -84,18 +85,44 @@ def _latin1(text: str, encoding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
 
+class _ArrayType:
+    """Stands for `numpy.ndarray`, which pickles name and never call: a call would invent an array of any size."""
+
+
+def _empty_array(kind: Any, shape: Any, _code: Any) -> np.ndarray:
+    """NumPy's `_reconstruct`: the empty array that a state is then set on."""
+    if kind is not _ArrayType or tuple(shape) != (0,):
+        raise _RefusedError(f"an array of shape {shape} without numbers")
+    return np.empty(0, dtype=np.int8)
+
+
+def _scalar(dtype: Any, data: Any = None) -> Any:
+    from numpy._core import multiarray
+
+    if not isinstance(dtype, np.dtype) or dtype.hasobject or not isinstance(data, bytes):
+        raise _RefusedError("a number without bytes")
+    return multiarray.scalar(dtype, data)
+
+
+def _dtype(*arguments: Any) -> np.dtype[Any]:
+    dtype = np.dtype(*arguments)
+    if dtype.subdtype is not None or dtype.names is not None:
+        raise _RefusedError(f"numbers of type {dtype}")
+    return dtype
+
+
 def _admitted() -> dict[tuple[str, str], Any]:
-    from numpy._core import multiarray, numeric
+    from numpy._core import numeric
 
     admitted: dict[tuple[str, str], Any] = {
-        ("numpy", "ndarray"): np.ndarray,
-        ("numpy", "dtype"): np.dtype,
+        ("numpy", "ndarray"): _ArrayType,
+        ("numpy", "dtype"): _dtype,
         ("_codecs", "encode"): _latin1,
         ("joblib.numpy_pickle", "NumpyArrayWrapper"): _JoblibArray,
     }
     for package in ("numpy._core", "numpy.core"):
-        admitted[f"{package}.multiarray", "_reconstruct"] = multiarray._reconstruct
-        admitted[f"{package}.multiarray", "scalar"] = multiarray.scalar
+        admitted[f"{package}.multiarray", "_reconstruct"] = _empty_array
+        admitted[f"{package}.multiarray", "scalar"] = _scalar
         admitted[f"{package}.numeric", "_frombuffer"] = getattr(numeric, "_frombuffer")  # noqa: B009 (private)
     return admitted
 
@@ -130,6 +157,7 @@ class _PlainUnpickler(pickle._Unpickler):
     def __init__(self, file: io.BytesIO):
         super().__init__(file)
         self._file = file
+        self._held = 0
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
         admitted = _admitted().get((module, name))
@@ -140,6 +168,34 @@ class _PlainUnpickler(pickle._Unpickler):
     def persistent_load(self, pid: Any) -> Any:
         raise _RefusedError("a persistent id")
 
+    def _hold(self, value: Any) -> None:
+        """Count what an instruction made: a few bytes can repeat it without end."""
+        if isinstance(value, np.ndarray | np.generic):
+            self._held += value.nbytes
+        elif isinstance(value, bytes | str):
+            self._held += len(value)
+        if self._held > limits.PICKLE_BYTES:
+            raise _RefusedError(f"arrays of more than {limits.PICKLE_BYTES // limits.MIB} MiB")
+
+    def load_bytearray8(self) -> None:
+        # Python's own makes the array before it looks whether the file is as long.
+        size = int.from_bytes(self.read(8), "little")  # type: ignore[attr-defined]
+        data = self.read(size)  # type: ignore[attr-defined]
+        if len(data) != size:
+            raise EOFError
+        self.append(bytearray(data))  # type: ignore[attr-defined]
+
+    def _instantiate(self, kind: Any, arguments: Any) -> None:
+        super()._instantiate(kind, arguments)  # type: ignore[misc]
+        self._hold(self.stack[-1])  # type: ignore[attr-defined]
+
+    def load_reduce(self) -> None:
+        stack: list[Any] = self.stack  # type: ignore[attr-defined]
+        if stack[-2] is _ArrayType:
+            raise _RefusedError("a call of numpy.ndarray")
+        super().load_reduce()  # type: ignore[misc]
+        self._hold(self.stack[-1])  # type: ignore[attr-defined]
+
     def load_build(self) -> None:
         stack: list[Any] = self.stack  # type: ignore[attr-defined]
         # A state is set on arrays and their types only: set on a function it would change the function.
@@ -148,9 +204,12 @@ class _PlainUnpickler(pickle._Unpickler):
         super().load_build()  # type: ignore[misc]
         if isinstance(stack[-1], _JoblibArray):
             stack[-1] = _JoblibArray.read(stack[-1], self._file)
+        self._hold(stack[-1])
 
     dispatch = dict(pickle._Unpickler.dispatch)
     dispatch[pickle.BUILD[0]] = load_build  # type: ignore[assignment]
+    dispatch[pickle.REDUCE[0]] = load_reduce  # type: ignore[assignment]
+    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8  # type: ignore[assignment]
 
 
 def load_plain_pickle(path: str | Path, *, flag: str = "--policy replay:") -> Any:
@@ -159,18 +218,42 @@ def load_plain_pickle(path: str | Path, *, flag: str = "--policy replay:") -> An
     Raises:
         InputError: The file is absent, damaged, or holds anything else; nothing of it was executed.
     """
+    data = read_bytes(path, limits.PICKLE_BYTES, where=f"{flag}{path}")
     try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{flag}{path}: cannot be read ({error.strerror})") from error
-    try:
-        return _PlainUnpickler(io.BytesIO(data)).load()
+        content = _PlainUnpickler(io.BytesIO(data)).load()
+        _check_size(content)
+        return content
     except _RefusedError as error:
         raise InputError(
             f"{flag}{path}: the pickle holds {error}, which is refused: only NumPy arrays and plain containers are read"
         ) from error
     except Exception as error:  # a damaged pickle raises nearly anything
         raise InputError(f"{flag}{path}: not a readable pickle ({type(error).__name__})") from error
+
+
+def _check_size(content: Any) -> None:
+    """Refuse lists that hold one another again and again: a few bytes of them unfold to any number of numbers."""
+    sizes: dict[int, int] = {}
+
+    def measured(value: Any, depth: int) -> int:
+        if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+            return value.nbytes
+        if not isinstance(value, dict | list | tuple | set | frozenset | np.ndarray):
+            return 8
+        known = sizes.get(id(value))
+        if known is not None:
+            return known
+        if depth > limits.NESTING:
+            raise _RefusedError(f"lists nested deeper than {limits.NESTING}")
+        sizes[id(value)] = 0
+        items = value.values() if isinstance(value, dict) else value.flat if isinstance(value, np.ndarray) else value
+        size = 8 + sum(measured(item, depth + 1) for item in items)
+        if size > limits.PICKLE_BYTES:
+            raise _RefusedError(f"lists that unfold to more than {limits.PICKLE_BYTES // limits.MIB} MiB")
+        sizes[id(value)] = size
+        return size
+
+    measured(content, 0)
 
 
 def load_clip(path: str | Path, *, flag: str = "--policy replay:", trim: bool = True) -> Clip:
@@ -362,15 +445,10 @@ def load_actions(path: str | Path, *, flag: str = "--policy replay:") -> np.ndar
         InputError: The array is missing, of another width, or not finite.
     """
     where = f"{flag}{path}"
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if "action" not in file.files:
-                raise InputError(f"{where}: array action is missing")
-            actions = np.asarray(file["action"], dtype=np.float32)
-    except FileNotFoundError as error:
-        raise InputError(f"{where}: no such file") from error
-    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{where}: not a readable NPZ file ({type(error).__name__})") from error
+    arrays = read_arrays(path, ("action",), where=where)
+    if "action" not in arrays:
+        raise InputError(f"{where}: array action is missing")
+    actions = numbers(arrays["action"], f"{where}: array action", np.float32)
     if actions.ndim != 2 or len(actions) == 0:
         raise InputError(f"{where}: action has shape {list(actions.shape)}, expected [ticks, {ACTION_WIDTH}]")
     return validate_action(actions, where)

@@ -141,3 +141,27 @@ def test_help_is_quick():
     code += "except SystemExit: print(any(m in sys.modules for m in ('torch', 'warp', 'newton', 'mujoco', 'cv2')))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip().endswith("False") and time.perf_counter() - start < 5.0
+
+
+def test_one_bad_file_of_several(tmp_path, capsys):
+    """`convert` names the file that it cannot read, and says that nothing is made of the others."""
+    good, table, out = clip_file(tmp_path, "good"), tmp_path / "a.csv", tmp_path / "lib.npz"
+    table.write_text("\n".join([",".join(["0"] * 36)] * 5))
+    flags = ["--out", str(out), "--licence", "MIT", "--source", "https://example.org"]
+    assert main(["convert", str(good), str(table), *flags]) == 2
+    printed = capsys.readouterr()
+    assert f"{table}: the order of the quaternions is not clear" in printed.err
+    assert printed.err.rstrip().endswith("nothing is made of the other 1 file") and not out.exists()
+    assert main(["convert", str(table), *flags]) == 2
+    assert "nothing is made" not in capsys.readouterr().err
+
+
+def test_a_table_is_counted_before_it_is_split(tmp_path, capsys):
+    """A single line of a million columns is refused by its commas; a line among others by its number."""
+    table = tmp_path / "a.csv"
+    table.write_text("0," * 1_000_000 + "0\n")
+    assert main(["inspect", str(table)]) == 2
+    assert "has 1000001 columns, expected 36" in capsys.readouterr().err
+    table.write_text(",".join(["0"] * 36) + "\n\n" + ",".join(["0"] * 35) + "\n")
+    assert main(["inspect", str(table)]) == 2
+    assert "line 3 does not hold 36 numbers" in capsys.readouterr().err

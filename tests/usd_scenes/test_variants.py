@@ -1,0 +1,174 @@
+"""Variants: a skeleton that may lie anywhere, what a variant changes, and what starts inside something else."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arena_newton import rules, tasks
+from arena_newton.errors import InputError
+from arena_newton.scene import SCENES, load_scene
+from arena_newton.usd_scenes.__main__ import main
+from arena_newton.usd_scenes.spawn import penetrations
+from arena_newton.usd_scenes.validate import REQUIRED, differences, layers, task_of, validate
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes a variant of a task with these prims in its world."""
+
+    def write(body: str = "", task: str = "football", name: str = "mine.usda") -> Path:
+        path = tmp_path / name
+        path.unlink(missing_ok=True)
+        assert main(["new", task, str(path)]) == 0
+        text = path.read_text()
+        end = text.rindex("}")
+        path.write_text(text[:end] + body.replace("{", "\n{\n").replace("}", "\n}\n") + text[end:])
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("task", REQUIRED)
+def test_a_skeleton_is_sound(task, written):
+    """`new` writes a layer that validates as its task wherever it lies."""
+    path = written(task=task)
+    assert validate(path) == [] and task_of(path) == task
+    assert (SCENES / task / "scene.usda").resolve() in {file.resolve() for file in layers(path)}
+
+
+def test_new_overwrites_nothing(tmp_path, capsys):
+    """A file that exists, an unknown task, another kind of file and a missing folder are one line each."""
+    path = tmp_path / "mine.usda"
+    path.write_text("mine")
+    for arguments, words in (
+        (["football", str(path)], "exists already"),
+        (["tennis", str(tmp_path / "a.usda")], "unknown task 'tennis'"),
+        (["football", str(tmp_path / "a.txt")], "ends in .usda"),
+        (["football", str(tmp_path / "no" / "a.usda")], "cannot be written"),
+    ):
+        assert main(["new", *arguments]) == 2
+        printed = capsys.readouterr()
+        assert words in printed.err and len(printed.err.splitlines()) == 1 and not printed.out
+    assert path.read_text() == "mine" and not (tmp_path / "a.usda").exists()
+
+
+def test_the_package_is_found_from_an_installation(written, tmp_path):
+    """The skeleton's path leads to the scenes of whatever installation reads it, folders of links or not."""
+    installed = tmp_path / "site-packages"
+    code = SCENES.resolve().parent
+    shutil.copytree(code / "arena_newton", installed / "arena_newton", symlinks=False)
+    path = written()
+    command = "from arena_newton.usd_scenes.validate import layers, validate; import sys; p = sys.argv[1];"
+    command += "print(validate(p), *layers(p), sep='\\n')"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", command, str(path)],
+        env=os.environ | {"PYTHONPATH": str(installed)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    first, *files = done.stdout.splitlines()
+    assert first == "[]"
+    assert str(installed / "arena_newton" / "usd_scenes" / "football" / "scene.usda") in files
+
+
+def test_the_package_is_no_way_out(tmp_path):
+    """Only scenes of the package are looked up there, and a file beside the layer comes first, as in USD."""
+    text = '#usda 1.0\n(\n    defaultPrim = "A"\n    subLayers = [@{}@]\n)\n'
+    path = tmp_path / "mine.usda"
+    for asset in ("arena_newton/usd_scenes/../camera.usda", "arena_newton/other/a.usda", "numpy/a.usda"):
+        path.write_text(text.format(asset))
+        with pytest.raises(InputError, match="does not exist"):
+            layers(path)
+    near = tmp_path / "arena_newton" / "usd_scenes" / "football" / "scene.usda"
+    near.parent.mkdir(parents=True)
+    near.write_text('#usda 1.0\n(\n    defaultPrim = "A"\n)\n')
+    path.write_text(text.format("arena_newton/usd_scenes/football/scene.usda"))
+    assert layers(path) == [path, near]
+
+
+def over(lines: str, *names: str) -> str:
+    return "".join(f'over "{name}" {{ ' for name in names) + lines + " }" * len(names)
+
+
+CHANGES = {
+    "gravity": (
+        over("float physics:gravityMagnitude = 0", "physicsScene"),
+        ["gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81"],
+    ),
+    "robot": (
+        over("float physics:mass = 0.01", "Robot", "pelvis"),
+        ["robot: /World/Robot/pelvis: physics:mass is 0.01, not 3.814; its inertia is not changed in proportion"],
+    ),
+    "rule": (
+        over("float3 arena:size = (9, 2, 1.85)", "Goal", "Volume"),
+        ["rule: /World/Goal/Volume: arena:size is (9, 2, 1.85), not (5.1, 2, 1.85)"],
+    ),
+    "moved rule": (
+        over("double3 xformOp:translate = (0.05, 4.03, 1.925)", "Goal", "Volume"),
+        ["rule: /World/Goal/Volume: is moved by 1 m"],
+    ),
+    "collider": (
+        over("double radius = 0.25", "Ball", "Collider"),
+        ["object: /World/Ball/Collider: radius is 0.25, not 0.11"],
+    ),
+    "new": ('def Cube "Stool" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', ["object: /World/Stool is new"]),
+    "look": (over("float focalLength = 20", "WorldCamera") + 'def Cube "Seen" {}', []),
+    "own variant": ("", ["scene: selects the variant semantic by itself"]),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_changes_are_told(written, case):
+    """Gravity, robot, rule markers, masses and colliders that differ are told in sentences; looks are free."""
+    body, sentences = CHANGES[case]
+    path = written(body)
+    if case == "own variant":
+        path.write_text(
+            path.read_text().replace('over "World"', 'over "World" (variants = { string semantics = "semantic" })')
+        )
+    assert differences(path, "football") == sentences
+
+
+def test_the_own_scenes_change_nothing(written):
+    """No task's scene differs from itself, and a skeleton changes nothing."""
+    for task in ("football", "open_door"):
+        assert differences(SCENES / task / "scene.usda", task) == []
+    assert differences(written(), "football") == []
+    with pytest.raises(InputError, match="unknown task"):
+        differences(SCENES / "football" / "scene.usda", "tennis")
+
+
+def test_a_larger_ball_starts_on_the_floor(written):
+    """The ball's height comes from its collider; in the project's own scene nothing is added to the sample."""
+    (ball,) = tasks.get("football").objects
+    own = load_scene("football", native=True, device="cpu")
+    assert ball.raised(own) == 0.0
+    larger = load_scene("football", variant_file=written(over("double radius = 0.25", "Ball", "Collider")), native=True)
+    assert ball.raised(larger) == pytest.approx(0.14, abs=1e-6)
+    np.testing.assert_allclose(larger.lowest("/World/Ball"), -0.25, atol=1e-6)
+
+
+def test_what_starts_inside_something_is_named(written, capsys):
+    """`validate` resets an episode of each mode: a stool under the ball is named; what a variant changes is printed."""
+    ball = tasks.get("football").draw(0, "base", rules.get("paper"))
+    x, y, _ = ball.placed["/World/Ball"].pos
+    stool = (
+        'def Cube "Stool" (prepend apiSchemas = ["PhysicsCollisionAPI"]) { double size = 0.3\n'
+        f"double3 xformOp:translate = ({x}, {y}, 0.15)\n" + 'uniform token[] xformOpOrder = ["xformOp:translate"]\n}'
+    )
+    path = written(stool)
+    capsys.readouterr()
+    assert main(["validate", str(path)]) == 2
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{path}: /World/Ball: starts ") and "inside /World/Stool" in first and "base" in first
+    assert second == f"{path}: changed: object: /World/Stool is new"
+    assert main(["validate", str(path), "--no-spawn"]) == 0
+    new, known = penetrations(written(over("double radius = 0.25", "Ball", "Collider")), "football")
+    assert (new, known) == ([], [])

@@ -1,0 +1,227 @@
+"""What a variant changes that moves, weighs or judges, against the task's own scene, in plain sentences."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.usd_scenes.shapes import open_stage
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+__all__ = ["differences"]
+
+_SCENES = Path(__file__).resolve().parent
+_ROBOT = "/World/Robot"
+_MOST = 40
+"""Sentences that are told; a scene with more is another scene."""
+_PHYSICAL = ("physics:", "mjc:", "newton:", "arena:", "drive:", "limit:", "physx")
+"""Attributes of these namespaces move, weigh or judge."""
+_SHAPE = ("size", "radius", "height", "width", "length", "axis", "points", "faceVertexIndices")
+_LENS = ("focalLength", "horizontalAperture", "verticalAperture", "projection", "clippingRange")
+_SKIPPED = ("arena:resolution",)
+_CLOSE = 1e-6
+"""Relative difference of numbers that are the same."""
+
+
+@dataclass
+class _Part:
+    """What counts of one prim."""
+
+    kind: str
+    """`gravity`, `robot`, `rule`, `joint`, `surface` or `object`: what a sentence begins with."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """Attributes by name; `pose` is the pose in the body that carries the prim."""
+
+
+def differences(path: str | Path, task: str) -> list[str]:
+    """What a layer changes of a task's gravity, robot, rules, joints, surfaces, masses and colliders.
+
+    Looks, lights and the world camera are free; nothing is said about them.
+
+    Args:
+        path: A layer that passes `validate`.
+        task: The task that it is a variant of.
+
+    Returns:
+        One sentence a change, such as `gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81`.
+
+    Raises:
+        InputError: The layer cannot be composed, or there is no such task.
+    """
+    built_in = _SCENES / task / "scene.usda"
+    if not built_in.is_file():
+        raise InputError(f"unknown task {task!r}: it has no scene")
+    theirs, ours = open_stage(path), open_stage(built_in, checked=False)
+    told: dict[str, None] = {}
+    own = _selection(theirs)
+    if own and own != _selection(ours):
+        told[f"scene: selects the variant {own} by itself"] = None
+        _select(ours, own)
+    for variant in ("base", "semantic"):
+        if variant != "base":
+            for stage in (theirs, ours):
+                _select(stage, variant)
+        note = "" if variant == "base" else f" (variant {variant})"
+        for sentence in _compared(_parts(theirs), _parts(ours)):
+            if sentence not in told:
+                told[sentence + note] = None
+    sentences = list(told)
+    if len(sentences) > _MOST:
+        return [*sentences[: _MOST - 1], f"and {len(sentences) - _MOST + 1} more changes"]
+    return sentences
+
+
+def _selection(stage: "Usd.Stage") -> str:
+    world = stage.GetPrimAtPath("/World")
+    return world.GetVariantSet("semantics").GetVariantSelection() if world else ""
+
+
+def _select(stage: "Usd.Stage", variant: str) -> None:
+    from pxr import Usd
+
+    world = stage.GetPrimAtPath("/World")
+    if world and variant in world.GetVariantSet("semantics").GetVariantNames():
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            world.GetVariantSet("semantics").SetVariantSelection(variant)
+
+
+def _parts(stage: "Usd.Stage") -> dict[str, _Part]:
+    """Every prim that counts, by its path."""
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    poses = UsdGeom.XformCache()
+    parts: dict[str, _Part] = {}
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
+        path = str(prim.GetPath())
+        robot = path == _ROBOT or path.startswith(f"{_ROBOT}/")
+        values = {
+            attribute.GetName(): attribute.Get()
+            for attribute in prim.GetAttributes()
+            if attribute.GetName().startswith(_PHYSICAL) and attribute.HasAuthoredValue()
+            if attribute.GetName() not in _SKIPPED
+        }
+        collides = prim.HasAPI(UsdPhysics.CollisionAPI)
+        body = prim.HasAPI(UsdPhysics.RigidBodyAPI)
+        camera = robot and prim.IsA(UsdGeom.Camera)
+        if collides or camera:
+            names = _SHAPE if collides else _LENS
+            values |= {name: prim.GetAttribute(name).Get() for name in names if prim.HasAttribute(name)}
+        marker = prim.HasAttribute("arena:size")
+        if not (values or collides or body or camera):
+            continue
+        if collides or marker or camera or (robot and body):
+            values["pose"] = _pose(prim, poses)
+        if prim.IsA(UsdPhysics.Joint):
+            for name in ("body0", "body1"):
+                values[name] = [str(target) for target in prim.GetRelationship(f"physics:{name}").GetTargets()]
+        if prim.IsA(UsdPhysics.Scene):
+            kind = "gravity"
+        elif robot:
+            kind = "robot"
+        elif marker:
+            kind = "rule"
+        elif prim.IsA(UsdPhysics.Joint):
+            kind = "joint"
+        elif prim.HasAPI(UsdPhysics.MaterialAPI):
+            kind = "surface"
+        else:
+            kind = "object"
+        parts[path] = _Part(kind, values)
+    return parts
+
+
+def _pose(prim: "Usd.Prim", poses: Any) -> tuple[float, ...]:
+    """Matrix of a prim in the body that carries it, or in the world; a body of the robot in the robot."""
+    from pxr import UsdPhysics
+
+    carrier = prim.GetParent()
+    inside = str(prim.GetPath()).startswith(_ROBOT)
+    while carrier and not (inside and str(carrier.GetPath()) == _ROBOT):
+        if carrier.HasAPI(UsdPhysics.RigidBodyAPI):
+            break
+        carrier = carrier.GetParent()
+    matrix = poses.GetLocalToWorldTransform(prim)
+    if carrier and not carrier.IsPseudoRoot():
+        matrix = matrix * poses.GetLocalToWorldTransform(carrier).GetInverse()
+    return tuple(value for row in matrix for value in row)
+
+
+def _compared(theirs: dict[str, _Part], ours: dict[str, _Part]) -> Iterator[str]:
+    for path, part in ours.items():
+        if path not in theirs:
+            yield f"{part.kind}: {path} is gone"
+            continue
+        changed = [
+            _change(name, theirs[path].values.get(name), part.values.get(name))
+            for name in (*part.values, *(name for name in theirs[path].values if name not in part.values))
+        ]
+        told = [text for text in changed if text]
+        if told:
+            yield f"{part.kind}: {path}: {', '.join(told)}{_unscaled(theirs[path].values, part.values)}"
+    for path, part in theirs.items():
+        if path not in ours:
+            yield f"{part.kind}: {path} is new"
+
+
+def _change(name: str, new: Any, old: Any) -> str | None:
+    if _same(new, old):
+        return None
+    if name == "pose" and new is not None and old is not None:
+        moved = math.dist(new[12:15], old[12:15])
+        return f"is moved by {moved:.3g} m" if moved > 1e-4 else "is turned or scaled"
+    if new is None:
+        return f"{name} is missing"
+    if _long(new) or _long(old):
+        return f"{name} differs"
+    return f"{name} is {_shown(new)}, not {_shown(old)}" if old is not None else f"{name} is {_shown(new)}"
+
+
+def _unscaled(new: dict[str, Any], old: dict[str, Any]) -> str:
+    """A remark where a mass was changed and its inertia was not."""
+    mass, inertia = "physics:mass", "physics:diagonalInertia"
+    if mass not in old or inertia not in old or _same(new.get(mass), old[mass]):
+        return ""
+    return "; its inertia is not changed in proportion" if _same(new.get(inertia), old[inertia]) else ""
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """The value as numbers, None if it is not about numbers."""
+    from pxr import Gf
+
+    if isinstance(value, Gf.Quatf | Gf.Quatd | Gf.Quath):
+        value = (value.real, *value.imaginary)
+    if value is None or isinstance(value, str | bool):
+        return None
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return array
+
+
+def _same(a: Any, b: Any) -> bool:
+    one, other = _numbers(a), _numbers(b)
+    if one is None or other is None:
+        return bool(a == b)
+    if one.shape != other.shape:
+        return False
+    return bool((np.abs(one - other) <= _CLOSE * np.maximum(1.0, np.abs(other))).all())
+
+
+def _long(value: Any) -> bool:
+    return not isinstance(value, str) and hasattr(value, "__len__") and len(value) > 4
+
+
+def _shown(value: Any) -> str:
+    numbers = _numbers(value)
+    if numbers is None:
+        return str(value)
+    if numbers.ndim == 0:
+        return f"{float(numbers):.6g}"
+    return f"({', '.join(f'{float(number):.6g}' for number in numbers.ravel())})"

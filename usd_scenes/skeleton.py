@@ -1,0 +1,71 @@
+"""The first lines of a variant: a layer over a task's scene that may lie anywhere."""
+
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.usd_scenes.validate import REQUIRED
+from arena_newton.usd_scenes.walk import PACKAGE
+
+__all__ = ["write"]
+
+_TEXT = """#usda 1.0
+(
+    "A variant of the task {task}: says only what is different from its scene."
+    defaultPrim = "World"
+    metersPerUnit = 1
+    kilogramsPerUnit = 1
+    upAxis = "Z"
+    # Looked up in the installed package, so this file may lie anywhere.
+    subLayers = [@{package}{task}/scene.usda@]
+)
+
+over "World"
+{{
+    # Every attribute stands on a line of its own. What the task needs, and what rules read:
+{prims}
+    over "Light"
+    {{
+        color3f inputs:color = {color}
+    }}
+}}
+"""
+
+
+def write(task: str, path: str | Path) -> Path:
+    """Write a variant that validates, runs and changes nothing.
+
+    Args:
+        task: Name of a task.
+        path: The `.usda` file; one that exists stays as it is.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: Unknown task, another kind of file, or the file exists or cannot be written.
+    """
+    path = Path(path)
+    if task not in REQUIRED:
+        raise InputError(f"unknown task {task!r}; tasks are {', '.join(REQUIRED)}")
+    if path.suffix != ".usda":
+        raise InputError(f"{path}: expected a name that ends in .usda")
+    prims = "".join(f"    #   {item.path} ({item.kind})\n" for item in REQUIRED[task])
+    text = _TEXT.format(task=task, package=PACKAGE, prims=prims, color=_light(task))
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise InputError(f"{path}: exists already, choose another name") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def _light(task: str) -> str:
+    """Colour of the scene's light, as USD writes it."""
+    from arena_newton.usd_scenes.build import FOLDER
+    from arena_newton.usd_scenes.shapes import open_stage
+
+    stage = open_stage(FOLDER / task / "scene.usda", checked=False)
+    color = stage.GetPrimAtPath("/World/Light").GetAttribute("inputs:color").Get()
+    return f"({', '.join(f'{value:g}' for value in color)})"
