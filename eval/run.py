@@ -275,7 +275,7 @@ def _run_group(
             if isinstance(actor, RecordingPolicy):
                 assert env is not None
                 actor.write(result, env.spec.gym_id)
-            media = _media(folder, recorder.label(result.episode)) if recorder is not None else {}
+            media = recorder.media(result.episode) if recorder is not None else {}
             journal.append(_record(config, result, media))
             left.pop(result.episode.index, None)
             bar.update()
@@ -293,6 +293,8 @@ def _run_group(
             journal.append(_error_record(config, episode, message))
             bar.update()
     finally:
+        if recorder is not None:
+            recorder.close()
         env = recorder = None
         gc.collect()
 
@@ -307,17 +309,6 @@ def _policy_camera(policy: Any) -> Any:
     from arena_newton.camera import CameraConfig
 
     return CameraConfig()
-
-
-def _media(folder: Path, label: str) -> dict[str, str]:
-    """Recordings of an episode that lie in the results folder, by name."""
-    found = {}
-    for kind, suffix in (("videos", "mp4"), ("strips", "png")):
-        for camera in ("ego", "world"):
-            path = Path(kind) / f"{label}__{camera}.{suffix}"
-            if (folder / path).is_file():
-                found[camera if kind == "videos" else f"{camera} strip"] = path.as_posix()
-    return found
 
 
 class _TickRate:
