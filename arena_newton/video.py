@@ -18,7 +18,9 @@ __all__ = ["VideoWriter", "caption", "evenly", "film_strip"]
 GAP = 4
 """Space between the frames of a film strip [px]."""
 LABEL_HEIGHT = 18
-"""Height of a film strip's label line, and of the line of captions under it [px]."""
+"""Least height of a film strip's label line, and of the line of captions under it [px]."""
+LABEL_SHARE = 0.12
+"""That height of a frame's, where the frame is large enough: a page shows a strip at a third of its size."""
 JPEG_QUALITY = 90
 """Quality of film strips that are JPEGs: a third of the PNG's size, no visible loss at the size of a page."""
 PARTIAL = ".part"
@@ -212,18 +214,20 @@ def film_strip(
     height, width = chosen[0].shape[:2]
     if any(frame.shape != chosen[0].shape for frame in chosen):
         raise ArenaError(f"{path}: the frames of a film strip must be of one size")
-    top, bottom = LABEL_HEIGHT if label else 0, LABEL_HEIGHT if captions else 0
+    line = max(LABEL_HEIGHT, round(LABEL_SHARE * height))
+    top, bottom = line if label else 0, line if captions else 0
     strip = np.full((top + height + bottom, len(chosen) * (width + GAP) - GAP, 3), 255, np.uint8)
 
     def write(text: str, x: int, y: int, ink: tuple[int, int, int]) -> None:
-        cv2.putText(strip, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, ink, 1, cv2.LINE_AA)
+        at = (x, y + line - round(0.28 * line))
+        cv2.putText(strip, text, at, cv2.FONT_HERSHEY_SIMPLEX, line / 43, ink, round(line / 25), cv2.LINE_AA)
 
     for i, frame in enumerate(chosen):
         strip[top : top + height, i * (width + GAP) : i * (width + GAP) + width] = frame
         if captions:
-            write(captions[picks[i]], i * (width + GAP) + 2, top + height + LABEL_HEIGHT - 5, (60, 60, 60))
+            write(captions[picks[i]], i * (width + GAP) + 2, top + height, (60, 60, 60))
     if label:
-        write(label, GAP, LABEL_HEIGHT - 5, colour)
+        write(label, GAP, 0, colour)
     how = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
     encoded = cv2.imencode(path.suffix, cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), how)[1]
     part = path.with_name(path.name + PARTIAL)
