@@ -24,10 +24,10 @@ from arena_newton.eval.journal import Journal
 from arena_newton.eval.stats import wilson
 
 
-def folder_with(tmp_path, rows, planned, **config):
-    """A results folder with these journal records."""
+def document_of(planned, **config):
+    """Content of a config.json."""
     identity = {"rules": "paper", "seeds": [0, 1, 2], "repeats": 20, "max_steps": None, "tracker": "t"} | config
-    document = {
+    return {
         "config": identity,
         "config_hash": "0123456789ab",
         "options": {},
@@ -35,8 +35,12 @@ def folder_with(tmp_path, rows, planned, **config):
         "gym_ids": {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"},
         "rule_set": {"fall": "tilt > 60° <&>"},
     }
+
+
+def folder_with(tmp_path, rows, planned, **config):
+    """A results folder with these journal records."""
     tmp_path.mkdir(exist_ok=True)
-    (tmp_path / "config.json").write_text(json.dumps(document))
+    (tmp_path / "config.json").write_text(json.dumps(document_of(planned, **config)))
     with Journal(tmp_path / "episodes.jsonl") as journal:
         for row in rows:
             journal.append(full(row))
@@ -251,8 +255,8 @@ PLACES = ("task", "tracker", "policy", "mode", "reason", "error", "outcome", "gr
 SLOTS = ("ego", "world", "ego strip", "world strip", "x", "<b>")
 
 
-def hostile_run(folder, number):
-    """A results folder with hostile strings in journal and configuration; which and where follow from a number."""
+def hostile_run(number):
+    """A run with hostile strings in journal and configuration; which and where follow from a number."""
     draw = random.Random(number)
 
     def text():
@@ -264,22 +268,21 @@ def hostile_run(folder, number):
     for row in draw.sample(rows, 6):
         row[draw.choice(PLACES[:6])] = text()
     rows[0] |= {"outcome": "error", "error": text()}
-    folder_with(folder, rows, 12)
-    document = json.loads((folder / "config.json").read_text())
+    document = document_of(12)
     document["config"] |= {draw.choice(["policy", "device", "<i>", text()]): text(), "task": ["football", text()]}
     document["rule_set"] |= {text(): text()}
     document["options"] |= {"policy": text(), "checkpoint": text()}
     document["variant_changes"] = [text()]
     document["environments"] = {text(): {"engine": text(), text(): {text(): text()}}}
     document["versions"] = {text(): text()}
-    (folder / "config.json").write_text(json.dumps(document))
-    return report.load_run(folder)
+    document, rows = json.loads(json.dumps([document, [full(row) for row in rows]]))
+    return report.RunRecord(Path("nowhere"), document, rows)
 
 
 def test_strangers_results_carry_nothing_into_the_page(tmp_path):
     """240 hostile journals: the page has no element, attribute or kind of address that a harmless one has not."""
     rows = [recorded(row, *SLOTS[:4]) for row in episodes("football", (2, 1, 0))]
-    harmless = html(folder_with(tmp_path / "a", rows, 60))
+    harmless = html(folder_with(tmp_path / "a", rows, 120))
     document = json.loads((tmp_path / "a" / "config.json").read_text())
     document |= {
         "variant_changes": ["x"],
@@ -295,7 +298,7 @@ def test_strangers_results_carry_nothing_into_the_page(tmp_path):
     allowed = {(tag, name) for tag, name, _ in shape}
     scripts = harmless.text["script"], harmless.text["style"]
     for number in range(240):
-        run = hostile_run(tmp_path / str(number), number)
+        run = hostile_run(number)
         text = html_page(run)
         tree = Tree(text)
         assert {(tag, name) for tag, name, _ in tree.shape} <= allowed, number
