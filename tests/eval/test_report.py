@@ -262,13 +262,13 @@ def hostile_run(number):
     def text():
         return "".join(draw.choice(HOSTILE) for _ in range(draw.choice((1, 1, 1, 2))))
 
-    rows = [recorded(row, "ego strip", "ego") for row in episodes("football", (2, 1, 0), repeats=4, falls=2)]
+    rows = [recorded(row, "ego strip", "ego") for row in episodes("football", (1, 1, 0), repeats=2, falls=2)]
     for row in rows:
         row["media"] |= {draw.choice(SLOTS): draw.choice((text(), 7, None, ["a"])) for _ in range(3)}
-    for row in draw.sample(rows, 6):
+    for row in draw.sample(rows, 4):
         row[draw.choice(PLACES[:6])] = text()
     rows[0] |= {"outcome": "error", "error": text()}
-    document = document_of(12)
+    document = document_of(6)
     document["config"] |= {draw.choice(["policy", "device", "<i>", text()]): text(), "task": ["football", text()]}
     document["rule_set"] |= {text(): text()}
     document["options"] |= {"policy": text(), "checkpoint": text()}
