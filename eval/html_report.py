@@ -206,7 +206,7 @@ def replay_command(options: Mapping[str, Any], record: Mapping[str, Any]) -> str
 def environment_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What an environment said of itself, in words: engine, physics rate, drive, start-up and the rest."""
     left = dict(facts)
-    found = [(name, plain(left.pop(name))) for name in ("engine", "device") if name in left]
+    found: list[tuple[str, str]] = [(name, plain(left.pop(name))) for name in ("engine", "device") if name in left]
     dt, substeps = left.pop("physics_dt", None), left.pop("substeps", None)
     if isinstance(dt, int | float) and not isinstance(dt, bool):
         found.append(("physics", f"{1e3 * dt:g} ms" + (f" × {plain(substeps)}" if substeps is not None else "")))
