@@ -234,6 +234,7 @@ class Camera:
         fit: Fit = "native",
         aspect: float = 4.0 / 3.0,
         samples: int = 1,
+        views: int | None = None,
     ):
         """Allocate the pictures.
 
@@ -250,6 +251,8 @@ class Camera:
             fit: See `CameraConfig.fit`.
             aspect: Width over height of the sensor, for `fit="pad"`.
             samples: Rays per pixel along each axis.
+            views: Pictures that one render draws; one per world by default. A camera with fewer takes less memory and
+                is told at each render which worlds to show (`render_worlds`).
 
         Raises:
             InputError: A size that is not positive, or an unknown `fit`.
@@ -269,6 +272,9 @@ class Camera:
         self.model, self.lights = model, lights
         self.width, self.height, self.samples = width, height, samples
         self.worlds, self.device = model.world_count, model.device
+        self.views = self.worlds if views is None else views
+        if not 1 <= self.views <= self.worlds:
+            raise InputError(f"camera: {views} views of {self.worlds} worlds, choose 1 to {self.worlds}")
         inner_w, inner_h = width, height
         if fit == "pad":
             inner_w = min(width, max(1, round(height * aspect)))
@@ -290,16 +296,18 @@ class Camera:
         qw, qx, qy, qz = (float(v) for v in quat)
         self._local = wp.transform(wp.vec3(*(float(v) for v in position)), wp.normalize(wp.quat(qx, qy, qz, qw)))
         with wp.ScopedDevice(self.device):
-            self._body = wp.array(np.broadcast_to(body, self.worlds), dtype=wp.int32)
-            self.poses = wp.zeros(self.worlds, dtype=wp.transform)
-            """World pose of each camera at the last render [m]."""
-            self._view_world = wp.array(np.arange(self.worlds), dtype=wp.int32)
-            self._albedo = sensor.allocate_image_albedo(self.worlds, w, h)
-            self._normals = sensor.allocate_image_normal(self.worlds, w, h)
-            self._depth = sensor.allocate_image_depth(self.worlds, w, h)
-            self._nearest = wp.zeros((self.worlds, h, w), dtype=wp.uint64)
-            self.image = wp.zeros((self.worlds, height, width, 3), dtype=wp.uint8)
-            """The pictures of the last render, uint8 [worlds, height, width, 3]."""
+            self._body_of_world = np.broadcast_to(np.asarray(body, dtype=np.int32), self.worlds)
+            self._body = wp.array(self._body_of_world[: self.views], dtype=wp.int32)
+            self._view_body = wp.zeros(self.views, dtype=wp.int32)
+            self.poses = wp.zeros(self.views, dtype=wp.transform)
+            """World pose of each camera at the last render [m], shape [views]."""
+            self._view_world = wp.array(np.arange(self.views), dtype=wp.int32)
+            self._albedo = sensor.allocate_image_albedo(self.views, w, h)
+            self._normals = sensor.allocate_image_normal(self.views, w, h)
+            self._depth = sensor.allocate_image_depth(self.views, w, h)
+            self._nearest = wp.zeros((self.views, h, w), dtype=wp.uint64)
+            self.image = wp.zeros((self.views, height, width, 3), dtype=wp.uint8)
+            """The pictures of the last render, uint8 [views, height, width, 3]."""
         # Two texels a pixel, and no more than a video needs.
         self._shadow_size = min(max(2 * max(w, h), 256), 1024)
         self._shadows: Any = None
@@ -307,7 +315,7 @@ class Camera:
         self._trace_shadows = False
         self._torch_image = wp.to_torch(self.image)
         self._torch_view_world = wp.to_torch(self._view_world)
-        self._every = torch.arange(self.worlds, dtype=torch.int32, device=self._torch_image.device)
+        self._every = torch.arange(self.views, dtype=torch.int32, device=self._torch_image.device)
 
     @classmethod
     def from_scene(
@@ -321,6 +329,7 @@ class Camera:
         *,
         fit: Fit = "native",
         samples: int = 1,
+        views: int | None = None,
     ) -> Camera:
         """A camera authored in the scene's stage: its lens, its pose and the body that carries it.
 
@@ -333,6 +342,7 @@ class Camera:
             lights: The worlds' lights; by default the stage's light in every world.
             fit: See `CameraConfig.fit`.
             samples: Rays per pixel along each axis.
+            views: Pictures that one render draws; one per world by default.
 
         Raises:
             InputError: The prim is missing or is not a camera.
@@ -361,6 +371,7 @@ class Camera:
             fit=fit,
             aspect=aperture / vertical,
             samples=samples,
+            views=views,
         )
 
     def render(self, state: Any, mask: Any = None) -> Any:
@@ -376,23 +387,83 @@ class Camera:
         """
         import torch
 
-        from arena_newton.kernels import lighting, shadow
-
-        tracer, lights = self._tracer, self.lights
+        if self.views != self.worlds:
+            raise InputError(f"camera: {self.views} views of {self.worlds} worlds; name the worlds with render_worlds")
         if mask is None:
             self._torch_view_world.copy_(self._every)
         else:
             if not torch.is_tensor(mask) and hasattr(mask, "numpy"):
                 mask = mask.numpy()
             asked = torch.as_tensor(mask, device=self._every.device).bool()
-            self._torch_view_world.copy_(torch.where(asked, self._every, tracer.preserve))
+            self._torch_view_world.copy_(torch.where(asked, self._every, self._tracer.preserve))
+        return self._render(state, self._body)
+
+    def render_worlds(self, state: Any, worlds: Sequence[int], poses: np.ndarray | None = None) -> Any:
+        """Render chosen worlds, one after the other in the order given.
+
+        Args:
+            state: Newton state whose `body_q` holds the bodies' poses.
+            worlds: World of each picture; at most `views`.
+            poses: Where the camera stands in each of them instead of on its body: float32 [len(worlds), 7],
+                position [m] and quaternion xyzw.
+
+        Returns:
+            torch tensor uint8 [len(worlds), height, width, 3], on the model's device, overwritten by the next render.
+
+        Raises:
+            InputError: More worlds than views.
+        """
+        count = len(worlds)
+        if count > self.views:
+            raise InputError(f"camera: {count} worlds for {self.views} views")
+        rows = np.asarray(worlds, dtype=np.int64)
+        view_world = np.full(self.views, self._tracer.preserve, dtype=np.int32)
+        view_world[:count] = rows
+        self._view_world.assign(view_world)
+        if poses is None:
+            body = np.full(self.views, -1, dtype=np.int32)
+            body[:count] = self._body_of_world[rows]
+            self._view_body.assign(body)
+            self._render(state, self._view_body)
+        else:
+            placed = np.zeros((self.views, 7), dtype=np.float32)
+            placed[:, 6] = 1.0
+            placed[:count] = poses
+            self.poses.assign(placed)
+            self._render(state, None)
+        return self._torch_image[:count]
+
+    def distances(self, view: int, points: np.ndarray) -> np.ndarray:
+        """Distance to what the last render met in the direction of some points [m], 0 where it met nothing.
+
+        Args:
+            view: Which of the pictures.
+            points: Points in the camera's frame, [n, 3]; of one outside the picture the nearest pixel counts.
+        """
+        import torch
+        import warp as wp
+
+        height, width = self._depth.shape[1:]
+        ahead = np.maximum(-points[:, 2], 1e-6)
+        column = 0.5 * (1.0 + points[:, 0] / ahead / self._tangents[0]) * width
+        row = 0.5 * (1.0 - points[:, 1] / ahead / self._tangents[1]) * height
+        rows = torch.as_tensor(np.clip(row, 0, height - 1).astype(np.int64), device=self._every.device)
+        columns = torch.as_tensor(np.clip(column, 0, width - 1).astype(np.int64), device=self._every.device)
+        return wp.to_torch(self._depth)[view, rows, columns].cpu().numpy()
+
+    def _render(self, state: Any, body: Any) -> Any:
+        """Draw the views; `body` carries each one's camera, None leaves `poses` as they are."""
+        from arena_newton.kernels import lighting, shadow
+
+        tracer, lights = self._tracer, self.lights
         lights.upload()
         self.model.bvh_refit_shapes(state)
-        lighting.launch_camera_poses(state.body_q, self._body, self._local, self.poses)
+        if body is not None:
+            lighting.launch_camera_poses(state.body_q, body, self._local, self.poses)
         self._draw()
         maps = self._shadow_maps()
-        part = maps.frames.shape[0] or self.worlds
-        for first in range(0, self.worlds, part):
+        part = maps.frames.shape[0] or self.views
+        for first in range(0, self.views, part):
             if lights.any_distant and not self._trace_shadows:
                 shadow.launch_shadow_maps(
                     first=first,
@@ -410,7 +481,7 @@ class Camera:
             lighting.launch_shade(
                 tracer.traced if self._trace_shadows else shadow.MAPPED,
                 tracer.occluders if self._trace_shadows else maps,
-                views=(first, min(part, self.worlds - first)),
+                views=(first, min(part, self.views - first)),
                 view_world=self._view_world,
                 poses=self.poses,
                 rays=self._rays,
@@ -437,7 +508,7 @@ class Camera:
         wanted = self.lights.any_distant and not self._trace_shadows
         if self._shadows is None or (wanted and not self._shadows.frames.shape[0]):
             size = self._shadow_size
-            count = min(self.worlds, max(1, SHADOW_BYTES // (8 * size * size))) if wanted else 0
+            count = min(self.views, max(1, SHADOW_BYTES // (8 * size * size))) if wanted else 0
             self._shadows = ShadowMaps()
             with wp.ScopedDevice(self.device):
                 self._shadows.frames = wp.zeros(count, dtype=wp.transform)

@@ -1,34 +1,74 @@
-"""Pictures of episodes: ego and world videos, and the paper's film strip of ten frames."""
+"""Pictures of episodes: ego and world videos, and the paper's film strip of ten frames.
+
+A strip costs its ten frames: while an episode runs, only poses are kept (a few kB a frame), and what the strip shows is
+drawn when it ends. A video draws each of its frames. Pictures depend on the episode alone, not on how many worlds run
+beside it, and strips not on whether there are videos.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from arena_newton import follow as following
+from arena_newton.errors import InputError
+from arena_newton.robot import TICK
+from arena_newton.video import VideoWriter, caption, evenly, film_strip
 
 __all__ = ["EpisodeRecorder"]
 
 STRIP_FRAMES = 10
 """Frames of a film strip, as in the paper's rollout figures."""
+STRIP_POSES = 4 * STRIP_FRAMES
+"""Most poses kept of an episode; beyond them every other one is dropped. Frames are then evenly spaced to 1 in 40."""
+STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
+"""Size of a strip's frames (width, height) [px]."""
+VIDEO_SIZE = (480, 270)
+"""Size of world videos (width, height) [px]."""
+SIZE_LIMITS = (32, 4096)
+"""Smallest and largest width and height of a video [px]."""
+VIEWS = 32
+"""Worlds that are drawn at once: bounds the memory of the pictures for any number of worlds."""
+HOLD_FRAMES = 25
+"""Frames for which a video's last picture stands, with the outcome on it."""
+
+COLOURS = {"success": (36, 128, 84), "fall": (192, 64, 40), "timeout": (150, 104, 0), "error": (122, 70, 168)}
+"""Outcome → RGB of its name on strips."""
+BRIGHT = {"success": (120, 240, 170), "fall": (255, 130, 100), "timeout": (255, 205, 90), "error": (215, 165, 255)}
+"""Outcome → RGB of its name on videos."""
 
 
-class _Frames:
-    """At most 2·n evenly spaced frames of a stream of unknown length."""
+@dataclass
+class _Stream:
+    """What is recorded of one world's episode."""
 
-    def __init__(self, n: int):
-        self.limit, self.stride, self.count = 2 * n, 1, 0
-        self.kept: list[Any] = []
+    label: str
+    rows: Any
+    """Bodies of the world in the model, torch [n]."""
+    writers: dict[str, VideoWriter]
+    stride: int
+    """Frames from one kept pose to the next."""
+    ticks: list[int] = field(default_factory=list)
+    """Ticks of the kept poses."""
+    poses: list[Any] = field(default_factory=list)
+    """Kept poses of the world's bodies, torch [n, 7]."""
+    last: int = -1
+    """Tick of the last frame."""
+    last_frame: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def add(self, frame: Any) -> None:
-        if self.count % self.stride == 0:
-            self.kept.append(frame.copy())
-            if len(self.kept) > self.limit:
-                self.kept = self.kept[::2]
-                self.stride *= 2
-        self.count += 1
+    def keep(self, tick: int, poses: Any) -> None:
+        self.ticks.append(tick)
+        self.poses.append(poses)
+        if len(self.poses) > STRIP_POSES:
+            self.ticks, self.poses, self.stride = self.ticks[::2], self.poses[::2], 2 * self.stride
 
 
 class EpisodeRecorder:
-    """Records the worlds of an `ArenaEnv`; give it to `ArenaEnv.run_episodes`."""
+    """Records the worlds of an `ArenaEnv`; give it to `ArenaEnv.run_episodes`, and close it after."""
 
     def __init__(
         self,
@@ -36,9 +76,10 @@ class EpisodeRecorder:
         *,
         video: bool = True,
         strip: bool = True,
+        episodes: int | None = None,
+        size: tuple[int, int] | None = None,
+        follow: bool = False,
         every: int = 2,
-        ego: tuple[int, int] = (320, 240),
-        world: tuple[int, int] = (480, 270),
     ):
         """Set up the recorder.
 
@@ -46,17 +87,32 @@ class EpisodeRecorder:
             folder: Where `videos/` and `strips/` are written.
             video: Write H.264 MP4s.
             strip: Write film strips.
+            episodes: Videos of the first so many episodes of each task and mode only, in the order of the plan.
+            size: Width and height of world videos [px]; head camera videos are as high, 4:3. 480×270 (and 320×240) by
+                default. Strips keep their size.
+            follow: The world camera keeps the robot in the picture, from behind and the left; by default it is the
+                scene's own.
             every: Ticks between frames (2 is 25 frames/s).
-            ego: Head camera size (width, height) [px].
-            world: World camera size (width, height) [px].
+
+        Raises:
+            InputError: A number that cannot be.
         """
+        low, high = SIZE_LIMITS
+        if size is not None and not all(low <= n <= high for n in size):
+            raise InputError(f"--video-size {size[0]}x{size[1]}: expected {low} to {high} pixels each")
+        if episodes is not None and episodes < 1:
+            raise InputError(f"--video-episodes {episodes}: expected at least 1")
+        if every < 1:
+            raise InputError(f"recorder: a frame every {every} ticks, expected at least 1")
         self.folder = Path(folder)
-        self.video, self.strip, self.every = video, strip, every
-        self.sizes = {"ego": ego, "world": world}
-        self._cameras: dict[str, Any] = {}
+        self.video, self.strip, self.episodes, self.follow, self.every = video, strip, episodes, follow, every
+        width, height = size or VIDEO_SIZE
+        ego = (round(height * 4 / 3), height) if size else STRIP_SIZES["ego"]
+        self.video_sizes = {"ego": ego, "world": (width, height)}
         self._env: Any = None
-        self._streams: dict[int, dict[str, Any]] = {}
-        self._ticks = 0
+        self._cameras: dict[str, Any] = {}
+        self._strip_cameras: dict[str, Any] = {}
+        self._streams: dict[int, _Stream] = {}
 
     @staticmethod
     def label(episode: Any) -> str:
@@ -64,64 +120,206 @@ class EpisodeRecorder:
         parts = [episode.task, episode.mode, f"seed{episode.group_seed}", f"repeat{episode.repeat}"]
         return "__".join(str(p) for p in parts)
 
+    def media(self, episode: Any) -> dict[str, str]:
+        """Files of a finished episode, relative to the folder: `ego`, `world`, `ego strip`, `world strip`."""
+        label = self.label(episode)
+        found = {}
+        if self._filmed(episode):
+            found |= {name: f"videos/{label}__{name}.mp4" for name in self.video_sizes}
+        if self.strip:
+            found |= {f"{name} strip": f"strips/{label}__{name}.jpg" for name in STRIP_SIZES}
+        return {name: path for name, path in found.items() if (self.folder / path).is_file()}
+
+    def _filmed(self, episode: Any) -> bool:
+        return self.video and (self.episodes is None or episode.rank < self.episodes)
+
     def _bind(self, env: Any) -> None:
-        from arena_newton.camera import Camera
+        """Cameras and work space of an environment."""
+        import warp as wp
 
         if self._env is env:
             return
+        self._discard()
         self._env = env
-        self._cameras = {
-            name: Camera.from_scene(env.scene, env.physics, prim=name, width=w, height=h, lights=env._lights())
-            for name, (w, h) in self.sizes.items()
-        }
+        # Poses as they are now, and those of another time: the second is drawn when a strip is made.
+        self._now, self._then = env.scene.model.state(), env.scene.model.state()
+        self._now_poses, self._then_poses = wp.to_torch(self._now.body_q), wp.to_torch(self._then.body_q)
+        self._walls = following.room_walls(env.scene.mj_model) if self.follow else ()
+        self._headings: dict[int, float] = {}
+        self._follower = following.Follower(self._headings, self._walls)
+        lights = env._lights()
+        views = min(env.worlds, VIEWS)
+        if self.video:
+            self._cameras = {n: self._camera(env, n, size, lights, views) for n, size in self.video_sizes.items()}
+        if self.strip:
+            self._strip_cameras = {n: self._camera(env, n, size, lights, 1) for n, size in STRIP_SIZES.items()}
+
+    def _camera(self, env: Any, name: str, size: tuple[int, int], lights: Any, views: int) -> Any:
+        from arena_newton.camera import Camera
+
+        width, height = size
+        if name == "world" and self.follow:
+            return Camera(
+                env.scene.model,
+                np.full(env.worlds, -1),
+                (0.0, 0.0, 0.0),
+                (1.0, 0.0, 0.0, 0.0),
+                width=width,
+                height=height,
+                focal_length=following.FOCAL,
+                horizontal_aperture=following.APERTURE,
+                lights=lights,
+                views=views,
+            )
+        return Camera.from_scene(
+            env.scene, env.physics, prim=name, width=width, height=height, lights=lights, views=views
+        )
 
     def start(self, env: Any, world: int, episode: Any) -> None:
-        """Open the streams of a world's new episode."""
-        from arena_newton.video import VideoWriter
+        """Open the streams of a world's new episode.
+
+        Raises:
+            OSError: A file cannot be written; the error carries its name.
+        """
+        import torch
 
         self._bind(env)
-        streams: dict[str, Any] = {"label": self.label(episode)}
-        for name, (w, h) in self.sizes.items():
-            frames = _Frames(STRIP_FRAMES) if self.strip else None
-            writer = None
-            if self.video:
-                path = self.folder / "videos" / f"{streams['label']}__{name}.mp4"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                writer = VideoWriter(path, w, h, fps=50 / self.every)
-            streams[name] = (writer, frames)
-        self._streams[world] = streams
+        label = self.label(episode)
+        bodies = np.asarray(env.scene.body_to_newton[world])
+        rows = torch.as_tensor(np.unique(bodies[bodies >= 0]), device=self._now_poses.device)
+        stream = self._streams[world] = _Stream(label, rows, {}, stride=1)
+        if self._filmed(episode):
+            for name, (width, height) in self.video_sizes.items():
+                path = self.folder / "videos" / f"{label}__{name}.mp4"
+                stream.writers[name] = VideoWriter(path, width, height, fps=50 / self.every)
+        if self.follow or env.tick[world] >= 0:
+            env.physics.write_newton_state(self._now)
+        if self.follow:
+            x, y, z, w = self._now_poses[self._pelvis(world), 3:].tolist()
+            self._headings[world] = float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+            self._follower.forget(world)
+        if env.tick[world] >= 0:  # without a start-up the first frame is the spawn's
+            self._take(env, [world])
 
     def tick(self, env: Any) -> None:
-        """Take a frame of every recorded world that is past its start-up."""
-        self._ticks += 1
-        if self._ticks % self.every:
-            return
-        mask = env.active & (env.tick >= 0)
-        if not mask.any():
-            return
+        """Take a frame of every recorded world that is past its start-up and whose frame is due.
+
+        Raises:
+            OSError: A file cannot be written; the error carries its name.
+        """
+        due = [w for w in self._streams if env.active[w] and env.tick[w] >= 0 and env.tick[w] % self.every == 0]
+        wanted = [w for w in due if self._streams[w].writers or self._due(w, int(env.tick[w]))]
+        if wanted:
+            env.physics.write_newton_state(self._now)
+            self._take(env, wanted)
+
+    def _due(self, world: int, tick: int) -> bool:
+        """Whether a strip keeps the poses of this tick."""
+        return self.strip and tick % (self.every * self._streams[world].stride) == 0
+
+    def _take(self, env: Any, worlds: Sequence[int], *, final: bool = False) -> None:
+        """A frame of some worlds, whose poses lie in `_now`; poses that are not finite cannot be drawn."""
+        finite = [w for w in worlds if self._now_poses[self._streams[w].rows].isfinite().all()]
+        for world in finite:
+            stream, tick = self._streams[world], int(env.tick[world])
+            stream.last = tick
+            if self._due(world, tick) or (self.strip and final):
+                stream.keep(tick, self._now_poses[stream.rows].clone())
+        filmed = [w for w in finite if self._streams[w].writers]
         for name, camera in self._cameras.items():
-            images = env.render(camera, mask).cpu().numpy()
-            for world, streams in self._streams.items():
-                if not mask[world]:
-                    continue
-                writer, frames = streams[name]
-                if writer is not None:
-                    writer.write(images[world])
-                if frames is not None:
-                    frames.add(images[world])
+            for first in range(0, len(filmed), camera.views):
+                part = filmed[first : first + camera.views]
+                ticks = [int(env.tick[w]) for w in part]
+                images = self._draw(name, camera, self._now, self._now_poses, part, ticks, self._follower)
+                for image, world in zip(images, part, strict=True):
+                    stream = self._streams[world]
+                    stream.last_frame[name] = image
+                    stream.writers[name].write(caption(image, _time(int(env.tick[world]))))
+
+    def _pelvis(self, world: int) -> int:
+        return int(self._env.scene.body_to_newton[world, self._env.scene.robot.root_body])
+
+    def _draw(
+        self, name: str, camera: Any, state: Any, poses: Any, worlds: Sequence[int], ticks: Sequence[int], follower: Any
+    ) -> np.ndarray:
+        """Pictures of some worlds from one camera, uint8 [len(worlds), H, W, 3]."""
+        if name == "world" and self.follow:
+            places = poses[[self._pelvis(w) for w in worlds], :2].cpu().numpy()
+            return follower.draw(camera, state, worlds, places, ticks)
+        return camera.render_worlds(state, worlds).cpu().numpy().copy()
 
     def finish(self, env: Any, world: int, result: Any) -> None:
-        """Close the streams of a world's episode; the outcome goes into the strip's label."""
-        from arena_newton.video import film_strip
+        """Close the streams of a world's episode; the outcome goes onto its pictures.
 
-        streams = self._streams.pop(world, None)
-        if streams is None:
+        Raises:
+            OSError: A file cannot be written; the error carries its name.
+        """
+        stream = self._streams.get(world)
+        if stream is None:
             return
-        for name in self.sizes:
-            writer, frames = streams[name]
-            if writer is not None:
-                writer.close()
-            if frames is not None and frames.kept:
-                path = self.folder / "strips" / f"{streams['label']}__{name}.png"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                film_strip(frames.kept, path, n=STRIP_FRAMES, label=f"{streams['label']} {result.outcome}")
+        if env.tick[world] >= 0 and stream.last != env.tick[world]:
+            env.physics.write_newton_state(self._now)
+            self._take(env, [world], final=True)
+        elif self.strip and stream.last >= 0 and stream.ticks[-1] != stream.last:
+            stream.keep(stream.last, self._now_poses[stream.rows].clone())
+        said = result.outcome if result.reason in (result.outcome, "", None) else f"{result.outcome} ({result.reason})"
+        for name, writer in stream.writers.items():
+            if name in stream.last_frame:
+                held = caption(
+                    stream.last_frame[name],
+                    f"{_time(stream.last)}  {said}",
+                    BRIGHT.get(result.outcome, (255, 255, 255)),
+                )
+                for _ in range(HOLD_FRAMES):
+                    writer.write(held)
+            writer.close()
+        if self.strip and stream.poses:
+            self._write_strips(stream, world, result, said)
+        del self._streams[world]
+
+    def _write_strips(self, stream: _Stream, world: int, result: Any, said: str) -> None:
+        """Draw the frames of a strip, and nothing else, from the poses that were kept."""
+        # Nearest to even spacing in time, first and last included.
+        wanted = np.linspace(stream.ticks[0], stream.ticks[-1], STRIP_FRAMES)
+        nearest = [int(np.abs(np.asarray(stream.ticks) - tick).argmin()) for tick in wanted]
+        picks = sorted(set(nearest)) if len(stream.ticks) > STRIP_FRAMES else evenly(len(stream.ticks), STRIP_FRAMES)
+        for name, camera in self._strip_cameras.items():
+            # Not the videos' follower: a strip is the same with and without videos.
+            follower = following.Follower(self._headings, self._walls)
+            frames = []
+            for i in picks:
+                self._then_poses[stream.rows] = stream.poses[i]
+                tick = stream.ticks[i]
+                frames.append(self._draw(name, camera, self._then, self._then_poses, [world], [tick], follower)[0])
+            film_strip(
+                frames,
+                self.folder / "strips" / f"{stream.label}__{name}.jpg",
+                n=STRIP_FRAMES,
+                label=f"{stream.label.replace('__', ' ')}: {said}",
+                colour=COLOURS.get(result.outcome, (0, 0, 0)),
+                captions=[_time(stream.ticks[i]) for i in picks],
+            )
+
+    def close(self) -> None:
+        """Drop what is unfinished; no partial file stays."""
+        self._discard()
+        self._env = None
+        self._cameras, self._strip_cameras = {}, {}
+
+    def _discard(self) -> None:
+        for stream in self._streams.values():
+            for writer in stream.writers.values():
+                writer.discard()
+        self._streams = {}
+
+    def __enter__(self) -> EpisodeRecorder:
+        """The recorder itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Drop what is unfinished."""
+        self.close()
+
+
+def _time(tick: int) -> str:
+    return f"step {tick}  {tick * TICK:.2f} s"

@@ -1,7 +1,8 @@
-"""Pictures on disk: H.264 videos and film strips."""
+"""Pictures on disk: H.264 videos, film strips, and the text on both."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from fractions import Fraction
@@ -12,12 +13,18 @@ import numpy as np
 
 from arena_newton.errors import ArenaError
 
-__all__ = ["VideoWriter", "film_strip"]
+__all__ = ["VideoWriter", "caption", "evenly", "film_strip"]
 
 GAP = 4
 """Space between the frames of a film strip [px]."""
 LABEL_HEIGHT = 18
-"""Height of a film strip's label line [px]."""
+"""Least height of a film strip's label line, and of the line of captions under it [px]."""
+LABEL_SHARE = 0.12
+"""That height of a frame's, where the frame is large enough: a page shows a strip at a third of its size."""
+JPEG_QUALITY = 90
+"""Quality of film strips that are JPEGs: a third of the PNG's size, no visible loss at the size of a page."""
+PARTIAL = ".part"
+"""Suffix of a file that is being written."""
 
 
 def _rgb(frame: Any) -> np.ndarray:
@@ -30,6 +37,11 @@ def _rgb(frame: Any) -> np.ndarray:
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ArenaError(f"a frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
     return np.ascontiguousarray(frame)
+
+
+def _named(error: OSError, path: Path) -> OSError:
+    """The same error with the file's name, which a failed write does not carry."""
+    return OSError(error.errno, os.strerror(error.errno) if error.errno else str(error), str(path))
 
 
 class VideoWriter:
@@ -48,6 +60,9 @@ class VideoWriter:
             height: Frame height [px].
             fps: Frame rate [1/s].
             crf: x264's constant rate factor; smaller is better and larger on disk.
+
+        Raises:
+            OSError: The file cannot be written; the error carries its name.
         """
         import av
 
@@ -56,7 +71,7 @@ class VideoWriter:
         self.frames = 0
         """Frames written so far."""
         self._size = (self.height + self.height % 2, self.width + self.width % 2)
-        self._part = self.path.with_name(self.path.name + ".part")
+        self._part = self.path.with_name(self.path.name + PARTIAL)
         self._part.parent.mkdir(parents=True, exist_ok=True)
         self._container: Any = av.open(str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(float(fps)).limit_denominator(1000)
@@ -72,6 +87,7 @@ class VideoWriter:
 
         Raises:
             ArenaError: The frame has another size or type, or the video is closed.
+            OSError: The file cannot be written; what was written of it is removed.
         """
         import av
 
@@ -82,7 +98,11 @@ class VideoWriter:
             raise ArenaError(f"{self.path}: expected frames of {self.width}×{self.height}, got {pixels.shape[1::-1]}")
         if self._size != pixels.shape[:2]:
             pixels = np.pad(pixels, ((0, self._size[0] - self.height), (0, self._size[1] - self.width), (0, 0)))
-        self._mux(self._stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        try:
+            self._mux(self._stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        except OSError as error:
+            self.discard()
+            raise _named(error, self.path) from None
         self.frames += 1
 
     def _mux(self, packets: Any) -> None:
@@ -90,36 +110,36 @@ class VideoWriter:
             self._container.mux(packet)
 
     def close(self) -> None:
-        """Finish the file and give it its name; a video without frames leaves nothing."""
+        """Finish the file and give it its name; a video without frames leaves nothing.
+
+        Raises:
+            OSError: The file cannot be finished; what was written of it is removed.
+        """
         if self._container is None:
             return
+        if not self.frames:
+            self.discard()
+            return
         try:
-            if self.frames:
-                self._mux(self._stream.encode(None))
-        finally:
+            self._mux(self._stream.encode(None))
             container, self._container = self._container, None
-            if self.frames:
-                container.close()
-        if self.frames:
+            container.close()
             os.replace(self._part, self.path)
-        else:
-            self._abandon(container)
+        except OSError as error:
+            self.discard()
+            raise _named(error, self.path) from None
 
     def discard(self) -> None:
         """Drop the file."""
-        if self._container is not None:
-            container, self._container = self._container, None
-            self._abandon(container)
-
-    def _abandon(self, container: Any) -> None:
-        import contextlib
-
         import av
 
-        # An MP4 without a frame cannot be finished: the muxer complains, and the file is dropped anyway.
-        with contextlib.suppress(av.error.FFmpegError, ValueError):
-            container.close()
-        self._part.unlink(missing_ok=True)
+        container, self._container = self._container, None
+        if container is not None:
+            # An MP4 without a frame cannot be finished: the muxer complains, and the file is dropped anyway.
+            with contextlib.suppress(av.error.FFmpegError, ValueError):
+                container.close()
+        with contextlib.suppress(OSError):
+            self._part.unlink(missing_ok=True)
 
     def __enter__(self) -> VideoWriter:
         """The writer itself."""
@@ -133,37 +153,90 @@ class VideoWriter:
             self.discard()
 
 
-def film_strip(frames: Sequence[Any], path: str | Path, n: int = 10, label: str | None = None) -> Path:
-    """Write `n` evenly spaced frames side by side as one PNG, first and last frame included.
+def caption(frame: Any, text: str, colour: tuple[int, int, int] = (255, 255, 255)) -> np.ndarray:
+    """A copy of a frame with a line of text at the lower left, as large as suits its height.
+
+    Args:
+        frame: uint8 [H, W, 3].
+        text: ASCII.
+        colour: RGB of the text; a dark edge keeps it readable on any ground.
+    """
+    import cv2
+
+    picture = _rgb(frame).copy()
+    scale = max(0.35, picture.shape[0] / 600)
+    at = (round(10 * scale) + 2, picture.shape[0] - round(12 * scale) - 2)
+    for line, thickness in (((16, 16, 16), 3 * max(1, round(scale))), (colour, max(1, round(scale)))):
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, line, thickness, cv2.LINE_AA)
+    return picture
+
+
+def evenly(count: int, n: int) -> list[int]:
+    """Indices of `n` evenly spaced ones of `count`, first and last included; all of them where there are fewer."""
+    return [int(i) for i in np.linspace(0, count - 1, min(n, count)).round()]
+
+
+def film_strip(
+    frames: Sequence[Any],
+    path: str | Path,
+    n: int = 10,
+    label: str | None = None,
+    *,
+    colour: tuple[int, int, int] = (0, 0, 0),
+    captions: Sequence[str] | None = None,
+) -> Path:
+    """Write `n` evenly spaced frames side by side as one picture, first and last frame included.
 
     Args:
         frames: Frames of one size, uint8 [H, W, 3].
-        path: Target, `.png`.
+        path: Target, `.png` or `.jpg`.
         n: Number of frames; with fewer frames than that, all of them.
         label: Line of text above the strip.
+        colour: RGB of the label.
+        captions: A line under each of `frames`, for the chosen ones.
 
     Returns:
         The path.
 
     Raises:
-        ArenaError: No frames.
+        ArenaError: No frames, frames of different sizes, or another kind of file.
+        OSError: The file cannot be written; the error carries its name.
     """
-    from PIL import Image, ImageDraw
+    import cv2
 
+    path = Path(path)
     if len(frames) == 0:
         raise ArenaError(f"{path}: a film strip needs at least one frame")
-    picks = np.linspace(0, len(frames) - 1, min(n, len(frames))).round().astype(int)
+    if path.suffix not in (".png", ".jpg"):
+        raise ArenaError(f"{path}: a film strip is a .png or a .jpg")
+    picks = evenly(len(frames), n)
     chosen = [_rgb(frames[i]) for i in picks]
     height, width = chosen[0].shape[:2]
-    top = LABEL_HEIGHT if label else 0
-    strip = Image.new("RGB", (len(chosen) * (width + GAP) - GAP, height + top), "white")
+    if any(frame.shape != chosen[0].shape for frame in chosen):
+        raise ArenaError(f"{path}: the frames of a film strip must be of one size")
+    line = max(LABEL_HEIGHT, round(LABEL_SHARE * height))
+    top, bottom = line if label else 0, line if captions else 0
+    strip = np.full((top + height + bottom, len(chosen) * (width + GAP) - GAP, 3), 255, np.uint8)
+
+    def write(text: str, x: int, y: int, ink: tuple[int, int, int]) -> None:
+        at = (x, y + line - round(0.28 * line))
+        cv2.putText(strip, text, at, cv2.FONT_HERSHEY_SIMPLEX, line / 43, ink, round(line / 25), cv2.LINE_AA)
+
     for i, frame in enumerate(chosen):
-        strip.paste(Image.fromarray(frame), (i * (width + GAP), top))
+        strip[top : top + height, i * (width + GAP) : i * (width + GAP) + width] = frame
+        if captions:
+            write(captions[picks[i]], i * (width + GAP) + 2, top + height, (60, 60, 60))
     if label:
-        ImageDraw.Draw(strip).text((GAP, 3), label, fill="black")
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    strip.save(part, format="PNG")
-    os.replace(part, path)
+        write(label, GAP, 0, colour)
+    how = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    encoded = cv2.imencode(path.suffix, cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), how)[1]
+    part = path.with_name(path.name + PARTIAL)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(encoded.tobytes())
+        os.replace(part, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise _named(error, path) from None
     return path

@@ -29,7 +29,7 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: help tick throughput camera episodes tests, or `all` (everything but tests)."""
+    """What to measure: help tick throughput camera pictures episodes tests, or `all` (everything but tests)."""
     checkpoint: str | None = None
     """Official TWIST2 ONNX file; without it a network of its shape with random weights takes its place."""
     worlds: int = 20
@@ -309,6 +309,39 @@ def _camera(options: BenchOptions) -> Iterator[Figure]:
     yield Figure("ego camera 224x224, shadows and textures, one CPU core", 40, "frames/s", False, value, note)
 
 
+def _pictures(options: BenchOptions) -> Iterator[Figure]:
+    """What strips and videos add to two VisNavi episodes of the expert, taken in turn in one environment."""
+    from arena_newton import policies, trackers
+    from arena_newton.env import ArenaEnv
+    from arena_newton.eval import plan
+    from arena_newton.recorder import EpisodeRecorder
+
+    env = ArenaEnv("vis_navi", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu")
+    episodes = plan.expand(["vis_navi"], tracker="twist2", policy="expert", seeds=[0], repeats=2)
+    policy = policies.get("expert")
+    times: dict[str, list[float]] = {"none": [], "strip": [], "video": []}
+    with tempfile.TemporaryDirectory() as folder:
+
+        def play(kind: str) -> None:
+            with EpisodeRecorder(folder, video=kind == "video", strip=kind == "strip") as recorder:
+                began = time.perf_counter()
+                env.run_episodes(policy, episodes, recorder=None if kind == "none" else recorder)
+                times[kind].append(time.perf_counter() - began)
+
+        # Kernels of tick and camera first.
+        with EpisodeRecorder(folder, video=False) as recorder:
+            env.run_episodes(policy, episodes, recorder=recorder, max_steps=20)
+        for _ in range(3):
+            play("none")
+            play("strip")
+        play("video")
+    alone = statistics.median(times["none"])
+    for kind, bar in (("strip", 1.5), ("video", 8.0)):
+        value = statistics.median(times[kind])
+        note = f"{value:.1f} s / {alone:.1f} s"
+        yield Figure(f"--{kind} / no pictures, 2 VisNavi episodes, expert, CPU", bar, "x", True, value / alone, note)
+
+
 def _episodes(options: BenchOptions) -> Iterator[Figure]:
     from arena_newton import policies
     from arena_newton.env import ArenaEnv
@@ -363,5 +396,6 @@ _ITEMS: dict[str, Callable[[BenchOptions], Iterator[Figure]]] = {
     "tick": _tick,
     "throughput": _throughput,
     "camera": _camera,
+    "pictures": _pictures,
     "episodes": _episodes,
 }

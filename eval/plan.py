@@ -40,6 +40,8 @@ class Episode:
     object_seed: int
     max_steps: int
     """Step budget [50 Hz ticks]."""
+    rank: int = 0
+    """Place among the episodes of its task and mode, from 0."""
 
     @property
     def key(self) -> str:
@@ -98,7 +100,7 @@ def expand(
         spec = tasks.get(name)
         budget = spec.max_steps(rule_set)
         for mode in modes:
-            for group_seed in seeds:
+            for place, group_seed in enumerate(seeds):
                 for repeat in range(repeats):
                     seed = seeding.episode_seed(spec.gym_id, group_seed, repeat)
                     episodes.append(
@@ -115,6 +117,7 @@ def expand(
                             episode_seed=seed,
                             object_seed=seeding.object_seed(seed),
                             max_steps=budget if max_steps is None else min(budget, max_steps),
+                            rank=place * repeats + repeat,
                         )
                     )
     return episodes

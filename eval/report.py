@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from arena_newton.eval.html_report import Page, environment_facts, media_of, page, plain, rules_that_ran
 from arena_newton.eval.journal import read_journal, write_atomic
 from arena_newton.eval.original_format import write_original
 from arena_newton.eval.records import check_plan, counted, read_document
-from arena_newton.eval.stats import aggregate, outside_suites
+from arena_newton.eval.stats import aggregate, error_reasons, outside_suites
 
 __all__ = ["RunRecord", "load_run", "notes", "results_json", "table", "write_reports"]
 
@@ -39,19 +40,6 @@ _COLUMNS = (
     "afr",
     "mean_steps",
 )
-
-_STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;color:#1c2430;background:#fff}
-h1{font-size:1.5rem;margin-bottom:.2rem}h2{font-size:1.1rem;margin-top:2rem}
-table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
-th,td{padding:.35rem .6rem;border-bottom:1px solid #dde3ea;text-align:right;white-space:nowrap}
-th:first-child,td:first-child,td.text,th.text{text-align:left}thead th{border-bottom:2px solid #1c2430}
-.bar{display:inline-block;width:6rem;height:.7rem;background:#e6ebf1;vertical-align:middle;margin-right:.5rem}
-.bar i{display:block;height:100%;background:#2f7d5b}.note{color:#5b6775}.warn{color:#a33}
-code{font-size:.92em}.scroll{overflow-x:auto}
-@media(prefers-color-scheme:dark){body{color:#e4e9ef;background:#14181d}th,td{border-color:#2c343d}
-thead th{border-color:#e4e9ef}.bar{background:#2c343d}.note{color:#93a0ae}a{color:#7db7ff}}
-"""
 
 
 @dataclass(frozen=True)
@@ -118,10 +106,7 @@ def _cell_text(cell: dict[str, Any]) -> list[str]:
     low_high = "-" if cell["ci95"] is None else f"{100 * cell['ci95'][0]:.1f} to {100 * cell['ci95'][1]:.1f}"
     running = cell["falls"] - cell["startup_falls"]
     return [
-        cell["task"],
-        cell["tracker"],
-        cell["policy"],
-        cell["mode"],
+        *(plain(cell[name]) for name in ("task", "tracker", "policy", "mode")),
         str(cell["episodes"]),
         f"{_percent(cell['sr'])} ± {_percent(cell['sr_seed_std'])}",
         low_high,
@@ -139,10 +124,7 @@ _HEAD += ["falls running + at start", "timeouts", "errors", "mean steps"]
 
 def _suite_text(suite: dict[str, Any]) -> list[str]:
     return [
-        suite["suite"],
-        suite["tracker"],
-        suite["policy"],
-        suite["mode"],
+        *(plain(suite[name]) for name in ("suite", "tracker", "policy", "mode")),
         str(suite["episodes"]),
         f"{_percent(suite['sr'])} ± {_percent(suite['sr_std'])}",
         "",
@@ -160,7 +142,7 @@ def _rows(results: dict[str, Any]) -> list[list[str]]:
 
 def table(results: dict[str, Any]) -> str:
     """The result table as Markdown with aligned columns; it is also what the command line prints."""
-    rows = [_HEAD, *_rows(results)]
+    rows = [_HEAD, *([_escaped(text) for text in row] for row in _rows(results))]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
 
     def line(row: list[str]) -> str:
@@ -178,7 +160,8 @@ def table_csv(results: dict[str, Any]) -> str:
     writer.writeheader()
     for cell in results["cells"]:
         low, high = cell["ci95"] or (None, None)
-        writer.writerow(cell | {"ci95_low": low, "ci95_high": high})
+        names = {name: plain(cell[name]) for name in ("task", "tracker", "policy", "mode")}
+        writer.writerow(cell | names | {"ci95_low": low, "ci95_high": high})
     return text.getvalue()
 
 
@@ -202,89 +185,66 @@ def notes(results: dict[str, Any]) -> list[str]:
     return found
 
 
+def _escaped(text: object) -> str:
+    """Text of a results folder as Markdown that stays text."""
+    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
+
+
+def _code(text: object) -> str:
+    """The same as code."""
+    return f"`{plain(text).replace('`', "'")}`"
+
+
 def _markdown(run: RunRecord, results: dict[str, Any]) -> str:
-    lines = [f"# HumanoidArena results {results['config_hash']}", ""]
-    lines += [f"> {note}" for note in notes(results)] + [""]
-    lines += [table(results)]
+    lines = [f"# HumanoidArena results {_escaped(results['config_hash'])}", ""]
+    lines += [f"> {_escaped(note)}" for note in notes(results)]
+    lines += [f"> The scene is a variant: {_escaped(text)}" for text in run.document.get("variant_changes") or []]
+    lines += ["", table(results)]
     lines += [
         "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
         "seed rates pooled); the interval is Wilson's; AFR is falls per episode; falls at start happened while the",
         "tracker settled.",
         "",
-        "## Configuration",
-        "",
     ]
-    lines += [f"- {key}: `{_plain(value)}`" for key, value in run.config.items()]
-    lines += ["", f"## Rule set `{run.config['rules']}`", ""]
-    lines += [f"- {key}: `{_plain(value)}`" for key, value in run.document["rule_set"].items()]
-    media = _media(run)
-    if media:
-        lines += ["", "## Recordings", ""]
-        lines += [f"- {title}: " + ", ".join(f"[{name}]({path})" for name, path in links) for title, links in media]
+    reasons = error_reasons(run.records)
+    if reasons:
+        lines += ["## Errors", "", "| reason | message | episodes |", "|---|---|---:|"]
+        lines += [f"| {_escaped(r['reason'])} | {_escaped(r['message'])} | {r['count']} |" for r in reasons]
+        lines += ["", "Run them again, in this folder: `python -m arena_newton.eval resume . --retry-errors`", ""]
+    strips = [(r, media_of(r)) for r in run.records if media_of(r)]
+    if strips:
+        lines += ["## Recordings", ""]
+        strips.sort(key=lambda entry: entry[0]["outcome"] == "success")
+        lines += [
+            f"- {_escaped(r['task'])} {_escaped(r['mode'])} seed {_escaped(r['group_seed'])} repeat "
+            f"{_escaped(r['repeat'])} ({_escaped(r['outcome'])}): "
+            + ", ".join(f"[{name}]({path})" for name, path in media.items())
+            for r, media in strips
+        ]
+        lines += [""]
+    for name, facts in (run.document.get("environments") or {}).items():
+        lines += [f"## What ran: {_escaped(name)}", ""]
+        lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in environment_facts(facts)] + [""]
+    lines += ["## Configuration", ""]
+    lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in run.config.items()]
+    tasks = run.config.get("task") or list(dict.fromkeys(r["task"] for r in run.records))
+    lines += ["", f"## Rule set {_code(run.config['rules'])}", ""]
+    lines += [f"- {_escaped(item)}: {_code(text)}" for item, text in rules_that_ran(run.document["rule_set"], tasks)]
     return "\n".join(lines) + "\n"
 
 
-def _plain(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _media(run: RunRecord) -> list[tuple[str, list[tuple[str, str]]]]:
-    found = []
-    for record in run.records:
-        links = sorted((record.get("media") or {}).items())
-        if links:
-            title = (
-                f"{record['task']} {record['mode']} seed {record['group_seed']} repeat {record['repeat']}"
-                f" ({record['outcome']})"
-            )
-            found.append((title, links))
-    return found
-
-
 def _html(run: RunRecord, results: dict[str, Any]) -> str:
-    escape = html.escape
-    parts = [
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width,initial-scale=1">',
-        f"<title>HumanoidArena results {results['config_hash']}</title><style>{_STYLE}</style></head><body>",
-        f"<h1>HumanoidArena results</h1><p class='note'>configuration <code>{results['config_hash']}</code>, "
-        f"{results['finished']} of {results['planned']} episodes</p>",
-    ]
-    parts += [f"<p class='warn'>{escape(note)}</p>" for note in notes(results)]
-    parts.append("<div class='scroll'><table><thead><tr>")
-    parts += [f"<th{' class=text' if i < 4 else ''}>{escape(name)}</th>" for i, name in enumerate(_HEAD)]
-    parts.append("</tr></thead><tbody>")
-    entries = [(c["sr"], _cell_text(c)) for c in results["cells"]]
-    entries += [(s["sr"], _suite_text(s)) for s in results["suites"]]
-    for rate, row in entries:
-        parts.append("<tr>")
-        for i, text in enumerate(row):
-            bar = f"<span class='bar'><i style='width:{100 * (rate or 0):.1f}%'></i></span>" if i == 5 else ""
-            parts.append(f"<td{' class=text' if i < 4 else ''}>{bar}{escape(text)}</td>")
-        parts.append("</tr>")
-    parts.append("</tbody></table></div>")
-    parts.append(
-        "<p class='note'>SR: success rate ± population standard deviation over group seeds (suite rows: over all task "
-        "and seed rates pooled). CI: Wilson. AFR: falls per episode. Falls at start happened while the tracker settled."
-        "</p>"
+    return page(
+        Page(
+            document=run.document,
+            records=run.records,
+            results=results,
+            notes=notes(results),
+            head=_HEAD,
+            rows=_rows(results),
+            reasons=error_reasons(run.records),
+        )
     )
-    sections = {"Configuration": run.config, f"Rule set {run.config['rules']}": run.document["rule_set"]}
-    for title, content in sections.items():
-        parts.append(f"<h2>{escape(title)}</h2><div class='scroll'><table><tbody>")
-        parts += [
-            f"<tr><td>{escape(key)}</td><td class='text'><code>{escape(_plain(value))}</code></td></tr>"
-            for key, value in content.items()
-        ]
-        parts.append("</tbody></table></div>")
-    media = _media(run)
-    if media:
-        parts.append("<h2>Recordings</h2><ul>")
-        for title, links in media:
-            anchors = ", ".join(f"<a href='{escape(path, quote=True)}'>{escape(name)}</a>" for name, path in links)
-            parts.append(f"<li>{escape(title)}: {anchors}</li>")
-        parts.append("</ul>")
-    parts.append("</body></html>\n")
-    return "".join(parts)
 
 
 def write_reports(run: RunRecord) -> dict[str, Any]:

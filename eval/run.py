@@ -192,8 +192,7 @@ def _variant_changes(config: RunConfig) -> dict[str, list[str]]:
         return {}
     from arena_newton.usd_scenes import validate
 
-    differences = getattr(validate, "differences", None)
-    return {} if differences is None else {"variant_changes": differences(config.variant, config.tasks[0])}
+    return {"variant_changes": validate.differences(config.variant, config.tasks[0])}
 
 
 def _check_folder(folder: Path, config: RunConfig, options: RunOptions, installed: Versions) -> dict[str, Any] | None:
@@ -450,7 +449,7 @@ class _Run:
                 if isinstance(actor, RecordingPolicy):
                     assert env is not None
                     actor.write(result, env.spec.gym_id)
-                media = _media(self.folder, recorder, result.episode)
+                media = recorder.media(result.episode) if recorder is not None else {}
                 self.journal.append(_record(c, result, media, self.hashes))
                 left.pop(result.episode.index, None)
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK_S))
@@ -465,7 +464,7 @@ class _Run:
                 max_steps=episodes[0].max_steps,
             )
         finally:
-            if recorder is not None and hasattr(recorder, "close"):
+            if recorder is not None:
                 recorder.close()
             if env is not None:
                 env.close()
@@ -558,21 +557,6 @@ def _policy_camera(policy: Any) -> Any:
     from arena_newton.camera import CameraConfig
 
     return CameraConfig()
-
-
-def _media(folder: Path, recorder: Any, episode: Any) -> dict[str, str]:
-    """Recordings of an episode that lie in the results folder, by name."""
-    if recorder is None:
-        return {}
-    if hasattr(recorder, "media"):
-        return recorder.media(episode)
-    found, label = {}, recorder.label(episode)
-    for kind, suffix in (("videos", "mp4"), ("strips", "png")):
-        for camera in ("ego", "world"):
-            path = Path(kind) / f"{label}__{camera}.{suffix}"
-            if (folder / path).is_file():
-                found[camera if kind == "videos" else f"{camera} strip"] = path.as_posix()
-    return found
 
 
 def _record(config: RunConfig, result: Any, media: dict[str, str], hashes: dict[str, str]) -> dict[str, Any]:

@@ -1,20 +1,33 @@
 """Reports are derived from configuration and journal alone, and hold what a reader needs."""
 
+import base64
+import hashlib
 import json
+import random
 import re
+import shlex
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
 from test_stats import episodes
 
 from arena_newton.errors import InputError
 from arena_newton.eval import report
+from arena_newton.eval.html_report import replay_command, rules_that_ran
 from arena_newton.eval.journal import Journal
+from arena_newton.eval.stats import wilson
 
 
-def folder_with(tmp_path, rows, planned, **config):
-    """A results folder with these journal records."""
+def document_of(planned, **config):
+    """Content of a config.json."""
     identity = {"rules": "paper", "seeds": [0, 1, 2], "repeats": 20, "max_steps": None, "tracker": "t"} | config
-    document = {
+    return {
         "config": identity,
         "config_hash": "0123456789ab",
         "options": {},
@@ -22,8 +35,12 @@ def folder_with(tmp_path, rows, planned, **config):
         "gym_ids": {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"},
         "rule_set": {"fall": "tilt > 60° <&>"},
     }
+
+
+def folder_with(tmp_path, rows, planned, **config):
+    """A results folder with these journal records."""
     tmp_path.mkdir(exist_ok=True)
-    (tmp_path / "config.json").write_text(json.dumps(document))
+    (tmp_path / "config.json").write_text(json.dumps(document_of(planned, **config)))
     with Journal(tmp_path / "episodes.jsonl") as journal:
         for row in rows:
             journal.append(full(row))
@@ -60,19 +77,307 @@ def test_wall_clock_is_nowhere_in_the_tables(tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
+VOID = {"meta", "img", "br", "hr", "input", "link", "base"}
+URLS = {"href", "src", "srcset", "action", "formaction", "poster", "data", "background", "ping", "xlink:href"}
+
+
+class Tree(HTMLParser):
+    """The elements of a page as a browser's parser nests them: (tag, attributes, text)."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self._open, self.text = [], [], {}
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        assert len({name for name, _ in attributes}) == len(attributes), "an attribute twice"
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        where = self._open[-1] if self._open else ""
+        self.text[where] = self.text.get(where, "") + data
+
+    def close(self):
+        super().close()
+        assert not self._open
+
+    @property
+    def shape(self):
+        """Every tag with the names of its attributes, and the addresses."""
+        return {
+            (tag, name, value if name in URLS else "") for tag, given in self.elements for name, value in given.items()
+        }
+
+    def find(self, tag, **wanted):
+        return [given for name, given in self.elements if name == tag and wanted.items() <= given.items()]
+
+
+def html(folder):
+    """The parsed page of a results folder."""
+    report.write_reports(report.load_run(folder))
+    return Tree((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def recorded(row, *names):
+    """A record with recordings."""
+    stem = f"{row['task']}__base__seed{row['group_seed']}__repeat{row['repeat']}"
+    paths = {n: f"strips/{stem}__{n[:-6]}.jpg" if n.endswith("strip") else f"videos/{stem}__{n}.mp4" for n in names}
+    return row | {"media": paths}
+
+
 def test_html_is_self_contained_and_escaped(tmp_path):
     """The HTML report loads nothing from elsewhere, shows configuration and rules, and escapes what it prints."""
     rows = episodes("football", (1, 0, 0), falls=2)
     rows[1]["startup_fall"] = True
     rows[0]["media"] = {"ego": "videos/x__ego.mp4"}
     folder = folder_with(tmp_path / "a", rows, 60, policy="<script>")
-    report.write_reports(report.load_run(folder))
+    tree = html(folder)
     text = (folder / "report.html").read_text()
-    assert not re.search(r"<(script|link|img|iframe)|https?://|url\(", text)
+    assert not re.search(r"<(link|iframe|object|embed|base)|https?://|url\(|@import", text)
     assert "&lt;script&gt;" in text and "tilt &gt; 60° &lt;&amp;&gt;" in text
-    assert "<a href='videos/x__ego.mp4'>ego</a>" in text
+    assert {given["href"] for given in tree.find("a")} == {"videos/x__ego.mp4"}
     assert "1 + 1" in text
-    assert "videos/x__ego.mp4" in (folder / "report.md").read_text()
+    assert "[ego](videos/x__ego.mp4)" in (folder / "report.md").read_text()
+
+
+def test_page_opens_with_table_and_bars(tmp_path):
+    """Table, outcome bars with interval and seeds, strips, episodes and folded configuration stand in this order."""
+    rows = [recorded(row, "ego strip", "world strip", "ego") for row in episodes("football", (10, 10, 12), falls=3)]
+    folder = folder_with(tmp_path / "a", rows, 60)
+    tree = html(folder)
+    text = (folder / "report.html").read_text()
+    places = [text.index(f">{name}<") for name in ("Results", "Outcomes", "Film strips", "Episodes", "Configuration")]
+    assert places == sorted(places)
+    bars = [float(r["width"].rstrip("%")) for r in tree.find("rect") if "x" in r]
+    assert sum(bars) == pytest.approx(100.0, abs=0.02) and bars[0] == pytest.approx(100 * 32 / 60, abs=0.01)
+    low, high = wilson(32, 60)
+    assert tree.find("line", x1=f"{100 * low:.2f}%", x2=f"{100 * high:.2f}%", y1="25")
+    assert len(tree.find("circle", **{"class": "seed"})) == 3 + 1  # and one in the legend
+    assert all(given["loading"] == "lazy" for given in tree.find("img"))
+    assert len([1 for tag, given in tree.elements if tag == "tr" and "data-outcome" in given]) == 60
+    folded = text[text.index(">Episodes<") :]
+    assert '<details><summary class="head">Configuration' in folded
+
+
+def test_failures_come_first_and_the_rest_is_folded(tmp_path):
+    """Strips of falls, then of timeouts, then a few successes are shown; nothing is left out."""
+    rows = [recorded(row, "ego strip") for row in episodes("football", (12, 12, 12), falls=4)]
+    folder = folder_with(tmp_path / "a", rows, 60)
+    shown = [given["alt"].rsplit(": ", 1)[1].split(",")[0] for given in html(folder).find("img")]
+    assert len(shown) == 60
+    assert shown[:12] == ["fall"] * 4 + ["timeout"] * 5 + ["success"] * 3
+    assert "48 more episodes" in (folder / "report.html").read_text()
+
+
+def test_only_rules_of_tasks_that_ran(tmp_path):
+    """Rows of other tasks, and their parts of lists, are left out; no text points at what does not follow."""
+    from arena_newton import rules
+
+    for name in rules.names():
+        said = dict(rules.get(name).table())
+        rows = dict(rules_that_ran(said, ["vis_navi"]))
+        text = json.dumps(rows)
+        assert not re.search("football|ball|double_desk|pp_box|open_door|sit_sofa|boxing|ranges below", text), text
+        assert rows["fall"] == said["fall"] and "feet" in rows["vis_navi"]
+        assert rows["step budget (50 Hz ticks)"].startswith("vis_navi ")
+        assert "football" in dict(rules_that_ran(said, ["football"]))
+
+
+def test_reasons_environments_and_variants_are_told(tmp_path):
+    """Errors with counts and the command, what ran, and what a variant changes stand in both reports."""
+    rows = episodes("football", (1, 0, 0))
+    for i in (3, 4, 9):
+        rows[i] |= {"outcome": "error", "reason": "policy", "error": "server gone" if i < 9 else "answered \x1b[2J500"}
+    folder = folder_with(tmp_path / "a", rows, 60)
+    document = json.loads((folder / "config.json").read_text())
+    document["variant_changes"] = ["gravity is 0 m/s²"]
+    document["environments"] = {
+        "football base": {"engine": "warp", "physics_dt": 0.005, "substeps": 4, "drive": "twist2", "startup_ticks": 50}
+    }
+    (folder / "config.json").write_text(json.dumps(document))
+    html(folder)
+    for name in ("report.html", "report.md"):
+        text = (folder / name).read_text()
+        assert "5 ms × 4" in text and "gravity is 0 m/s²" in text and "\x1b" not in text
+        assert "resume . --retry-errors" in text and "50 ticks" in text
+    counts = [(r["message"], r["count"]) for r in report.error_reasons([full(row) for row in rows])]
+    assert counts[0] == ("server gone", 2) and len(counts) == 2
+
+
+def test_command_plays_the_episode_again(tmp_path):
+    """An episode's command names its task, mode, seed and repeat and all that it depends on, quoted for a shell."""
+    options = {"policy": "replay:a b;rm", "tracker": "twist2", "max_steps": 50, "rules": "paper", "out": "secret"}
+    record = {"task": "boxing", "mode": "visual", "group_seed": 2, "repeat": 3}
+    command = replay_command(options, record)
+    words = shlex.split(command)
+    assert words[:3] == ["python", "-m", "arena_newton.eval"] and "secret" not in words
+    assert words[3:11] == ["--task", "boxing", "--mode", "visual", "--seeds", "2", "--repeats", "4"]
+    assert words[words.index("--policy") + 1] == "replay:a b;rm"
+    assert words[words.index("--max-steps") + 1] == "50"
+
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    "</title></style></script><img src=x onerror=alert(1)>",
+    '"><svg onload=alert(1)>',
+    "' onmouseover='alert(1)",
+    "javascript:alert(1)",
+    "data:text/html,<script>alert(1)</script>",
+    "//evil.example/x.png",
+    "https://evil.example/x.mp4",
+    "file:///etc/passwd",
+    "videos/../../../etc/passwd",
+    "strips/..%2f..%2fx.png",
+    "videos/x.mp4#javascript:alert(1)",
+    "videos/x.svg",
+    "strips/a.html",
+    "strips/a.jpg ",
+    "strips/a.jpg\n",
+    "\\\\host\\share\\x.png",
+    "&lt;script&gt;&#x3c;b&#x3e;",
+    "]]><!--<b>-->",
+    "`<b>` | [x](javascript:alert(1)) ![x](//evil.example/t.png)",
+    "\x1b]8;;http://evil.example\x07\x1b[2J",
+    "\u202egpj.exe\u2066",
+    "\ud800\udfffx\ud800",
+    "\x00\x01\x85\u2028",
+    "= cmd|' /C calc'!A0",
+    "\uff1cscript\uff1ealert(1)",
+    "{{7*7}}${7*7}<%= 7 %>",
+)
+PLACES = ("task", "tracker", "policy", "mode", "reason", "error", "outcome", "group_seed", "repeat", "steps", "margin")
+SLOTS = ("ego", "world", "ego strip", "world strip", "x", "<b>")
+
+
+def hostile_run(number):
+    """A run with hostile strings in journal and configuration; which and where follow from a number."""
+    draw = random.Random(number)
+
+    def text():
+        return "".join(draw.choice(HOSTILE) for _ in range(draw.choice((1, 1, 1, 2))))
+
+    rows = [recorded(row, "ego strip", "ego") for row in episodes("football", (1, 1, 0), repeats=2, falls=2)]
+    for row in rows:
+        row["media"] |= {draw.choice(SLOTS): draw.choice((text(), 7, None, ["a"])) for _ in range(3)}
+    for row in draw.sample(rows, 4):
+        row[draw.choice(PLACES[:6])] = text()
+    rows[0] |= {"outcome": "error", "error": text()}
+    document = document_of(6)
+    document["config"] |= {draw.choice(["policy", "device", "<i>", text()]): text(), "task": ["football", text()]}
+    document["rule_set"] |= {text(): text()}
+    document["options"] |= {"policy": text(), "checkpoint": text()}
+    document["variant_changes"] = [text()]
+    document["environments"] = {text(): {"engine": text(), text(): {text(): text()}}}
+    document["versions"] = {text(): text()}
+    document, rows = json.loads(json.dumps([document, [full(row) for row in rows]]))
+    return report.RunRecord(Path("nowhere"), document, rows)
+
+
+def test_strangers_results_carry_nothing_into_the_page(tmp_path):
+    """240 hostile journals: the page has no element, attribute or kind of address that a harmless one has not."""
+    rows = [recorded(row, *SLOTS[:4]) for row in episodes("football", (2, 1, 0))]
+    harmless = html(folder_with(tmp_path / "a", rows, 120))
+    document = json.loads((tmp_path / "a" / "config.json").read_text())
+    document |= {
+        "variant_changes": ["x"],
+        "environments": {"football base": {"engine": "warp"}},
+        "versions": {"a": "1"},
+    }
+    (tmp_path / "a" / "config.json").write_text(json.dumps(document))
+    rows = [full(r | {"outcome": "error", "error": "x"}) for r in episodes("football", (1, 0, 0), index=60)]
+    with Journal(tmp_path / "a" / "episodes.jsonl") as journal:
+        for row in rows:
+            journal.append(row)
+    shape = html(tmp_path / "a").shape | harmless.shape
+    allowed = {(tag, name) for tag, name, _ in shape}
+    scripts = harmless.text["script"], harmless.text["style"]
+    for number in range(240):
+        run = hostile_run(number)
+        text = html_page(run)
+        tree = Tree(text)
+        assert {(tag, name) for tag, name, _ in tree.shape} <= allowed, number
+        assert (tree.text["script"], tree.text["style"]) == scripts
+        for _, name, address in tree.shape:
+            if name in URLS:
+                assert re.fullmatch(r"(videos/[\w.-]+\.mp4|strips/[\w.-]+\.(png|jpg))", address), (number, address)
+        assert not any(c in text for c in "\x00\x1b\x07\u202e\u2066\u2028")
+        text.encode("utf-8")
+        if number % 8 == 0:
+            markdown = report._markdown(run, report.results_json(run))
+            assert not re.search(r"(?<!\\)<|(?<!\\)\]\((?!videos/|strips/)", re.sub(r"`[^`]*`", "", markdown)), number
+            assert "\x1b" not in markdown
+            report.table_csv(report.results_json(run)).encode("utf-8")
+
+
+def html_page(run):
+    """The page of a run without writing it."""
+    return report._html(run, report.results_json(run))
+
+
+def test_policy_names_the_one_script(tmp_path):
+    """The Content-Security-Policy allows this script and this style by their hashes, and nothing from elsewhere."""
+    tree = html(folder_with(tmp_path / "a", episodes("football", (1, 0, 0)), 60))
+    (policy,) = [m["content"] for m in tree.find("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'") and "unsafe" not in policy and "http" not in policy
+    for tag in ("script", "style"):
+        digest = base64.b64encode(hashlib.sha256(tree.text[tag].encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in policy
+    assert not any(name.startswith("on") or name == "style" for _, given in tree.elements for name in given)
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless browser."""
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip(f"needs a browser ({', '.join(BROWSERS)}), none is installed")
+    return found
+
+
+def dump(browser, tmp_path, page, width):
+    """The page's DOM after its script ran in a window of a width."""
+    command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    command += [f"--window-size={width},900", "--virtual-time-budget=2000", "--dump-dom", page.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+
+
+def test_page_in_a_browser(tmp_path, browser):
+    """In a browser the script runs under the policy, and at 400 and 1280 px nothing is wider than the window."""
+    rows = [recorded(row, "ego strip") for row in episodes("football", (2, 1, 0), repeats=4)]
+    rows[3] |= {"policy": "remote:http://a-policy-server.with-a-long-name.example:8000/v1", "tracker": "sonic"}
+    folder = folder_with(tmp_path / "a", rows, 12)
+    report.write_reports(report.load_run(folder))
+    (folder / "strips").mkdir()
+    tree = Tree(dump(browser, tmp_path, folder / "report.html", 1280).split("<!DOCTYPE html>")[-1])
+    (controls,) = tree.find("div", id="controls")
+    assert "hidden" not in controls and "12 of 12 episodes" in tree.text["output"]
+    # A probe beside the page measures it in a frame.
+    for width in (400, 1280):
+        probe = tmp_path / f"probe{width}.html"
+        probe.write_text(
+            f"<iframe src='a/report.html' width={width} height=900></iframe><p></p><script>onload = () => {{"
+            "const d = frames[0].document.documentElement;"
+            "document.querySelector('p').textContent = d.scrollWidth + ' of ' + d.clientWidth}</script>"
+        )
+        command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
+        command += [
+            f"--user-data-dir={tmp_path / 'profile'}",
+            "--virtual-time-budget=2000",
+            "--dump-dom",
+            probe.as_uri(),
+        ]
+        out = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+        wide, window = re.search(r"<p>(\d+) of (\d+)</p>", out).groups()
+        assert int(wide) <= int(window), width
 
 
 def test_notes_tell_what_the_table_hides(tmp_path):
