@@ -217,6 +217,12 @@ def environment_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     return found + [(plain(name), plain(value)) for name, value in left.items()]
 
 
+def tasks_of(config: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of a run's tasks: those of its configuration, or those of its records where that names none."""
+    named = config.get("task")
+    return [plain(name) for name in (named if isinstance(named, list) else _distinct(records, "task"))]
+
+
 def rules_that_ran(rule_set: Mapping[str, Any], tasks: Sequence[str]) -> list[tuple[str, str]]:
     """The rows of a rule set that speak of the tasks of a run, or of all tasks."""
     from arena_newton import tasks as specs
@@ -662,9 +668,8 @@ def _folded(body: ElementTree.Element, content: Page) -> None:
     for facts, names in groups.items():
         title = "What ran" if len(groups) == 1 else f"What ran: {', '.join(names)}"
         _fold(body, title, [(name, value) for name, value in json.loads(facts)])
-    tasks = config.get("task")
-    ran = tasks if isinstance(tasks, list) else _distinct(content.records, "task")
-    _fold(body, f"Rule set {plain(config.get('rules', ''))}", rules_that_ran(document["rule_set"], [*map(plain, ran)]))
+    ran = tasks_of(config, content.records)
+    _fold(body, f"Rule set {plain(config.get('rules', ''))}", rules_that_ran(document["rule_set"], ran))
     _fold(body, "Configuration", [(plain(key), plain(value)) for key, value in config.items()])
     versions = document.get("versions")
     if isinstance(versions, dict):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arena_newton.eval.html_report import Page, environment_facts, media_of, page, plain, rules_that_ran
+from arena_newton.eval.html_report import Page, environment_facts, media_of, page, plain, rules_that_ran, tasks_of
 from arena_newton.eval.journal import read_journal, write_atomic
 from arena_newton.eval.original_format import write_original
 from arena_newton.eval.records import check_plan, counted, read_document
@@ -227,7 +227,7 @@ def _markdown(run: RunRecord, results: dict[str, Any]) -> str:
         lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in environment_facts(facts)] + [""]
     lines += ["## Configuration", ""]
     lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in run.config.items()]
-    tasks = run.config.get("task") or list(dict.fromkeys(r["task"] for r in run.records))
+    tasks = tasks_of(run.config, run.records)
     lines += ["", f"## Rule set {_code(run.config['rules'])}", ""]
     lines += [f"- {_escaped(item)}: {_code(text)}" for item, text in rules_that_ran(run.document["rule_set"], tasks)]
     return "\n".join(lines) + "\n"

@@ -21,7 +21,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import report
 from arena_newton.eval.html_report import replay_command, rules_that_ran
 from arena_newton.eval.journal import Journal
-from arena_newton.eval.stats import wilson
+from arena_newton.eval.stats import error_reasons, wilson
 
 
 def document_of(planned, **config):
@@ -206,7 +206,7 @@ def test_reasons_environments_and_variants_are_told(tmp_path):
         text = (folder / name).read_text()
         assert "5 ms × 4" in text and "gravity is 0 m/s²" in text and "\x1b" not in text
         assert "resume . --retry-errors" in text and "50 ticks" in text
-    counts = [(r["message"], r["count"]) for r in report.error_reasons([full(row) for row in rows])]
+    counts = [(r["message"], r["count"]) for r in error_reasons([full(row) for row in rows])]
     assert counts[0] == ("server gone", 2) and len(counts) == 2
 
 
@@ -285,12 +285,13 @@ def test_strangers_results_carry_nothing_into_the_page(tmp_path):
     harmless = html(folder_with(tmp_path / "a", rows, 120))
     document = json.loads((tmp_path / "a" / "config.json").read_text())
     document |= {
+        "gym_ids": document["gym_ids"] | {"boxing": "x"},
         "variant_changes": ["x"],
         "environments": {"football base": {"engine": "warp"}},
         "versions": {"a": "1"},
     }
     (tmp_path / "a" / "config.json").write_text(json.dumps(document))
-    rows = [full(r | {"outcome": "error", "error": "x"}) for r in episodes("football", (1, 0, 0), index=60)]
+    rows = [full(r | {"outcome": "error", "error": "x"}) for r in episodes("boxing", (1, 0, 0), index=60)]
     with Journal(tmp_path / "a" / "episodes.jsonl") as journal:
         for row in rows:
             journal.append(row)
