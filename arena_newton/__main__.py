@@ -38,7 +38,7 @@ COMMANDS = (
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("eval oracle", "arena_newton.eval.oracle", "official TWIST2 here beside its own MJCF in plain MuJoCo"),
     Command("rules", "arena_newton.rules", "print both rule sets"),
-    Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list or preview USD scenes"),
+    Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
     Command("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
