@@ -17,6 +17,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from test_stats import episodes
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import report
 from arena_newton.eval.html_report import replay_command, rules_that_ran
@@ -32,7 +33,7 @@ def document_of(planned, **config):
         "config_hash": "0123456789ab",
         "options": {},
         "planned": planned,
-        "gym_ids": {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"},
+        "gym_ids": {n: tasks.get(n).gym_id for n in tasks.names()},
         "rule_set": {"fall": "tilt > 60° <&>"},
     }
 
@@ -173,6 +174,21 @@ def test_failures_come_first_and_the_rest_is_folded(tmp_path):
     assert len(shown) == 60
     assert shown[:12] == ["fall"] * 4 + ["timeout"] * 5 + ["success"] * 3
     assert "48 more episodes" in (folder / "report.html").read_text()
+
+
+def test_strips_of_every_cell_come_before_a_second_one(tmp_path):
+    """With many tasks the strips that are shown come from as many of them as there is room for."""
+    names = ("football", "boxing", "vis_navi", "open_door")
+    rows = [recorded(row, "ego strip") for i, n in enumerate(names) for row in episodes(n, (9, 9, 9), index=60 * i)]
+    folder = folder_with(tmp_path / "a", rows, 240)
+    shown = [given["alt"].split()[0] for given in html(folder).find("img")][:12]
+    assert {name: shown[:9].count(name) for name in names} == {
+        "football": 3,
+        "boxing": 2,
+        "vis_navi": 2,
+        "open_door": 2,
+    }
+    assert shown[9:] == ["football", "boxing", "vis_navi"]
 
 
 def test_only_rules_of_tasks_that_ran(tmp_path):
