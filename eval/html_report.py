@@ -91,8 +91,8 @@ padding:.15rem .4rem}
 th button{border:0;background:none;padding:0;font-weight:600;cursor:pointer}
 th[aria-sort=ascending] button::after{content:" ▲"}th[aria-sort=descending] button::after{content:" ▼"}
 .links{white-space:nowrap}#episodes td a{margin-right:.5rem}#episodes td details{margin:0}
-#episodes td code{display:block;user-select:all;width:24rem;max-width:100%}
-.why{color:var(--soft);font-size:.88rem}
+#episodes td code{display:block;user-select:all;min-width:15rem}
+.why{color:var(--soft);font-size:.88rem;min-width:11rem}
 .pairs td:first-child{width:15rem}
 @media(max-width:62rem){table{font-size:.86rem}th,td{padding:.3rem .4rem}
 CARDS(table.full)}
