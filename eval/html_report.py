@@ -94,7 +94,7 @@ th[aria-sort=ascending] button::after{content:" ▲"}th[aria-sort=descending] bu
 #episodes td code{display:block;user-select:all;min-width:15rem}
 .why{color:var(--soft);font-size:.88rem;min-width:11rem}
 .pairs td:first-child{width:15rem}
-@media(max-width:62rem){table{font-size:.86rem}th,td{padding:.3rem .4rem}
+@media(max-width:74rem){table{font-size:.86rem}th,td{padding:.3rem .4rem}
 CARDS(table.full)}
 @media(max-width:46rem){table{font-size:inherit}
 CARDS(table.cards)}
