@@ -297,22 +297,15 @@ def hostile_run(number):
 
 def test_strangers_results_carry_nothing_into_the_page(tmp_path):
     """240 hostile journals: the page has no element, attribute or kind of address that a harmless one has not."""
-    rows = [recorded(row, *SLOTS[:4]) for row in episodes("football", (2, 1, 0))]
-    harmless = html(folder_with(tmp_path / "a", rows, 120))
-    document = json.loads((tmp_path / "a" / "config.json").read_text())
-    document |= {
-        "gym_ids": document["gym_ids"] | {"boxing": "x"},
-        "variant_changes": ["x"],
-        "environments": {"football base": {"engine": "warp"}},
-        "versions": {"a": "1"},
-    }
-    (tmp_path / "a" / "config.json").write_text(json.dumps(document))
-    rows = [full(r | {"outcome": "error", "error": "x"}) for r in episodes("boxing", (1, 0, 0), index=60)]
-    with Journal(tmp_path / "a" / "episodes.jsonl") as journal:
-        for row in rows:
-            journal.append(row)
-    shape = html(tmp_path / "a").shape | harmless.shape
-    allowed = {(tag, name) for tag, name, _ in shape}
+    rows = [recorded(row, *SLOTS[:4]) for row in episodes("football", (2, 1, 0), falls=9)]
+    rows[30] |= {"outcome": "error", "reason": "policy", "error": "x"}
+    folder = folder_with(tmp_path / "a", rows, 60)
+    document = json.loads((folder / "config.json").read_text())
+    document |= {"variant_changes": ["x"], "versions": {"a": "1"}}
+    document |= {"environments": {"football base": {"engine": "warp"}}}
+    (folder / "config.json").write_text(json.dumps(document))
+    harmless = html(folder)
+    allowed = {(tag, name) for tag, name, _ in harmless.shape}
     scripts = harmless.text["script"], harmless.text["style"]
     for number in range(240):
         run = hostile_run(number)
