@@ -61,7 +61,8 @@ th,td{padding:.34rem .55rem;border-bottom:1px solid var(--line);text-align:right
 th{font-weight:600;vertical-align:bottom}thead th{border-bottom:2px solid var(--ink)}
 .text{text-align:left}.long,code{overflow-wrap:anywhere}.figure{white-space:nowrap}
 .suite td{background:var(--raised);color:var(--soft)}
-.outcomes{display:grid;grid-template-columns:minmax(7rem,13rem) 1fr minmax(9rem,auto);gap:.1rem 1rem;align-items:center}
+.outcomes{display:grid;grid-template-columns:fit-content(13rem) minmax(12rem,1fr) fit-content(11.5rem);
+gap:.1rem 1rem;align-items:center}
 .outcomes svg{width:100%;height:44px;overflow:visible;display:block}.outcomes .axis{height:18px}
 .axis text{font-size:11px;fill:var(--soft);text-anchor:middle}.axis text:first-child{text-anchor:start}
 .axis text:last-child{text-anchor:end}
@@ -90,10 +91,10 @@ padding:.15rem .4rem}
 th button{border:0;background:none;padding:0;font-weight:600;cursor:pointer}
 th[aria-sort=ascending] button::after{content:" ▲"}th[aria-sort=descending] button::after{content:" ▼"}
 .links{white-space:nowrap}#episodes td a{margin-right:.5rem}#episodes td details{margin:0}
-#episodes td code{display:block;user-select:all;max-width:34rem}
-.why{color:var(--soft);font-size:.88rem}
+#episodes td code{display:block;user-select:all;min-width:15rem}
+.why{color:var(--soft);font-size:.88rem;min-width:11rem}
 .pairs td:first-child{width:15rem}
-@media(max-width:62rem){table{font-size:.86rem}th,td{padding:.3rem .4rem}
+@media(max-width:74rem){table{font-size:.86rem}th,td{padding:.3rem .4rem}
 CARDS(table.full)}
 @media(max-width:46rem){table{font-size:inherit}
 CARDS(table.cards)}
@@ -108,7 +109,7 @@ CARDS(table.cards)}
 # Rows of a table as cards of three columns, for screens that the table does not fit.
 _CARDS = """\
 TABLE thead{display:none}TABLE,TABLE tbody{display:block}
-TABLE tr{display:grid;grid-template-columns:repeat(3,1fr);gap:.1rem .8rem;padding:.5rem 0;
+TABLE tr{display:grid;grid-template-columns:repeat(auto-fill,minmax(6.4rem,1fr));gap:.1rem .8rem;padding:.5rem 0;
 border-bottom:2px solid var(--line)}
 TABLE tr[hidden]{display:none}
 TABLE td{display:block;border:0;padding:.08rem 0;text-align:left;background:none;min-width:0}
@@ -507,10 +508,17 @@ def _strips(body: ElementTree.Element, records: Sequence[Mapping[str, Any]]) -> 
         return FAILURES_FIRST.index(outcome) if outcome in FAILURES_FIRST else 0
 
     ordered = sorted(filmed, key=place)  # stable: plan order within an outcome
-    wins = [r for r in ordered if r["outcome"] == "success"]
-    failures = [r for r in ordered if r["outcome"] != "success"]
+    # Every task and mode is to be seen, before a second one of any.
+    turns: dict[tuple[str, str, bool], int] = {}
+    turn = {}
+    for record in ordered:
+        cell = (plain(record["task"]), plain(record["mode"]), record["outcome"] == "success")
+        turn[id(record)] = turns[cell] = turns.get(cell, -1) + 1
+    wins = sorted((r for r in ordered if r["outcome"] == "success"), key=lambda r: turn[id(r)])
+    failures = sorted((r for r in ordered if r["outcome"] != "success"), key=lambda r: turn[id(r)])
     shown = failures[: SHOWN_STRIPS - min(SHOWN_SUCCESSES, len(wins))]
     shown += wins[: SHOWN_STRIPS - len(shown)]
+    shown.sort(key=place)
     folded = [r for r in ordered if not any(r is s for s in shown)]
     _element(body, "h2", "Film strips")
     section = _element(body, "section", id="strips")
@@ -593,7 +601,7 @@ def _episodes(body: ElementTree.Element, content: Page) -> None:
         for value in _distinct(records, name):
             _element(select, "option", value, value=value)
     _element(controls, "output")
-    table = _element(_element(body, "div", class_="scroll"), "table", id="episodes", class_="cards")
+    table = _element(_element(body, "div", class_="scroll"), "table", id="episodes", class_="cards full")
     line = _element(_element(table, "thead"), "tr")
     for name, key in _COLUMNS:
         style = None if name in ("seed", "repeat", "steps", "margin") else "text"

@@ -225,7 +225,9 @@ except OSError as error:
 """
     path = tmp_path / ("x.mp4" if kind == "video" else "x.jpg")
     command = [sys.executable, "-c", program, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=_limited, env=os.environ)
+    # The limit holds for everything that the process writes, compiled modules too, which it would cut off.
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=_limited, env=environment)
     assert done.stdout.split() == ["27", str(path)], done.stderr[-500:]
     assert list(tmp_path.iterdir()) == []
 

@@ -17,6 +17,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from test_stats import episodes
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import report
 from arena_newton.eval.html_report import replay_command, rules_that_ran
@@ -32,7 +33,7 @@ def document_of(planned, **config):
         "config_hash": "0123456789ab",
         "options": {},
         "planned": planned,
-        "gym_ids": {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"},
+        "gym_ids": {n: tasks.get(n).gym_id for n in tasks.names()},
         "rule_set": {"fall": "tilt > 60° <&>"},
     }
 
@@ -175,6 +176,21 @@ def test_failures_come_first_and_the_rest_is_folded(tmp_path):
     assert "48 more episodes" in (folder / "report.html").read_text()
 
 
+def test_strips_of_every_cell_come_before_a_second_one(tmp_path):
+    """With many tasks the strips that are shown come from as many of them as there is room for."""
+    names = ("football", "boxing", "vis_navi", "open_door")
+    rows = [recorded(row, "ego strip") for i, n in enumerate(names) for row in episodes(n, (9, 9, 9), index=60 * i)]
+    folder = folder_with(tmp_path / "a", rows, 240)
+    shown = [given["alt"].split()[0] for given in html(folder).find("img")][:12]
+    assert {name: shown[:9].count(name) for name in names} == {
+        "football": 3,
+        "boxing": 2,
+        "vis_navi": 2,
+        "open_door": 2,
+    }
+    assert shown[9:] == ["football", "boxing", "vis_navi"]
+
+
 def test_only_rules_of_tasks_that_ran(tmp_path):
     """Rows of other tasks, and their parts of lists, are left out; no text points at what does not follow."""
     from arena_newton import rules
@@ -281,22 +297,15 @@ def hostile_run(number):
 
 def test_strangers_results_carry_nothing_into_the_page(tmp_path):
     """240 hostile journals: the page has no element, attribute or kind of address that a harmless one has not."""
-    rows = [recorded(row, *SLOTS[:4]) for row in episodes("football", (2, 1, 0))]
-    harmless = html(folder_with(tmp_path / "a", rows, 120))
-    document = json.loads((tmp_path / "a" / "config.json").read_text())
-    document |= {
-        "gym_ids": document["gym_ids"] | {"boxing": "x"},
-        "variant_changes": ["x"],
-        "environments": {"football base": {"engine": "warp"}},
-        "versions": {"a": "1"},
-    }
-    (tmp_path / "a" / "config.json").write_text(json.dumps(document))
-    rows = [full(r | {"outcome": "error", "error": "x"}) for r in episodes("boxing", (1, 0, 0), index=60)]
-    with Journal(tmp_path / "a" / "episodes.jsonl") as journal:
-        for row in rows:
-            journal.append(row)
-    shape = html(tmp_path / "a").shape | harmless.shape
-    allowed = {(tag, name) for tag, name, _ in shape}
+    rows = [recorded(row, *SLOTS[:4]) for row in episodes("football", (2, 1, 0), falls=9)]
+    rows[30] |= {"outcome": "error", "reason": "policy", "error": "x"}
+    folder = folder_with(tmp_path / "a", rows, 60)
+    document = json.loads((folder / "config.json").read_text())
+    document |= {"variant_changes": ["x"], "versions": {"a": "1"}}
+    document |= {"environments": {"football base": {"engine": "warp"}}}
+    (folder / "config.json").write_text(json.dumps(document))
+    harmless = html(folder)
+    allowed = {(tag, name) for tag, name, _ in harmless.shape}
     scripts = harmless.text["script"], harmless.text["style"]
     for number in range(240):
         run = hostile_run(number)
