@@ -126,7 +126,7 @@ class RunOptions:
     strip: bool = False
     """Write the 10-frame picture strip of each episode."""
     video_episodes: int | None = None
-    """Record only the first so many episodes of each task and mode; all when not given."""
+    """Videos of only the first so many episodes of each task and mode; of all when not given."""
     video_size: str | None = None
     """Size of the world camera's pictures, such as 960x540 [px]."""
     follow: bool = False

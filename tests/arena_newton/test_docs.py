@@ -43,7 +43,7 @@ def test_commands_of_the_index_exist():
     for command in COMMANDS:
         assert any(f"{words} ".startswith(f"{command.words} ") for words in listed), command.words
     known = {word for command in COMMANDS for word in command.words.split()}
-    assert {words.split()[0] for words in listed} <= known | {"validate", "list", "preview"}
+    assert {words.split()[0] for words in listed} <= known | {"validate", "list", "preview", "new"}
 
 
 def test_the_world_from_python():

@@ -226,21 +226,31 @@ def door():
 
 def test_the_latch_is_found_by_its_label(tmp_path):
     """An equality that a layer brings with it is not taken for the latch, and stays active."""
-    from pxr import Sdf, Usd
-
-    from arena_newton.scene import load_scene, scene_path
+    from arena_newton.scene import load_scene
 
     path = tmp_path / "door.usda"
-    layer = Sdf.Layer.CreateNew(str(path))
-    layer.subLayerPaths.append(str(scene_path("open_door")))
-    layer.defaultPrim = "World"
-    layer.Save()
-    stage = Usd.Stage.Open(str(path))
-    weld = stage.DefinePrim("/World/Door/Tie", "PhysicsFixedJoint")
-    weld.AddAppliedSchema("MjcEqualityWeldAPI")
-    weld.CreateRelationship("physics:body0").SetTargets(["/World/Door/Frame"])
-    weld.CreateRelationship("physics:body1").SetTargets(["/World/Door/Handle"])
-    stage.Save()
+    path.write_text(
+        """#usda 1.0
+(
+    defaultPrim = "World"
+    subLayers = [@arena_newton/usd_scenes/open_door/scene.usda@]
+)
+
+over "World"
+{
+    over "Door"
+    {
+        def PhysicsFixedJoint "Tie" (
+            prepend apiSchemas = ["MjcEqualityWeldAPI"]
+        )
+        {
+            rel physics:body0 = </World/Door/Frame>
+            rel physics:body1 = </World/Door/Handle>
+        }
+    }
+}
+"""
+    )
     scene = load_scene("open_door", native=True, variant_file=path)
     assert scene.mj_model.neq == 2 and scene.latch.equality == 1, "the layer's weld comes first"
     import mujoco

@@ -338,10 +338,10 @@ over "World"
 
 def test_a_box_of_several_solids_is_judged_whole(tmp_path):
     """P&PBox's centre and half sizes are those of the box around all its solids, here a cube and a wider lid."""
-    from arena_newton.scene import load_scene, scene_path
+    from arena_newton.scene import load_scene
 
     layer = tmp_path / "lid.usda"
-    layer.write_text(LID.format(scene=scene_path("pp_box").resolve()))
+    layer.write_text(LID.format(scene="arena_newton/usd_scenes/pp_box/scene.usda"))
     for variant_file, centre, half in (
         (None, (0.0, 0.0, 0.105), (0.105, 0.105, 0.105)),
         (layer, (0.02, 0.0, 0.125), (0.125, 0.105, 0.125)),
