@@ -191,8 +191,9 @@ def test_bad_spec(spec, text):
     assert text in message and message.startswith("--policy") and "\n" not in message
 
 
-def test_registration():
+def test_registration(monkeypatch):
     """A third party's policy is found under its name, with its argument."""
+    monkeypatch.setattr(policies.base, "_registered", {})
 
     class Mine(policies.Policy):
         def __init__(self, argument):

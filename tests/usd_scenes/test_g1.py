@@ -122,6 +122,7 @@ def _stage(hands: str = "dex3"):
     from arena_newton.usd_scenes.g1.build import PATH
 
     stage = Usd.Stage.Open(str(PATH))
+    stage.SetEditTarget(stage.GetSessionLayer())  # the file's own layer is every other test's too
     stage.GetDefaultPrim().GetVariantSet("hands").SetVariantSelection(hands)
     return stage
 
