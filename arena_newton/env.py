@@ -455,7 +455,9 @@ class ArenaEnv:
         )
         self.tick[self.active] += 1
         status = self._status.numpy().copy()
-        status[settling & ((status == tick.SUCCESS) | (status > tick.EVENT))] = tick.RUNNING
+        early = settling & ((status == tick.SUCCESS) | (status > tick.EVENT))
+        if early.any():
+            status[early] = np.where(self._fallen.numpy()[early] != 0, tick.FALL, tick.RUNNING)
         return status
 
     @functools.cached_property
@@ -550,12 +552,17 @@ class ArenaEnv:
             if asks.any():
                 answer = policy.act(self.observe(asks, image=policy.needs_image))
                 actions = torch.as_tensor(answer.actions, dtype=torch.float32, device=self.torch_device)
+                if actions.ndim != 3 or actions.shape[::2] != (self.worlds, 40) or not actions.shape[1]:
+                    raise InputError(
+                        f"policy {getattr(policy, 'name', type(policy).__name__)}: a chunk of shape "
+                        f"{list(actions.shape)}, expected [{self.worlds}, n, 40] with n of at least 1"
+                    )
                 if actions.shape[1] > chunk.shape[1]:
                     chunk = torch.nn.functional.pad(chunk, (0, 0, 0, actions.shape[1] - chunk.shape[1]))
                 ask = torch.from_numpy(asks).to(self.torch_device)
                 chunk[ask, : actions.shape[1]] = actions[ask]
                 cursor[asks], length[asks] = 0, actions.shape[1]
-                policy_errors = dict(answer.errors)
+                policy_errors = {w: message for w, message in answer.errors.items() if asks[w]}
                 for w, message in policy_errors.items():
                     finish(w, "error", "policy", message)
                 if policy_errors:

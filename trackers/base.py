@@ -87,13 +87,10 @@ class Tracker:
         raise TypeError(f"tracker {self.name!r} defines no step()")
 
     def describe(self) -> dict[str, Any]:
-        """What a result must record to name this tracker exactly."""
+        """What a result must record to name this tracker exactly; drive and physics rate are the environment's."""
         return {
             "name": self.name,
             "checkpoint_hash": self.checkpoint_hash,
-            "drive": self.drive.name,
-            "physics_dt": self.physics_rate.dt,
-            "substeps": self.physics_rate.substeps,
             "ignores": list(self.ignores),
         }
 

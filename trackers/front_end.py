@@ -248,7 +248,8 @@ class NetworkTracker(Tracker):
 
     def describe(self) -> dict[str, Any]:
         """What a result must record to name this tracker exactly; once it is bound, what runs its network too."""
-        return super().describe() | {"inference": self._inference()}
+        inference = self._inference()
+        return super().describe() | ({} if inference is None else {"inference": inference})
 
     def _inference(self) -> str | None:
         runner = getattr(self, "_runner", None)

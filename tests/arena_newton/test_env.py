@@ -345,3 +345,46 @@ def test_a_drive_can_be_chosen():
         assert env.describe()["drive"] == env.drive.name == name
         gains = env.physics.mj_model.actuator_gainprm[env.scene.robot.joint_ctrl, 0]
         assert np.allclose(gains, env.drive.kp)
+
+
+def test_a_fall_counts_in_the_startup_whatever_the_predicate_says(env, monkeypatch):
+    """A robot that lies on the ground before step 0 has fallen, also where the success predicate holds."""
+
+    def evaluate(physics):
+        env.judge.success.fill_(1)
+
+    lying = lambda seed: ((0.0, -8.0, 0.15), (0.7071068, 0.7071068, 0.0, 0.0))  # noqa: E731
+    monkeypatch.setattr(env.judge, "evaluate", evaluate)
+    env.reset([1, 2], spawn=lying)
+    for _ in range(6):
+        status = env.step(np.tile(STAND_ACTION, (2, 1)))
+    assert status.tolist() == [codes.FALL, codes.FALL]
+
+
+def test_errors_of_worlds_that_did_not_ask_are_ignored(env):
+    """A policy that names a world without a question ends nothing and breaks nothing."""
+
+    class Loud(Sway):
+        def act(self, observation):
+            chunk = super().act(observation)
+            chunk.errors = {w: "not asked" for w in range(2) if not observation.mask[w]}
+            return chunk
+
+    results = env.run_episodes(Loud(), _episodes(3), max_steps=7)
+    assert [r.outcome for r in results] == ["timeout"] * 3
+
+
+@pytest.mark.parametrize("cut", [lambda a: a[:, :0], lambda a: a[:, :, :39], lambda a: a[:1], lambda a: a[:, 0]])
+def test_chunks_of_another_shape_are_refused(env, cut):
+    """A chunk without actions or of another width stops the run with one line that names the policy."""
+
+    class Cut(Sway):
+        name = "cut"
+
+        def act(self, observation):
+            chunk = super().act(observation)
+            chunk.actions = cut(chunk.actions)
+            return chunk
+
+    with pytest.raises(InputError, match=r"policy cut: a chunk of shape .*expected \[2, n, 40\]"):
+        env.run_episodes(Cut(), _episodes(2), max_steps=7)
