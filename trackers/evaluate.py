@@ -174,7 +174,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         tracker = entry.make()
         outcome = run(tracker, played, **options)
         times = inference(entry.make) if args.bench else {}
-        result = Result(entry.label, tracker.name, entry.official, tracker.describe(), played, outcome, inference=times)
+        facts = tracker.describe() | {"drive": tracker.drive.name}
+        result = Result(entry.label, tracker.name, entry.official, facts, played, outcome, inference=times)
         results.append(result)
         print(f"{entry.label}: {outcome.rollout_s:.1f} s", file=sys.stderr, flush=True)
     resolved = {
