@@ -1,4 +1,4 @@
-"""Files that somebody else made: how they are read without taking more than `limits` says."""
+"""Files that somebody else made: how they are read without taking more than `limits` says, and written beside."""
 
 from __future__ import annotations
 
@@ -8,18 +8,28 @@ import stat
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 
 from arena_newton import limits
 from arena_newton.errors import InputError
 
-__all__ = ["check_size", "numbers", "read_arrays", "read_bytes"]
+__all__ = ["check_size", "create", "numbers", "read_arrays", "read_bytes"]
 _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dtype[Any]]]] = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+
+
+def create(path: Path) -> BinaryIO:
+    """Open a new file for writing in a folder that may be a stranger's: what had its name is removed, no link followed.
+
+    Raises:
+        OSError: It cannot be created; the error carries its name.
+    """
+    path.unlink(missing_ok=True)
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644), "wb")
 
 
 def check_size(path: str | Path, most: int, *, where: str = "") -> None:

@@ -19,7 +19,7 @@ from arena_newton.errors import InputError
 from arena_newton.robot import TICK
 from arena_newton.video import VideoWriter, caption, evenly, film_strip
 
-__all__ = ["EpisodeRecorder"]
+__all__ = ["EpisodeRecorder", "video_sizes"]
 
 STRIP_FRAMES = 10
 """Frames of a film strip, as in the paper's rollout figures."""
@@ -30,7 +30,7 @@ STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
 VIDEO_SIZE = (480, 270)
 """Size of world videos (width, height) [px]."""
 SIZE_LIMITS = (32, 4096)
-"""Smallest and largest width and height of a video [px]."""
+"""Smallest and largest width and height of a video, the head camera's too [px]; H.264 encoders end at 4096."""
 VIEWS = 32
 """Worlds that are drawn at once: bounds the memory of the pictures for any number of worlds."""
 HOLD_FRAMES = 25
@@ -40,6 +40,29 @@ COLOURS = {"success": (36, 128, 84), "fall": (192, 64, 40), "timeout": (150, 104
 """Outcome → RGB of its name on strips."""
 BRIGHT = {"success": (120, 240, 170), "fall": (255, 130, 100), "timeout": (255, 205, 90), "error": (215, 165, 255)}
 """Outcome → RGB of its name on videos."""
+
+
+def video_sizes(size: tuple[int, int] | None) -> dict[str, tuple[int, int]]:
+    """Width and height of the videos of each camera [px].
+
+    Args:
+        size: Those of world videos; head camera videos are as high, 4:3. None for 480×270 and 320×240.
+
+    Raises:
+        InputError: A video would be smaller or larger than encoders take.
+    """
+    if size is None:
+        return {"ego": STRIP_SIZES["ego"], "world": VIDEO_SIZE}
+    low, high = SIZE_LIMITS
+    if not all(low <= n <= high for n in size):
+        raise InputError(f"--video-size {size[0]}x{size[1]}: expected {low} to {high} pixels each")
+    ego = (round(size[1] * 4 / 3), size[1])
+    if max(ego) > high:
+        raise InputError(
+            f"--video-size {size[0]}x{size[1]}: makes head camera videos of {ego[0]}x{ego[1]}, expected at most {high} "
+            f"pixels each: a height of at most {high * 3 // 4}"
+        )
+    return {"ego": ego, "world": size}
 
 
 @dataclass
@@ -97,18 +120,13 @@ class EpisodeRecorder:
         Raises:
             InputError: A number that cannot be.
         """
-        low, high = SIZE_LIMITS
-        if size is not None and not all(low <= n <= high for n in size):
-            raise InputError(f"--video-size {size[0]}x{size[1]}: expected {low} to {high} pixels each")
+        self.video_sizes = video_sizes(size)
         if episodes is not None and episodes < 1:
             raise InputError(f"--video-episodes {episodes}: expected at least 1")
         if every < 1:
             raise InputError(f"recorder: a frame every {every} ticks, expected at least 1")
         self.folder = Path(folder)
         self.video, self.strip, self.episodes, self.follow, self.every = video, strip, episodes, follow, every
-        width, height = size or VIDEO_SIZE
-        ego = (round(height * 4 / 3), height) if size else STRIP_SIZES["ego"]
-        self.video_sizes = {"ego": ego, "world": (width, height)}
         self._env: Any = None
         self._cameras: dict[str, Any] = {}
         self._strip_cameras: dict[str, Any] = {}

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.errors import ArenaError
+from arena_newton.foreign import create
 
 __all__ = ["VideoWriter", "caption", "evenly", "film_strip"]
 
@@ -73,6 +74,7 @@ class VideoWriter:
         self._size = (self.height + self.height % 2, self.width + self.width % 2)
         self._part = self.path.with_name(self.path.name + PARTIAL)
         self._part.parent.mkdir(parents=True, exist_ok=True)
+        create(self._part).close()  # a link that lay there would be followed
         self._container: Any = av.open(str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(float(fps)).limit_denominator(1000)
         self._stream = self._container.add_stream("libx264", rate=rate)
@@ -233,7 +235,8 @@ def film_strip(
     part = path.with_name(path.name + PARTIAL)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(encoded.tobytes())
+        with create(part) as file:
+            file.write(encoded.tobytes())
         os.replace(part, path)
     except OSError as error:
         with contextlib.suppress(OSError):

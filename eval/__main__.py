@@ -125,11 +125,11 @@ def _run(arguments: list[str], factories: Factories | None) -> int:
         print(OVERVIEW)
     options = _parse(RunOptions, arguments, "run")
     from arena_newton.eval.config import is_quick
-    from arena_newton.eval.run import execute, new_folder
+    from arena_newton.eval.run import execute, results_folder
 
     if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
         return execute(options, factories)
-    folder = Path(options.out or new_folder())
+    folder = results_folder(options)
     code = execute(dataclasses.replace(options, out=str(folder)), factories)
     return code if code == INTERRUPTED else max(code, _show_expert(options, folder / "expert", factories))
 
@@ -193,7 +193,7 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     from arena_newton.eval import config as configs
 
     config = configs.resolve(options)
-    from arena_newton.eval.progress import duration
+    from arena_newton.eval.progress import simulated
     from arena_newton.eval.records import counted
 
     episodes = configs.episodes(config)
@@ -205,8 +205,7 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
         rows = [json.dumps(row, allow_nan=False) for row in plan.to_list_json(episodes)]
         print("[\n" + ",\n".join(rows) + "\n]")
         return 0
-    ticks = sum(episode.max_steps for episode in episodes)
-    print(f"{counted(len(episodes), 'episode')}, at most {ticks:,} world-ticks ({duration(0.02 * ticks)} simulated)")
+    print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
     for episode in episodes:
         print(
             f"{episode.index:>5} {episode.task:<12} {episode.mode:<10} seed {episode.group_seed} "

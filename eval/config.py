@@ -71,8 +71,6 @@ UNHASHED = (
 added to the package."""
 UNVERSIONED = ("arena-newton", "av", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
-MIN_VIDEO, MAX_VIDEO = 16, 4096
-"""Bounds of --video-size [px]; H.264 encoders end at 4096."""
 
 
 QUICK_SEEDS = (0,)
@@ -436,13 +434,12 @@ def _size(given: str | None) -> tuple[int, int] | None:
     """Width and height of --video-size."""
     if given is None:
         return None
-    numbers = re.fullmatch(r"(\d{1,5})[x×](\d{1,5})", given)
-    size = (int(numbers[1]), int(numbers[2])) if numbers else (0, 0)
-    if not MIN_VIDEO <= min(size) <= max(size) <= MAX_VIDEO:
-        raise InputError(
-            f"--video-size {given}: expected width x height, such as 960x540, each from {MIN_VIDEO} to {MAX_VIDEO}"
-        )
-    return size
+    from arena_newton.recorder import video_sizes
+
+    numbers = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", given)
+    if not numbers:
+        raise InputError(f"--video-size {given}: expected width x height, such as 960x540")
+    return video_sizes((int(numbers[1]), int(numbers[2])))["world"]
 
 
 def _files(root: Path) -> list[Path]:

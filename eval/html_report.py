@@ -32,6 +32,13 @@ MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head
 """Media of an episode that the page knows → what they show."""
 REPLAYED = ("policy", "tracker", "checkpoint", "rules", "drive", "engine", "device", "variant", "max_steps")
 """Flags with a value on which an episode depends, besides its task, mode, seed and repeat."""
+REMOTE: dict[str, object] = {
+    "remote_timeout": 60.0,
+    "remote_retries": 4,
+    "remote_sequential": False,
+    "remote_insecure": False,
+}
+"""Flags that belong to a policy server → their defaults; others are named in the command."""
 RULE_OWNERS = {"ball": "football"}
 """First word of a rule's item → the task that it belongs to."""
 
@@ -192,14 +199,27 @@ def media_of(record: Mapping[str, Any]) -> dict[str, str]:
     return {name: path for name, path in found.items() if path is not None}
 
 
-def replay_command(options: Mapping[str, Any], record: Mapping[str, Any]) -> str:
-    """The command line that plays an episode again, the last one of its seed's that it plays."""
+def replay_command(options: Mapping[str, Any], record: Mapping[str, Any], worlds: object = None) -> str:
+    """The command line that plays an episode again, the last one of its seed's that it plays.
+
+    Args:
+        options: Flags of the run, as config.json has them.
+        record: The episode.
+        worlds: How many worlds asked at once, where the policy depends on it.
+    """
     words = ["python", "-m", "arena_newton.eval", "--task", record["task"], "--mode", record["mode"]]
     words += ["--seeds", record["group_seed"], "--repeats", _number(record["repeat"]) + 1]
     for name in REPLAYED:
         value = options.get(name)
         if value not in (None, "", "auto"):
             words += ["--" + name.replace("_", "-"), value]
+    for name, default in REMOTE.items() if plain(options.get("policy")).startswith("remote:") else ():
+        value = options.get(name, default)
+        if value is True:
+            words += ["--" + name.replace("_", "-")]
+        elif value is not False and value != default:
+            words += ["--" + name.replace("_", "-"), value]
+    words += ["--worlds", worlds] if worlds is not None else []
     words += ["--fast-physics"] if options.get("fast_physics") is True else []
     return " ".join(shlex.quote(plain(word)) for word in [*words, "--video", "--strip"])
 
@@ -608,10 +628,10 @@ def _episodes(body: ElementTree.Element, content: Page) -> None:
         _element(line, "th", name, class_=style, scope="col", data_key=key)
     rows = _element(table, "tbody")
     for record in records:
-        _row(rows, record, content.document.get("options") or {})
+        _row(rows, record, content.document)
 
 
-def _row(rows: ElementTree.Element, record: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+def _row(rows: ElementTree.Element, record: Mapping[str, Any], document: Mapping[str, Any]) -> None:
     margin = record.get("margin")
     margin = margin if isinstance(margin, int | float) and not isinstance(margin, bool) else None
     line = _element(
@@ -648,7 +668,8 @@ def _row(rows: ElementTree.Element, record: Mapping[str, Any], options: Mapping[
             for camera, path in links:
                 _element(entry, "a", camera, href=path)
     command = _element(None, "details", _element(None, "summary", "command"))
-    _element(command, "code", replay_command(options, record))
+    worlds = document["config"].get("worlds")  # stands there only where the policy depends on it
+    _element(command, "code", replay_command(document.get("options") or {}, record, worlds))
     _element(line, "td", command, class_="text wide")
 
 

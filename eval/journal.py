@@ -13,6 +13,7 @@ from typing import Any
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.records import MAX_JOURNAL_BYTES, check_record, counted, parse, read_regular
+from arena_newton.foreign import create
 
 __all__ = ["Journal", "StorageError", "read_journal", "write_atomic"]
 
@@ -142,10 +143,8 @@ def write_atomic(path: Path, text: str) -> None:
     temporary = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.unlink(missing_ok=True)
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
-        with open(handle, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
+        with create(temporary) as file:
+            file.write(text.encode("utf-8"))
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

@@ -10,6 +10,7 @@ from typing import Any
 from arena_newton import rules as rule_sets
 from arena_newton import seeding, tasks
 from arena_newton.errors import InputError
+from arena_newton.eval.records import MAX_COUNT, MAX_EPISODES, MAX_SEED
 
 __all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "to_list_json"]
 
@@ -17,8 +18,6 @@ PROTOCOL_SEEDS = (0, 1, 2)
 """Group seeds of the benchmark's protocol (original benchmark: 3 seeds)."""
 PROTOCOL_REPEATS = 20
 """Repeats per group seed of the benchmark's protocol."""
-MAX_EPISODES = 200_000
-"""Episodes of one plan; the benchmark's largest has 1,680."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +84,9 @@ def expand(
         twice = next((v for v in values if list(values).count(v) > 1), None)
         if twice is not None:
             raise InputError(f"{flag} {twice}: given twice")
+    high = max(seeds)
+    if high > MAX_SEED:
+        raise InputError(f"--seeds {_cut(high)}: expected at most {MAX_SEED}")
     for mode in modes:
         if mode not in rule_sets.MODES:
             raise InputError(f"--mode {mode}: unknown, choose from {', '.join(rule_sets.MODES)}")
@@ -92,9 +94,12 @@ def expand(
         raise InputError(f"--repeats {repeats}: expected at least 1")
     if max_steps is not None and max_steps < 1:
         raise InputError(f"--max-steps {max_steps}: expected at least 1")
+    if max_steps is not None and max_steps > MAX_COUNT:
+        raise InputError(f"--max-steps {_cut(max_steps)}: expected at most {MAX_COUNT:,}")
     total = len(names) * len(modes) * len(seeds) * repeats
     if total > MAX_EPISODES:
-        raise InputError(f"--repeats {repeats}: makes {total:,} episodes, at most {MAX_EPISODES:,} are planned at once")
+        made = f"{total:,} episodes" if total < 10**12 else "too many episodes"
+        raise InputError(f"--repeats {_cut(repeats)}: makes {made}, at most {MAX_EPISODES:,} are planned at once")
     episodes: list[Episode] = []
     for name in names:
         spec = tasks.get(name)
@@ -121,6 +126,11 @@ def expand(
                         )
                     )
     return episodes
+
+
+def _cut(number: int) -> str:
+    """A number for a message, shortened where it has more digits than a line."""
+    return str(number) if number < 10**40 else f"{str(number)[:40]}..."
 
 
 def to_list_json(episodes: Iterable[Episode]) -> list[dict[str, Any]]:

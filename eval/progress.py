@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 from arena_newton.eval.records import counted
 
-__all__ = ["Progress", "duration", "kernels_to_compile"]
+__all__ = ["Progress", "duration", "kernels_to_compile", "simulated"]
 
 LINE_SECONDS = 30.0
 """In a log file a line appears at least so often while ticks go on [s]."""
@@ -30,6 +30,13 @@ def duration(seconds: float) -> str:
         return f"{max(1, round(seconds))} s"
     minutes = round(seconds / 60.0)
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def simulated(ticks: int) -> str:
+    """Size of a run in words: its largest number of ticks of 0.02 s, and the time that they simulate."""
+    seconds = 0.02 * ticks
+    told = f"{seconds:g} s" if seconds < 1.0 else duration(seconds)
+    return f"at most {counted(ticks, 'world-tick')} ({told} simulated)"
 
 
 def kernels_to_compile(cache: Path, engine: str, device: str) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.eval.journal import StorageError
+from arena_newton.foreign import create
 from arena_newton.interfaces import Chunk, EpisodeResult, Observation
 from arena_newton.policies.base import Policy, world_mask
 
@@ -87,7 +88,7 @@ class RecordingPolicy(Policy):
         partial = path.with_name(path.name + ".partial")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with partial.open("wb") as file:
+            with create(partial) as file:
                 np.savez_compressed(
                     file,
                     action=np.concatenate(chunks)[: result.steps],

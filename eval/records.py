@@ -7,11 +7,13 @@ and whoever reads a report may have been sent the folder. A record that fits her
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import math
 import os
 import re
 import stat
+import sys
 import types
 import typing
 import unicodedata
@@ -24,6 +26,9 @@ from arena_newton.errors import InputError
 __all__ = [
     "CONFIG_FILE",
     "JOURNAL_FILE",
+    "MAX_COUNT",
+    "MAX_EPISODES",
+    "MAX_SEED",
     "OUTCOMES",
     "SUBFOLDERS",
     "check_document",
@@ -57,6 +62,8 @@ MAX_NAME = 512
 MAX_COUNT = 10**7
 """Steps, repeats, episodes."""
 MAX_SEED = 2**64
+MAX_EPISODES = 200_000
+"""Episodes of one plan; the benchmark's largest has 1,680."""
 
 _ESCAPES = re.compile(
     r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[PX^_][^\x1b]*(?:\x1b\\)?|[@-Z\\-_])?"
@@ -159,7 +166,22 @@ def _flag(value: Any) -> bool:
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    """A number that a float can hold: JSON's integers have no end."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _facts(value: Any) -> bool:
+    """An object whose numbers, at any depth, a float can hold."""
+    waiting = [value]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, dict):
+            waiting += part.values()
+        elif isinstance(part, list):
+            waiting += part
+        elif isinstance(part, (int, float)) and not isinstance(part, bool) and not _number(part):
+            return False
+    return isinstance(value, dict)
 
 
 def _count(least: int, most: int) -> Callable[[Any], bool]:
@@ -176,6 +198,10 @@ def _list_of(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 def _table_of(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, dict) and all(_name(k) and test(v) for k, v in value.items())
+
+
+def _distinct_names(value: Any) -> bool:
+    return _list_of(_name)(value) and bool(value) and len(set(value)) == len(value)
 
 
 _INT = _count(0, MAX_COUNT)
@@ -215,6 +241,26 @@ _CONFIG: Fields = {
     "repeats": (_count(1, MAX_COUNT), "a number of at least 1"),
     "max_steps": (_none_or(_count(1, MAX_COUNT)), "a number of ticks or null"),
 }
+_CONFIG_OPTIONAL: Fields = {
+    "task": (lambda value: _distinct_names(value), "names of tasks"),
+    "mode": (lambda value: _distinct_names(value), "names of modes"),
+    "version": (_name, "a version"),
+    "tracker": (_name, "a name"),
+    "policy": (_name, "a name"),
+    "engine": (_name, "a name"),
+    "device": (_name, "a name"),
+    "drive": (_name, "a name"),
+    "checkpoint": (_none_or(_name), "a hash or null"),
+    "policy_file": (_none_or(_name), "a hash or null"),
+    "variant": (_none_or(_name), "a hash or null"),
+    "rules_hash": (_name, "a hash"),
+    "scenes": (_text, "a hash"),
+    "code": (_text, "a hash"),
+    "worlds": (_none_or(_number), "a number or null"),
+    "fast_physics": (_flag, "true or false"),
+    "tracker_facts": (_none_or(_facts), "facts by name or null"),
+    "policy_facts": (_none_or(_facts), "facts by name or null"),
+}
 _DOCUMENT: Fields = {
     "config": (lambda value: isinstance(value, dict), "an object"),
     "config_hash": (lambda v: isinstance(v, str) and bool(re.fullmatch("[0-9a-f]{12}", v)), "12 hex digits"),
@@ -226,7 +272,7 @@ _DOCUMENT: Fields = {
 _DOCUMENT_OPTIONAL: Fields = {
     "versions": (_table_of(_none_or(_name)), "versions by library"),
     "later_versions": (_list_of(_table_of(_none_or(_name))), "versions by library"),
-    "environments": (_table_of(lambda value: isinstance(value, dict)), "facts by task and mode"),
+    "environments": (_table_of(_facts), "facts by task and mode"),
     "variant_changes": (_list_of(_text), "sentences"),
 }
 
@@ -288,6 +334,7 @@ def check_document(path: Path, document: Any) -> dict[str, Any]:
     fit(where, document, _DOCUMENT)
     fit(where, document, _DOCUMENT_OPTIONAL, required=False)
     fit(f"{where}: config", document["config"], _CONFIG)
+    fit(f"{where}: config", document["config"], _CONFIG_OPTIONAL, required=False)
     for key, value in document["config"].items():
         if not _name(key) or (isinstance(value, str) and not _name(value)):
             raise InputError(f"{where}: config: {_shown(key)} is {_shown(value)}, expected plain text")
@@ -313,13 +360,31 @@ def read_document(folder: Path) -> dict[str, Any]:
 
 
 def check_plan(path: Path, records: typing.Iterable[dict[str, Any]], document: Mapping[str, Any]) -> None:
-    """Hold a journal to its configuration: no episode that the plan lacks, none twice under two numbers.
+    """Hold a journal to its configuration.
+
+    No episode that the plan lacks or that another run played, none twice under two numbers, and none again that had
+    ended as something else than an error; seeds and step budgets are the plan's.
+
+    Args:
+        path: The journal, for messages.
+        records: Its lines, in their order.
+        document: Content of config.json.
 
     Raises:
-        InputError: A record belongs to another plan.
+        InputError: A record belongs to another plan or another run.
     """
+    from arena_newton import seeding
+
     config = document["config"]
     numbers: dict[tuple[Any, ...], int] = {}
+    ended: dict[int, str] = {}
+    budgets, places = _budgets(config), _places(path.with_name(CONFIG_FILE), config)
+    if places and document["planned"] != len(places):
+        raise InputError(
+            f"{path.with_name(CONFIG_FILE)}: planned is {document['planned']}, the plan has {len(places)}; "
+            "it was changed by hand"
+        )
+    run = {key: config[key] for key in ("tracker", "policy", "rules", "engine") if key in config}
     for record in records:
         key = (record["task"], record["mode"], record["group_seed"], record["repeat"])
         name = f"{path}: episode {record['index']} ({key[0]} {key[1]} seed {key[2]} repeat {key[3]})"
@@ -333,6 +398,54 @@ def check_plan(path: Path, records: typing.Iterable[dict[str, Any]], document: M
             raise InputError(f"{name}: is not in the plan of {CONFIG_FILE}; the journal was changed by hand")
         if numbers.setdefault(key, record["index"]) != record["index"]:
             raise InputError(f"{name}: stands in the journal as episode {numbers[key]} too")
+        seed = seeding.episode_seed(document["gym_ids"][record["task"]], record["group_seed"], record["repeat"])
+        planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
+        if record["task"] in budgets:
+            planned["max_steps"] = budgets[record["task"]]
+        if key in places:
+            planned["index"] = places[key]
+        told = record | {"config hash": (record.get("hashes") or {}).get("config")}
+        for field, wanted in (planned | {"config hash": document["config_hash"]}).items():
+            if told.get(field) != wanted:
+                raise InputError(
+                    f"{name}: {field} is {_shown(told.get(field))}, this run's is {_shown(wanted)}; "
+                    "the journal was changed by hand"
+                )
+        if record["steps"] > record["max_steps"]:
+            raise InputError(
+                f"{name}: {record['steps']} steps of at most {record['max_steps']}; the journal was changed by hand"
+            )
+        if ended.get(record["index"], "error") != "error":
+            raise InputError(
+                f"{name}: stands in the journal again after it had ended ({ended[record['index']]}); "
+                "the journal was changed by hand"
+            )
+        ended[record["index"]] = record["outcome"]
+
+
+def _budgets(config: Mapping[str, Any]) -> dict[str, int]:
+    """Step budgets by task; none where the run's rule set is not one that is known here."""
+    from arena_newton import rules, tasks
+
+    names = config.get("task", ())
+    if config["rules"] not in rules.names() or not set(names) <= set(tasks.names()):
+        return {}
+    rule_set = rules.get(config["rules"])
+    if config.get("rules_hash") != rule_set.hash_for(tuple(names)):
+        return {}
+    cap = config["max_steps"]
+    budgets = {name: tasks.get(name).max_steps(rule_set) for name in names}
+    return {name: budget if cap is None else min(budget, cap) for name, budget in budgets.items()}
+
+
+def _places(path: Path, config: Mapping[str, Any]) -> dict[tuple[Any, ...], int]:
+    """Numbers of the plan's episodes by task, mode, group seed and repeat; none where the plan is not told."""
+    if "task" not in config or "mode" not in config:
+        return {}
+    parts = (config["task"], config["mode"], config["seeds"], range(config["repeats"]))
+    if math.prod(map(len, parts)) > MAX_EPISODES:
+        raise InputError(f"{path}: plans more than {MAX_EPISODES:,} episodes")
+    return {key: number for number, key in enumerate(itertools.product(*parts))}
 
 
 def check_folder(folder: Path) -> None:

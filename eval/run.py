@@ -24,12 +24,12 @@ from arena_newton.eval import records, report, stats
 from arena_newton.eval.config import RunConfig, RunOptions
 from arena_newton.eval.journal import Journal, StorageError, write_atomic
 from arena_newton.eval.plan import Episode
-from arena_newton.eval.progress import Progress, duration, kernels_to_compile
+from arena_newton.eval.progress import Progress, duration, kernels_to_compile, simulated
 from arena_newton.eval.recordings import RecordingPolicy
 from arena_newton.eval.records import counted, plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
-__all__ = ["Factories", "RunStopped", "execute", "new_folder", "stored_options"]
+__all__ = ["Factories", "RunStopped", "execute", "new_folder", "results_folder", "stored_options"]
 
 Versions = dict[str, str | None]
 
@@ -101,17 +101,22 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
 
     config = configs.resolve(options)
     installed = versions()
-    folder = Path(options.out).expanduser() if options.out else new_folder()
+    folder = results_folder(options)
     _check_folder(folder, config, options, installed)
     episodes = configs.episodes(config)
-    config, policy = _check_parts(config, episodes, factories)
+    try:
+        config, policy = _check_parts(config, episodes, factories)
+    except SystemExit as stop:
+        parts = f"--tracker {config.tracker} or --policy {configs.policy_label(config.policy)}"
+        raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
     began = time.perf_counter()
     resume = f"python -m arena_newton.eval resume {shlex.quote(str(folder))}"
     try:
         _make_folder(folder)
         with Journal(folder / records.JOURNAL_FILE) as journal:
-            document = _settle(folder, options, config, len(episodes), installed)
+            document = _settle(folder, options, config, len(episodes), installed, journal.records)
             run = _Run(options, config, folder, episodes, journal, factories, policy, document)
+            run.hashes["config"] = document["config_hash"]
             run.hashes["versions"] = configs.config_hash(configs.moving_versions(installed))
             try:
                 run.play()
@@ -157,6 +162,19 @@ def _sweep(folder: Path) -> None:
         for part in folder.glob(pattern):
             with contextlib.suppress(OSError):
                 part.unlink()
+
+
+def results_folder(options: RunOptions) -> Path:
+    """Folder of --out; a new one where none is named.
+
+    Raises:
+        InputError: --out names nothing.
+    """
+    if options.out is None:
+        return new_folder()
+    if not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
+    return Path(options.out).expanduser()
 
 
 def new_folder() -> Path:
@@ -237,7 +255,14 @@ def _make_folder(folder: Path) -> None:
         raise InputError(f"--out {folder}: cannot be created ({error.strerror})") from None
 
 
-def _settle(folder: Path, options: RunOptions, config: RunConfig, planned: int, installed: Versions) -> dict[str, Any]:
+def _settle(
+    folder: Path,
+    options: RunOptions,
+    config: RunConfig,
+    planned: int,
+    installed: Versions,
+    played: Sequence[dict[str, Any]],
+) -> dict[str, Any]:
     """Write config.json into a new folder, or hold the run to the one that is there; the journal's lock is held.
 
     Returns:
@@ -246,6 +271,7 @@ def _settle(folder: Path, options: RunOptions, config: RunConfig, planned: int, 
     path = folder / records.CONFIG_FILE
     stored = _check_folder(folder, config, options, installed)
     document = _document(options, config, planned, installed) if stored is None else stored
+    records.check_plan(folder / records.JOURNAL_FILE, played, document)
     sets = [document.get("versions", {}), *document.get("later_versions", ())]
     if configs.moving_versions(installed) not in map(configs.moving_versions, sets):
         document["later_versions"] = [*sets[1:], installed]
@@ -350,8 +376,9 @@ class _Run:
         done = {}
         for record in self.journal.records:
             episode = planned.get(record["index"])
-            same = ("task", "mode", "group_seed", "repeat", "episode_seed", "max_steps")
-            if episode is None or any(record[key] != getattr(episode, key) for key in same):
+            same = ("task", "mode", "group_seed", "repeat", "episode_seed", "object_seed", "max_steps")
+            parts = ("tracker", "policy", "rules", "engine")
+            if episode is None or any(record.get(key) != getattr(episode, key) for key in (*same, *parts)):
                 raise InputError(
                     f"{self.journal.path}: episode {record['index']} is not that of the plan; the journal was changed "
                     "by hand"
@@ -373,11 +400,13 @@ class _Run:
             parts = (tasks, " ".join(c.modes), f"tracker {c.tracker}", f"policy {configs.policy_label(c.policy)}")
             print(f"configuration {c.hash}: {', '.join(parts)}, rules {c.rules}, engine {c.engine} on {c.device}")
         size = f"{finished} finished, {len(waiting)} remain" if finished else ""
-        ticks = sum(episode.max_steps for episode in waiting)
         size = ", ".join(filter(None, (counted(len(self.episodes), "episode"), size)))
-        simulated = f"at most {ticks:,} world-ticks ({duration(ticks * TICK_S)} simulated)"
-        worlds = min(c.worlds, max(map(len, _groups(waiting).values()), default=1))
-        print(f"  {size}, {counted(worlds, 'world')} at once, {simulated} -> {self.folder}", flush=True)
+        if not waiting:
+            print(f"  {counted(len(self.episodes), 'episode')}, all finished -> {self.folder}", flush=True)
+            return
+        worlds = min(c.worlds, max(map(len, _groups(waiting).values())))
+        most = simulated(sum(episode.max_steps for episode in waiting))
+        print(f"  {size}, {counted(worlds, 'world')} at once, {most} -> {self.folder}", flush=True)
         if c.worlds_matter and c.worlds > 1:
             print(
                 f"  the policy server does not declare that it honours seeds: if it draws random numbers, results "
@@ -407,7 +436,7 @@ class _Run:
                     where = plain_text(error.filename or self.folder)
                     raise StorageError(f"{where}: disk full; {self.kept()}, what was running is not") from None
                 raise RunStopped(_failed(task, mode, error)) from None
-            except Exception as error:
+            except (Exception, SystemExit) as error:  # a part that leaves must not end the run as if all were played
                 self._keep_trace()
                 # The next episode starts as soon as a world is free, so these are what was running.
                 running = [e for e in order[: started + len(order) - len(left)] if e.index in left]

@@ -78,3 +78,22 @@ def test_film_strip_spaces_frames_evenly(tmp_path):
     assert labelled.shape[1] == 3 * 64 + 2 * 4
     with pytest.raises(ArenaError, match="at least one frame"):
         film_strip([], tmp_path / "u.png")
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "dangling link"])
+def test_pictures_follow_no_link(tmp_path, kind):
+    """A link that lies where a picture is written, under its name or its partial name, leads nowhere."""
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    for name in ("a.mp4", "a.mp4.part", "a.jpg", "a.jpg.part"):
+        link = tmp_path / name
+        link.hardlink_to(victim) if kind == "hard link" else link.symlink_to(victim if kind == "link" else "absent")
+    with VideoWriter(tmp_path / "a.mp4", 64, 48) as writer:
+        for frame in _frames(3):
+            writer.write(frame)
+    film_strip(_frames(3), tmp_path / "a.jpg")
+    assert victim.read_text() == "mine" and not (tmp_path / "absent").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.jpg", "a.mp4", "victim"]
+    assert all(path.is_file() and not path.is_symlink() for path in tmp_path.iterdir())
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 3

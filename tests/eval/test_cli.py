@@ -43,6 +43,10 @@ def test_configuration_is_two_lines(tmp_path, capsys):
         r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy stand, rules paper, ", brief[0]
     )
     assert "  1 episode, 1 world at once, at most 1,300 world-ticks (26 s simulated) -> " in brief[1]
+    assert main(["resume", str(tmp_path / "a")], factories()) == 0
+    assert capsys.readouterr().out.splitlines()[1] == f"  1 episode, all finished -> {tmp_path / 'a'}"
+    assert main([*SHORT, "--max-steps", "1", "--out", str(tmp_path / "c")], factories()) == 0
+    assert "at most 1 world-tick (0.02 s simulated) -> " in capsys.readouterr().out.splitlines()[1]
     assert main([*SHORT, "-v", "--out", str(tmp_path / "b")], factories()) == 0
     captured = capsys.readouterr()
     full = captured.out.split("\n\n")[0].splitlines()
@@ -100,6 +104,11 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["engines", "--seed", "-1"], "--seed -1"),
         (["--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--seeds", "-1"], "seeds"),
+        (["--task", "football", "--seeds", "99999999999999999999999"], "--seeds 99999999999999999999999: expected at"),
+        (["--task", "football", "--max-steps", "99999999"], "--max-steps 99999999: expected at most"),
+        (["--video", "--video-size", "40x4000"], "--video-size 40x4000: .* a height of at most 3072"),
+        (["--task", "football", "--out", ""], "--out: is empty, name a folder"),
+        (["--out", " "], "--out: is empty, name a folder"),
         (["--repeats", "two"], "repeats"),
         (["--tasks", "football"], "--tasks"),
         (["resume"], "name the results folder"),

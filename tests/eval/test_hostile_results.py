@@ -169,3 +169,112 @@ def test_mutated_configurations(base, capsys):
                 with_raw(document, (part,), mutated(document[part], rng).decode("latin-1")).encode("latin-1")
             )
     check(base, mutants, path.write_bytes, capsys, (["resume"], ["report"]))
+
+
+def refused(folder, capsys, *words):
+    """Both commands that read a folder refuse it in one line with these words, and leave the journal alone."""
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for command in (["report"], ["resume"], ["resume", "--accept-versions", "--retry-errors", "--skip-broken"]):
+        capsys.readouterr()
+        assert main([command[0], str(folder), *command[1:]], factories()) == 2, command
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and error.startswith(f"error: {folder}"), error
+        assert all(word in error for word in words), error
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("tracker", "sonic"),
+        ("policy", "expert"),
+        ("rules", "released"),
+        ("engine", "warp"),
+        ("episode_seed", 5),
+        ("object_seed", 5),
+        ("max_steps", 3),
+        ("steps", 1_000_000),
+        ("hashes", {"config": "deadbeef0000"}),
+        ("hashes", {}),
+    ],
+)
+def test_a_line_of_another_run_is_refused(base, capsys, field, value):
+    """A line that another tracker, policy, rule set, engine or configuration played is no line of this run."""
+    path = base / "episodes.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines[2][field] = value
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    refused(base, capsys, "changed by hand", f"episode {lines[2]['index']} ")
+
+
+def test_a_finished_episode_stands_once(base, capsys):
+    """A second line of an episode is taken after an error, and refused after any other end."""
+    path = base / "episodes.jsonl"
+    whole = path.read_text()
+    first = json.loads(whole.splitlines()[0])
+    path.write_text(whole + json.dumps(first | {"outcome": "success"}) + "\n")
+    refused(base, capsys, "again after it had ended", "changed by hand")
+    path.write_text(json.dumps(first | {"outcome": "error"}) + "\n" + whole)
+    assert main(["report", str(base)], factories()) == 0
+    assert main(["resume", str(base)], factories()) == 0
+
+
+def test_numbers_of_two_episodes_are_not_exchanged(base, capsys):
+    """Numbers follow from task, mode, seed and repeat; so does how many there are."""
+    path = base / "episodes.jsonl"
+    lines = sorted((json.loads(line) for line in path.read_text().splitlines()), key=lambda line: line["index"])
+    lines[0]["index"], lines[1]["index"] = 1, 0
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    refused(base, capsys, "index is 1, this run's is 0")
+    config_file = base / "config.json"
+    document = json.loads(config_file.read_text())
+    config_file.write_text(json.dumps(document | {"planned": 1000}))
+    assert main(["report", str(base)], factories()) == 2
+    assert "planned is 1000, the plan has 8" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("raw", ["1" + "0" * 400, "-1" + "0" * 400])
+@pytest.mark.parametrize("place", [("margin",), ("durations", "wall_s"), ("steps",), ("group_seed",)])
+def test_integers_that_no_float_holds_are_refused(base, capsys, place, raw):
+    """JSON's integers have no end; a record's do."""
+    path = base / "episodes.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text(with_raw(json.loads(lines[0]), place, raw) + "\n" + "".join(lines[1:]))
+    refused(base, capsys, "line 1", place[0])
+
+
+@pytest.mark.parametrize(
+    ("place", "raw"),
+    [
+        (("config", "mode"), "3"),
+        (("config", "mode"), '"base"'),
+        (("config", "mode"), "[3]"),
+        (("config", "task"), "5"),
+        (("config", "task"), "[[]]"),
+        (("config", "seeds"), '"01"'),
+        (("config", "seeds"), "[[0]]"),
+        (("config", "repeats"), "true"),
+        (("config", "repeats"), "2.0"),
+        (("config", "max_steps"), "[1]"),
+        (("config", "tracker"), "{}"),
+        (("config", "tracker_facts"), '{"physics_dt": 1' + "0" * 400 + "}"),
+        (("environments",), '{"football base": {"physics_dt": 1' + "0" * 400 + "}}"),
+        (("environments",), '{"football base": {"a": [{"b": 1' + "0" * 400 + "}]}}"),
+        (("planned",), "1" + "0" * 400),
+    ],
+)
+def test_a_configuration_of_other_types_is_refused(base, capsys, place, raw):
+    """What a configuration holds has the types that a run writes."""
+    path = base / "config.json"
+    path.write_text(with_raw(json.loads(path.read_text()), place, raw))
+    refused(base, capsys, place[-1])
+
+
+def test_options_of_other_types_still_give_a_report(base):
+    """A report shows whatever the stored flags are; resume names the one that is wrong."""
+    path = base / "config.json"
+    document = json.loads(path.read_text())
+    for values in ({"policy": ["a"], "max_steps": {"a": 1}, "worlds": 10**400}, {"remote_timeout": 10**400, "task": 3}):
+        path.write_text(json.dumps(document | {"options": document["options"] | values}))
+        assert main(["report", str(base)], factories()) == 0
+        assert main(["resume", str(base)], factories()) == 2

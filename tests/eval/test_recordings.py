@@ -1,6 +1,7 @@
 """`run --actions` keeps what a policy decided; `replay:` plays each episode's own recording."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval import __main__ as command_line
+from arena_newton.eval.recordings import RecordingPolicy
 from arena_newton.interfaces import Observation
 
 RUN = ["--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco", "--max-steps", "50", "--worlds", "2"]
@@ -107,3 +109,21 @@ def test_unfit_folders_are_refused(recorded, tmp_path):
         np.savez(tmp_path / "c.npz", action=arrays["action"])
     with pytest.raises(InputError, match="c.npz: episode_seed, task and mode are missing or unfit"):
         policies.get(f"replay:{tmp_path}")
+
+
+def test_recordings_follow_no_link(tmp_path):
+    """A link that lies where a recording is written, under its name or its partial name, leads nowhere."""
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    folder = tmp_path / "actions"
+    folder.mkdir()
+    for name in ("boxing_base_s0_r0.npz", "boxing_base_s0_r0.npz.partial"):
+        (folder / name).symlink_to(victim)
+    actor = RecordingPolicy(policies.get("stand"), folder)
+    actor.reset([7], ["boxing"], np.ones(1, dtype=bool))
+    actor._chunks[7].append(np.zeros((5, 40), np.float32))
+    episode = SimpleNamespace(episode_seed=7, key="boxing/base/s0/r0", mode="base")
+    path = actor.write(SimpleNamespace(episode=episode, steps=3), "gym")
+    assert victim.read_text() == "mine" and not path.is_symlink() and list(folder.iterdir()) == [path]
+    with np.load(path) as arrays:
+        assert arrays["action"].shape == (3, 40)

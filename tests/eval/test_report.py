@@ -1,6 +1,7 @@
 """Reports are derived from configuration and journal alone, and hold what a reader needs."""
 
 import base64
+import dataclasses
 import hashlib
 import json
 import random
@@ -17,10 +18,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from test_stats import episodes
 
-from arena_newton import tasks
+from arena_newton import seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import report
-from arena_newton.eval.html_report import replay_command, rules_that_ran
+from arena_newton.eval.config import RunOptions
+from arena_newton.eval.html_report import REMOTE, replay_command, rules_that_ran
 from arena_newton.eval.journal import Journal
 from arena_newton.eval.stats import error_reasons, wilson
 
@@ -50,7 +52,10 @@ def folder_with(tmp_path, rows, planned, **config):
 
 def full(row):
     """A record with all journal keys."""
-    rest = {"rules": "paper", "engine": "mujoco", "episode_seed": 7, "object_seed": 9, "max_steps": 1300, "margin": 0.1}
+    known = row["task"] in tasks.names()
+    seed = seeding.episode_seed(tasks.get(row["task"]).gym_id, row["group_seed"], row["repeat"]) if known else 7
+    rest = {"rules": "paper", "engine": "mujoco", "episode_seed": seed, "object_seed": seeding.object_seed(seed)}
+    rest |= {"max_steps": 1300, "margin": 0.1, "hashes": {"config": "0123456789ab"}}
     rest |= {"reason": row["outcome"], "overflow": False, "error": None, "media": {}, "video": ""}
     rest |= {"durations": {"wall_s": 1.0, "sim_s": 2.0}, "started_at": "a", "finished_at": "b"}
     return rest | row
@@ -137,6 +142,7 @@ def test_html_is_self_contained_and_escaped(tmp_path):
     rows = episodes("football", (1, 0, 0), falls=2)
     rows[1]["startup_fall"] = True
     rows[0]["media"] = {"ego": "videos/x__ego.mp4"}
+    rows = [row | {"policy": "<script>"} for row in rows]
     folder = folder_with(tmp_path / "a", rows, 60, policy="<script>")
     tree = html(folder)
     text = (folder / "report.html").read_text()
@@ -236,6 +242,29 @@ def test_command_plays_the_episode_again(tmp_path):
     assert words[3:11] == ["--task", "boxing", "--mode", "visual", "--seeds", "2", "--repeats", "4"]
     assert words[words.index("--policy") + 1] == "replay:a b;rm"
     assert words[words.index("--max-steps") + 1] == "50"
+    assert not {"--worlds", "--remote-timeout", "--remote-insecure"} & set(words)
+
+
+def test_command_asks_a_policy_server_in_the_same_way():
+    """Of a policy server the command keeps how it was asked, and the worlds at once if they matter."""
+    record = {"task": "boxing", "mode": "base", "group_seed": 0, "repeat": 0}
+    options = {"policy": "remote:https://host:1", "remote_timeout": 3.5, "remote_retries": 4, "worlds": 7}
+    options |= {"remote_insecure": True, "remote_sequential": True}
+    words = shlex.split(replay_command(options, record, 7))
+    assert {"--remote-insecure", "--remote-sequential"} <= set(words) and "--remote-retries" not in words
+    assert words[words.index("--remote-timeout") + 1] == "3.5" and words[words.index("--worlds") + 1] == "7"
+    defaults = {f.name: f.default for f in dataclasses.fields(RunOptions) if f.name.startswith("remote_")}
+    assert defaults == REMOTE
+    plain = {"policy": "remote:http://host:1"} | defaults
+    assert not [word for word in shlex.split(replay_command(plain, record)) if word.startswith("--remote")]
+
+
+def test_worlds_of_a_policy_that_depends_on_them_stand_in_the_command(tmp_path):
+    """The page's commands name --worlds only where the configuration says that results depend on it."""
+    for name, worlds in (("a", None), ("b", 5)):
+        folder = folder_with(tmp_path / name, episodes("football", (1, 0, 0)), 60, worlds=worlds)
+        report.write_reports(report.load_run(folder))
+        assert ("--worlds 5" in (folder / "report.html").read_text()) == (worlds == 5)
 
 
 HOSTILE = (
@@ -363,7 +392,8 @@ def dump(browser, tmp_path, page, width):
 def test_page_in_a_browser(tmp_path, browser):
     """In a browser the script runs under the policy, and at 400 and 1280 px nothing is wider than the window."""
     rows = [recorded(row, "ego strip") for row in episodes("football", (2, 1, 0), repeats=4)]
-    rows[3] |= {"policy": "remote:http://a-policy-server.with-a-long-name.example:8000/v1", "tracker": "sonic"}
+    policy = "remote:http://a-policy-server.with-a-long-name.example:8000/v1"
+    rows = [row | {"policy": policy} for row in rows]
     folder = folder_with(tmp_path / "a", rows, 12)
     report.write_reports(report.load_run(folder))
     (folder / "strips").mkdir()

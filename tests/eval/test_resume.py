@@ -170,6 +170,7 @@ class BreaksOnce(FakeEnv):
     [
         (RuntimeError("device lost"), "boxing base: RuntimeError: device lost; running were s0/r2 s0/r3 s1/r0"),
         (RuntimeError("CUDA out of memory"), "fewer --worlds"),
+        (SystemExit(0), "boxing base: SystemExit: 0; running were"),
         (OSError(errno.ENOSPC, "No space left on device", "v.mp4.part"), "v.mp4.part: disk full"),
         (ConnectionResetError("peer left"), "boxing base: ConnectionResetError: peer left"),
         (PolicyUnavailable("http://host:1 does not\x1b[2J answer"), "http://host:1 does not answer"),
@@ -387,3 +388,28 @@ def test_a_journal_of_another_plan_is_refused(tmp_path, uninterrupted, capsys):
         for command in ("report", "resume"):
             assert main([command, str(folder)], factories()) == 2, (command, change)
             assert re.fullmatch(r"error: .*episodes\.jsonl: episode .*\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("part", ["tracker", "policy"])
+def test_a_part_that_leaves_is_no_run_that_ended_well(tmp_path, capsys, part):
+    """SystemExit of a tracker or policy that is being made is told in one line with code 2."""
+
+    def leaves(*_, **__):
+        sys.exit(0)
+
+    assert main(["run", *FLAGS, "--out", str(tmp_path / "d")], factories(**{part: leaves})) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "left with SystemExit: 0 before the first episode" in error
+    assert not (tmp_path / "d").exists()
+
+
+def test_lines_carry_the_hash_of_their_folder(tmp_path, uninterrupted):
+    """Every line, before and after a resume, has the hash of config.json, by which a journal is known as the run's."""
+    folder = tmp_path / "half"
+    shutil.copytree(uninterrupted, folder)
+    kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
+    (folder / "episodes.jsonl").write_text("".join(kept))
+    assert main(["resume", str(folder)], factories()) == 0
+    document = json.loads((folder / "config.json").read_text())
+    written = [json.loads(line)["hashes"]["config"] for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert len(written) == 48 and set(written) == {document["config_hash"]}
