@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from arena_newton.scene import Scene
 
-__all__ = ["Compiled", "Told", "compiled", "compiled_changes", "lost_contacts", "own_compiled"]
+__all__ = ["Compiled", "Told", "compiled", "compiled_changes", "lost_contacts", "own_compiled", "release"]
 
 _SCENES = Path(__file__).resolve().parent
 _ROBOT = "/World/Robot"
@@ -186,7 +186,7 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
     options |= {"equality constraints": np.array(m.neq), "tendons": np.array(m.ntendon)}
     prims = Usd.PrimRange(scene.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
     colliders = frozenset(str(prim.GetPath()) for prim in prims if prim.HasAPI(UsdPhysics.CollisionAPI))
-    found = Compiled(
+    return Compiled(
         gravity=tuple(float(value) for value in m.opt.gravity),
         options=options,
         bodies=_bodies(scene),
@@ -199,10 +199,14 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
         meets=_meets(scene),
         colliders=colliders,
     )
-    # The importer leaves cycles that hold the stage: USD would go on with the layer as it was when the file changes.
-    del scene, prims
+
+
+def release() -> None:
+    """Let go of the stages that were built: the importer leaves cycles that hold them.
+
+    USD would otherwise go on with the layers as they were when the files change.
+    """
     gc.collect()
-    return found
 
 
 @functools.lru_cache(maxsize=4)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.compiled import Told, compiled, compiled_changes, own_compiled
+from arena_newton.usd_scenes.compiled import Told, compiled, compiled_changes, own_compiled, release
 from arena_newton.usd_scenes.shapes import open_stage
 
 if TYPE_CHECKING:
@@ -89,6 +89,7 @@ def differences(path: str | Path, task: str) -> list[str]:
         for sentence in (*sentences, *compiled_changes(*models, Told(tuple(sentences)), needed)):
             if sentence not in told:
                 told[sentence + note] = None
+    release()
     sentences = sorted(told, key=lambda text: not text.startswith(_FIRST))
     if len(sentences) > _MOST:
         return [*sentences[: _MOST - 1], f"and {len(sentences) - _MOST + 1} more changes"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled
+from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
 from arena_newton.usd_scenes.differences import differences
 from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
 from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, search_context, walk
@@ -197,11 +197,12 @@ def _contacts(stage: "Usd.Stage", file: Path, found: Walk, task: str) -> Iterato
             models = compiled(file, variant), own_compiled(task, variant)
         except InputError as error:
             yield Problem(str(file), "", str(error).removeprefix(f"{file}: "))
-            return
+            break
         for prim, message in lost_contacts(*models, needed):
             if (prim, message) not in told:
                 yield Problem(str(file), prim, message + ("" if variant == own else f" (variant {variant})"))
             told.add((prim, message))
+    release()
 
 
 def _speaks_of_collisions(stage: "Usd.Stage", found: Walk) -> bool:
