@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.compiled import Told, compiled, compiled_changes, own_compiled, release
 from arena_newton.usd_scenes.shapes import open_stage
 
 if TYPE_CHECKING:
@@ -25,6 +26,10 @@ _PHYSICAL = ("physics:", "mjc:", "newton:", "arena:", "drive:", "limit:", "physx
 _SHAPE = ("size", "radius", "height", "width", "length", "axis", "points", "faceVertexIndices")
 _LENS = ("focalLength", "horizontalAperture", "verticalAperture", "projection", "clippingRange")
 _SKIPPED = ("arena:resolution",)
+_TARGETS = ("physics:", "collection:colliders:")
+"""Relationships of these namespaces count as well; those of a joint's bodies are told by their short names."""
+_FIRST = ("scene:", "gravity:", "collisions:")
+"""Sentences that stand first, since they concern everything."""
 _CLOSE = 1e-6
 """Relative difference of numbers that are the same."""
 
@@ -34,15 +39,17 @@ class _Part:
     """What counts of one prim."""
 
     kind: str
-    """`gravity`, `robot`, `rule`, `joint`, `surface` or `object`: what a sentence begins with."""
+    """`gravity`, `collisions`, `robot`, `rule`, `joint`, `surface` or `object`: what a sentence begins with."""
     values: dict[str, Any] = field(default_factory=dict)
     """Attributes by name; `pose` is the pose in the body that carries the prim."""
 
 
 def differences(path: str | Path, task: str) -> list[str]:
-    """What a layer changes of a task's gravity, robot, rules, joints, surfaces, masses and colliders.
+    """What a layer changes of a task's gravity, collisions, robot, rules, joints, surfaces, masses and colliders.
 
-    Looks, lights and the world camera are free; nothing is said about them.
+    The layers are compared attribute by attribute, and so are the MuJoCo models that they are compiled to: what changes
+    by other ways (a scaled parent, a collision group, another surface bound) shows there. Looks, lights and the world
+    camera are free; nothing is said about them.
 
     Args:
         path: A layer that passes `validate`.
@@ -52,29 +59,62 @@ def differences(path: str | Path, task: str) -> list[str]:
         One sentence a change, such as `gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81`.
 
     Raises:
-        InputError: The layer cannot be composed, or there is no such task.
+        InputError: The layer cannot be composed or built, or there is no such task.
     """
+    from arena_newton.usd_scenes.validate import REQUIRED
+
     built_in = _SCENES / task / "scene.usda"
     if not built_in.is_file():
         raise InputError(f"unknown task {task!r}: it has no scene")
     theirs, ours = open_stage(path), open_stage(built_in, checked=False)
+    if Path(path).resolve() == built_in.resolve():
+        return []
     told: dict[str, None] = {}
     own = _selection(theirs)
     if own and own != _selection(ours):
         told[f"scene: selects the variant {own} by itself"] = None
         _select(ours, own)
+    needed = [item.path for item in REQUIRED[task]]
     for variant in ("base", "semantic"):
+        selected = [own if own in _names(stage) else None for stage in (theirs, ours)]
         if variant != "base":
+            if not all(variant in _names(stage) for stage in (theirs, ours)):
+                continue
+            selected = [variant, variant]
             for stage in (theirs, ours):
                 _select(stage, variant)
         note = "" if variant == "base" else f" (variant {variant})"
-        for sentence in _compared(_parts(theirs), _parts(ours)):
+        models = compiled(path, selected[0]), own_compiled(task, selected[1])
+        sentences = _authored(_parts(theirs), _parts(ours), models[0].gravity == models[1].gravity)
+        for sentence in (*sentences, *compiled_changes(*models, Told(tuple(sentences)), needed)):
             if sentence not in told:
                 told[sentence + note] = None
-    sentences = list(told)
+    release()
+    sentences = sorted(told, key=lambda text: not text.startswith(_FIRST))
     if len(sentences) > _MOST:
         return [*sentences[: _MOST - 1], f"and {len(sentences) - _MOST + 1} more changes"]
     return sentences
+
+
+def _authored(theirs: dict[str, _Part], ours: dict[str, _Part], same_gravity: bool) -> list[str]:
+    """What the layers say differently; what a PhysicsScene says has no effect where another one counts."""
+    sentences = []
+    stays = "; gravity stays" if same_gravity else ""
+    for sentence in _compared(theirs, ours):
+        if not sentence.startswith("gravity: "):
+            sentences.append(sentence)
+        elif sentence.endswith(" is new"):
+            text = sentence.removeprefix("gravity: ").removesuffix(" is new")
+            sentences.append(f"physics: {text} is one more PhysicsScene{stays}")
+        else:
+            sentences.append(sentence + (stays if "physics:gravity" in sentence else ""))
+    return sentences
+
+
+def _names(stage: "Usd.Stage") -> list[str]:
+    """Variants of `semantics`."""
+    world = stage.GetPrimAtPath("/World")
+    return list(world.GetVariantSet("semantics").GetVariantNames()) if world else []
 
 
 def _selection(stage: "Usd.Stage") -> str:
@@ -106,6 +146,13 @@ def _parts(stage: "Usd.Stage") -> dict[str, _Part]:
             if attribute.GetName().startswith(_PHYSICAL) and attribute.HasAuthoredValue()
             if attribute.GetName() not in _SKIPPED
         }
+        values |= {
+            relation.GetName(): [str(target) for target in relation.GetTargets()]
+            for relation in prim.GetRelationships()
+            if relation.GetName().startswith(_TARGETS) and relation.HasAuthoredTargets()
+            if relation.GetName() not in ("physics:body0", "physics:body1")
+        }
+        group, joint = prim.IsA(UsdPhysics.CollisionGroup), prim.IsA(UsdPhysics.Joint)
         collides = prim.HasAPI(UsdPhysics.CollisionAPI)
         body = prim.HasAPI(UsdPhysics.RigidBodyAPI)
         camera = robot and prim.IsA(UsdGeom.Camera)
@@ -113,20 +160,22 @@ def _parts(stage: "Usd.Stage") -> dict[str, _Part]:
             names = _SHAPE if collides else _LENS
             values |= {name: prim.GetAttribute(name).Get() for name in names if prim.HasAttribute(name)}
         marker = prim.HasAttribute("arena:size")
-        if not (values or collides or body or camera):
+        if not (values or collides or body or camera or group or joint):
             continue
         if collides or marker or camera or (robot and body):
             values["pose"] = _pose(prim, poses)
-        if prim.IsA(UsdPhysics.Joint):
+        if joint:
             for name in ("body0", "body1"):
                 values[name] = [str(target) for target in prim.GetRelationship(f"physics:{name}").GetTargets()]
         if prim.IsA(UsdPhysics.Scene):
             kind = "gravity"
+        elif group:
+            kind = "collisions"
         elif robot:
             kind = "robot"
         elif marker:
             kind = "rule"
-        elif prim.IsA(UsdPhysics.Joint):
+        elif joint:
             kind = "joint"
         elif prim.HasAPI(UsdPhysics.MaterialAPI):
             kind = "surface"
@@ -166,7 +215,8 @@ def _compared(theirs: dict[str, _Part], ours: dict[str, _Part]) -> Iterator[str]
             yield f"{part.kind}: {path}: {', '.join(told)}{_unscaled(theirs[path].values, part.values)}"
     for path, part in theirs.items():
         if path not in ours:
-            yield f"{part.kind}: {path} is new"
+            what = "a new collision group" if part.kind == "collisions" else "new"
+            yield f"{part.kind}: {path} is {what}"
 
 
 def _change(name: str, new: Any, old: Any) -> str | None:
@@ -220,6 +270,8 @@ def _long(value: Any) -> bool:
 
 def _shown(value: Any) -> str:
     numbers = _numbers(value)
+    if isinstance(value, list):
+        return ", ".join(value) or "nothing"
     if numbers is None:
         return str(value)
     if numbers.ndim == 0:

@@ -49,7 +49,7 @@ def write(task: str, path: str | Path) -> Path:
         raise InputError(f"unknown task {task!r}; tasks are {', '.join(REQUIRED)}")
     if path.suffix != ".usda":
         raise InputError(f"{path}: expected a name that ends in .usda")
-    prims = "".join(f"    #   {item.path} ({item.kind})\n" for item in REQUIRED[task])
+    prims = "".join(f"    #   {item.path} ({item.kind})\n" for item in REQUIRED[task] if not item.variants)
     text = _TEXT.format(task=task, package=PACKAGE, prims=prims, color=_light(task))
     try:
         with path.open("x", encoding="utf-8") as file:

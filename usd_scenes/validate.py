@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
 from arena_newton.usd_scenes.differences import differences
 from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
 from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, search_context, walk
@@ -42,6 +43,8 @@ class Required:
     variants: tuple[str, ...] = ()
     """Variants of `semantics` that need it; empty: all of them."""
 
+
+_FOLDER = Path(__file__).resolve().parent
 
 COMMON = (
     Required("/World/physicsScene", "physics"),
@@ -165,7 +168,59 @@ def _validate(file: Path, task: str | None) -> list[Problem]:
         problems.append(Problem(str(file), "/World", "is not the layer's defaultPrim"))
     problems += [Problem(str(file), prim, message) for prim, message in _selections(stage)]
     problems += [*_prims(stage, file, task), *_strangers(stage, file, found)]
+    if not problems and task is not None:
+        problems += _contacts(stage, file, found, task)
     return list(dict.fromkeys(problems))
+
+
+_COLLISION_WORDS = ("filter", "group", "colli", "contype", "conaffinity", "enabled", "flag")
+"""Parts of names of attributes and relationships that decide which colliders meet."""
+
+
+def _contacts(stage: "Usd.Stage", file: Path, found: Walk, task: str) -> Iterator[Problem]:
+    """Needed things that no longer meet each other; built, since groups and filters have no simpler answer.
+
+    Only a layer that says something of collisions itself is built.
+    """
+    if not _speaks_of_collisions(stage, found):
+        return
+    choice = stage.GetPrimAtPath("/World").GetVariantSet("semantics")
+    own = choice.GetVariantSelection() or None
+    told: set[tuple[str, str]] = set()
+    for variant in dict.fromkeys((own, *sorted(choice.GetVariantNames()))):
+        needed = [
+            item.path
+            for item in REQUIRED[task]
+            if item.kind in ("body", "fixture", "collider") and _wanted(item, variant or "base")
+        ]
+        try:
+            models = compiled(file, variant), own_compiled(task, variant)
+        except InputError as error:
+            yield Problem(str(file), "", str(error).removeprefix(f"{file}: "))
+            break
+        for prim, message in lost_contacts(*models, needed):
+            if (prim, message) not in told:
+                yield Problem(str(file), prim, message + ("" if variant == own else f" (variant {variant})"))
+            told.add((prim, message))
+    release()
+
+
+def _speaks_of_collisions(stage: "Usd.Stage", found: Walk) -> bool:
+    from pxr import Sdf
+
+    layers = {layer.identifier: layer for layer in stage.GetUsedLayers() if not layer.anonymous}
+    files = (path for path in found.files if path.suffix in (".usda", ".usd", ".usdc", ".usdz"))
+    layers |= {layer.identifier: layer for path in files if (layer := Sdf.Layer.FindOrOpen(str(path)))}
+    names: list[str] = []
+
+    def note(path: "Sdf.Path") -> None:
+        if path.IsPropertyPath():
+            names.append(path.name.lower())
+
+    for layer in layers.values():
+        if not Path(layer.realPath).resolve().is_relative_to(_FOLDER):
+            layer.Traverse(Sdf.Path.absoluteRootPath, note)
+    return any(word in name for name in names for word in _COLLISION_WORDS)
 
 
 def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem]:
@@ -261,7 +316,10 @@ _KIND_WORDS = {
 def _collides(prim: "Usd.Prim") -> bool:
     from pxr import Usd, UsdPhysics
 
-    return any(p.HasAPI(UsdPhysics.CollisionAPI) for p in Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))
+    return any(
+        p.HasAPI(UsdPhysics.CollisionAPI) and UsdPhysics.CollisionAPI(p).GetCollisionEnabledAttr().Get()
+        for p in Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
+    )
 
 
 def _body_fault(prim: "Usd.Prim") -> str | None:
@@ -269,7 +327,17 @@ def _body_fault(prim: "Usd.Prim") -> str | None:
 
     if not prim.HasAPI(UsdPhysics.RigidBodyAPI):
         return "is not a rigid body"
-    return None if _collides(prim) else "has no collision geom"
+    return _held_fault(prim) or (None if _collides(prim) else "has no collision geom")
+
+
+def _held_fault(prim: "Usd.Prim") -> str | None:
+    """A rigid body that does not move by itself."""
+    from pxr import UsdPhysics
+
+    body = UsdPhysics.RigidBodyAPI(prim)
+    if not body.GetRigidBodyEnabledAttr().Get():
+        return "physics:rigidBodyEnabled is false"
+    return "physics:kinematicEnabled is true" if body.GetKinematicEnabledAttr().Get() else None
 
 
 def _target_fault(prim: "Usd.Prim") -> str | None:
@@ -347,8 +415,10 @@ def _physics_fault(prim: "Usd.Prim") -> str | None:
 def _robot_fault(prim: "Usd.Prim") -> str | None:
     from pxr import Usd, UsdPhysics
 
-    found = any(p.GetName() == "pelvis" and p.HasAPI(UsdPhysics.RigidBodyAPI) for p in Usd.PrimRange(prim))
-    return None if found else "has no rigid body pelvis"
+    bodies = [p for p in Usd.PrimRange(prim) if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+    if all(p.GetName() != "pelvis" for p in bodies):
+        return "has no rigid body pelvis"
+    return next((f"{p.GetName()}: {fault}" for p in bodies if (fault := _held_fault(p))), None)
 
 
 _KIND_TESTS = {

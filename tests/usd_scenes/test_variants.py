@@ -120,6 +120,25 @@ CHANGES = {
     ),
     "new": ('def Cube "Stool" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', ["object: /World/Stool is new"]),
     "look": (over("float focalLength = 20", "WorldCamera") + 'def Cube "Seen" {}', []),
+    "joint": (
+        'def PhysicsFixedJoint "Glue" { rel physics:body0 = </World/Ball> }',
+        ["joint: /World/Glue is new", "rule object: /World/Ball: free directions is 0, not 6"],
+    ),
+    "second physics scene": (
+        'def PhysicsScene "A" { float physics:gravityMagnitude = 0 }',
+        ["physics: /World/A is one more PhysicsScene; gravity stays"],
+    ),
+    "scaled body": (
+        over(
+            'float3 xformOp:scale = (2, 2, 2)\nuniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]',
+            "Ball",
+        ),
+        ["rule object: /World/Ball/Collider: size is (0.22, 0.22, 0.22), not (0.11, 0.11, 0.11)"],
+    ),
+    "another surface": (
+        over("rel material:binding:physics = </World/Looks/GoalSurface>", "Ball", "Collider"),
+        ["rule object: /World/Ball/Collider: friction is (0.5, 0.005, 0.0001), not (0.7, 0.005, 0.0001)"],
+    ),
     "own variant": ("", ["scene: selects the variant semantic by itself"]),
 }
 
@@ -134,6 +153,86 @@ def test_changes_are_told(written, case):
             path.read_text().replace('over "World"', 'over "World" (variants = { string semantics = "semantic" })')
         )
     assert differences(path, "football") == sentences
+
+
+GROUP = 'def PhysicsCollisionGroup "G" (prepend apiSchemas = ["CollectionAPI:colliders"]) {{ {} }}'
+FILTERS = {
+    "all": (
+        GROUP.format("rel collection:colliders:includes = </World>\nrel physics:filteredGroups = </World/G>"),
+        [f"/World/{name} no longer meets anything" for name in ("Ball", "Goal", "Ground", "Robot")],
+        "/World/Robot: no longer meets /World/Ground",
+    ),
+    "inverted": (
+        GROUP.format("rel collection:colliders:includes = </World/Ball>\nbool physics:invertFilteredGroups = true"),
+        ["/World/Ball no longer meets anything"],
+        "/World/Robot: no longer meets /World/Ball",
+    ),
+    "pair": (
+        over("rel physics:filteredPairs = </World/Ground>", "Ball").replace(
+            '"Ball"', '"Ball" (prepend apiSchemas = ["PhysicsFilteredPairsAPI"])'
+        ),
+        ["/World/Ball and /World/Ground no longer meet"],
+        "/World/Ball: no longer meets /World/Ground",
+    ),
+    "foot": (
+        over("rel physics:filteredPairs = </World/Ground>", "Robot", "left_ankle_roll_link").replace(
+            "_roll_link", '_roll_link" (prepend apiSchemas = ["PhysicsFilteredPairsAPI"]) #'
+        ),
+        ["/World/Ground and /World/Robot no longer meet in 1 of 31 pairs of colliders"],
+        "/World/Robot/left_ankle_roll_link/collision: no longer meets /World/Ground: expected",
+    ),
+    "switched off": (
+        over("bool physics:collisionEnabled = false", "Ground"),
+        ["/World/Ground no longer meets anything"],
+        "/World/Robot: no longer meets /World/Ground",
+    ),
+    "no contacts": (
+        over("custom bool mjc:flag:contact = false", "physicsScene"),
+        [f"/World/{name} no longer meets anything" for name in ("Ball", "Goal", "Ground", "Robot")],
+        "/World/Robot: no longer meets /World/Ground",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FILTERS)
+def test_lost_collisions_are_told_and_refused(written, case):
+    """Whatever keeps robot, ground and rule objects from meeting is told as a change and named by `validate`."""
+    body, told, fault = FILTERS[case]
+    path = written(body)
+    effects = [text for text in differences(path, "football") if "no longer meet" in text]
+    assert effects == [f"collisions: {text}" for text in told]
+    problems = [str(problem) for problem in validate(path)]
+    assert problems[0].startswith(f"{path}: {fault}") and all("no longer meets" in text for text in problems)
+
+
+@pytest.mark.parametrize("prim", [("Ball",), ("Robot", "pelvis")])
+@pytest.mark.parametrize("line", ["rigidBodyEnabled = false", "kinematicEnabled = true"])
+def test_bodies_that_do_not_move_are_refused(written, prim, line):
+    """A body of the robot or of a rule that is switched off or held is a fault that names the attribute."""
+    (problem,) = validate(written(over(f"bool physics:{line}", *prim)))
+    assert prim[-1] in str(problem) and f"physics:{line.replace('=', 'is')}" in str(problem)
+
+
+def test_collisions_that_stay_are_no_fault(written):
+    """A collision group that filters nothing that the task needs is accepted, and the new group is told."""
+    path = written(GROUP.format("rel collection:colliders:includes = </World/Ball>"))
+    assert validate(path) == []
+    assert differences(path, "football") == ["collisions: /World/G is a new collision group"]
+
+
+def test_a_robot_that_changes_all_over_is_summed_up(written):
+    """Dozens of changed links are a few sentences, the same every time."""
+    order = 'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient", "xformOp:scale"]'
+    path = written(over(f"float3 xformOp:scale = (2, 2, 2)\n{order}", "Robot"))
+    told = differences(path, "football")
+    assert 1 <= len(told) <= 5 and all(text.startswith("robot: /World/Robot: ") for text in told)
+    assert told == differences(path, "football")
+
+
+def test_a_skeleton_lists_what_base_needs(written):
+    """What only one variant of the scene has is not listed as needed."""
+    text = written().read_text()
+    assert "/World/Ball (body)" in text and "Distractor" not in text
 
 
 def test_the_own_scenes_change_nothing(written):
