@@ -242,8 +242,8 @@ _CONFIG: Fields = {
     "max_steps": (_none_or(_count(1, MAX_COUNT)), "a number of ticks or null"),
 }
 _CONFIG_OPTIONAL: Fields = {
-    "task": (lambda value: _distinct_names(value), "names of tasks"),
-    "mode": (lambda value: _distinct_names(value), "names of modes"),
+    "task": (_distinct_names, "names of tasks"),
+    "mode": (_distinct_names, "names of modes"),
     "version": (_name, "a version"),
     "tracker": (_name, "a name"),
     "policy": (_name, "a name"),

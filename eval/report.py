@@ -14,13 +14,10 @@ from typing import Any
 from arena_newton.eval.html_report import Page, environment_facts, media_of, page, plain, rules_that_ran, tasks_of
 from arena_newton.eval.journal import read_journal, write_atomic
 from arena_newton.eval.original_format import write_original
-from arena_newton.eval.records import check_plan, counted, read_document
+from arena_newton.eval.records import JOURNAL_FILE, check_plan, counted, read_document
 from arena_newton.eval.stats import aggregate, error_reasons, outside_suites
 
 __all__ = ["RunRecord", "load_run", "notes", "results_json", "table", "write_reports"]
-
-CONFIG_FILE = "config.json"
-JOURNAL_FILE = "episodes.jsonl"
 
 _COLUMNS = (
     "task",
@@ -63,15 +60,6 @@ class RunRecord:
         return self.document["config"]
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Read a results folder's config.json.
-
-    Raises:
-        InputError: the folder holds no run.
-    """
-    return read_document(folder)
-
-
 def in_plan_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Records by plan order; of two with the same index the later one in the journal counts."""
     latest = {record["index"]: record for record in records}
@@ -80,7 +68,7 @@ def in_plan_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def load_run(folder: Path) -> RunRecord:
     """Read a results folder."""
-    document = read_config(folder)
+    document = read_document(folder)
     records, _ = read_journal(folder / JOURNAL_FILE)
     check_plan(folder / JOURNAL_FILE, records, document)
     return RunRecord(folder, document, in_plan_order(records))

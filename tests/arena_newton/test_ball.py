@@ -97,6 +97,19 @@ def test_the_ball_rises_by_the_square_of_its_restitution(rule_set, rate):
         assert rise == pytest.approx(built.ball_restitution, abs=0.03), height
 
 
+def on_the_grass(built, rate):
+    """The ball at rest on the pitch, its contacts set for a physics step, and the robot out of the way."""
+    import mujoco
+
+    set_restitution(built, built.ball_restitution, rate)
+    built.mj_model.opt.timestep = rate
+    data = mujoco.MjData(built.mj_model)
+    data.qpos[built.robot.root_qpos] += 50.0
+    at = built.joint_qpos(BALL)
+    data.qpos[at : at + 3] = (3.5, -4.0, RADIUS)
+    return data
+
+
 @pytest.mark.parametrize("rule_set", ["paper", "released"])
 def test_a_bouncing_ball_also_rolls_and_rests(rule_set):
     """The contact that bounces takes no speed from a rolling ball and keeps a resting one on the grass."""
@@ -105,11 +118,7 @@ def test_a_bouncing_ball_also_rolls_and_rests(rule_set):
     built = one_world(rule_set)
     model, q, v = built.mj_model, built.joint_qpos(BALL), built.joint_qvel(BALL)
     for rate in RATES:
-        set_restitution(built, built.ball_restitution, rate)
-        model.opt.timestep = rate
-        data = mujoco.MjData(model)
-        data.qpos[built.robot.root_qpos] += 50.0
-        data.qpos[q : q + 3] = (3.5, -4.0, RADIUS)
+        data = on_the_grass(built, rate)
         data.qvel[v : v + 6] = (0, 0.9, 0, -0.9 / RADIUS, 0, 0)
         mujoco.mj_step(model, data, round(2.0 / rate))
         assert data.qvel[v + 1] == pytest.approx(0.9, abs=0.01)
@@ -124,11 +133,7 @@ def test_a_sliding_ball_stays_down(rule_set):
     built = one_world(rule_set)
     model, q, v = built.mj_model, built.joint_qpos(BALL), built.joint_qvel(BALL)
     for rate in RATES:
-        set_restitution(built, built.ball_restitution, rate)
-        model.opt.timestep = rate
-        data = mujoco.MjData(model)
-        data.qpos[built.robot.root_qpos] += 50.0
-        data.qpos[q : q + 3] = (3.5, -4.0, RADIUS)
+        data = on_the_grass(built, rate)
         data.qvel[v + 1] = 3.0
         top = 0.0
         for _ in range(round(0.8 / rate)):
