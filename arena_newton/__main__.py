@@ -37,7 +37,7 @@ COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to mend"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("eval oracle", "arena_newton.eval.oracle", "official TWIST2 here beside its own MJCF in plain MuJoCo"),
-    Command("rules", "arena_newton.rules", "print both rule sets"),
+    Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
@@ -84,9 +84,9 @@ def _run(arguments: list[str]) -> int:
 def _rules(arguments: list[str]) -> int:
     if arguments:
         raise InputError(f"rules {arguments[0]}: takes no arguments; it prints both rule sets as Markdown")
-    from arena_newton import rules
+    from arena_newton import rule_sets
 
-    print(rules.markdown(), end="")
+    print(rule_sets.markdown(), end="")
     return 0
 
 

@@ -82,8 +82,7 @@ class ArenaEnv:
         import torch
         import warp as wp
 
-        from arena_newton import rules as rule_sets
-        from arena_newton import tasks
+        from arena_newton import rule_sets, tasks
         from arena_newton.kernels import canonical
         from arena_newton.physics import make_physics, resolve_engine
         from arena_newton.scene import load_scene
@@ -198,7 +197,7 @@ class ArenaEnv:
 
     def add_camera(self, config: Any) -> Any:
         """Attach the head camera (done at construction when `camera` is given)."""
-        from arena_newton.camera import Camera
+        from arena_newton.pictures.camera import Camera
 
         self.camera = Camera.from_scene(
             self.scene,
@@ -213,7 +212,7 @@ class ArenaEnv:
         return self.camera
 
     def _lights(self) -> Any:
-        from arena_newton.camera import WorldLights
+        from arena_newton.pictures.camera import WorldLights
 
         if self.lights is None:
             self.lights = WorldLights.allocate(self.worlds, self.device, self.scene.stage)

@@ -271,8 +271,8 @@ def _throughput(options: BenchOptions) -> Iterator[Figure]:
 def _frames(worlds: int, device: str, engine: str, rounds: int) -> tuple[float, float]:
     """Head camera at 224 x 224 with a drawn light per world: frames per second, and per second of processor time."""
     from arena_newton import trackers
-    from arena_newton.camera import CameraConfig
     from arena_newton.env import ArenaEnv
+    from arena_newton.pictures.camera import CameraConfig
 
     env = ArenaEnv(
         "football",
@@ -314,7 +314,7 @@ def _pictures(options: BenchOptions) -> Iterator[Figure]:
     from arena_newton import policies, trackers
     from arena_newton.env import ArenaEnv
     from arena_newton.eval import plan
-    from arena_newton.recorder import EpisodeRecorder
+    from arena_newton.pictures.recorder import EpisodeRecorder
 
     env = ArenaEnv("vis_navi", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu")
     episodes = plan.expand(["vis_navi"], tracker="twist2", policy="expert", seeds=[0], repeats=2)

@@ -295,8 +295,7 @@ def resolve(options: RunOptions) -> RunConfig:
     Raises:
         InputError: a flag names something unknown or absent; the message says what is known.
     """
-    from arena_newton import policies
-    from arena_newton import rules as rule_sets
+    from arena_newton import policies, rule_sets
     from arena_newton import tasks as task_specs
     from arena_newton.eval import plan
     from arena_newton.physics import resolve_engine
@@ -434,7 +433,7 @@ def _size(given: str | None) -> tuple[int, int] | None:
     """Width and height of --video-size."""
     if given is None:
         return None
-    from arena_newton.recorder import video_sizes
+    from arena_newton.pictures.recorder import video_sizes
 
     numbers = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", given)
     if not numbers:

@@ -312,10 +312,10 @@ def run_oracle(
     import mujoco
     import torch
 
-    from arena_newton import rules, trackers
+    from arena_newton import rule_sets, trackers
     from arena_newton.env import STAND_ACTION
 
-    worlds, startup = len(streams), rules.get("paper").startup.ticks
+    worlds, startup = len(streams), rule_sets.get("paper").startup.ticks
     driver = trackers.get(tracker, checkpoint)
     rate = driver.rate(fast=fast)
     m = model if model is not None else load_official(mjcf, driver.drive, rate.dt)

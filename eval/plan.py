@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from arena_newton import rules as rule_sets
-from arena_newton import seeding, tasks
+from arena_newton import rule_sets, seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.records import MAX_COUNT, MAX_EPISODES, MAX_SEED
+from arena_newton.rules import MODES
 
 __all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "to_list_json"]
 
@@ -88,8 +88,8 @@ def expand(
     if high > MAX_SEED:
         raise InputError(f"--seeds {_cut(high)}: expected at most {MAX_SEED}")
     for mode in modes:
-        if mode not in rule_sets.MODES:
-            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(rule_sets.MODES)}")
+        if mode not in MODES:
+            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)}")
     if repeats < 1:
         raise InputError(f"--repeats {repeats}: expected at least 1")
     if max_steps is not None and max_steps < 1:

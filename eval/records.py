@@ -425,12 +425,12 @@ def check_plan(path: Path, records: typing.Iterable[dict[str, Any]], document: M
 
 def _budgets(config: Mapping[str, Any]) -> dict[str, int]:
     """Step budgets by task; none where the run's rule set is not one that is known here."""
-    from arena_newton import rules, tasks
+    from arena_newton import rule_sets, tasks
 
     names = config.get("task", ())
-    if config["rules"] not in rules.names() or not set(names) <= set(tasks.names()):
+    if config["rules"] not in rule_sets.names() or not set(names) <= set(tasks.names()):
         return {}
-    rule_set = rules.get(config["rules"])
+    rule_set = rule_sets.get(config["rules"])
     if config.get("rules_hash") != rule_set.hash_for(tuple(names)):
         return {}
     cap = config["max_steps"]

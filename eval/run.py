@@ -190,12 +190,12 @@ def _shown(value: Any) -> str:
 
 def _document(options: RunOptions, config: RunConfig, planned: int, installed: Versions) -> dict[str, Any]:
     """Content of config.json; what the environments say of themselves is added when they are built."""
-    from arena_newton import rules, tasks
+    from arena_newton import rule_sets, tasks
 
     return {
         "config_hash": config.hash,
         "config": config.identity(),
-        "rule_set": dict(rules.get(config.rules).table()),
+        "rule_set": dict(rule_sets.table(rule_sets.get(config.rules))),
         "gym_ids": {name: tasks.get(name).gym_id for name in config.tasks},
         "options": json.loads(json.dumps(dataclasses.asdict(configs.explicit(options, config)))),
         "versions": installed,
@@ -569,7 +569,7 @@ def _recorder(config: RunConfig, folder: Path) -> Any:
     """What takes the pictures; None when none are wanted."""
     if not (config.video or config.strip):
         return None
-    from arena_newton.recorder import EpisodeRecorder
+    from arena_newton.pictures.recorder import EpisodeRecorder
 
     asked: dict[str, Any] = {"episodes": config.video_episodes, "size": config.video_size, "follow": config.follow}
     given = {key: value for key, value in asked.items() if value}
@@ -583,7 +583,7 @@ def _policy_camera(policy: Any) -> Any:
     own = getattr(policy, "camera", None)
     if own is not None:
         return own
-    from arena_newton.camera import CameraConfig
+    from arena_newton.pictures.camera import CameraConfig
 
     return CameraConfig()
 

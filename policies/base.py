@@ -14,7 +14,7 @@ from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
 
 if TYPE_CHECKING:
-    from arena_newton.camera import CameraConfig
+    from arena_newton.pictures.camera import CameraConfig
 
 __all__ = [
     "Chunk",

@@ -28,9 +28,9 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from arena_newton.camera import CameraConfig
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Chunk, Observation, Policy, PolicyUnavailable, world_mask
 
 __all__ = ["MAX_FAILURES", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]

@@ -29,16 +29,16 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def football_native():
     """Football on native MuJoCo, three worlds."""
-    from arena_newton import rules
+    from arena_newton import rule_sets
     from arena_newton.scene import load_scene
 
-    return load_scene("football", worlds=3, device="cpu", native=True, rules=rules.get("paper"))
+    return load_scene("football", worlds=3, device="cpu", native=True, rules=rule_sets.get("paper"))
 
 
 @pytest.fixture(scope="session")
 def football_warp():
     """Football on the Warp CPU backend, two worlds."""
-    from arena_newton import rules
+    from arena_newton import rule_sets
     from arena_newton.scene import load_scene
 
-    return load_scene("football", worlds=2, device="cpu", rules=rules.get("paper"))
+    return load_scene("football", worlds=2, device="cpu", rules=rule_sets.get("paper"))

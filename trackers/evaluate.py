@@ -154,11 +154,11 @@ def _evaluate(args: argparse.Namespace) -> int:
         entry.make()  # complains about files before anything is built
 
     from arena_newton.physics import resolve_engine
-    from arena_newton.trackers.evaluation import chart, report
-    from arena_newton.trackers.evaluation.bench import inference
+    from arena_newton.trackers.evaluation import chart, tracker_report
     from arena_newton.trackers.evaluation.figures import Result
-    from arena_newton.trackers.evaluation.film import film
+    from arena_newton.trackers.evaluation.inference_times import inference
     from arena_newton.trackers.evaluation.rollout import plan, run
+    from arena_newton.trackers.evaluation.tracker_film import film
 
     resolve_engine(args.engine, args.device)
     if args.out is not None:
@@ -188,9 +188,9 @@ def _evaluate(args: argparse.Namespace) -> int:
         "only": " ".join(args.only),
         "clips": " ".join(path.name for path in args.clips),
     }
-    print(report.figure_table(results))
+    print(tracker_report.figure_table(results))
     if args.out is not None:
-        for path in report.write(results, resolved, args.out):
+        for path in tracker_report.write(results, resolved, args.out):
             print(path, file=sys.stderr)
         picture = args.out / "evaluation.png"
         print(f"{picture}: {chart.missing()}" if chart.missing() else chart.chart(results, picture), file=sys.stderr)

@@ -21,12 +21,12 @@ import torch
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import MUJOCO_JOINTS, DriveGains
-from arena_newton.trackers import networks
 from arena_newton.trackers.base import Tracker
-from arena_newton.trackers.blocks import BlockRunner
+from arena_newton.trackers.inference import networks
+from arena_newton.trackers.inference.blocks import BlockRunner
 
 if TYPE_CHECKING:
-    from arena_newton.trackers.weights_file import Weights
+    from arena_newton.trackers.inference.weights_file import Weights
 
 __all__ = ["ActionForm", "FrontEnd", "Mirror", "NetworkTracker", "residual_form"]
 

@@ -21,11 +21,11 @@ from arena_newton.robot import (
     SONIC_DRIVE,
     PhysicsRate,
 )
-from arena_newton.trackers import onnx_session, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
+from arena_newton.trackers.inference import onnx_session, weights_file
+from arena_newton.trackers.inference.quadratic import Quadratic, products
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
-from arena_newton.trackers.quadratic import Quadratic, products
 
 __all__ = [
     "ENCODER_INPUT",

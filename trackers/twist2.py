@@ -15,11 +15,11 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
-from arena_newton.trackers import onnx_mlp, weights_file
 from arena_newton.trackers.base import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
+from arena_newton.trackers.inference import onnx_mlp, weights_file
+from arena_newton.trackers.inference.quadratic import Quadratic, products
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
-from arena_newton.trackers.quadratic import Quadratic, products
 
 __all__ = ["FRAME", "HISTORY", "OBSERVATION", "OFFICIAL_FORM", "Twist2FrontEnd", "Twist2Tracker", "from_checkpoint"]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
-    from arena_newton.usd_scenes.walk import Problem
+    from arena_newton.usd_scenes.dependencies import Problem
 
 MODES = ("base", "semantic", "visual", "all")
 

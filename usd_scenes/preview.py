@@ -79,7 +79,7 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
 
 def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
     """Pictures of one scene in one mode, uint8 [height, width, 3] each."""
-    from arena_newton.camera import Camera, WorldLights
+    from arena_newton.pictures.camera import Camera, WorldLights
     from arena_newton.scene import load_scene
 
     scene = load_scene(target, worlds=1, device="cpu", native=True, variant=_variant(target, mode))
@@ -113,9 +113,9 @@ def _selected(target: str) -> str | None:
 
 def _light() -> Any:
     """Visual mode's light of one fixed seed; its ranges are the same for every task."""
-    from arena_newton import rules, tasks
+    from arena_newton import rule_sets, tasks
 
-    return tasks.get("football").draw(_LIGHT_SEED, "visual", rules.get("paper")).light
+    return tasks.get("football").draw(_LIGHT_SEED, "visual", rule_sets.get("paper")).light
 
 
 def _settled(scene: Scene) -> Any:

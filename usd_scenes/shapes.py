@@ -10,7 +10,7 @@ import numpy as np
 
 from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.walk import check_files, reason, search_context
+from arena_newton.usd_scenes.dependencies import check_files, reason, search_context
 
 if TYPE_CHECKING:
     from pxr import Usd

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.dependencies import PACKAGE
 from arena_newton.usd_scenes.validate import REQUIRED
-from arena_newton.usd_scenes.walk import PACKAGE
 
 __all__ = ["write"]
 

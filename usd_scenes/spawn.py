@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from arena_newton import limits
 from arena_newton import robot as g1
-from arena_newton.usd_scenes.walk import Problem
+from arena_newton.rules import MODES
+from arena_newton.usd_scenes.dependencies import Problem
 
 if TYPE_CHECKING:
     from arena_newton.scene import Scene
@@ -47,14 +48,13 @@ def penetrations(path: str | Path, task: str) -> tuple[list[Problem], list[Probl
 
 def _pairs(path: str | Path, task: str) -> dict[tuple[str, str], tuple[float, list[str]]]:
     """(prim, prim) → depth [m] and the modes in which they start so."""
-    from arena_newton import rules as rule_sets
-    from arena_newton import tasks
+    from arena_newton import rule_sets, tasks
     from arena_newton.scene import load_scene
 
     spec, rules = tasks.get(task), rule_sets.get("paper")
     scenes: dict[str | None, Scene] = {}
     found: dict[tuple[str, str], tuple[float, list[str]]] = {}
-    for mode in rule_sets.MODES:
+    for mode in MODES:
         # As in a run: a user's file keeps its own selection but in semantic mode.
         variant = spec.variant(mode, rules) if mode == "semantic" or str(path) == task else None
         if variant not in scenes:

@@ -13,9 +13,17 @@ from typing import TYPE_CHECKING
 from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
+from arena_newton.usd_scenes.dependencies import (
+    Dependencies,
+    Problem,
+    check_files,
+    collect,
+    layers,
+    reason,
+    search_context,
+)
 from arena_newton.usd_scenes.differences import differences
 from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
-from arena_newton.usd_scenes.walk import Problem, Walk, check_files, layers, reason, search_context, walk
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -144,13 +152,13 @@ def check(path: str | Path, task: str | None = None) -> None:
 
 def task_of(path: str | Path) -> str | None:
     """The task whose folder the layer, or a layer it builds on, lies in; `None` if that is none or several."""
-    return _deduce(walk(Path(path)).files)
+    return _deduce(collect(Path(path)).files)
 
 
 def _validate(file: Path, task: str | None) -> list[Problem]:
     from pxr import Usd
 
-    found = walk(file)
+    found = collect(file)
     if found.fatal:
         return found.problems
     problems = list(found.problems)
@@ -177,7 +185,7 @@ _COLLISION_WORDS = ("filter", "group", "colli", "contype", "conaffinity", "enabl
 """Parts of names of attributes and relationships that decide which colliders meet."""
 
 
-def _contacts(stage: "Usd.Stage", file: Path, found: Walk, task: str) -> Iterator[Problem]:
+def _contacts(stage: "Usd.Stage", file: Path, found: Dependencies, task: str) -> Iterator[Problem]:
     """Needed things that no longer meet each other; built, since groups and filters have no simpler answer.
 
     Only a layer that says something of collisions itself is built.
@@ -205,7 +213,7 @@ def _contacts(stage: "Usd.Stage", file: Path, found: Walk, task: str) -> Iterato
     release()
 
 
-def _speaks_of_collisions(stage: "Usd.Stage", found: Walk) -> bool:
+def _speaks_of_collisions(stage: "Usd.Stage", found: Dependencies) -> bool:
     from pxr import Sdf
 
     layers = {layer.identifier: layer for layer in stage.GetUsedLayers() if not layer.anonymous}
@@ -280,8 +288,8 @@ def _composition(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
         yield Problem(str(file), "" if where.IsAbsoluteRootPath() else str(where), reason(error))
 
 
-def _strangers(stage: "Usd.Stage", file: Path, found: Walk) -> Iterator[Problem]:
-    """Layers that the stage uses and the walk did not look at; there should be none."""
+def _strangers(stage: "Usd.Stage", file: Path, found: Dependencies) -> Iterator[Problem]:
+    """Layers that the stage uses and the search did not look at; there should be none."""
     for layer in stage.GetUsedLayers():
         path = layer.realPath.split("[", 1)[0]
         if not layer.anonymous and not (path and Path(path) in found.files):

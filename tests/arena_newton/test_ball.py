@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from arena_newton import rules
+from arena_newton import rule_sets
 from arena_newton.physics import make_physics
 from arena_newton.robot import PhysicsRate
 from arena_newton.scene import BALL, BALL_SKIN, SKIN_HEIGHT, ball_solref, load_scene, set_restitution
@@ -22,7 +22,7 @@ RATES = {0.001: PhysicsRate(0.001, 1), 0.005: PhysicsRate(0.005, 1)}
 @cache
 def one_world(rule_set: str):
     """One world for native MuJoCo."""
-    return load_scene("football", device="cpu", native=True, rules=rules.get(rule_set))
+    return load_scene("football", device="cpu", native=True, rules=rule_sets.get(rule_set))
 
 
 @pytest.fixture(scope="module", params=["mujoco", "warp"])
@@ -30,7 +30,7 @@ def drops(request):
     """Engine and a scene with one world for each height and phase."""
     worlds = len(HEIGHTS) * len(PHASES)
     built = load_scene(
-        "football", worlds=worlds, device="cpu", native=request.param == "mujoco", rules=rules.get("paper")
+        "football", worlds=worlds, device="cpu", native=request.param == "mujoco", rules=rule_sets.get("paper")
     )
     return request.param, built
 
@@ -69,7 +69,7 @@ def bounce(drops, restitution: float, dt: float, steps: int) -> np.ndarray:
 @pytest.mark.parametrize("rule_set", ["paper", "released"])
 def test_the_ball_bounces_as_the_rule_says(drops, rule_set, rate):
     """Dropped from 0.3, 1 and 3 m it leaves with the stated part of its speed ± 0.03, wherever in a step it lands."""
-    restitution = rules.get(rule_set).ball_restitution
+    restitution = rule_sets.get(rule_set).ball_restitution
     assert bounce(drops, restitution, rate, 8) == pytest.approx(restitution, abs=0.03)
 
 
@@ -145,7 +145,7 @@ def test_a_sliding_ball_stays_down(rule_set):
 
 def test_scene_keeps_the_rule_sets_restitution():
     """A scene is built with the contact of its rule set at its model's own step, and says which it is."""
-    built = load_scene("football", device="cpu", native=True, rules=rules.get("released"))
+    built = load_scene("football", device="cpu", native=True, rules=rule_sets.get("released"))
     geom, skin = built.geom_ids(BALL)
     assert built.geom_labels[skin] == BALL_SKIN
     assert built.mj_model.geom_condim[[geom, skin]].tolist() == [1, 3]

@@ -8,8 +8,8 @@ import pytest
 newton = pytest.importorskip("newton")
 wp = pytest.importorskip("warp")
 
-from arena_newton.camera import Camera, CameraConfig, WorldLights  # noqa: E402
 from arena_newton.errors import InputError  # noqa: E402
+from arena_newton.pictures.camera import Camera, CameraConfig, WorldLights  # noqa: E402
 
 WORLDS = 3
 DOWN = (0.0, 0.0, -1.0)
@@ -207,7 +207,7 @@ def test_worlds_beyond_the_memory_of_the_maps_come_in_parts(model, monkeypatch):
     for world in range(WORLDS):
         lights.set(world, _light((1 - world, 0.2, -2)))
     whole = _camera(model, lights).render(model.state()).numpy().copy()
-    monkeypatch.setattr("arena_newton.camera.SHADOW_BYTES", 1)
+    monkeypatch.setattr("arena_newton.pictures.camera.SHADOW_BYTES", 1)
     camera = _camera(model, lights)
     parts = camera.render(model.state()).numpy()
     assert camera._shadows.frames.shape == (1,)

@@ -43,7 +43,7 @@ class Network(trackers.base.Tracker):
     name = "network"
 
     def bind(self, worlds, device="cpu", scene=None):
-        from arena_newton.trackers.blocks import BlockRunner
+        from arena_newton.trackers.inference.blocks import BlockRunner
 
         torch.manual_seed(0)
         layers = [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from arena_newton import robot as g1
-from arena_newton import rules, seeding, tasks
+from arena_newton import rule_sets, seeding, tasks
 from arena_newton.rules import MODES
 from arena_newton.scene import ROBOT, Scene, load_scene
 
@@ -72,9 +72,9 @@ def measure(task: str) -> dict[tuple, tuple[int, float]]:
     spec = tasks.get(task)
     known: dict[str, dict[tuple[str, str], float]] = {}
     found: dict[tuple, tuple[int, float]] = {}
-    for name in rules.names():
+    for name in rule_sets.names():
         for mode in MODES:
-            rule_set = rules.get(name)
+            rule_set = rule_sets.get(name)
             variant = spec.variant(mode, rule_set)
             built = scene(task, variant)
             data = mujoco.MjData(built.mj_model)

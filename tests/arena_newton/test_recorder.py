@@ -14,12 +14,12 @@ from PIL import Image
 
 torch = pytest.importorskip("torch")
 
-from arena_newton.camera import Camera  # noqa: E402
 from arena_newton.env import STAND_ACTION, ArenaEnv  # noqa: E402
 from arena_newton.errors import InputError  # noqa: E402
-from arena_newton.follow import OFFSETS, follow_pose, room_walls  # noqa: E402
-from arena_newton.recorder import STRIP_FRAMES, EpisodeRecorder  # noqa: E402
-from arena_newton.video import VideoWriter, film_strip  # noqa: E402
+from arena_newton.pictures.camera import Camera  # noqa: E402
+from arena_newton.pictures.follow import OFFSETS, follow_pose, room_walls  # noqa: E402
+from arena_newton.pictures.recorder import STRIP_FRAMES, EpisodeRecorder  # noqa: E402
+from arena_newton.pictures.video import VideoWriter, film_strip  # noqa: E402
 
 TICKS = 23
 
@@ -86,7 +86,7 @@ def test_frames_of_a_strip_are_evenly_spaced(env, tmp_path, monkeypatch):
     """The frames' steps are evenly spaced to one in forty, from the first to the last, for an odd last tick too."""
     said = {}
     monkeypatch.setattr(
-        "arena_newton.recorder.film_strip", lambda frames, path, **o: said.update({path.stem: o["captions"]})
+        "arena_newton.pictures.recorder.film_strip", lambda frames, path, **o: said.update({path.stem: o["captions"]})
     )
     record(env, tmp_path, ticks=175, video=False)
     steps = [int(text.split()[1]) for text in said["vis_navi__base__seed0__repeat0__ego"]]
@@ -210,7 +210,7 @@ def test_a_full_disk_names_the_file(tmp_path, kind):
 import sys
 import numpy as np
 from pathlib import Path
-from arena_newton.video import VideoWriter, film_strip
+from arena_newton.pictures.video import VideoWriter, film_strip
 noise = np.random.default_rng(0).integers(0, 255, (60, 120, 160, 3), np.uint8)
 path = Path(sys.argv[1])
 try:

@@ -6,34 +6,34 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton import rules, tasks
+from arena_newton import rule_sets, rules, tasks
 from arena_newton.errors import InputError
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "rules.md"
 
 
 def test_documentation_page_matches_the_rules():
-    """docs/rules.md is what `python -m arena_newton.rules` prints."""
-    assert PAGE.read_text(encoding="utf-8") == rules.markdown()
+    """docs/rules.md is what `python -m arena_newton.rule_sets` prints."""
+    assert PAGE.read_text(encoding="utf-8") == rule_sets.markdown()
 
 
-@pytest.mark.parametrize("name", rules.names())
+@pytest.mark.parametrize("name", rule_sets.names())
 def test_a_rule_set_is_frozen_hashed_and_printable(name):
     """A rule set cannot be changed, and its hash follows its content."""
-    rule_set = rules.get(name)
+    rule_set = rule_sets.get(name)
     with pytest.raises(dataclasses.FrozenInstanceError):
         rule_set.name = "mine"
     assert len(rule_set.hash) == 12
-    assert rule_set.hash == rules.get(name).hash
+    assert rule_set.hash == rule_sets.get(name).hash
     changed = dataclasses.replace(rule_set, fall=dataclasses.replace(rule_set.fall, hard_tilt_deg=74.0))
     assert changed.hash != rule_set.hash
-    assert rule_set.hash in str(rule_set)
+    assert rule_set.hash in rule_sets.text(rule_set)
     assert json.loads(json.dumps(rule_set.to_dict())) == rule_set.to_dict()
 
 
 def test_a_changed_range_changes_the_hash():
     """Placement ranges belong to the hashed content."""
-    paper = rules.get("paper")
+    paper = rule_sets.get("paper")
     first = paper.tasks[0]
     moved = dataclasses.replace(first.objects[0], base=dataclasses.replace(first.objects[0].base, x=(-1.0, 1.0)))
     changed = dataclasses.replace(paper, tasks=(dataclasses.replace(first, objects=(moved,)), *paper.tasks[1:]))
@@ -43,11 +43,11 @@ def test_a_changed_range_changes_the_hash():
 def test_unknown_names_are_refused():
     """Rule set and task names are checked with a list of what there is."""
     with pytest.raises(InputError, match="paper or released"):
-        rules.get("strict")
+        rule_sets.get("strict")
     with pytest.raises(InputError, match="football"):
-        rules.get("paper").task("golf")
+        rule_sets.get("paper").task("golf")
     with pytest.raises(InputError, match="football"):
-        rules.get("paper").hash_for(["golf"])
+        rule_sets.get("paper").hash_for(["golf"])
     with pytest.raises(InputError, match="typo: unknown, choose paper or released"):
         rules.ByRules(1, 2).of("typo")
 
@@ -58,21 +58,21 @@ def test_unknown_names_are_refused():
 )
 def test_step_budgets(name, steps):
     """Budgets of the paper and of the launch scripts, in the order of the tasks (rule table, first row)."""
-    rule_set = rules.get(name)
+    rule_set = rule_sets.get(name)
     assert tuple(tasks.get(task).max_steps(rule_set) for task in tasks.names()) == steps
 
 
 def test_fall_rules():
     """Angles, force and confirmation of both sets (rule table, row fall)."""
-    paper, released = rules.get("paper").fall, rules.get("released").fall
+    paper, released = rule_sets.get("paper").fall, rule_sets.get("released").fall
     assert dataclasses.astuple(paper) == (True, 60.0, 75.0, 50.0, 5)
     assert dataclasses.astuple(released) == (False, 60.0, 75.0, 50.0, 5)
 
 
 def test_predicate_numbers_that_differ():
     """The numbers in which the two sets differ (rule table)."""
-    paper, released = ({t.task: t.success for t in rules.get(n).tasks} for n in rules.names())
-    assert (rules.get("paper").ball_restitution, rules.get("released").ball_restitution) == (0.1, 0.75)
+    paper, released = ({t.task: t.success for t in rule_sets.get(n).tasks} for n in rule_sets.names())
+    assert (rule_sets.get("paper").ball_restitution, rule_sets.get("released").ball_restitution) == (0.1, 0.75)
     assert (paper["football"].rear_bound, released["football"].rear_bound) == (True, False)
     assert (paper["football"].ball_out, released["football"].ball_out) == (True, False)
     assert (paper["double_desk"].crate_frame, released["double_desk"].min_z) == (True, 0.445)
@@ -85,14 +85,14 @@ def test_predicate_numbers_that_differ():
     assert dataclasses.astuple(paper["boxing"]) == (0.0, 0.08)
     assert dataclasses.astuple(released["boxing"]) == (0.10, 0.08)
     assert (paper["vis_navi"].round_signs, released["vis_navi"].round_signs) == (False, True)
-    assert dataclasses.astuple(rules.get("paper").standing) == (0.45, 0.60)
+    assert dataclasses.astuple(rule_sets.get("paper").standing) == (0.45, 0.60)
 
 
 def test_every_task_has_rules_in_both_sets():
     """Both sets know all seven tasks in the same order and the same objects."""
-    for name in rules.names():
-        assert tuple(t.task for t in rules.get(name).tasks) == tasks.names()
-    for ours, theirs in zip(rules.get("paper").tasks, rules.get("released").tasks, strict=True):
+    for name in rule_sets.names():
+        assert tuple(t.task for t in rule_sets.get(name).tasks) == tasks.names()
+    for ours, theirs in zip(rule_sets.get("paper").tasks, rule_sets.get("released").tasks, strict=True):
         assert [o.record for o in ours.objects] == [o.record for o in theirs.objects]
         assert [o.base for o in ours.objects] == [o.base for o in theirs.objects]
 
@@ -116,15 +116,15 @@ def with_an_eighth_task(rule_set):
 
 def test_a_further_task_prints_its_own_success_condition():
     """A rule set says what any task's success is, in the task's own words."""
-    rows = dict(with_an_eighth_task(rules.get("paper")).table())
+    rows = dict(rule_sets.table(with_an_eighth_task(rule_sets.get("paper"))))
     assert rows["bell"] == "the bell rings 3 times"
-    for name in rules.names():
-        assert set(tasks.names()) <= set(dict(rules.get(name).table()))
+    for name in rule_sets.names():
+        assert set(tasks.names()) <= set(dict(rule_sets.table(rule_sets.get(name))))
 
 
 def test_the_hash_of_a_run_is_that_of_its_tasks():
     """Another task leaves it alone, and so does order; a task of its own, the fall rule or the set's name change it."""
-    paper = rules.get("paper")
+    paper = rule_sets.get("paper")
     used = ("boxing", "football")
     first = paper.hash_for(used)
     assert first == paper.hash_for(reversed(used)) == with_an_eighth_task(paper).hash_for(used)
@@ -133,7 +133,7 @@ def test_the_hash_of_a_run_is_that_of_its_tasks():
     own = tuple(dataclasses.replace(t, max_steps=1) if t.task in used else t for t in paper.tasks)
     assert dataclasses.replace(paper, tasks=own).hash_for(used) != first
     assert dataclasses.replace(paper, fall=rules.FallRule(at_once=False)).hash_for(used) != first
-    assert rules.get("released").hash_for(used) != first
+    assert rule_sets.get("released").hash_for(used) != first
     assert paper.hash_for(tasks.names()) == paper.hash != first
 
 
@@ -148,8 +148,8 @@ def test_contradictory_rules_are_refused(crate_frame, min_z):
 
 def test_every_number_of_a_predicate_is_printed():
     """Each number of a success rule appears in the table, and a changed one changes the text."""
-    for name in rules.names():
-        for task in rules.get(name).tasks:
+    for name in rule_sets.names():
+        for task in rule_sets.get(name).tasks:
             for field in dataclasses.fields(task.success):
                 value = getattr(task.success, field.name)
                 if isinstance(value, bool | tuple) or value is None or value == 0.0:

@@ -7,12 +7,12 @@ import random
 import numpy as np
 import pytest
 
-from arena_newton import rules, seeding, tasks
+from arena_newton import rule_sets, seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.rules import MODES, PoseRange
 from arena_newton.tasks.base import light_direction, widened
 
-PAPER, RELEASED = rules.get("paper"), rules.get("released")
+PAPER, RELEASED = rule_sets.get("paper"), rule_sets.get("released")
 
 
 def seed_of(task: str, group_seed: int = 0, repeat: int = 0) -> int:

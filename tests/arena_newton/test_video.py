@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from arena_newton.errors import ArenaError
-from arena_newton.video import VideoWriter, film_strip
+from arena_newton.pictures.video import VideoWriter, film_strip
 
 
 def _frames(n, height=48, width=64):

@@ -10,7 +10,7 @@ import pytest
 
 from arena_newton.errors import InputError
 from arena_newton.eval import config
-from arena_newton.rules import get
+from arena_newton.rule_sets import get
 
 TASKS = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
 

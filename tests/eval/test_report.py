@@ -199,10 +199,10 @@ def test_strips_of_every_cell_come_before_a_second_one(tmp_path):
 
 def test_only_rules_of_tasks_that_ran(tmp_path):
     """Rows of other tasks, and their parts of lists, are left out; no text points at what does not follow."""
-    from arena_newton import rules
+    from arena_newton import rule_sets
 
-    for name in rules.names():
-        said = dict(rules.get(name).table())
+    for name in rule_sets.names():
+        said = dict(rule_sets.table(rule_sets.get(name)))
         rows = dict(rules_that_ran(said, ["vis_navi"]))
         text = json.dumps(rows)
         assert not re.search("football|ball|double_desk|pp_box|open_door|sit_sofa|boxing|ranges below", text), text

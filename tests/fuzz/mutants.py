@@ -316,7 +316,7 @@ def onnx(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[s
     import torch
     from onnx_files import twist2_like
 
-    from arena_newton.trackers import onnx_mlp
+    from arena_newton.trackers.inference import onnx_mlp
 
     torch.set_num_threads(1)
     path = twist2_like(folder / "a.onnx", frame=10, command=4, history=8, out=5)
@@ -356,8 +356,8 @@ def safetensors(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], 
     import torch
 
     from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-    from arena_newton.trackers import networks, weights_file
     from arena_newton.trackers.front_end import residual_form
+    from arena_newton.trackers.inference import networks, weights_file
 
     torch.set_num_threads(1)
     network = networks.make("twist2", {"hidden": [8, 8]})
@@ -403,9 +403,9 @@ def results(reader: str, count: int, seed: int, folder: Path) -> Iterator[tuple[
             yield once(read, path)
     if reader == "usdc":
         # All are opened by the process that may crash, then one after the other by this one.
-        from arena_newton.usd_scenes import walk
+        from arena_newton.usd_scenes import dependencies
 
-        walk.probe_layers(files)
+        dependencies.probe_layers(files)
         for path in files:
             yield once(read, path)
 

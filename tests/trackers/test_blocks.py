@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from arena_newton.trackers import blocks
-from arena_newton.trackers.blocks import BlockRunner
+from arena_newton.trackers.inference import blocks
+from arena_newton.trackers.inference.blocks import BlockRunner
 
 
 def outputs(network, rows: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ from arena_newton.trackers.evaluation import chart
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
 from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
-from arena_newton.trackers.evaluation.measure import FEET, LINKS, Meter, Reference
+from arena_newton.trackers.evaluation.meter import FEET, LINKS, Meter, Reference
 from arena_newton.trackers.evaluation.rollout import Outcome, plan, run, sill_place
 from arena_newton.trackers.evaluation.suite import Cell, Navigation
 from arena_newton.trackers.motions import primitives
@@ -195,7 +195,7 @@ def _exact_follower(name: str):
     """The lab and a cell's reference as positions and velocities of every tick, [ticks, nq] and [ticks, nv]."""
     import mujoco
 
-    from arena_newton import rules
+    from arena_newton import rule_sets
     from arena_newton.scene import load_scene
     from arena_newton.trackers.motions.frames import actions_to_motion
 
@@ -203,7 +203,13 @@ def _exact_follower(name: str):
     tables = plan([cell], 1, 0).tables(torch.device("cpu"))
     motion = actions_to_motion(tables.actions.transpose(0, 1))
     scene = load_scene(
-        "lab", hands="fixed", variant="ball", rules=rules.get("paper"), drive=g1.TWIST2_DRIVE, native=True, device="cpu"
+        "lab",
+        hands="fixed",
+        variant="ball",
+        rules=rule_sets.get("paper"),
+        drive=g1.TWIST2_DRIVE,
+        native=True,
+        device="cpu",
     )
     m, robot = scene.mj_model, scene.robot
     q, v = np.tile(m.qpos0, (cell.ticks, 1)), np.zeros((cell.ticks, m.nv))
@@ -435,12 +441,12 @@ def test_film_shows_the_robot(tmp_path, monkeypatch):
     from PIL import Image
 
     from arena_newton.trackers.base import get
-    from arena_newton.trackers.evaluation import film
+    from arena_newton.trackers.evaluation import tracker_film
 
     for name, value in (("FILMED", {"squat 0.45": "squat"}), ("PICTURES", 2), ("WIDTH", 48), ("HEIGHT", 48)):
-        monkeypatch.setattr(film, name, value)
-    monkeypatch.setitem(film.SHOWN, "squat 0.45", (0.0, 2.0))
-    (path,) = film.film(get("pd"), "pd", tmp_path, engine="mujoco", threads=1)
+        monkeypatch.setattr(tracker_film, name, value)
+    monkeypatch.setitem(tracker_film.SHOWN, "squat 0.45", (0.0, 2.0))
+    (path,) = tracker_film.film(get("pd"), "pd", tmp_path, engine="mujoco", threads=1)
     assert path.name == "film_pd_squat.png"
     strip = np.asarray(Image.open(path).convert("RGB")).astype(int)
     first, second = strip[-48:, :48], strip[-48:, -48:]

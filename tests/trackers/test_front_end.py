@@ -6,8 +6,9 @@ import torch
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
-from arena_newton.trackers import RobotState, TrackerCommand, weights_file
+from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import ActionForm, residual_form
+from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.twist2 import Twist2FrontEnd
 

@@ -12,7 +12,7 @@ from onnx_files import Builder, twist2_like
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
-from arena_newton.trackers import onnx_mlp, onnx_session
+from arena_newton.trackers.inference import onnx_mlp, onnx_session
 
 OFFICIAL = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2"
 

@@ -7,7 +7,7 @@ import torch
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
-from arena_newton.trackers import weights_file
+from arena_newton.trackers.inference import weights_file
 
 
 def message(spec: str, checkpoint=None) -> str:

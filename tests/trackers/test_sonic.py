@@ -8,7 +8,7 @@ from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand
-from arena_newton.trackers.networks import SonicNet
+from arena_newton.trackers.inference.networks import SonicNet
 from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicTracker
 
 ORDER = [MUJOCO_JOINTS.index(name) for name in CANONICAL_JOINTS]

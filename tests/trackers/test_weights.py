@@ -10,8 +10,9 @@ from safetensors.torch import save_file
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import RobotState, TrackerCommand, networks, weights_file
+from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import residual_form
+from arena_newton.trackers.inference import networks, weights_file
 from arena_newton.trackers.sonic import SONIC_FORM, SonicFrontEnd
 from arena_newton.trackers.twist2 import Twist2FrontEnd
 

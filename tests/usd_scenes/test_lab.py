@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from arena_newton import robot as g1
-from arena_newton import rules, tasks
+from arena_newton import rule_sets, tasks
 from arena_newton.physics import make_physics
 from arena_newton.scene import load_scene
 from arena_newton.usd_scenes.build import PARTS, build_all
@@ -25,7 +25,7 @@ def lab(engine: str, variant: str = "ball"):
             device="cpu",
             hands="fixed",
             variant=variant,
-            rules=rules.get("paper"),
+            rules=rule_sets.get("paper"),
             native=engine == "mujoco",
         )
         _LOADED[key] = (scene, make_physics(scene, RATE, engine, threads=1))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arena_newton import rules, tasks
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.scene import SCENES, load_scene
 from arena_newton.usd_scenes.__main__ import main
@@ -256,7 +256,7 @@ def test_a_larger_ball_starts_on_the_floor(written):
 
 def test_what_starts_inside_something_is_named(written, capsys):
     """`validate` resets an episode of each mode: a stool under the ball is named; what a variant changes is printed."""
-    ball = tasks.get("football").draw(0, "base", rules.get("paper"))
+    ball = tasks.get("football").draw(0, "base", rule_sets.get("paper"))
     x, y, _ = ball.placed["/World/Ball"].pos
     stool = (
         'def Cube "Stool" (prepend apiSchemas = ["PhysicsCollisionAPI"]) { double size = 0.3\n'

@@ -181,7 +181,7 @@ class Lab:
         import torch
         import warp as wp
 
-        from arena_newton import rules
+        from arena_newton import rule_sets
         from arena_newton.scene import load_scene
 
         self.engine, device = resolve_engine(engine, device)
@@ -192,7 +192,7 @@ class Lab:
             device=device,
             hands="fixed",
             variant="ball",
-            rules=rules.get("paper"),
+            rules=rule_sets.get("paper"),
             drive=drive,
             native=self.engine == "mujoco",
             contacts_per_world=CONTACTS,

@@ -14,7 +14,7 @@ from arena_newton import robot as g1
 from arena_newton.errors import ArenaError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
-from arena_newton.trackers.evaluation.measure import Meter, Reference
+from arena_newton.trackers.evaluation.meter import Meter, Reference
 from arena_newton.trackers.evaluation.suite import Cell, Tables, tabulate
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 from arena_newton.trackers.motions.library import FIXTURES

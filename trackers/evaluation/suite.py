@@ -150,7 +150,7 @@ def tabulate(cells: list[Cell], device: torch.device) -> Tables:
 
     from arena_newton.canonical import ACTION, ACTION_WIDTH
     from arena_newton.env import STAND_ACTION
-    from arena_newton.trackers.evaluation.measure import FEET, LINKS
+    from arena_newton.trackers.evaluation.meter import FEET, LINKS
     from arena_newton.trackers.motions.frames import actions_to_motion, heading, quat_apply, quat_from_yaw
     from arena_newton.trackers.motions.kinematics import forward, link_index
 

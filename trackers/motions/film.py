@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.pictures.video import GAP, LABEL_HEIGHT
 from arena_newton.robot import TICK
 from arena_newton.trackers.motions.library import MotionLibrary
-from arena_newton.video import GAP, LABEL_HEIGHT
 
 __all__ = ["film", "movie", "picked_frames"]
 
@@ -108,8 +108,8 @@ def movie(
     Raises:
         InputError: No clips, no time, or the file cannot be written.
     """
+    from arena_newton.pictures.video import VideoWriter
     from arena_newton.trackers.motions.render import ClipRenderer
-    from arena_newton.video import VideoWriter
 
     if not clips:
         raise InputError("render: name at least one clip")

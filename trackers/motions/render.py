@@ -12,7 +12,7 @@ from arena_newton.errors import InputError
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
 
 if TYPE_CHECKING:
-    from arena_newton.camera import Camera
+    from arena_newton.pictures.camera import Camera
 
 __all__ = ["ClipRenderer"]
 
@@ -45,7 +45,7 @@ class ClipRenderer:
         """
         import mujoco
 
-        from arena_newton.camera import WorldLights
+        from arena_newton.pictures.camera import WorldLights
         from arena_newton.scene import load_scene
         from arena_newton.tasks import LightDraw
 
@@ -119,7 +119,7 @@ class ClipRenderer:
         self._state.body_q.assign(poses)
 
     def _camera(self, pos: np.ndarray) -> Camera:
-        from arena_newton.camera import Camera
+        from arena_newton.pictures.camera import Camera
 
         eye = np.array([pos[0], pos[1], TARGET_HEIGHT]) + EYE
         back = np.array(EYE) / np.linalg.norm(EYE)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.trackers.train.config import TrainOptions
+from arena_newton.trackers.train.options import TrainOptions
 
 __all__ = ["main"]
 

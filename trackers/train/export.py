@@ -14,7 +14,7 @@ from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
     from arena_newton.robot import DriveGains
-    from arena_newton.trackers.weights_file import Weights
+    from arena_newton.trackers.inference.weights_file import Weights
 
 __all__ = ["ExportCommand", "ExportOptions", "export", "write"]
 
@@ -58,8 +58,8 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         InputError: The checkpoint is unfit, or a file cannot be written.
     """
     from arena_newton.robot import PhysicsRate
-    from arena_newton.trackers import networks, weights_file
     from arena_newton.trackers.front_end import ActionForm
+    from arena_newton.trackers.inference import networks, weights_file
     from arena_newton.trackers.train.runner import read_checkpoint
 
     if options.out.suffix != ".safetensors":
@@ -110,7 +110,7 @@ def write(weights: Weights, out: Path) -> Path:
     Raises:
         InputError: A file cannot be written.
     """
-    from arena_newton.trackers import weights_file
+    from arena_newton.trackers.inference import weights_file
 
     text = _markdown(dict(weights.card))
     try:

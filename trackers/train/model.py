@@ -12,7 +12,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
 
-from arena_newton.trackers import networks
+from arena_newton.trackers.inference import networks
 
 __all__ = ["TrackerActor", "TrackerCritic"]
 

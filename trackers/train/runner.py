@@ -25,9 +25,9 @@ from rsl_rl.utils.logger import Logger
 from tensordict import TensorDict
 
 from arena_newton.errors import InputError, naming
-from arena_newton.trackers.train.env import TrackerEnv
 from arena_newton.trackers.train.model import TrackerActor
 from arena_newton.trackers.train.ppo import IterationPPO
+from arena_newton.trackers.train.tracker_env import TrackerEnv
 
 __all__ = ["TrackerRunner"]
 
@@ -135,7 +135,7 @@ class TrackerRunner(OnPolicyRunner):
         Raises:
             InputError: The file is absent, of another interface or of other widths.
         """
-        from arena_newton.trackers import weights_file
+        from arena_newton.trackers.inference import weights_file
 
         actor = self.alg.get_policy()
         interface = str(self.cfg["card"]["tracker"])

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton.errors import InputError, naming
-from arena_newton.trackers.train.config import FAMILY_WEIGHTS, TrainOptions, runner_config
+from arena_newton.trackers.train.options import FAMILY_WEIGHTS, TrainOptions, runner_config
 
 if TYPE_CHECKING:
     from arena_newton.robot import DriveGains, PhysicsRate
@@ -200,7 +200,7 @@ def _checkpoint(options: TrainOptions) -> tuple[dict[str, Any] | None, str]:
     Raises:
         InputError: The file to begin with is unfit, or of another tracker or form than asked for.
     """
-    from arena_newton.trackers import weights_file
+    from arena_newton.trackers.inference import weights_file
     from arena_newton.trackers.train.runner import check_same, read_checkpoint
 
     if options.start_from is not None:
@@ -236,11 +236,11 @@ def build(options: TrainOptions) -> TrackerRunner:
     check(options)
     import torch
 
-    from arena_newton.trackers import networks
-    from arena_newton.trackers.train.env import EnvConfig, TrackerEnv
+    from arena_newton.trackers.inference import networks
     from arena_newton.trackers.train.rewards import REWARDS
     from arena_newton.trackers.train.runner import TrackerRunner
     from arena_newton.trackers.train.simulation import share_stream
+    from arena_newton.trackers.train.tracker_env import EnvConfig, TrackerEnv
 
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")

@@ -16,17 +16,18 @@ from PIL import Image
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import train, weights_file
+from arena_newton.trackers import train
+from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
-from arena_newton.trackers.train.config import TrainOptions, runner_config
-from arena_newton.trackers.train.env import EnvConfig, TrackerEnv
 from arena_newton.trackers.train.export import ExportOptions, export
+from arena_newton.trackers.train.options import TrainOptions, runner_config
 from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, read_checkpoint
 from arena_newton.trackers.train.simulation import share_stream
+from arena_newton.trackers.train.tracker_env import EnvConfig, TrackerEnv
 from arena_newton.trackers.twist2 import Twist2FrontEnd, Twist2Tracker
 
 WORLDS = 8
@@ -404,7 +405,7 @@ def test_two_processes_train_one_network(library, tmp_path):
     script.write_text(
         "import os, sys, torch\n"
         "from arena_newton.trackers.train import session\n"
-        "from arena_newton.trackers.train.config import TrainOptions\n"
+        "from arena_newton.trackers.train.options import TrainOptions\n"
         "import tyro\n"
         "options = tyro.cli(TrainOptions, args=sys.argv[1:])\n"
         "runner = session.build(options)\n"

@@ -11,8 +11,8 @@ import torch
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.trackers import onnx_mlp
 from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker
+from arena_newton.trackers.inference import onnx_mlp
 
 FRAMES, FRAME = 5, 115
 LEG = (-0.1, 0.0, 0.0, 0.3, -0.2, 0.0)

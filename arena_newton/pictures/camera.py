@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.triangles import srgb_to_linear, triangles
+from arena_newton.pictures.triangles import srgb_to_linear, triangles
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics

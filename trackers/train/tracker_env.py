@@ -33,7 +33,7 @@ from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
     from arena_newton.trackers.motions.library import DeviceLibrary
-    from arena_newton.trackers.train.config import TrainOptions
+    from arena_newton.trackers.train.options import TrainOptions
 
 __all__ = ["EnvConfig", "TrackerEnv"]
 

@@ -1,6 +1,6 @@
 """Follow everything that a USD layer names, file by file, before anything is composed.
 
-USD opens what a layer names while it composes, a named pipe included, and composes on when that fails. The walk looks
+USD opens what a layer names while it composes, a named pipe included, and composes on when that fails. The search looks
 at every path first: only regular files of the right kind are opened, none larger than `limits` says, and the prims that
 references would make are counted.
 """
@@ -32,13 +32,13 @@ __all__ = [
     "PACKAGE",
     "Place",
     "Problem",
-    "Walk",
+    "Dependencies",
     "check_files",
     "layers",
     "probe_layers",
     "reason",
     "search_context",
-    "walk",
+    "collect",
 ]
 
 LAYERS = (".usda", ".usd", ".usdc", ".usdz")
@@ -96,7 +96,7 @@ class Place:
 
 
 @dataclass
-class Walk:
+class Dependencies:
     """What following every asset path of a layer found."""
 
     files: list[Path] = field(default_factory=list)
@@ -117,7 +117,7 @@ def layers(path: str | Path) -> list[Path]:
     Raises:
         InputError: A file that the scene needs is missing, no regular file or unreadable, or a number is not finite.
     """
-    found = walk(Path(path))
+    found = collect(Path(path))
     _raise_fatal(found)
     return found.files
 
@@ -128,17 +128,17 @@ def check_files(path: str | Path) -> None:
     Raises:
         InputError: One line that names the file and its first fault.
     """
-    _raise_fatal(walk(Path(path)))
+    _raise_fatal(collect(Path(path)))
 
 
-def _raise_fatal(found: Walk) -> None:
+def _raise_fatal(found: Dependencies) -> None:
     if found.fatal:
         raise InputError(str(found.problems[0]))
 
 
-def walk(path: Path) -> Walk:
+def collect(path: Path) -> Dependencies:
     """Follow sublayers, references, payloads and asset values through the files, without composing anything."""
-    found = Walk()
+    found = Dependencies()
     start = Place(Path(os.path.abspath(path)))
     message = _file_fault(start.file) or _suffix_fault(str(path), LAYERS)
     if message:
@@ -195,7 +195,7 @@ def search_context() -> "Ar.DefaultResolverContext":
     return Ar.DefaultResolverContext([str(_ROOT)])
 
 
-def _read_layer(place: Place, shown: str, found: Walk, *, built_on: bool) -> Contents:
+def _read_layer(place: Place, shown: str, found: Dependencies, *, built_on: bool) -> Contents:
     """What a layer names; faults of its units and numbers go to `found`."""
     from pxr import Sdf, Tf
 
@@ -268,7 +268,7 @@ def _probe(places: list[Place]) -> None:
 
 
 def probe_layers(paths: Sequence[Path]) -> None:
-    """Open many binary layers in one process of their own at once; a walk through each then asks no more."""
+    """Open many binary layers in one process of their own at once; a search through each then asks no more."""
     _probe([Place(Path(os.path.abspath(path))) for path in paths])
 
 

@@ -15,7 +15,7 @@ import torch
 from arena_newton import limits, probe
 from arena_newton.errors import InputError
 from arena_newton.foreign import check_size
-from arena_newton.trackers import onnx_mlp
+from arena_newton.trackers.inference import onnx_mlp
 
 __all__ = ["OnnxSession", "load_any"]
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from arena_newton import follow as following
 from arena_newton.errors import InputError
+from arena_newton.pictures import follow as following
+from arena_newton.pictures.video import VideoWriter, caption, evenly, film_strip
 from arena_newton.robot import TICK
-from arena_newton.video import VideoWriter, caption, evenly, film_strip
 
 __all__ = ["EpisodeRecorder", "video_sizes"]
 
@@ -173,7 +173,7 @@ class EpisodeRecorder:
             self._strip_cameras = {n: self._camera(env, n, size, lights, 1) for n, size in STRIP_SIZES.items()}
 
     def _camera(self, env: Any, name: str, size: tuple[int, int], lights: Any, views: int) -> Any:
-        from arena_newton.camera import Camera
+        from arena_newton.pictures.camera import Camera
 
         width, height = size
         if name == "world" and self.follow:

@@ -50,7 +50,7 @@ class _Camera:
         self._cameras: list[Any] = []
 
     def _place(self, lab: Any) -> None:
-        from arena_newton.camera import Camera, WorldLights
+        from arena_newton.pictures.camera import Camera, WorldLights
 
         lights = WorldLights.allocate(lab.worlds, lab.scene.device, lab.scene.stage)
         for name in self.names:
@@ -95,7 +95,7 @@ def film(tracker: Tracker, label: str, out: Path, *, seed: int = 0, **options: A
         seed: Seed of the plan.
         options: Engine, device and so on of `rollout.run`.
     """
-    from arena_newton.video import film_strip
+    from arena_newton.pictures.video import film_strip
 
     cells = [cell for cell in suite("full") if cell.name in FILMED]
     names = [cell.name for cell in cells]

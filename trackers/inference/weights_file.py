@@ -21,8 +21,9 @@ from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.foreign import read_bytes
 from arena_newton.robot import TICK, DriveGains, PhysicsRate
-from arena_newton.trackers import base, networks
+from arena_newton.trackers import base
 from arena_newton.trackers.front_end import JOINTS, ActionForm
+from arena_newton.trackers.inference import networks
 
 __all__ = ["FORMAT", "METADATA_KEY", "Weights", "default", "default_path", "load", "save"]
 

@@ -1,0 +1,1 @@
+"""Pictures: cameras, triangles, lights per world, videos and film strips."""
