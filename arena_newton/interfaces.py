@@ -1,23 +1,59 @@
-"""What passes between the world, a tracker and a policy: plain records, no behaviour."""
+"""What passes between the world, a tracker and a policy, and what each of them promises: records and Protocols.
+
+Nothing here behaves, and nothing here imports a room above it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-__all__ = ["Chunk", "EpisodeResult", "Observation", "RobotState", "TrackerCommand"]
+import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
+    import torch
+    import warp as wp
+
+    from arena_newton.robot import DriveGains, PhysicsRate
+    from arena_newton.scene import Scene
+    from arena_newton.tasks.base import TaskSpec
+
+__all__ = [
+    "Chunk",
+    "Disturbance",
+    "EpisodeEvent",
+    "EpisodeResult",
+    "Judge",
+    "Observation",
+    "Physics",
+    "Planned",
+    "Policy",
+    "Predicate",
+    "Recorder",
+    "RobotState",
+    "Spawn",
+    "Tracker",
+    "TrackerCommand",
+    "Verdict",
+    "World",
+]
+
+Spawn = Callable[[int], tuple[Sequence[float], Sequence[float]]]
+"""Episode seed → the robot's root position [m] and orientation wxyz at the reset."""
 
 
 @dataclass
 class Observation:
     """What a policy sees; rows are worlds."""
 
-    state: Any
-    """Canonical state, float32 torch tensor [worlds, 64]."""
-    image: Any
-    """Head camera, uint8 torch tensor [worlds, H, W, 3], or None when the policy needs none."""
-    mask: Any
-    """bool NumPy array [worlds]: the worlds that ask for a new chunk."""
+    state: torch.Tensor
+    """Canonical state, float32, shape [worlds, 64]."""
+    image: torch.Tensor | None
+    """Head camera, uint8, shape [worlds, H, W, 3]; None when the policy needs none."""
+    mask: np.ndarray
+    """Worlds that ask for a new chunk, bool, shape [worlds]."""
     task: str
     """Task name."""
     gym_id: str
@@ -30,38 +66,77 @@ class Observation:
 class Chunk:
     """A policy's answer."""
 
-    actions: Any
-    """Canonical actions, float32 torch tensor or array [worlds, n, 40]; only rows of the asking worlds are read."""
+    actions: torch.Tensor | np.ndarray
+    """Canonical actions, float32, shape [worlds, n, 40]; only rows of the asking worlds are read."""
     errors: dict[int, str] = field(default_factory=dict)
     """World → what went wrong; those episodes end as `error`, the others go on."""
+    phases: Sequence[str | None] | None = None
+    """Name of the phase that each world is in from this chunk on, where the policy knows phases; rows as `actions`."""
 
 
 @dataclass
 class RobotState:
-    """Measured robot state as torch views; rows are worlds, joints in MuJoCo order."""
+    """Measured robot state; rows are worlds, joints in MuJoCo order."""
 
-    quat: Any
-    """Root orientation wxyz, [worlds, 4]."""
-    ang_vel_body: Any
-    """Root angular velocity in the body frame [rad/s], [worlds, 3]."""
-    joint_pos: Any
-    """[rad], [worlds, 29]."""
-    joint_vel: Any
-    """[rad/s], [worlds, 29]."""
+    quat: torch.Tensor
+    """Root orientation wxyz, shape [worlds, 4]."""
+    ang_vel_body: torch.Tensor
+    """Root angular velocity in the body frame [rad/s], shape [worlds, 3]."""
+    joint_pos: torch.Tensor
+    """[rad], shape [worlds, 29]."""
+    joint_vel: torch.Tensor
+    """[rad/s], shape [worlds, 29]."""
 
 
 @dataclass
 class TrackerCommand:
-    """The reference of one tick as torch views; rows are worlds, joints in MuJoCo order."""
+    """The reference of one tick; rows are worlds, joints in MuJoCo order."""
 
-    mimic: Any
-    """TWIST2's mimic command, [worlds, 35]."""
-    joints: Any
-    """Reference joint positions [rad], [worlds, 29]."""
-    joint_vel: Any
-    """Backward difference of the reference joints [rad/s], [worlds, 29]."""
-    quat: Any
-    """Reference root orientation in the world, wxyz, [worlds, 4]."""
+    mimic: torch.Tensor
+    """TWIST2's mimic command, shape [worlds, 35]."""
+    joints: torch.Tensor
+    """Reference joint positions [rad], shape [worlds, 29]."""
+    joint_vel: torch.Tensor
+    """Backward difference of the reference joints [rad/s], shape [worlds, 29]."""
+    quat: torch.Tensor
+    """Reference root orientation in the world, wxyz, shape [worlds, 4]."""
+
+
+@dataclass(frozen=True)
+class Predicate:
+    """One step on the way to a task's success, such as `approach` or `contact`."""
+
+    name: str
+    sentence: str
+    """When it holds, in one sentence."""
+
+
+@dataclass(frozen=True)
+class EpisodeEvent:
+    """Something that happened once in an episode."""
+
+    kind: str
+    """`contact`: a critical body was pressed for the first time; `object_out`; `fall`."""
+    tick: int
+    """Ticks since step 0."""
+    detail: str = ""
+    """Of a fall its trigger (`tilt`, `tilt_held`, `contact`), of an object its name."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the judge and the physics say of one world's episode so far."""
+
+    margin: float
+    """Signed distance to success [m or the task's unit]."""
+    overflow: bool = False
+    """A contact or constraint buffer overflowed."""
+    predicates: Mapping[str, int | None] = field(default_factory=dict)
+    """Predicate of the task, in its order → first tick since step 0 at which it held; None where it never did."""
+    progress: float = 0.0
+    """Fraction of the task's predicates that have held, in [0, 1]; 1 after a success."""
+    events: tuple[EpisodeEvent, ...] = ()
+    """In the order of their ticks."""
 
 
 @dataclass
@@ -69,7 +144,7 @@ class EpisodeResult:
     """How one planned episode ended."""
 
     episode: Any
-    """The plan's object."""
+    """The plan's object, a `Planned`."""
     outcome: str
     """`success`, `fall`, `timeout` or `error`."""
     reason: str
@@ -79,7 +154,7 @@ class EpisodeResult:
     margin: float
     """Signed distance to success at the end."""
     startup_fall: bool = False
-    """The robot fell while settling, before the policy acted."""
+    """The robot fell in the start-up, before the policy acted."""
     overflow: bool = False
     """A contact or constraint buffer overflowed in this episode's world."""
     sim_s: float = 0.0
@@ -88,3 +163,244 @@ class EpisodeResult:
     """Wall-clock time from reset to end [s]."""
     error: str | None = None
     """Message of an `error`."""
+    phases: tuple[tuple[str, int], ...] = ()
+    """The policy's phases: name and first tick since step 0, each time one begins."""
+    predicates: Mapping[str, int | None] = field(default_factory=dict)
+    """As in `Verdict`."""
+    progress: float = 0.0
+    """As in `Verdict`."""
+    events: tuple[EpisodeEvent, ...] = ()
+    """As in `Verdict`."""
+
+
+class Planned(Protocol):
+    """An episode of a plan, as far as the world must know it."""
+
+    @property
+    def episode_seed(self) -> int:
+        """Everything random about the episode follows from it."""
+        ...
+
+
+class Tracker(Protocol):
+    """Turns the reference of one 50 Hz tick into 29 joint targets for every world at once (`trackers.base`)."""
+
+    name: str
+    drive: DriveGains
+    original_drive: DriveGains | None
+    physics_rate: PhysicsRate
+    fast_physics_rate: PhysicsRate
+    max_root_delta_deg: float
+
+    def rate(self, *, fast: bool = False) -> PhysicsRate:
+        """Physics step and substeps per tick."""
+        ...
+
+    def bind(self, worlds: int, device: Any = "cpu") -> None:
+        """Allocate buffers for `worlds` worlds on a torch device."""
+        ...
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Forget the past of the worlds in `mask`, bool, shape [worlds]; all without one."""
+        ...
+
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """Fill the observation history of the masked worlds with the current frame."""
+        ...
+
+    def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; valid until the next call.
+
+        Args:
+            command: Reference of the tick.
+            state: Measured state.
+            mask: Worlds that advance, bool, shape [worlds]; all without one. The history of the others stays as it is,
+                bit for bit, and their rows of the answer mean nothing.
+        """
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """What a result must record to name this tracker exactly, as JSON."""
+        ...
+
+
+class Policy(Protocol):
+    """Looks at all worlds that ask and answers a chunk of canonical actions for each (`policies.base`)."""
+
+    name: str
+    needs_image: bool
+
+    def attach(self, env: World) -> None:
+        """Get to know the environment before its first episode."""
+        ...
+
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: np.ndarray | None = None) -> None:
+        """Begin new episodes in the worlds of `mask`."""
+        ...
+
+    def act(self, observation: Observation) -> Chunk:
+        """Actions for the worlds that ask."""
+        ...
+
+
+class Physics(Protocol):
+    """A batch of worlds that moves (`arena_newton.physics`): Warp arrays in MuJoCo's layout, one row per world."""
+
+    engine: str
+    worlds: int
+    device: wp.Device
+    qpos: wp.array
+    """Positions, shape [worlds, nq]."""
+    qvel: wp.array
+    """Velocities, shape [worlds, nv]."""
+    ctrl: wp.array
+    """Actuator targets, shape [worlds, nu]."""
+    xpos: wp.array
+    """Body positions [m], shape [worlds, nbody, 3]."""
+    xquat: wp.array
+    """Body orientations wxyz, shape [worlds, nbody, 4]."""
+    contact_force: wp.array
+    """Norm of the net contact force on each body [N], shape [worlds, nbody]."""
+
+    @property
+    def models(self) -> Sequence[mujoco.MjModel]:
+        """One MuJoCo model for all worlds, or one per world."""
+        ...
+
+    @property
+    def external_force(self) -> wp.array:
+        """Force [N] and torque [N·m] on each body, world frame, shape [worlds, nbody, 6]; stays until changed."""
+        ...
+
+    def add_velocity(self, change: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """Add to the robot root's velocity: linear [m/s], world frame; angular [rad/s], body frame; [worlds, 6]."""
+        ...
+
+    def set_active(self, mask: np.ndarray) -> None:
+        """Worlds that `step` moves, bool, shape [worlds]; the others keep every bit of their state."""
+        ...
+
+    def step(self) -> None:
+        """Advance the active worlds by one 50 Hz tick under the present `ctrl`."""
+        ...
+
+    def snapshot(self) -> Any:
+        """Everything that the next tick depends on, as an opaque value for `restore`."""
+        ...
+
+    def restore(self, snapshot: Any, mask: np.ndarray | None = None) -> None:
+        """Put the masked worlds (all without a mask) back into the state of a snapshot, bit for bit."""
+        ...
+
+    def overflowed(self, world: int) -> bool:
+        """Whether a contact or constraint buffer overflowed in this world since its reset."""
+        ...
+
+    def close(self) -> None:
+        """Release threads; the physics steps no more."""
+        ...
+
+
+class Judge(Protocol):
+    """Judges every world once per tick, on the device (`tasks.base`)."""
+
+    success: wp.array
+    """1 = success, int32, shape [worlds]."""
+    margin: wp.array
+    """Signed distance to success, float32, shape [worlds]."""
+    event: wp.array
+    """0 nothing, otherwise one of the task's events, int32, shape [worlds]."""
+    predicates: wp.array
+    """1 where a predicate of the task holds at this tick, int32, [worlds, n], columns as `TaskSpec.predicates`."""
+
+    def evaluate(self, physics: Any) -> None:
+        """Fill the outputs for the state after this tick."""
+        ...
+
+    def reset(self, mask: wp.array) -> None:
+        """Forget the past of the worlds in `mask`, int32, shape [worlds], 1 = reset."""
+        ...
+
+
+class World(Protocol):
+    """A batch of worlds of one task (`arena_newton.env.ArenaEnv`)."""
+
+    spec: TaskSpec
+    scene: Scene
+    physics: Any
+    tracker: Any
+    worlds: int
+    torch_device: torch.device
+    startup_ticks: int
+    """Length of the start-up [ticks]."""
+    tick: np.ndarray
+    """Ticks since each world's step 0, int64, shape [worlds]; negative in its start-up."""
+    active: np.ndarray
+    """Worlds that run an episode, bool, shape [worlds]."""
+    budget: int
+    """Step budget of the rule set [ticks]."""
+
+    def reset(
+        self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, *, spawn: Spawn | None = None
+    ) -> None:
+        """Start an episode in each of `worlds` (all by default) from its episode seed alone."""
+        ...
+
+    def release(self, worlds: Sequence[int] | np.ndarray) -> None:
+        """End the episodes of `worlds`: they stand still until their next reset."""
+        ...
+
+    def observe(self, mask: np.ndarray | None = None, *, image: bool = False) -> Observation:
+        """State of every world and, if asked, the head camera's picture of the worlds in `mask`."""
+        ...
+
+    def step(self, action: torch.Tensor | np.ndarray) -> np.ndarray:
+        """Advance every active world by one tick; status codes of `arena_newton.kernels.tick`, int32, [worlds]."""
+        ...
+
+    def render(self, camera: Any, mask: np.ndarray | None = None) -> torch.Tensor:
+        """Picture of one camera, uint8, shape [worlds, H, W, 3]."""
+        ...
+
+    def verdict(self, world: int) -> Verdict:
+        """What judge and physics say of a world's episode so far."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """What ran, for results to record, as JSON."""
+        ...
+
+    def close(self) -> None:
+        """Release the physics' threads; the environment steps no more."""
+        ...
+
+
+class Recorder(Protocol):
+    """Looks on while episodes run; `rollout.Rollout` calls it."""
+
+    def start(self, env: World, world: int, episode: Any) -> None:
+        """An episode begins in a world: it was reset."""
+        ...
+
+    def before_physics(self, env: World, observation: Observation, action: torch.Tensor) -> None:
+        """A tick begins.
+
+        Args:
+            env: The worlds.
+            observation: State of this tick; no picture unless the policy asked for one at this tick.
+            action: What the policy decided for this tick (the label), float32, shape [worlds, 40]; rows of worlds that
+                do not act mean nothing. A disturbance changes what is executed, never this.
+        """
+        ...
+
+    def tick(self, env: World) -> None:
+        """A tick is over."""
+        ...
+
+    def finish(self, env: World, world: int, result: EpisodeResult) -> None:
+        """An episode ended; the world still shows its last state."""
+        ...
+
+
+Disturbance = Callable[["World", "torch.Tensor"], "torch.Tensor"]
+"""(environment, actions [worlds, 40]) → what is executed instead; must not write into its argument."""

@@ -110,7 +110,7 @@ class Fingerprints:
             for table in ("table.csv", "table.md"):
                 yield f"{table}, {name}", digest((out / table).read_bytes())
             for file in sorted((out / "actions").glob("*.npz")):
-                yield from arrays(f"actions, {name}, {file.stem}", file, only=("actions",))
+                yield from arrays(f"actions, {name}, {file.stem}", file, only=("action",))
 
     def trackers(self) -> Iterator[tuple[str, str]]:
         """Measures of the tracker suite."""

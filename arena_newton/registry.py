@@ -1,0 +1,96 @@
+"""Things known by name: built in, registered in this process, or offered by other packages as entry points."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from arena_newton.errors import InputError
+
+__all__ = ["Registry"]
+
+
+class Registry[T]:
+    """Makers of one kind of thing; the built-in ones are imported when they are asked for."""
+
+    def __init__(self, noun: str, group: str, base: Callable[[], type[T]], built_in: Mapping[str, str]):
+        """Name the kind.
+
+        Args:
+            noun: What messages and the flag call it, such as `tracker` for `--tracker`.
+            group: Entry-point group under which other packages offer theirs.
+            base: Gives the class that everything made must be of.
+            built_in: Name to `module:attribute` of a maker.
+        """
+        self.noun, self.group, self.base, self.built_in = noun, group, base, built_in
+        self._registered: dict[str, Callable[..., T]] = {}
+
+    def register(self, name: str, factory: Callable[..., T]) -> None:
+        """Offer a maker in this process.
+
+        Raises:
+            InputError: A built-in one has that name.
+        """
+        if name in self.built_in:
+            raise InputError(f"{self.noun} {name!r}: is built in; register yours under another name")
+        self._registered[name] = factory
+
+    def points(self, name: str | None = None) -> list[importlib.metadata.EntryPoint]:
+        """Entry points of other packages, of one name or all."""
+        found = importlib.metadata.entry_points(group=self.group)
+        return [point for point in found if name is None or point.name == name]
+
+    def names(self) -> tuple[str, ...]:
+        """All names, sorted."""
+        return tuple(sorted({*self.built_in, *self._registered, *(point.name for point in self.points())}))
+
+    def check(self, name: str) -> None:
+        """Refuse a name that nobody offers, or that several do.
+
+        Raises:
+            InputError: The message says what is known, or who offers it.
+        """
+        if name not in self.names():
+            raise InputError(f"--{self.noun} {name}: unknown {self.noun}; known are {', '.join(self.names())}")
+        if name in self._registered:
+            return
+        offers = ["this package"] if name in self.built_in else []
+        offers += [f"package {point.dist.name}" if point.dist else "another package" for point in self.points(name)]
+        if len(offers) > 1:
+            raise InputError(
+                f"--{self.noun} {name}: offered by {' and by '.join(offers)}; uninstall or rename all but one"
+            )
+
+    def make(self, name: str, *arguments: Any, **options: Any) -> T:
+        """Make one by name.
+
+        Raises:
+            InputError: Unknown or doubled name, a package that does not load, or a maker that does not fit.
+        """
+        self.check(name)
+        if name not in self._registered and name in self.built_in:
+            module, _, attribute = self.built_in[name].partition(":")
+            return getattr(importlib.import_module(module), attribute)(*arguments, **options)
+        factory = self._registered.get(name) or self._loaded(name)
+        try:
+            inspect.signature(factory).bind(*arguments, **options)
+        except TypeError as error:
+            raise InputError(f"--{self.noun} {name}: its factory does not take what it is given ({error})") from None
+        except ValueError:  # some of those written in C have no signature
+            pass
+        made = factory(*arguments, **options)
+        if not isinstance(made, self.base()):
+            kind = self.base().__name__
+            raise InputError(f"--{self.noun} {name}: its factory makes a {type(made).__name__}, not a {kind}")
+        return made
+
+    def _loaded(self, name: str) -> Callable[..., T]:
+        try:
+            return self.points(name)[0].load()
+        except Exception as error:
+            reason = " ".join(str(error).split())
+            message = f"--{self.noun} {name}: its package does not load ({type(error).__name__}: {reason})"
+            raise InputError(message) from error
