@@ -166,7 +166,7 @@ class ArenaEnv:
         """Worlds that run an episode."""
         self._fresh, self._anchored = np.zeros(worlds, dtype=bool), np.zeros(worlds, dtype=bool)
         self.draws: list[Any] = [None] * worlds
-        self.lights: Any = None
+        self._lights: Any = None
         self.camera: Any = None
         if camera is not None:
             self.add_camera(camera)
@@ -201,24 +201,25 @@ class ArenaEnv:
 
         self.camera = Camera.from_scene(
             self.scene,
-            self.physics,
             prim=config.prim,
             width=config.width,
             height=config.height,
-            lights=self._lights(),
+            lights=self.lights,
             fit=config.fit,
             samples=config.samples,
         )
         return self.camera
 
-    def _lights(self) -> Any:
+    @property
+    def lights(self) -> Any:
+        """The worlds' lights (`WorldLights`), allocated at first use."""
         from arena_newton.pictures.camera import WorldLights
 
-        if self.lights is None:
-            self.lights = WorldLights.allocate(self.worlds, self.device, self.scene.stage)
+        if self._lights is None:
+            self._lights = WorldLights.allocate(self.worlds, self.device, self.scene.stage)
             for w, draws in enumerate(self.draws):
-                self.lights.set(w, draws.light if draws is not None else None)
-        return self.lights
+                self._lights.set(w, draws.light if draws is not None else None)
+        return self._lights
 
     def reset(
         self,
@@ -263,8 +264,8 @@ class ArenaEnv:
                     qpos[k, address : address + 3] = pose.pos
                     qpos[k, address + 2] += self._raised[prim]
                     qpos[k, address + 3 : address + 7] = pose.quat
-            if self.lights is not None:
-                self.lights.set(int(w), draws.light)
+            if self._lights is not None:
+                self._lights.set(int(w), draws.light)
         p.reset_worlds(rows, qpos, mocap_pos, mocap_quat)
         mask = self._upload(rows)
         canonical.launch_reset_reference(self.reference, p.qpos, h.root_qpos, mask)

@@ -7,7 +7,7 @@ light of radiance L (intensity · colour) gives the linear radiance
     distant:  a · L · (AMBIENT · A(n) + DIRECT · max(n·l, 0) · v)
 
 with A(n) = BOUNCE + (1 − BOUNCE) · (n_z + 1)/2, the light from above and what the floor gives back, l towards the light
-and v the share of its light that arrives. A ray that leaves the scene shows L · SKY_DOME or L · SKY_DISTANT. The
+and v the fraction of its light that arrives. A ray that leaves the scene shows L · SKY_DOME or L · SKY_DISTANT. The
 picture is sRGB(1 − exp(−EXPOSURE · radiance)): the dome of intensity 3000 and colour 0.75 puts albedo 0.5 at 0.48
 linear, and no light of the visual mode (3000 to 7000, colour 0.65 to 0.85) clips a white wall.
 """
@@ -24,11 +24,11 @@ __all__ = ["launch_camera_poses", "launch_shade"]
 EXPOSURE = wp.constant(wp.float32(1.0 / 1700.0))
 """Scale from light intensity units to the tone curve; puts the original's dome (3000 · 0.75) at 1.32."""
 BOUNCE = wp.constant(wp.float32(0.45))
-"""Share of the dome's light that a surface facing straight down receives from the floor."""
+"""Fraction of the dome's light that a surface facing straight down receives from the floor."""
 AMBIENT = wp.constant(wp.float32(0.2))
-"""Ambient share of a distant light, so that shadows keep their texture."""
+"""Ambient fraction of a distant light, so that shadows keep their texture."""
 DIRECT = wp.constant(wp.float32(0.5))
-"""Direct share of a distant light: with AMBIENT, intensity 5000 from above looks as bright as the dome of 3000."""
+"""Direct fraction of a distant light: with AMBIENT, intensity 5000 from above looks as bright as the dome of 3000."""
 SKY_DOME = wp.constant(wp.float32(2.0))
 """Brightness of the background under the dome: nearly white, as at the original's horizon."""
 SKY_DISTANT = wp.constant(wp.float32(0.2))
@@ -64,10 +64,10 @@ def _radiance(
 ) -> wp.vec3:
     """Linear radiance of a surface; see the module's formula."""
     ambient = BOUNCE + (1.0 - BOUNCE) * 0.5 * (normal[2] + 1.0)
-    share = ambient
+    fraction = ambient
     if distant != 0:
-        share = AMBIENT * ambient + DIRECT * wp.max(wp.dot(normal, to_light), 0.0) * visible
-    return wp.cw_mul(albedo, light) * share
+        fraction = AMBIENT * ambient + DIRECT * wp.max(wp.dot(normal, to_light), 0.0) * visible
+    return wp.cw_mul(albedo, light) * fraction
 
 
 @wp.func

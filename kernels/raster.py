@@ -18,7 +18,9 @@ class Soup:
     """The visible shapes as triangles: what `launch_rasterize` draws."""
 
     world_start: wp.array[wp.int32]
-    """First entry of each world in `shape` and `face`, then of no world's shapes, then the end, shape [worlds + 2]."""
+    """First entry of each world in `shape` and `face`, then that of the shapes of no world, shape [worlds + 1]."""
+    world_end: wp.array[wp.int32]
+    """End of the same entries, shape [worlds + 1]."""
     large_end: wp.array[wp.int32]
     """End of the entries, first of their world's, that cast shadows and are large, shape [worlds + 1]."""
     small_end: wp.array[wp.int32]
@@ -27,7 +29,7 @@ class Soup:
     """Shape of each entry, one entry for every visible triangle of every world."""
     face: wp.array[wp.int32]
     """Triangle in `faces` of each entry."""
-    spheres: wp.array[wp.vec4]
+    bounds: wp.array[wp.vec4]
     """Bounding sphere of each shape in its own frame, scaled: centre and radius [m]."""
     scales: wp.array[wp.vec3]
     transforms: wp.array[wp.transform]
@@ -43,7 +45,7 @@ class Soup:
     uvs: wp.array[wp.vec2]
     texels: wp.array[wp.uint8]
     """sRGB bytes of all textures, row by row from the top, RGB."""
-    texture_place: wp.array[wp.vec3i]
+    texture_layout: wp.array[wp.vec3i]
     """First texel, width and height of each texture."""
 
 
@@ -51,6 +53,45 @@ class Soup:
 def corner(soup: Soup, shape: wp.int32, vertex: wp.int32, pose: wp.transform) -> wp.vec3:
     """A vertex of a shape under a pose."""
     return wp.transform_point(pose, wp.cw_mul(soup.scales[shape], soup.vertices[vertex]))
+
+
+@wp.func
+def soup_entry(start: wp.array[wp.int32], end: wp.array[wp.int32], world: wp.int32, number: wp.int32) -> wp.int32:
+    """Entry of the triangle `number` of a world: first its own ones, then those of no world; −1 after the last.
+
+    Args:
+        start: First entry of each world and of no world, shape [worlds + 1].
+        end: End of these entries, same shape.
+        world: World.
+        number: Counts from 0.
+    """
+    own = end[world] - start[world]
+    if number < own:
+        return start[world] + number
+    common = end.shape[0] - 1
+    entry = start[common] + number - own
+    if entry >= end[common]:
+        entry = -1
+    return entry
+
+
+@wp.func
+def span(edge: wp.vec2, limits: wp.vec2) -> wp.vec2:
+    """Part of a row inside an edge: least and greatest x [px], within `limits`.
+
+    Args:
+        edge: Slope and offset of the edge function, slope · x + offset, which is positive inside.
+        limits: Least and greatest x so far [px].
+    """
+    low = limits[0]
+    high = limits[1]
+    if edge[0] > 0.0:
+        low = wp.max(low, -edge[1] / edge[0] - EDGE)
+    elif edge[0] < 0.0:
+        high = wp.min(high, -edge[1] / edge[0] + EDGE)
+    elif edge[1] < 0.0:
+        high = -1.0
+    return wp.vec2(low, high)
 
 
 @wp.kernel(enable_backward=False)
@@ -73,13 +114,9 @@ def _rasterize(
     world = view_world[view]
     if world < 0:
         return
-    # The triangles of the view's world, then those that belong to no world.
-    entry = soup.world_start[world] + number
-    own = soup.world_start[world + 1] - soup.world_start[world]
-    if number >= own:
-        entry = soup.world_start[soup.world_start.shape[0] - 2] + number - own
-        if entry >= soup.world_start[soup.world_start.shape[0] - 1]:
-            return
+    entry = soup_entry(soup.world_start, soup.world_end, world, number)
+    if entry < 0:
+        return
     height = nearest.shape[1]
     width = nearest.shape[2]
     # A pixel's ray is (x0 + px · dx, y0 − py · dy, −1).
@@ -89,13 +126,13 @@ def _rasterize(
     y0 = tan_y - 0.5 * dy
     shape = soup.shape[entry]
     pose = wp.transform_inverse(poses[view]) * soup.transforms[shape]
-    ball = soup.spheres[shape]
-    centre = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
-    if centre[2] - ball[3] > -NEAR:
+    bounds = soup.bounds[shape]
+    centre = wp.transform_point(pose, wp.vec3(bounds[0], bounds[1], bounds[2]))
+    if centre[2] - bounds[3] > -NEAR:
         return
-    if wp.abs(centre[0]) > -centre[2] * tan_x + ball[3] * wp.sqrt(1.0 + tan_x * tan_x):
+    if wp.abs(centre[0]) > -centre[2] * tan_x + bounds[3] * wp.sqrt(1.0 + tan_x * tan_x):
         return
-    if wp.abs(centre[1]) > -centre[2] * tan_y + ball[3] * wp.sqrt(1.0 + tan_y * tan_y):
+    if wp.abs(centre[1]) > -centre[2] * tan_y + bounds[3] * wp.sqrt(1.0 + tan_y * tan_y):
         return
     corners = soup.faces[soup.face[entry]]
     p0 = corner(soup, shape, corners[0], pose)
@@ -144,25 +181,17 @@ def _rasterize(
     slope = normal / volume
     for y in range(top, bottom + 1):
         ray_y = y0 - wp.float32(y) * dy
-        low = wp.float32(left)
-        high = wp.float32(right)
+        row = wp.vec2(wp.float32(left), wp.float32(right))
         for k in range(3):
             e = e0
             if k == 1:
                 e = e1
             elif k == 2:
                 e = e2
-            step = e[0] * dx
-            start = e[0] * x0 + e[1] * ray_y - e[2]
-            if step > 0.0:
-                low = wp.max(low, -start / step - EDGE)
-            elif step < 0.0:
-                high = wp.min(high, -start / step + EDGE)
-            elif start < 0.0:
-                high = -1.0
-        if low <= high:
+            row = span(wp.vec2(e[0] * dx, e[0] * x0 + e[1] * ray_y - e[2]), row)
+        if row[0] <= row[1]:
             base = slope[0] * x0 + slope[1] * ray_y - slope[2]
-            for x in range(wp.int32(wp.ceil(low)), wp.int32(wp.floor(high)) + 1):
+            for x in range(wp.int32(wp.ceil(row[0])), wp.int32(wp.floor(row[1])) + 1):
                 near = base + slope[0] * dx * wp.float32(x)
                 if near > 0.0 and near < 1.0 / NEAR:
                     # Positive floats are ordered as their bits, so the nearest triangle wins whatever the order.
@@ -187,15 +216,15 @@ def _linear(value: wp.float32) -> wp.float32:
 
 
 @wp.func
-def _texel(soup: Soup, place: wp.vec3i, x: wp.int32, y: wp.int32) -> wp.vec3:
+def _texel(soup: Soup, layout: wp.vec3i, x: wp.int32, y: wp.int32) -> wp.vec3:
     """Texel as sRGB in [0, 1], repeating."""
-    column = x % place[1]
-    row = y % place[2]
+    column = x % layout[1]
+    row = y % layout[2]
     if column < 0:
-        column += place[1]
+        column += layout[1]
     if row < 0:
-        row += place[2]
-    i = (place[0] + row * place[1] + column) * 3
+        row += layout[2]
+    i = (layout[0] + row * layout[1] + column) * 3
     scale = 1.0 / 255.0
     return wp.vec3(wp.float32(soup.texels[i]), wp.float32(soup.texels[i + 1]), wp.float32(soup.texels[i + 2])) * scale
 
@@ -242,16 +271,16 @@ def _resolve(
         normal = wp.cw_div(smooth, scale)
     colour = soup.colors[shape]
     if soup.texture[shape] >= 0:
-        place = soup.texture_place[soup.texture[shape]]
+        layout = soup.texture_layout[soup.texture[shape]]
         uv = soup.uvs[corners[0]] * w0 + soup.uvs[corners[1]] * w1 + soup.uvs[corners[2]] * w2
-        u = uv[0] * wp.float32(place[1]) - 0.5
-        v = (1.0 - uv[1]) * wp.float32(place[2]) - 0.5
+        u = uv[0] * wp.float32(layout[1]) - 0.5
+        v = (1.0 - uv[1]) * wp.float32(layout[2]) - 0.5
         column = wp.int32(wp.floor(u))
         row = wp.int32(wp.floor(v))
         fu = u - wp.floor(u)
         fv = v - wp.floor(v)
-        above = _texel(soup, place, column, row) * (1.0 - fu) + _texel(soup, place, column + 1, row) * fu
-        below = _texel(soup, place, column, row + 1) * (1.0 - fu) + _texel(soup, place, column + 1, row + 1) * fu
+        above = _texel(soup, layout, column, row) * (1.0 - fu) + _texel(soup, layout, column + 1, row) * fu
+        below = _texel(soup, layout, column, row + 1) * (1.0 - fu) + _texel(soup, layout, column + 1, row + 1) * fu
         seen = above * (1.0 - fv) + below * fv
         colour = wp.cw_mul(colour, wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
     albedo[view, y, x] = (
@@ -278,7 +307,7 @@ def launch_rasterize(
 ) -> None:
     """Albedo, normal and depth of the nearest triangle of each pixel.
 
-    A ray searches every tree anew; drawing each triangle once costs a third of that on a CPU core, a fifth on a GPU.
+    Rays search every tree again; drawing each triangle once takes a third of that on a CPU core, a fifth on a GPU.
 
     Args:
         view_world: int32 [views], world of each view, negative to leave its picture as it is.

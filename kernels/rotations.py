@@ -152,7 +152,7 @@ def wrap_angle(angle: float) -> float:
 
 @wp.func
 def limit_rotation(start: wp.quat, target: wp.quat, max_angle: float) -> wp.quat:
-    """`target`, or the point of the shortest arc from `start` to it that lies `max_angle` [rad] away."""
+    """`target`, or the point of the shortest arc from `start` to it `max_angle` [rad] away from it."""
     delta = wp.quat_inverse(start) * target
     w = delta[3]
     v = wp.vec3(delta[0], delta[1], delta[2])

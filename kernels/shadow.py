@@ -2,7 +2,7 @@
 
 Two maps cover what a view sees, one up to `SPLIT` from the camera, the other from there to `RANGE`. Their frame has its
 origin at the camera, +z towards the light and +y along the view; a map's window in x and y is the extent of the lit
-surfaces that a grid of the view's pixels shows in its part. What lies outside the window counts as lit. The look-up
+surfaces that a grid of the view's pixels shows in its part. Points outside the window count as lit. The look-up
 weighs the four nearest texels bilinearly and compares each with the depth of the receiver's own tangent plane at that
 texel, so that a slope needs no bias of its own.
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from arena_newton.kernels.raster import EDGE, Soup, corner
+from arena_newton.kernels.raster import EDGE, Soup, corner, soup_entry, span
 
 __all__ = ["MAPPED", "Occluders", "ShadowMaps", "launch_shadow_maps", "traced"]
 
@@ -28,9 +28,9 @@ MARGIN = wp.constant(wp.float32(0.02))
 DEPTH_ORIGIN = wp.constant(wp.float32(256.0))
 """Added to a depth, which makes it positive: a caster counts up to this far behind the camera [m]."""
 BIAS = wp.constant(wp.float32(3.0e-3))
-"""What a caster must stand out of the receiver's tangent plane, besides a share of a texel [m]."""
+"""What a caster must stand out of the receiver's tangent plane, in addition to a fraction of a texel [m]."""
 TEXEL_BIAS = wp.constant(wp.float32(0.35))
-"""That share: smooth normals tilt the tangent planes of facets."""
+"""That fraction: smooth normals tilt the tangent planes of facets."""
 STEEPEST = wp.constant(wp.float32(10.0))
 """Largest slope of a receiver's tangent plane; steeper ones get little light."""
 LANES = (32, 4)
@@ -166,27 +166,20 @@ def _cast(
     if world < 0 or distant[world] == 0:
         return
     lane = thread % (lanes_x * lanes_y)
-    entry = thread // (lanes_x * lanes_y)
-    # The triangles of the view's world, then those that belong to no world.
-    own = end[world] - start[world]
-    if entry < own:
-        entry += start[world]
-    else:
-        common = end.shape[0] - 1
-        entry += start[common] - own
-        if entry >= end[common]:
-            return
+    entry = soup_entry(start, end, world, thread // (lanes_x * lanes_y))
+    if entry < 0:
+        return
     window = _texels(maps, number)
     if window[2] <= 0.0:
         return
     size = wp.float32(maps.depth.shape[1])
     shape = soup.shape[entry]
     pose = wp.transform_inverse(maps.frames[number // 2]) * soup.transforms[shape]
-    ball = soup.spheres[shape]
-    centre = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
-    if wp.abs(centre[0] - window[0] - 0.5 * size * window[2]) > 0.5 * size * window[2] + ball[3]:
+    bounds = soup.bounds[shape]
+    centre = wp.transform_point(pose, wp.vec3(bounds[0], bounds[1], bounds[2]))
+    if wp.abs(centre[0] - window[0] - 0.5 * size * window[2]) > 0.5 * size * window[2] + bounds[3]:
         return
-    if wp.abs(centre[1] - window[1] - 0.5 * size * window[3]) > 0.5 * size * window[3] + ball[3]:
+    if wp.abs(centre[1] - window[1] - 0.5 * size * window[3]) > 0.5 * size * window[3] + bounds[3]:
         return
     corners = soup.faces[soup.face[entry]]
     # In texels, from the centre of the first; z stays in metres.
@@ -213,9 +206,8 @@ def _cast(
     side = wp.sign(normal[2])
     y = top + lane // lanes_x
     while y <= bottom:
-        row = wp.float32(y)
-        low = left
-        high = right
+        height = wp.float32(y)
+        row = wp.vec2(left, right)
         for k in range(3):
             a = p0
             b = p1
@@ -227,16 +219,10 @@ def _cast(
                 b = p0
             # Inside where side · ((b − a) × (q − a)) ≥ 0.
             step = (a[1] - b[1]) * side
-            offset = ((b[0] - a[0]) * (row - a[1])) * side - step * a[0]
-            if step > 0.0:
-                low = wp.max(low, -offset / step - EDGE)
-            elif step < 0.0:
-                high = wp.min(high, -offset / step + EDGE)
-            elif offset < 0.0:
-                high = -1.0
-        last = wp.int32(wp.floor(high))
-        x = wp.int32(wp.ceil(low)) + lane % lanes_x
-        base = p0[2] + slope_y * (row - p0[1]) - slope_x * p0[0] + DEPTH_ORIGIN
+            row = span(wp.vec2(step, ((b[0] - a[0]) * (height - a[1])) * side - step * a[0]), row)
+        last = wp.int32(wp.floor(row[1]))
+        x = wp.int32(wp.ceil(row[0])) + lane % lanes_x
+        base = p0[2] + slope_y * (height - p0[1]) - slope_x * p0[0] + DEPTH_ORIGIN
         # Close to edge-on the plane leaves the triangle between texels.
         while x <= last:
             z = wp.clamp(base + slope_x * wp.float32(x), lower[2] + DEPTH_ORIGIN, upper[2] + DEPTH_ORIGIN)
@@ -345,7 +331,7 @@ def _unshadowed(
 
 
 MAPPED = (ShadowMaps, _unshadowed)
-"""Shadows by map for `launch_shade`: the type of what it reads, and the share of the light that arrives."""
+"""Shadows by map for `launch_shade`: the type of what it reads, and the fraction of the light that arrives."""
 
 
 @wp.struct

@@ -1,5 +1,6 @@
-"""Shared, expensive things: one built scene a test session."""
+"""What all tests share: reference material, scenes that are built once per session, and a small heap to collect."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-SHARED = ROOT.parent / "shared"
+SHARED = Path(os.environ.get("ARENA_REFERENCE", ROOT.parent / "shared"))
 
 if sys.dont_write_bytecode:
     # Many tests start a Python of their own, and each would compile torch's sources again: they share a cache instead.
@@ -20,10 +21,17 @@ if sys.dont_write_bytecode:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """Folder of reference material beside the checkout; tests that need it skip without it."""
+    """Folder of reference material; tests that need it skip without it."""
     if not (SHARED / "reference").is_dir():
-        pytest.skip("needs the reference material in ../shared, which is not here")
+        pytest.skip(f"needs reference material, and {SHARED} has none; ARENA_REFERENCE names another folder")
     return SHARED
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_heap():
+    """Every evaluation collects garbage; with the objects of all earlier tests that took seconds per call."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -89,7 +89,7 @@ def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
     state = _settled(scene)
     pictures = []
     for view, aspect in _VIEWS:
-        camera = Camera.from_scene(scene, None, view, round(height * aspect), height, lights, samples=2)
+        camera = Camera.from_scene(scene, view, round(height * aspect), height, lights, samples=2)
         pictures.append(camera.render(state)[0].cpu().numpy().copy())
     return pictures
 

@@ -11,19 +11,27 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
+import newton
 import numpy as np
+import torch
+import warp as wp
+from newton._src.geometry.raycast import ray_intersect_shape_no_normal
+from newton.sensors import SensorCamera
+from pxr import Gf, Usd, UsdGeom, UsdLux
 
 from arena_newton.errors import InputError
+from arena_newton.kernels.lighting import launch_camera_poses, launch_shade
+from arena_newton.kernels.raster import launch_rasterize
+from arena_newton.kernels.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
 from arena_newton.pictures.triangles import srgb_to_linear, triangles
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
     from arena_newton.scene import Scene
     from arena_newton.tasks import LightDraw
 
-__all__ = ["CAMERA_PRIMS", "Camera", "CameraConfig", "WorldLights"]
+__all__ = ["CAMERA_PRIMS", "Buffers", "Camera", "CameraConfig", "WorldLights"]
 
 CAMERA_PRIMS = {
     "ego": "front_cam",
@@ -39,7 +47,7 @@ DOME_COLOR = (0.75, 0.75, 0.75)
 """Colour of the original's dome light, linear RGB."""
 Fit = Literal["native", "pad"]
 SHADOW_BYTES = 2 << 30
-"""Memory of a camera's shadow maps; more worlds than fit are drawn one part after the other [B]."""
+"""Memory of a camera's shadow maps; more worlds than fit are drawn in several parts [B]."""
 
 
 @dataclass(frozen=True)
@@ -56,16 +64,14 @@ class CameraConfig:
     """`native`: the lens fills width × height with square pixels, horizontal view kept; `pad`: the sensor's own aspect
     (4:3 for the robot's cameras) inside width × height, black around it, as the original prepares policy images."""
     samples: int = 1
-    """Rays per pixel along each axis (2 is 4 rays a pixel: smooth edges for videos)."""
+    """Rays per pixel along each axis (2 is 4 rays per pixel: smooth edges for videos)."""
 
 
 class WorldLights:
     """One light per world: a uniform dome, or a distant light with shadows."""
 
-    def __init__(self, worlds: int, device: Any, stage: Any = None):
+    def __init__(self, worlds: int, device: wp.DeviceLike, stage: Usd.Stage | None = None):
         """See `allocate`."""
-        import warp as wp
-
         self.worlds = worlds
         self.device = wp.get_device(device)
         with wp.ScopedDevice(self.device):
@@ -85,7 +91,7 @@ class WorldLights:
             self.set(world, None)
 
     @classmethod
-    def allocate(cls, worlds: int, device: Any, stage: Any = None) -> WorldLights:
+    def allocate(cls, worlds: int, device: wp.DeviceLike, stage: Usd.Stage | None = None) -> WorldLights:
         """Lights of a batch, all set to the base light.
 
         Args:
@@ -102,7 +108,7 @@ class WorldLights:
         dome_intensity: float | None = None,
         dome_color: Sequence[float] | None = None,
     ) -> None:
-        """Set the light of one world; it holds from the next render on.
+        """Set the light of one world, from the next render on.
 
         Args:
             world: World index.
@@ -145,12 +151,10 @@ class WorldLights:
             self._dirty = False
 
 
-def _stage_light(stage: Any) -> tuple[tuple[float, ...] | None, float, tuple[float, ...]]:
+def _stage_light(stage: Usd.Stage | None) -> tuple[tuple[float, ...] | None, float, tuple[float, ...]]:
     """Direction (None for a dome), intensity and colour of the stage's `/World/Light`."""
     if stage is None or not stage.GetPrimAtPath(LIGHT_PRIM):
         return None, DOME_INTENSITY, DOME_COLOR
-    from pxr import Gf, UsdGeom, UsdLux
-
     prim = stage.GetPrimAtPath(LIGHT_PRIM)
     light = UsdLux.LightAPI(prim)
     intensity = float(light.GetIntensityAttr().Get()) * 2.0 ** float(light.GetExposureAttr().Get())
@@ -165,16 +169,9 @@ def _stage_light(stage: Any) -> tuple[tuple[float, ...] | None, float, tuple[flo
 class _Tracer:
     """What the cameras of one model share: triangles and textures, and Newton's ray tracer for comparison."""
 
-    _of_model: weakref.WeakKeyDictionary[Any, _Tracer] = weakref.WeakKeyDictionary()
+    _of_model: ClassVar[weakref.WeakKeyDictionary[newton.Model, _Tracer]] = weakref.WeakKeyDictionary()
 
-    def __init__(self, model: Any):
-        import newton
-        import warp as wp
-        from newton._src.geometry.raycast import ray_intersect_shape_no_normal
-        from newton.sensors import SensorCamera
-
-        from arena_newton.kernels.shadow import Occluders, traced
-
+    def __init__(self, model: newton.Model):
         on_cuda = model.device.is_cuda
         self.sensor = SensorCamera(
             model,
@@ -207,7 +204,7 @@ class _Tracer:
         self.soup, self.triangles, self.casters = triangles(model)
 
     @classmethod
-    def of(cls, model: Any) -> _Tracer:
+    def of(cls, model: newton.Model) -> _Tracer:
         """The tracer of a model, made on first use."""
         if model.bvh_shapes is None:
             raise InputError("the scene has no visible shape to render")
@@ -216,12 +213,26 @@ class _Tracer:
         return cls._of_model[model]
 
 
+@dataclass
+class Buffers:
+    """What a render fills before it shades, one row per view."""
+
+    albedo: wp.array
+    """sRGB packed as RGBA, uint32, shape [views, H, W]."""
+    normals: wp.array
+    """World-space normals, same shape."""
+    depth: wp.array
+    """Distance along the ray [m], 0 where it met nothing, same shape."""
+    nearest: wp.array
+    """Work space of the rasterizer, uint64, same shape."""
+
+
 class Camera:
     """A camera in every world of a model; looks along its −z, +y up."""
 
     def __init__(
         self,
-        model: Any,
+        model: newton.Model,
         body: np.ndarray,
         position: Sequence[float],
         quat: Sequence[float],
@@ -252,15 +263,11 @@ class Camera:
             aspect: Width over height of the sensor, for `fit="pad"`.
             samples: Rays per pixel along each axis.
             views: Pictures that one render draws; one per world by default. A camera with fewer takes less memory and
-                is told at each render which worlds to show (`render_worlds`).
+                is given the worlds to show at each render (`render_worlds`).
 
         Raises:
             InputError: A size that is not positive, or an unknown `fit`.
         """
-        import torch
-        import warp as wp
-        from newton.sensors import SensorCamera
-
         if min(width, height, samples) < 1:
             raise InputError(f"camera: width, height and samples must be positive, got {width}×{height}, {samples}")
         if fit not in ("native", "pad"):
@@ -302,17 +309,20 @@ class Camera:
             self.poses = wp.zeros(self.views, dtype=wp.transform)
             """World pose of each camera at the last render [m], shape [views]."""
             self._view_world = wp.array(np.arange(self.views), dtype=wp.int32)
-            self._albedo = sensor.allocate_image_albedo(self.views, w, h)
-            self._normals = sensor.allocate_image_normal(self.views, w, h)
-            self._depth = sensor.allocate_image_depth(self.views, w, h)
-            self._nearest = wp.zeros((self.views, h, w), dtype=wp.uint64)
+            self.buffers = Buffers(
+                sensor.allocate_image_albedo(self.views, w, h),
+                sensor.allocate_image_normal(self.views, w, h),
+                sensor.allocate_image_depth(self.views, w, h),
+                wp.zeros((self.views, h, w), dtype=wp.uint64),
+            )
+            """Surfaces of the last render, before shading."""
             self.image = wp.zeros((self.views, height, width, 3), dtype=wp.uint8)
             """The pictures of the last render, uint8 [views, height, width, 3]."""
-        # Two texels a pixel, and no more than a video needs.
+        # Two texels per pixel, and no more than a video needs.
         self._shadow_size = min(max(2 * max(w, h), 256), 1024)
-        self._shadows: Any = None
-        # Rays instead of maps: what the maps are tested against.
-        self._trace_shadows = False
+        self._shadows: ShadowMaps | None = None
+        self.trace_shadows = False
+        """Shadows by ray instead of by map: exact and slow, the reference for the maps."""
         self._torch_image = wp.to_torch(self.image)
         self._torch_view_world = wp.to_torch(self._view_world)
         self._every = torch.arange(self.views, dtype=torch.int32, device=self._torch_image.device)
@@ -321,7 +331,6 @@ class Camera:
     def from_scene(
         cls,
         scene: Scene,
-        physics: Physics | None = None,
         prim: str = "ego",
         width: int = 224,
         height: int = 224,
@@ -335,7 +344,6 @@ class Camera:
 
         Args:
             scene: The built scene.
-            physics: Not needed to build a camera; kept so that a caller may hand both.
             prim: `ego`, `left_wrist`, `right_wrist`, `world`, or the path of a camera prim.
             width: Image width [px].
             height: Image height [px].
@@ -347,8 +355,6 @@ class Camera:
         Raises:
             InputError: The prim is missing or is not a camera.
         """
-        from pxr import UsdGeom
-
         name = CAMERA_PRIMS.get(prim, prim)
         frame = scene.frame(name)
         path = name if name.startswith("/") else _path_under_robot(scene.stage, name)
@@ -374,7 +380,7 @@ class Camera:
             views=views,
         )
 
-    def render(self, state: Any, mask: Any = None) -> Any:
+    def render(self, state: newton.State, mask: np.ndarray | torch.Tensor | wp.array | None = None) -> torch.Tensor:
         """Render the worlds of a mask; the pictures of the others stay as they were.
 
         Args:
@@ -382,33 +388,36 @@ class Camera:
             mask: bool [worlds] (array or tensor); None renders all.
 
         Returns:
-            torch tensor uint8 [worlds, height, width, 3], on the model's device, that shares memory with `image` and is
-            overwritten by the next render.
-        """
-        import torch
+            uint8 [worlds, height, width, 3], on the model's device, that shares memory with `image` and is overwritten
+            by the next render.
 
+        Raises:
+            InputError: The camera has fewer views than there are worlds.
+        """
         if self.views != self.worlds:
             raise InputError(f"camera: {self.views} views of {self.worlds} worlds; name the worlds with render_worlds")
         if mask is None:
             self._torch_view_world.copy_(self._every)
         else:
-            if not torch.is_tensor(mask) and hasattr(mask, "numpy"):
+            if isinstance(mask, wp.array):
                 mask = mask.numpy()
             asked = torch.as_tensor(mask, device=self._every.device).bool()
             self._torch_view_world.copy_(torch.where(asked, self._every, self._tracer.preserve))
         return self._render(state, self._body)
 
-    def render_worlds(self, state: Any, worlds: Sequence[int], poses: np.ndarray | None = None) -> Any:
+    def render_worlds(
+        self, state: newton.State, worlds: Sequence[int], poses: np.ndarray | None = None
+    ) -> torch.Tensor:
         """Render chosen worlds, one after the other in the order given.
 
         Args:
             state: Newton state whose `body_q` holds the bodies' poses.
             worlds: World of each picture; at most `views`.
-            poses: Where the camera stands in each of them instead of on its body: float32 [len(worlds), 7],
+            poses: Pose of the camera in each of them instead of the one on its body: float32 [len(worlds), 7],
                 position [m] and quaternion xyzw.
 
         Returns:
-            torch tensor uint8 [len(worlds), height, width, 3], on the model's device, overwritten by the next render.
+            uint8 [len(worlds), height, width, 3], on the model's device, overwritten by the next render.
 
         Raises:
             InputError: More worlds than views.
@@ -440,54 +449,49 @@ class Camera:
             view: Which of the pictures.
             points: Points in the camera's frame, [n, 3]; of one outside the picture the nearest pixel counts.
         """
-        import torch
-        import warp as wp
-
-        height, width = self._depth.shape[1:]
+        height, width = self.buffers.depth.shape[1:]
         ahead = np.maximum(-points[:, 2], 1e-6)
         column = 0.5 * (1.0 + points[:, 0] / ahead / self._tangents[0]) * width
         row = 0.5 * (1.0 - points[:, 1] / ahead / self._tangents[1]) * height
         rows = torch.as_tensor(np.clip(row, 0, height - 1).astype(np.int64), device=self._every.device)
         columns = torch.as_tensor(np.clip(column, 0, width - 1).astype(np.int64), device=self._every.device)
-        return wp.to_torch(self._depth)[view, rows, columns].cpu().numpy()
+        return wp.to_torch(self.buffers.depth)[view, rows, columns].cpu().numpy()
 
-    def _render(self, state: Any, body: Any) -> Any:
+    def _render(self, state: newton.State, body: wp.array | None) -> torch.Tensor:
         """Draw the views; `body` carries each one's camera, None leaves `poses` as they are."""
-        from arena_newton.kernels import lighting, shadow
-
-        tracer, lights = self._tracer, self.lights
+        tracer, lights, buffers = self._tracer, self.lights, self.buffers
         lights.upload()
         self.model.bvh_refit_shapes(state)
         if body is not None:
-            lighting.launch_camera_poses(state.body_q, body, self._local, self.poses)
-        self._draw()
+            launch_camera_poses(state.body_q, body, self._local, self.poses)
+        self.draw()
         maps = self._shadow_maps()
         part = maps.frames.shape[0] or self.views
         for first in range(0, self.views, part):
-            if lights.any_distant and not self._trace_shadows:
-                shadow.launch_shadow_maps(
+            if lights.any_distant and not self.trace_shadows:
+                launch_shadow_maps(
                     first=first,
                     view_world=self._view_world,
                     poses=self.poses,
                     rays=self._rays,
-                    normals=self._normals,
-                    depth=self._depth,
+                    normals=buffers.normals,
+                    depth=buffers.depth,
                     soup=tracer.soup,
                     casters=tracer.casters,
                     distant=lights.distant,
                     direction=lights.direction,
                     maps=maps,
                 )
-            lighting.launch_shade(
-                tracer.traced if self._trace_shadows else shadow.MAPPED,
-                tracer.occluders if self._trace_shadows else maps,
+            launch_shade(
+                tracer.traced if self.trace_shadows else MAPPED,
+                tracer.occluders if self.trace_shadows else maps,
                 views=(first, min(part, self.views - first)),
                 view_world=self._view_world,
                 poses=self.poses,
                 rays=self._rays,
-                albedo=self._albedo,
-                normals=self._normals,
-                depth=self._depth,
+                albedo=buffers.albedo,
+                normals=buffers.normals,
+                depth=buffers.depth,
                 decode=tracer.decode,
                 distant=lights.distant,
                 direction=lights.direction,
@@ -499,13 +503,9 @@ class Camera:
             )
         return self._torch_image
 
-    def _shadow_maps(self) -> Any:
+    def _shadow_maps(self) -> ShadowMaps:
         """The maps, without memory as long as no world has needed any."""
-        import warp as wp
-
-        from arena_newton.kernels.shadow import ShadowMaps
-
-        wanted = self.lights.any_distant and not self._trace_shadows
+        wanted = self.lights.any_distant and not self.trace_shadows
         if self._shadows is None or (wanted and not self._shadows.frames.shape[0]):
             size = self._shadow_size
             count = min(self.views, max(1, SHADOW_BYTES // (8 * size * size))) if wanted else 0
@@ -516,37 +516,34 @@ class Camera:
                 self._shadows.depth = wp.zeros((2 * count, size, size), dtype=wp.uint32)
         return self._shadows
 
-    def _trace(self, state: Any) -> None:
-        """The same by Newton's ray tracer: exact round shapes, slower; what `_draw` is tested against."""
+    def trace(self, state: newton.State) -> None:
+        """Fill `buffers` by Newton's ray tracer: exact round shapes, slower; the reference for `draw`."""
         self._tracer.sensor.update(
             state,
             self.poses,
             self._rays,
-            albedo_image=self._albedo,
-            normal_image=self._normals,
-            depth_image=self._depth,
+            albedo_image=self.buffers.albedo,
+            normal_image=self.buffers.normals,
+            depth_image=self.buffers.depth,
             world_indices=self._view_world,
         )
 
-    def _draw(self) -> None:
-        """Albedo, normal and depth by drawing triangles."""
-        from arena_newton.kernels import raster
-
-        raster.launch_rasterize(
+    def draw(self) -> None:
+        """Fill `buffers` by drawing triangles."""
+        buffers = self.buffers
+        launch_rasterize(
             view_world=self._view_world,
             poses=self.poses,
             rays=self._rays,
             soup=self._tracer.soup,
             tangents=self._tangents,
             triangles=self._tracer.triangles,
-            nearest=self._nearest,
-            albedo=self._albedo,
-            normals=self._normals,
-            depth=self._depth,
+            nearest=buffers.nearest,
+            albedo=buffers.albedo,
+            normals=buffers.normals,
+            depth=buffers.depth,
         )
 
 
-def _path_under_robot(stage: Any, name: str) -> str:
-    from pxr import Usd
-
+def _path_under_robot(stage: Usd.Stage, name: str) -> str:
     return next(str(p.GetPath()) for p in Usd.PrimRange(stage.GetPrimAtPath("/World/Robot")) if p.GetName() == name)

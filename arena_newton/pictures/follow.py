@@ -1,42 +1,43 @@
-"""A camera that follows a robot at a fixed offset and cuts to another one when something stands in between."""
+"""A camera that follows a robot at a fixed offset and cuts to another one when something hides the robot."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
+import mujoco
+import newton
 import numpy as np
+
+from arena_newton.pictures.camera import Camera
 
 __all__ = ["Follower", "follow_pose", "room_walls", "visible"]
 
 FOCAL, APERTURE = 18.0, 20.955
 """Lens: 60° wide [mm]."""
 OFFSETS = ((-2.2, 1.7), (-2.2, -1.7), (-0.3, 2.7), (-0.3, -2.7), (2.2, 1.7), (2.2, -1.7))
-"""Where the camera may stand, ahead of and left of the pelvis in the spawn's heading, the preferred one first [m]."""
+"""Positions of the camera, ahead of and left of the pelvis in the spawn's heading, the preferred one first [m]."""
 EYE_HEIGHT = 1.35
 """Its height above the floor [m]."""
 AIM = (0.25, 0.0, 0.7)
-"""What it looks at: ahead of and left of the pelvis, above the floor [m]."""
+"""Point that it looks at: ahead of and left of the pelvis, above the floor [m]."""
 WALL_GAP = 0.25
 """It stays this far inside the walls of a room [m]."""
 HEIGHTS = (0.3, 0.55, 0.8, 1.0, 1.2)
 """Points above the floor under the pelvis by which a robot counts as seen [m]."""
 ENOUGH = 3
-"""So many of them must not be hidden."""
+"""Number of them that must not be hidden."""
 BODY = 0.45
 """Something this much nearer than such a point hides it; less is the robot itself [m]."""
 PATIENCE = 50
-"""After no offset shows the robot, the next search waits so long [ticks]."""
+"""Pause before the next search after no offset showed the robot [ticks]."""
 
 
-def room_walls(model: Any) -> tuple[tuple[np.ndarray, float], ...]:
+def room_walls(model: mujoco.MjModel) -> tuple[tuple[np.ndarray, float], ...]:
     """Inward normal and offset [m] of the upright planes that bound a scene's room.
 
     Args:
         model: MuJoCo model.
     """
-    import mujoco
-
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
@@ -45,7 +46,7 @@ def room_walls(model: Any) -> tuple[tuple[np.ndarray, float], ...]:
 
 
 def follow_pose(
-    place: Sequence[float] | np.ndarray,
+    pelvis: Sequence[float] | np.ndarray,
     heading: float,
     offset: tuple[float, float] = OFFSETS[0],
     walls: Sequence[tuple[np.ndarray, float]] = (),
@@ -53,15 +54,15 @@ def follow_pose(
     """Pose of the camera: position [m] and quaternion xyzw, float32 [7].
 
     Args:
-        place: x and y of the pelvis [m].
+        pelvis: x and y of the pelvis [m].
         heading: The direction that counts as ahead [rad].
-        offset: Where it stands, see `OFFSETS` [m].
+        offset: See `OFFSETS` [m].
         walls: Inward normal and offset [m] of planes that it stays inside of.
     """
     cos, sin = np.cos(heading), np.sin(heading)
 
     def at(ahead: float, left: float, up: float) -> np.ndarray:
-        return np.array([place[0] + cos * ahead - sin * left, place[1] + sin * ahead + cos * left, up])
+        return np.array([pelvis[0] + cos * ahead - sin * left, pelvis[1] + sin * ahead + cos * left, up])
 
     eye = at(*offset, EYE_HEIGHT)
     for normal, distance in walls:
@@ -76,16 +77,16 @@ def follow_pose(
     return np.array([*eye, cy * sp, sy * sp, sy * cp, cy * cp], dtype=np.float32)
 
 
-def visible(camera: Any, view: int, pose: np.ndarray, place: Sequence[float] | np.ndarray) -> int:
+def visible(camera: Camera, view: int, pose: np.ndarray, pelvis: Sequence[float] | np.ndarray) -> int:
     """How many of `HEIGHTS` nothing hides in a picture that was just drawn.
 
     Args:
         camera: The camera.
         view: Which of its pictures.
-        pose: Where it stood, position [m] and quaternion xyzw.
-        place: x and y of the pelvis [m].
+        pose: Its pose, position [m] and quaternion xyzw.
+        pelvis: x and y of the pelvis [m].
     """
-    points = np.array([[place[0], place[1], height] for height in HEIGHTS]) - pose[:3]
+    points = np.array([[pelvis[0], pelvis[1], height] for height in HEIGHTS]) - pose[:3]
     axis, w = -pose[3:6].astype(np.float64), float(pose[6])
     cross = np.cross(axis, points)
     local = points + 2.0 * (w * cross + np.cross(axis, cross))
@@ -108,31 +109,31 @@ class Follower:
         self._wait: dict[int, int] = {}
 
     def draw(
-        self, camera: Any, state: Any, worlds: Sequence[int], places: np.ndarray, ticks: Sequence[int]
+        self, camera: Camera, state: newton.State, worlds: Sequence[int], pelvises: np.ndarray, ticks: Sequence[int]
     ) -> np.ndarray:
         """Pictures of some worlds, uint8 [len(worlds), H, W, 3].
 
         Args:
-            camera: Camera with at least so many views.
+            camera: Camera with at least as many views as worlds are given.
             state: Newton state.
             worlds: World of each picture.
-            places: x and y of each pelvis [m].
+            pelvises: x and y of each pelvis [m].
             ticks: Tick of each picture.
         """
 
         def pose(index: int, offset: int) -> np.ndarray:
-            return follow_pose(places[index], self.headings[worlds[index]], OFFSETS[offset], self.walls)
+            return follow_pose(pelvises[index], self.headings[worlds[index]], OFFSETS[offset], self.walls)
 
         poses = np.stack([pose(i, self._offset.get(world, 0)) for i, world in enumerate(worlds)])
         images = camera.render_worlds(state, worlds, poses).cpu().numpy().copy()
-        seen = [visible(camera, i, poses[i], places[i]) for i in range(len(worlds))]
+        seen = [visible(camera, i, poses[i], pelvises[i]) for i in range(len(worlds))]
         for i, world in enumerate(worlds):
             if seen[i] >= ENOUGH or ticks[i] < self._wait.get(world, 0):
                 continue
             for offset in range(len(OFFSETS)):
                 other = pose(i, offset)
                 image = camera.render_worlds(state, [world], other[None])[0].cpu().numpy()
-                count = visible(camera, 0, other, places[i])
+                count = visible(camera, 0, other, pelvises[i])
                 if count > seen[i]:
                     seen[i], self._offset[world], images[i] = count, offset, image
                 if count >= ENOUGH:

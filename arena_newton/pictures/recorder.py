@@ -1,8 +1,8 @@
 """Pictures of episodes: ego and world videos, and the paper's film strip of ten frames.
 
-A strip costs its ten frames: while an episode runs, only poses are kept (a few kB a frame), and what the strip shows is
-drawn when it ends. A video draws each of its frames. Pictures depend on the episode alone, not on how many worlds run
-beside it, and strips not on whether there are videos.
+A strip draws no more than its ten frames: while an episode runs, only poses are kept (a few kB per frame), and the
+frames are drawn when it ends. A video draws each of its frames. Pictures depend on the episode alone, not on the number
+of worlds, and strips not on whether there are videos.
 """
 
 from __future__ import annotations
@@ -10,14 +10,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
+import newton
 import numpy as np
+import torch
+import warp as wp
 
 from arena_newton.errors import InputError
 from arena_newton.pictures import follow as following
+from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.video import VideoWriter, caption, evenly, film_strip
 from arena_newton.robot import TICK
+
+if TYPE_CHECKING:
+    from arena_newton.env import ArenaEnv
+    from arena_newton.interfaces import EpisodeResult, Observation, World
 
 __all__ = ["EpisodeRecorder", "video_sizes"]
 
@@ -32,14 +40,25 @@ VIDEO_SIZE = (480, 270)
 SIZE_LIMITS = (32, 4096)
 """Smallest and largest width and height of a video, the head camera's too [px]; H.264 encoders end at 4096."""
 VIEWS = 32
-"""Worlds that are drawn at once: bounds the memory of the pictures for any number of worlds."""
+"""Worlds that are drawn at once: bounds the memory of the pictures."""
 HOLD_FRAMES = 25
-"""Frames for which a video's last picture stands, with the outcome on it."""
+"""Frames for which a video's last picture is held, with the outcome on it."""
 
 COLOURS = {"success": (36, 128, 84), "fall": (192, 64, 40), "timeout": (150, 104, 0), "error": (122, 70, 168)}
 """Outcome → RGB of its name on strips."""
 BRIGHT = {"success": (120, 240, 170), "fall": (255, 130, 100), "timeout": (255, 205, 90), "error": (215, 165, 255)}
 """Outcome → RGB of its name on videos."""
+
+
+class EpisodeKey(Protocol):
+    """What a plan's episode must have so that its pictures find a name."""
+
+    task: str
+    mode: str
+    group_seed: int
+    repeat: int
+    rank: int
+    """Number within task and mode, in the order of the plan."""
 
 
 def video_sizes(size: tuple[int, int] | None) -> dict[str, tuple[int, int]]:
@@ -70,20 +89,20 @@ class _Stream:
     """What is recorded of one world's episode."""
 
     label: str
-    rows: Any
-    """Bodies of the world in the model, torch [n]."""
+    rows: torch.Tensor
+    """Bodies of the world in the model, shape [n]."""
     writers: dict[str, VideoWriter]
     stride: int
     """Frames from one kept pose to the next."""
     ticks: list[int] = field(default_factory=list)
     """Ticks of the kept poses."""
-    poses: list[Any] = field(default_factory=list)
-    """Kept poses of the world's bodies, torch [n, 7]."""
+    poses: list[torch.Tensor] = field(default_factory=list)
+    """Kept poses of the world's bodies, each of shape [n, 7]."""
     last: int = -1
     """Tick of the last frame."""
     last_frame: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def keep(self, tick: int, poses: Any) -> None:
+    def keep(self, tick: int, poses: torch.Tensor) -> None:
         self.ticks.append(tick)
         self.poses.append(poses)
         if len(self.poses) > STRIP_POSES:
@@ -91,7 +110,7 @@ class _Stream:
 
 
 class EpisodeRecorder:
-    """Records the worlds of an `ArenaEnv`; give it to `ArenaEnv.run_episodes`, and close it after."""
+    """Records the worlds of an `ArenaEnv`, as an `interfaces.Recorder`; close it after use."""
 
     def __init__(
         self,
@@ -107,10 +126,11 @@ class EpisodeRecorder:
         """Set up the recorder.
 
         Args:
-            folder: Where `videos/` and `strips/` are written.
+            folder: Folder in which `videos/` and `strips/` are written.
             video: Write H.264 MP4s.
             strip: Write film strips.
-            episodes: Videos of the first so many episodes of each task and mode only, in the order of the plan.
+            episodes: Number of episodes with videos, the first of each task and mode in the order of the plan; all by
+                default.
             size: Width and height of world videos [px]; head camera videos are as high, 4:3. 480×270 (and 320×240) by
                 default. Strips keep their size.
             follow: The world camera keeps the robot in the picture, from behind and the left; by default it is the
@@ -118,7 +138,7 @@ class EpisodeRecorder:
             every: Ticks between frames (2 is 25 frames/s).
 
         Raises:
-            InputError: A number that cannot be.
+            InputError: A number out of range.
         """
         self.video_sizes = video_sizes(size)
         if episodes is not None and episodes < 1:
@@ -127,18 +147,18 @@ class EpisodeRecorder:
             raise InputError(f"recorder: a frame every {every} ticks, expected at least 1")
         self.folder = Path(folder)
         self.video, self.strip, self.episodes, self.follow, self.every = video, strip, episodes, follow, every
-        self._env: Any = None
-        self._cameras: dict[str, Any] = {}
-        self._strip_cameras: dict[str, Any] = {}
+        self._env: ArenaEnv | None = None
+        self._cameras: dict[str, Camera] = {}
+        self._strip_cameras: dict[str, Camera] = {}
         self._streams: dict[int, _Stream] = {}
 
     @staticmethod
-    def label(episode: Any) -> str:
+    def label(episode: EpisodeKey) -> str:
         """File stem of an episode."""
         parts = [episode.task, episode.mode, f"seed{episode.group_seed}", f"repeat{episode.repeat}"]
         return "__".join(str(p) for p in parts)
 
-    def media(self, episode: Any) -> dict[str, str]:
+    def media(self, episode: EpisodeKey) -> dict[str, str]:
         """Files of a finished episode, relative to the folder: `ego`, `world`, `ego strip`, `world strip`."""
         label = self.label(episode)
         found = {}
@@ -148,13 +168,11 @@ class EpisodeRecorder:
             found |= {f"{name} strip": f"strips/{label}__{name}.jpg" for name in STRIP_SIZES}
         return {name: path for name, path in found.items() if (self.folder / path).is_file()}
 
-    def _filmed(self, episode: Any) -> bool:
+    def _filmed(self, episode: EpisodeKey) -> bool:
         return self.video and (self.episodes is None or episode.rank < self.episodes)
 
-    def _bind(self, env: Any) -> None:
+    def _bind(self, env: ArenaEnv) -> None:
         """Cameras and work space of an environment."""
-        import warp as wp
-
         if self._env is env:
             return
         self._discard()
@@ -163,18 +181,17 @@ class EpisodeRecorder:
         self._now, self._then = env.scene.model.state(), env.scene.model.state()
         self._now_poses, self._then_poses = wp.to_torch(self._now.body_q), wp.to_torch(self._then.body_q)
         self._walls = following.room_walls(env.scene.mj_model) if self.follow else ()
+        self._pelvis = env.scene.body_to_newton[:, env.scene.robot.root_body]
         self._headings: dict[int, float] = {}
         self._follower = following.Follower(self._headings, self._walls)
-        lights = env._lights()
+        lights = env.lights
         views = min(env.worlds, VIEWS)
         if self.video:
             self._cameras = {n: self._camera(env, n, size, lights, views) for n, size in self.video_sizes.items()}
         if self.strip:
             self._strip_cameras = {n: self._camera(env, n, size, lights, 1) for n, size in STRIP_SIZES.items()}
 
-    def _camera(self, env: Any, name: str, size: tuple[int, int], lights: Any, views: int) -> Any:
-        from arena_newton.pictures.camera import Camera
-
+    def _camera(self, env: ArenaEnv, name: str, size: tuple[int, int], lights: WorldLights, views: int) -> Camera:
         width, height = size
         if name == "world" and self.follow:
             return Camera(
@@ -189,18 +206,14 @@ class EpisodeRecorder:
                 lights=lights,
                 views=views,
             )
-        return Camera.from_scene(
-            env.scene, env.physics, prim=name, width=width, height=height, lights=lights, views=views
-        )
+        return Camera.from_scene(env.scene, prim=name, width=width, height=height, lights=lights, views=views)
 
-    def start(self, env: Any, world: int, episode: Any) -> None:
+    def start(self, env: ArenaEnv, world: int, episode: EpisodeKey) -> None:
         """Open the streams of a world's new episode.
 
         Raises:
             OSError: A file cannot be written; the error carries its name.
         """
-        import torch
-
         self._bind(env)
         label = self.label(episode)
         bodies = np.asarray(env.scene.body_to_newton[world])
@@ -213,13 +226,16 @@ class EpisodeRecorder:
         if self.follow or env.tick[world] >= 0:
             env.physics.write_newton_state(self._now)
         if self.follow:
-            x, y, z, w = self._now_poses[self._pelvis(world), 3:].tolist()
+            x, y, z, w = self._now_poses[self._pelvis[world], 3:].tolist()
             self._headings[world] = float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
             self._follower.forget(world)
         if env.tick[world] >= 0:  # without a start-up the first frame is the spawn's
             self._take(env, [world])
 
-    def tick(self, env: Any) -> None:
+    def before_physics(self, env: World, observation: Observation, action: torch.Tensor) -> None:
+        """Nothing: pictures show the state after a tick."""
+
+    def tick(self, env: ArenaEnv) -> None:
         """Take a frame of every recorded world that is past its start-up and whose frame is due.
 
         Raises:
@@ -235,8 +251,8 @@ class EpisodeRecorder:
         """Whether a strip keeps the poses of this tick."""
         return self.strip and tick % (self.every * self._streams[world].stride) == 0
 
-    def _take(self, env: Any, worlds: Sequence[int], *, final: bool = False) -> None:
-        """A frame of some worlds, whose poses lie in `_now`; poses that are not finite cannot be drawn."""
+    def _take(self, env: ArenaEnv, worlds: Sequence[int], *, final: bool = False) -> None:
+        """A frame of some worlds, whose poses are in `_now`; poses that are not finite cannot be drawn."""
         finite = [w for w in worlds if self._now_poses[self._streams[w].rows].isfinite().all()]
         for world in finite:
             stream, tick = self._streams[world], int(env.tick[world])
@@ -254,19 +270,23 @@ class EpisodeRecorder:
                     stream.last_frame[name] = image
                     stream.writers[name].write(caption(image, _time(int(env.tick[world]))))
 
-    def _pelvis(self, world: int) -> int:
-        return int(self._env.scene.body_to_newton[world, self._env.scene.robot.root_body])
-
     def _draw(
-        self, name: str, camera: Any, state: Any, poses: Any, worlds: Sequence[int], ticks: Sequence[int], follower: Any
+        self,
+        name: str,
+        camera: Camera,
+        state: newton.State,
+        poses: torch.Tensor,
+        worlds: Sequence[int],
+        ticks: Sequence[int],
+        follower: following.Follower,
     ) -> np.ndarray:
         """Pictures of some worlds from one camera, uint8 [len(worlds), H, W, 3]."""
         if name == "world" and self.follow:
-            places = poses[[self._pelvis(w) for w in worlds], :2].cpu().numpy()
-            return follower.draw(camera, state, worlds, places, ticks)
+            pelvises = poses[self._pelvis[list(worlds)], :2].cpu().numpy()
+            return follower.draw(camera, state, worlds, pelvises, ticks)
         return camera.render_worlds(state, worlds).cpu().numpy().copy()
 
-    def finish(self, env: Any, world: int, result: Any) -> None:
+    def finish(self, env: ArenaEnv, world: int, result: EpisodeResult) -> None:
         """Close the streams of a world's episode; the outcome goes onto its pictures.
 
         Raises:
@@ -295,7 +315,7 @@ class EpisodeRecorder:
             self._write_strips(stream, world, result, said)
         del self._streams[world]
 
-    def _write_strips(self, stream: _Stream, world: int, result: Any, said: str) -> None:
+    def _write_strips(self, stream: _Stream, world: int, result: EpisodeResult, said: str) -> None:
         """Draw the frames of a strip, and nothing else, from the poses that were kept."""
         # Nearest to even spacing in time, first and last included.
         wanted = np.linspace(stream.ticks[0], stream.ticks[-1], STRIP_FRAMES)

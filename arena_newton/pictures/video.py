@@ -7,11 +7,15 @@ import os
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from types import TracebackType
 
+import av
+import cv2
 import numpy as np
+import torch
 
 from arena_newton.errors import ArenaError
+from arena_newton.files import PARTIAL, replace_atomically
 from arena_newton.foreign import create
 
 __all__ = ["VideoWriter", "caption", "evenly", "film_strip"]
@@ -20,21 +24,18 @@ GAP = 4
 """Space between the frames of a film strip [px]."""
 LABEL_HEIGHT = 18
 """Least height of a film strip's label line, and of the line of captions under it [px]."""
-LABEL_SHARE = 0.12
-"""That height of a frame's, where the frame is large enough: a page shows a strip at a third of its size."""
+LABEL_FRACTION = 0.12
+"""The same as a fraction of the frame's height, for larger frames: a page shows a strip at a third of its size."""
 JPEG_QUALITY = 90
 """Quality of film strips that are JPEGs: a third of the PNG's size, no visible loss at the size of a page."""
-PARTIAL = ".part"
-"""Suffix of a file that is being written."""
+
+Picture = np.ndarray | torch.Tensor
+"""A frame, uint8, shape [H, W, 3]."""
 
 
-def _rgb(frame: Any) -> np.ndarray:
-    """A frame as a contiguous uint8 array [H, W, 3]; torch tensors and arrays are accepted."""
-    if hasattr(frame, "cpu"):
-        frame = frame.cpu().numpy()
-    elif not isinstance(frame, np.ndarray) and hasattr(frame, "numpy"):
-        frame = frame.numpy()
-    frame = np.asarray(frame)
+def _rgb(frame: Picture) -> np.ndarray:
+    """A frame as a contiguous array."""
+    frame = frame.cpu().numpy() if isinstance(frame, torch.Tensor) else np.asarray(frame)
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ArenaError(f"a frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
     return np.ascontiguousarray(frame)
@@ -65,8 +66,6 @@ class VideoWriter:
         Raises:
             OSError: The file cannot be written; the error carries its name.
         """
-        import av
-
         self.path = Path(path)
         self.width, self.height = int(width), int(height)
         self.frames = 0
@@ -74,8 +73,11 @@ class VideoWriter:
         self._size = (self.height + self.height % 2, self.width + self.width % 2)
         self._part = self.path.with_name(self.path.name + PARTIAL)
         self._part.parent.mkdir(parents=True, exist_ok=True)
-        create(self._part).close()  # a link that lay there would be followed
-        self._container: Any = av.open(str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"})
+        create(self._part).close()  # a link of that name would be followed
+        self._container: av.container.OutputContainer | None
+        self._container = av.open(
+            str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"}
+        )
         rate = Fraction(float(fps)).limit_denominator(1000)
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.height, self._stream.width = self._size
@@ -84,15 +86,13 @@ class VideoWriter:
         self._stream.codec_context.thread_count = 1
         self._stream.options = {"crf": str(crf), "preset": "veryfast"}
 
-    def write(self, frame: Any) -> None:
+    def write(self, frame: Picture) -> None:
         """Append a frame, uint8 [height, width, 3] (array or torch tensor).
 
         Raises:
             ArenaError: The frame has another size or type, or the video is closed.
             OSError: The file cannot be written; what was written of it is removed.
         """
-        import av
-
         if self._container is None:
             raise ArenaError(f"{self.path}: the video is closed")
         pixels = _rgb(frame)
@@ -107,9 +107,9 @@ class VideoWriter:
             raise _named(error, self.path) from None
         self.frames += 1
 
-    def _mux(self, packets: Any) -> None:
-        for packet in packets:
-            self._container.mux(packet)
+    def _mux(self, packets: Sequence[av.Packet]) -> None:
+        if self._container is not None:
+            self._container.mux(packets)
 
     def close(self) -> None:
         """Finish the file and give it its name; a video without frames leaves nothing.
@@ -133,8 +133,6 @@ class VideoWriter:
 
     def discard(self) -> None:
         """Drop the file."""
-        import av
-
         container, self._container = self._container, None
         if container is not None:
             # An MP4 without a frame cannot be finished: the muxer complains, and the file is dropped anyway.
@@ -147,7 +145,7 @@ class VideoWriter:
         """The writer itself."""
         return self
 
-    def __exit__(self, kind: Any, *_: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         """Finish the file, or drop it after an error."""
         if kind is None:
             self.close()
@@ -155,7 +153,7 @@ class VideoWriter:
             self.discard()
 
 
-def caption(frame: Any, text: str, colour: tuple[int, int, int] = (255, 255, 255)) -> np.ndarray:
+def caption(frame: Picture, text: str, colour: tuple[int, int, int] = (255, 255, 255)) -> np.ndarray:
     """A copy of a frame with a line of text at the lower left, as large as suits its height.
 
     Args:
@@ -163,8 +161,6 @@ def caption(frame: Any, text: str, colour: tuple[int, int, int] = (255, 255, 255
         text: ASCII.
         colour: RGB of the text; a dark edge keeps it readable on any ground.
     """
-    import cv2
-
     picture = _rgb(frame).copy()
     scale = max(0.35, picture.shape[0] / 600)
     at = (round(10 * scale) + 2, picture.shape[0] - round(12 * scale) - 2)
@@ -179,7 +175,7 @@ def evenly(count: int, n: int) -> list[int]:
 
 
 def film_strip(
-    frames: Sequence[Any],
+    frames: Sequence[Picture],
     path: str | Path,
     n: int = 10,
     label: str | None = None,
@@ -204,8 +200,6 @@ def film_strip(
         ArenaError: No frames, frames of different sizes, or another kind of file.
         OSError: The file cannot be written; the error carries its name.
     """
-    import cv2
-
     path = Path(path)
     if len(frames) == 0:
         raise ArenaError(f"{path}: a film strip needs at least one frame")
@@ -216,7 +210,7 @@ def film_strip(
     height, width = chosen[0].shape[:2]
     if any(frame.shape != chosen[0].shape for frame in chosen):
         raise ArenaError(f"{path}: the frames of a film strip must be of one size")
-    line = max(LABEL_HEIGHT, round(LABEL_SHARE * height))
+    line = max(LABEL_HEIGHT, round(LABEL_FRACTION * height))
     top, bottom = line if label else 0, line if captions else 0
     strip = np.full((top + height + bottom, len(chosen) * (width + GAP) - GAP, 3), 255, np.uint8)
 
@@ -232,14 +226,9 @@ def film_strip(
         write(label, GAP, 0, colour)
     how = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
     encoded = cv2.imencode(path.suffix, cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), how)[1]
-    part = path.with_name(path.name + PARTIAL)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with create(part) as file:
+        with replace_atomically(path) as file:
             file.write(encoded.tobytes())
-        os.replace(part, path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
         raise _named(error, path) from None
     return path

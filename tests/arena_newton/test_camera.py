@@ -2,14 +2,14 @@
 
 from types import SimpleNamespace
 
+import newton
 import numpy as np
 import pytest
+import warp as wp
+from pxr import Gf, Usd, UsdGeom, UsdLux
 
-newton = pytest.importorskip("newton")
-wp = pytest.importorskip("warp")
-
-from arena_newton.errors import InputError  # noqa: E402
-from arena_newton.pictures.camera import Camera, CameraConfig, WorldLights  # noqa: E402
+from arena_newton.errors import InputError
+from arena_newton.pictures.camera import Camera, CameraConfig, WorldLights
 
 WORLDS = 3
 DOWN = (0.0, 0.0, -1.0)
@@ -140,7 +140,7 @@ def test_pad_keeps_the_sensor_aspect(model):
 
 
 def test_samples_smooth_edges(model):
-    """Several rays a pixel keep the picture's brightness and add shades between box and floor."""
+    """Several rays per pixel keep the picture's brightness and add shades between box and floor."""
     lights = WorldLights.allocate(WORLDS, "cpu")
     hard = _camera(model, lights).render(model.state()).numpy()[0].astype(float)
     soft = _camera(model, lights, samples=3).render(model.state()).numpy()[0].astype(float)
@@ -151,10 +151,11 @@ def test_samples_smooth_edges(model):
 def test_drawing_agrees_with_ray_tracing(model):
     """What the CPU draws is what Newton's ray tracer sees: albedo, normal and depth, but for silhouettes."""
     camera = _camera(model, WorldLights.allocate(WORLDS, "cpu"), 160, 120)
+    surfaces = (camera.buffers.depth, camera.buffers.normals, camera.buffers.albedo)
     camera.render(model.state())
-    drawn = [a.numpy().copy() for a in (camera._depth, camera._normals, camera._albedo)]
-    camera._trace(model.state())
-    traced = [a.numpy() for a in (camera._depth, camera._normals, camera._albedo)]
+    drawn = [a.numpy().copy() for a in surfaces]
+    camera.trace(model.state())
+    traced = [a.numpy() for a in surfaces]
     # Tessellated round shapes lie up to 1 % of their radius inside the exact ones.
     assert (np.abs(drawn[0] - traced[0]) > 1e-2).mean() < 0.003
     assert (np.abs(drawn[1] - traced[1]).max(-1) > 0.05).mean() < 0.01
@@ -163,11 +164,11 @@ def test_drawing_agrees_with_ray_tracing(model):
 
 
 def _difference(camera, state):
-    """Share of pixels that shadow maps show otherwise than shadow rays, by more than a twentieth of the range."""
+    """Fraction of pixels that shadow maps show otherwise than shadow rays, by more than a twentieth of the range."""
     mapped = camera.render(state).numpy().astype(int)
-    camera._trace_shadows = True
+    camera.trace_shadows = True
     traced = camera.render(state).numpy().astype(int)
-    camera._trace_shadows = False
+    camera.trace_shadows = False
     return (np.abs(mapped - traced).max(-1) > 13).mean()
 
 
@@ -216,10 +217,6 @@ def test_worlds_beyond_the_memory_of_the_maps_come_in_parts(model, monkeypatch):
 
 def test_stage_light_is_the_base_light():
     """The base light is the stage's: a dome, or a distant light along its local −z."""
-    pxr = pytest.importorskip("pxr")
-    from pxr import Gf, Usd, UsdGeom, UsdLux
-
-    assert pxr
     stage = Usd.Stage.CreateInMemory()
     dome = UsdLux.DomeLight.Define(stage, "/World/Light")
     dome.CreateIntensityAttr(1200.0)

@@ -70,8 +70,8 @@ def files(folder):
 def test_a_strip_draws_only_its_frames(env, tmp_path, monkeypatch):
     """A strip of any length draws ten frames per camera, the first and the last tick among them."""
     drawn = []
-    draw = Camera._draw
-    monkeypatch.setattr(Camera, "_draw", lambda self: (drawn.append(self.width), draw(self)))
+    draw = Camera.draw
+    monkeypatch.setattr(Camera, "draw", lambda self: (drawn.append(self.width), draw(self)))
     recorder = record(env, tmp_path, ticks=141, video=False)
     assert drawn.count(320) == drawn.count(480) == STRIP_FRAMES and len(drawn) == 2 * STRIP_FRAMES
     assert recorder.media(episode(0)) == {
@@ -147,7 +147,7 @@ def test_follow_camera_keeps_the_robot_large(env, tmp_path):
         height=54,
         focal_length=18.0,
         horizontal_aperture=20.955,
-        lights=env._lights(),
+        lights=env.lights,
         views=1,
     )
     walls = room_walls(env.scene.mj_model)
@@ -172,7 +172,7 @@ def test_views_show_the_worlds_that_are_asked_for():
     """A camera of two views shows any two of three worlds, in any order, as the full camera does."""
     env = environment(3)
     env.reset([1, 2, 3])
-    options = {"prim": "world", "width": 64, "height": 48, "lights": env._lights()}
+    options = {"prim": "world", "width": 64, "height": 48, "lights": env.lights}
     state = env.scene.model.state()
     env.physics.write_newton_state(state)
     every = Camera.from_scene(env.scene, **options).render(state).clone()

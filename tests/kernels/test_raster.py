@@ -17,16 +17,16 @@ def _soup(vertices, faces, color):
     def array(values, kind):
         return wp.array(values, dtype=kind, device="cpu")
 
-    soup.world_start = array([0, len(faces), len(faces)], wp.int32)
+    soup.world_start, soup.world_end = array([0, len(faces)], wp.int32), array([len(faces)] * 2, wp.int32)
     soup.large_end, soup.small_end = array([0, len(faces)], wp.int32), array([len(faces), len(faces)], wp.int32)
     soup.shape, soup.face = array(np.zeros(len(faces)), wp.int32), array(np.arange(len(faces)), wp.int32)
-    soup.spheres, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
+    soup.bounds, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
     soup.transforms = array([[0, 0, 0, 0, 0, 0, 1]], wp.transform)
     soup.colors, soup.texture = array([color], wp.vec3), array([-1], wp.int32)
     soup.faces, soup.vertices = array(faces, wp.vec3i), array(vertices, wp.vec3)
     soup.normals, soup.uvs = array(np.zeros((len(vertices), 3)), wp.vec3), array(np.zeros((len(vertices), 2)), wp.vec2)
     soup.texels = array(np.zeros(0, np.uint8), wp.uint8)
-    soup.texture_place = array(np.zeros((0, 3), np.int32), wp.vec3i)
+    soup.texture_layout = array(np.zeros((0, 3), np.int32), wp.vec3i)
     return soup
 
 

@@ -1,0 +1,210 @@
+"""The order of the house: which way imports run, what is private, how large a file is, which names stand twice.
+
+Each test lists everything that breaks its rule, as `file:line: what`, and each table of exceptions says why.
+"""
+
+import ast
+import collections
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.import_graph import PACKAGE, Module, circles, imports, modules, statements, upward
+
+ROOT = Path(__file__).resolve().parents[1]
+KNOWN = modules(ROOT)
+EDGES = imports(KNOWN)
+
+HEAVY = set("torch warp newton mujoco mujoco_warp pxr lerobot matplotlib cv2 av onnx onnxruntime rsl_rl".split())
+HEAVY |= {"safetensors", "trimesh"}
+"""Libraries whose import takes longer than the help of a command may."""
+STARTS = ("__main__", "eval.__main__", "trackers.__main__", "trackers.evaluate", "trackers.train.__main__")
+STARTS += ("trackers.motions.__main__", "usd_scenes.__main__")
+"""Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
+LATE = {
+    "arena_newton.doctor": "it reports libraries that do not import",
+    "arena_newton.probe": "its other process imports only the library that it tries",
+    "arena_newton.quiet": "light modules call it before they import Warp",
+}
+"""Other modules that import heavy libraries inside functions, and why."""
+OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
+"""Libraries that may be absent."""
+MOST_ANY = 30
+ANY = {
+    "arena_newton/foreign.py": "NumPy's dtypes",
+    "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
+    "arena_newton/registry.py": "what a maker takes is its own business",
+    "policies/base.py": "what a maker takes is its own business, and JSON",
+    "policies/experts/base.py": "JSON",
+    "policies/remote.py": "options of the command line and JSON",
+    "policies/replay.py": "JSON",
+}
+"""Files of arena_newton, eval and policies with `Any` in signatures, and why."""
+MOST_LINES = 600
+STEMS = {
+    "base": "the base class of a room's kind of thing",
+    "build": "every scene has its builder",
+    "boxing": "a task and its expert",
+    "vis_navi": "a task and its expert",
+    "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",
+    "canonical": "the layout, and its kernels",
+}
+"""Stems that two modules share, and why."""
+
+
+def place(module: Module, line: int) -> str:
+    """File and line as an editor opens them."""
+    return f"{module.path.relative_to(ROOT)}:{line}"
+
+
+def report(found: list[str]) -> None:
+    """Fail with every violation."""
+    if found:
+        pytest.fail(f"{len(found)}:\n" + "\n".join(sorted(found)), pytrace=False)
+
+
+def test_imports_have_no_circle():
+    """No module imports itself through others, imports inside functions counted."""
+    groups = circles(EDGES)
+    report(
+        [
+            f"{place(KNOWN[e.source], e.line)}: imports {e.target}, circle of {', '.join(group)}"
+            for group in groups
+            for e in EDGES
+            if e.source in group and e.target in group
+        ]
+    )
+
+
+def test_imports_run_one_way():
+    """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval."""
+    report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in upward(EDGES, KNOWN)])
+
+
+def private(name: str) -> bool:
+    """Whether a name is one module's own."""
+    return name.startswith("_") and not name.startswith("__")
+
+
+def test_private_names_stay_at_home():
+    """No module imports or reads another one's private names."""
+    found = []
+    for module in KNOWN.values():
+        for statement, _ in statements(module.tree):
+            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(PACKAGE):
+                names = [a.name for a in statement.names if private(a.name)]
+                found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
+        nodes = list(ast.walk(module.tree))
+        # Attributes that the file sets, methods that it defines: its own, on whatever they are read.
+        own = {n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
+        own |= {n.name for n in nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+        own |= {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        strangers = set()  # modules of other packages keep their own order
+        for statement, _ in statements(module.tree):
+            source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
+            for alias in statement.names:
+                if not (source or alias.name).startswith(PACKAGE):
+                    strangers.add((alias.asname or alias.name).split(".")[0])
+        inherited = {"_replace", "_asdict"}
+        for node in nodes:
+            if isinstance(node, ast.Attribute) and private(node.attr) and node.attr not in own | inherited:
+                base = ast.unparse(node.value).split(".")[0].split("(")[0]
+                if base not in strangers | {"self", "cls", "super"}:
+                    found.append(f"{place(module, node.lineno)}: {ast.unparse(node)}")
+    report(found)
+
+
+def signatures(tree: ast.Module) -> list[tuple[int, ast.expr]]:
+    """Line and annotation of every argument and answer."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            a = node.args
+            for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))):
+                if arg.annotation is not None:
+                    found.append((arg.lineno, arg.annotation))
+            if node.returns is not None:
+                found.append((node.lineno, node.returns))
+    return found
+
+
+def test_signatures_say_types():
+    """`Any` is in few signatures of the world, the policies and the evaluation, each for a reason."""
+    found = []
+    for module in KNOWN.values():
+        if module.room in (PACKAGE, "eval", "policies"):
+            for line, annotation in signatures(module.tree):
+                if re.search(r"\bAny\b", ast.unparse(annotation)):
+                    found.append((str(module.path.relative_to(ROOT)), place(module, line)))
+    report([where for file, where in found if file not in ANY])
+    assert len(found) <= MOST_ANY, f"{len(found)}:\n" + "\n".join(sorted(where for _, where in found))
+    assert not set(ANY) - {file for file, _ in found}, "no longer needed"
+
+
+def light() -> set[str]:
+    """The modules that a `--help` loads."""
+    following = collections.defaultdict(set)
+    for edge in EDGES:
+        if not edge.late:
+            following[edge.source].add(edge.target)
+    found: set[str] = set()
+    todo = [f"{PACKAGE}.{start}" for start in STARTS]
+    while todo:
+        name = todo.pop()
+        if name not in found:
+            found.add(name)
+            packages = [name.rsplit(".", n)[0] for n in range(1, name.count(".") + 1)]
+            todo += [*following[name], *(p for p in packages if p in KNOWN)]
+    return found
+
+
+def tops(statement: ast.Import | ast.ImportFrom) -> set[str]:
+    """Packages that a statement imports."""
+    names = [a.name for a in statement.names] if isinstance(statement, ast.Import) else [statement.module or ""]
+    return {name.split(".")[0] for name in names}
+
+
+def test_heavy_imports_stand_at_the_top():
+    """Only what a `--help` loads imports heavy libraries late; it imports none at its top."""
+    found, lights = [], light()
+    for module in KNOWN.values():
+        for statement, late in statements(module.tree):
+            for name in sorted(tops(statement) & HEAVY):
+                if not late and module.name in lights:
+                    found.append(f"{place(module, statement.lineno)}: {name} at the top of a module that --help loads")
+                if late and module.name not in lights | set(LATE) and name not in OPTIONAL:
+                    found.append(f"{place(module, statement.lineno)}: {name} inside a function")
+    report(found)
+    assert not set(LATE) - set(KNOWN), "no such module"
+
+
+def test_files_are_short():
+    """No file of the product or its tests is longer than one sitting."""
+    files = [m.path for m in KNOWN.values()] + sorted((ROOT / "tests").rglob("*.py"))
+    sizes = {str(path.relative_to(ROOT)): path.read_text().count("\n") for path in files}
+    report([f"{file}:{MOST_LINES}: {lines} lines" for file, lines in sizes.items() if lines > MOST_LINES])
+
+
+def test_a_stem_names_one_thing():
+    """Two modules have one name only where a table says why."""
+    homes = collections.defaultdict(list)
+    for module in KNOWN.values():
+        if not module.path.stem.startswith("__"):
+            homes[module.path.stem].append(module)
+    doubled = {stem: found for stem, found in homes.items() if len(found) > 1}
+    report([place(m, 1) for stem, found in doubled.items() if stem not in STEMS for m in found])
+    assert not set(STEMS) - set(doubled), "no longer needed"
+
+
+def test_a_class_name_names_one_thing():
+    """No public class name stands twice."""
+    homes = collections.defaultdict(list)
+    for module in KNOWN.values():
+        for node in module.tree.body:
+            if isinstance(node, ast.ClassDef) and not private(node.name):
+                homes[node.name].append(place(module, node.lineno))
+    # Interfaces name what they describe after it.
+    described = {"Judge", "Physics", "Policy", "Tracker"}
+    doubled = {name: found for name, found in homes.items() if len(found) > 1 + (name in described)}
+    report([f"{where}: {name}" for name, found in doubled.items() for where in found])
