@@ -1,11 +1,12 @@
 """The rule sets `paper` and `released`: assembled from the tasks, printed, hashed.
 
 `paper` is what the benchmark's paper says, made precise where it is silent; `released` is what its released code does.
-The numbers that belong to one task stand in that task's file, the common ones in `arena_newton.rules`.
+The numbers that belong to one task are in that task's file, the common ones in `arena_newton.rules`.
 """
 
 import dataclasses
 import functools
+import sys
 
 from arena_newton import tasks
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
@@ -19,7 +20,6 @@ def names() -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(ByRules))
 
 
-@functools.cache
 def get(name: str) -> RuleSet:
     """A rule set by name.
 
@@ -27,11 +27,16 @@ def get(name: str) -> RuleSet:
         InputError: Unknown name.
     """
     check_name(name)
+    return _assembled(name, tuple(tasks.get(task) for task in tasks.names()))
+
+
+@functools.lru_cache(maxsize=4)
+def _assembled(name: str, specs: tuple[tasks.TaskSpec, ...]) -> RuleSet:
     paper = name == "paper"
     return RuleSet(
         name=name,
         fall=FallRule(at_once=paper),
-        tasks=tuple(tasks.get(task).rules.of(name) for task in tasks.names()),
+        tasks=tuple(spec.rules.of(name) for spec in specs),
         navi_visual_room_swap=not paper,
         startup=StartupRule(ticks=50, prefill=True) if paper else StartupRule(ticks=0, prefill=False),
         original_drive=not paper,
@@ -75,6 +80,12 @@ def _placement_text(rules: RuleSet, placement: str) -> str:
     return ", ".join(found) or "none"
 
 
+def _mode_notes(rules: RuleSet, mode: str) -> list[tuple[str, str]]:
+    """Tasks in which a mode changes something in particular, and what this rule set says of it."""
+    notes = ((t.task, tasks.get(t.task).mode_notes.get(mode)) for t in rules.tasks)
+    return [(task, note.of(rules.name)) for task, note in notes if note is not None]
+
+
 def _light_text(rules: RuleSet) -> str:
     fixed = [t.task for t in rules.tasks if t.light is not None]
     text = "dome in base, execution and semantic"
@@ -113,19 +124,9 @@ def table(rules: RuleSet) -> list[tuple[str, str]]:
             if paper
             else "ranges as the released configuration has them",
         ),
-        (
-            "semantic football",
-            "texture-modified goal"
-            if rules.task("football").semantic_variant == "semantic"
-            else "texture-modified goal and a dynamic ball dropped beside the way (scene variant `semantic_released`)",
-        ),
+        *((f"semantic {task}", said) for task, said in _mode_notes(rules, "semantic")),
         ("lights", _light_text(rules)),
-        (
-            "vis_navi in visual mode",
-            "the original also swaps the room's asset; recorded here, the scene stays"
-            if rules.navi_visual_room_swap
-            else "light only",
-        ),
+        *((f"{task} in visual mode", said) for task, said in _mode_notes(rules, "visual")),
         ("start-up before step 0", _startup_text(rules.startup)),
         (
             "drive of official TWIST2 checkpoints",
@@ -249,6 +250,4 @@ def markdown() -> str:
 
 
 if __name__ == "__main__":
-    import sys
-
     sys.stdout.write(markdown())

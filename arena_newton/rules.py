@@ -1,7 +1,7 @@
 """What a rule set is made of: what counts as success and as a fall, how long an episode lasts, where objects are put.
 
 A rule set is frozen and hashed; its hash is stored with every result. No task is known here: the numbers that belong to
-one task stand in that task's file, `arena_newton.rule_sets` assembles them.
+one task are in that task's file, `arena_newton.rule_sets` assembles them.
 """
 
 import dataclasses
@@ -67,7 +67,7 @@ class CylinderRange:
 
 @dataclass(frozen=True)
 class ObjectRule:
-    """Where one randomised object may stand and how its sample becomes a world pose."""
+    """Where one randomised object may be put and how its sample becomes a world pose."""
 
     record: str
     """Name in the original's records, which seeds the object's generator."""
@@ -132,15 +132,19 @@ class LightRange:
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """Numbers of one task's predicate; each task derives its own and says them in words beside the predicate."""
+    """Numbers of one task's success condition; each task derives its own and says them in words."""
 
     def sentence(self) -> str:
-        """When an episode succeeds, with every number of this rule that the predicate reads."""
-        raise TypeError(f"{type(self).__name__} defines no sentence()")
+        """When an episode succeeds, with every number of this rule that the judge reads."""
+        raise NotImplementedError
 
     def notes(self) -> tuple[tuple[str, str], ...]:
-        """Further rows (item, what this rule says) beside the success condition."""
+        """Further rows (item, what this rule says) after the success condition."""
         return ()
+
+    def bounce(self) -> float | None:
+        """Coefficient of restitution of the scene's ball; None: the task has no ball."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -211,8 +215,8 @@ class RuleSet:
     fall: FallRule
     tasks: tuple[TaskRules, ...]
     navi_visual_room_swap: bool
-    """The original's released VisNavi visual configuration also exchanges the room's asset. No room of ours stands in
-    for that asset, so this records the difference and changes nothing in the scene."""
+    """The original's released visual mode also exchanges the room of one task. No room of ours replaces that asset, so
+    this records the difference, as part of the hash, and changes nothing in the scene."""
     startup: StartupRule
     original_drive: bool
     """Official TWIST2 checkpoints are driven by the gains of the original's robot asset instead of TWIST2's own."""
@@ -233,8 +237,13 @@ class RuleSet:
 
     @property
     def ball_restitution(self) -> float:
-        """Coefficient of restitution of Football's ball."""
-        return self.task("football").success.ball_restitution
+        """Coefficient of restitution of a ball in a scene that says none itself: the first task's that has a ball."""
+        return next(value for task in self.tasks if (value := task.success.bounce()) is not None)
+
+    def bounce(self, task: str) -> float:
+        """Coefficient of restitution of the ball in a task's scene, or in a scene of no task."""
+        own = next((entry.success.bounce() for entry in self.tasks if entry.task == task), None)
+        return self.ball_restitution if own is None else own
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, ready for JSON."""

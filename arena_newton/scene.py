@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton import robot as g1
+from arena_newton import tasks
 from arena_newton.errors import InputError
+from arena_newton.handles import BodyFrame, Latch, Marker, RobotHandles
+from arena_newton.tasks.base import SCENES
 
 if TYPE_CHECKING:
     from arena_newton.rules import RuleSet
 
 __all__ = [
-    "Frame",
-    "Latch",
-    "Marker",
-    "RobotHandles",
+    "SCENES",
     "Scene",
     "ball_solref",
     "load_scene",
@@ -33,7 +33,6 @@ __all__ = [
     "set_restitution",
 ]
 
-SCENES = Path(__file__).resolve().parent / "usd_scenes"
 ROBOT = "/World/Robot"
 BALL = "/World/Ball"
 BALL_SPRING = 0.025
@@ -59,72 +58,14 @@ LATCH_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Constraint impedance of the latch: at the default, the light handle softens it, 10 N·m turn the locked leaf 12°."""
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A pose fixed to a MuJoCo body (body 0 is the world)."""
-
-    body_id: int
-    """MuJoCo body index."""
-    pos: tuple[float, float, float]
-    """Position in the body's frame [m]."""
-    quat: tuple[float, float, float, float]
-    """Orientation in the body's frame, wxyz."""
-
-
-@dataclass(frozen=True)
-class Marker(Frame):
-    """An oriented box that a rule reads."""
-
-    half: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Half extents [m]."""
-    round: bool = False
-    """It marks the upright cylinder inscribed in the box (`arena:round`), for rules that tell the two apart."""
-
-
-@dataclass(frozen=True)
-class Latch:
-    """What locks a door's leaf until its handle is pressed."""
-
-    equality: int
-    """MuJoCo equality constraint that holds the leaf while it is active."""
-    handle_qpos: int
-    """Address of the handle's hinge in qpos."""
-    release_angle: float
-    """The latch releases once the handle is at or below this angle [rad]."""
-
-
-@dataclass(frozen=True)
-class RobotHandles:
-    """Addresses of the robot in the MuJoCo model."""
-
-    root_body: int
-    root_qpos: int
-    """First of the 7 root coordinates in qpos."""
-    root_qvel: int
-    """First of the 6 root velocities in qvel."""
-    joint_qpos: np.ndarray
-    """int32 [29], MuJoCo (TWIST2) order."""
-    joint_qvel: np.ndarray
-    """int32 [29], MuJoCo (TWIST2) order."""
-    joint_ctrl: np.ndarray
-    """int32 [29], MuJoCo (TWIST2) order."""
-    hand_qpos: np.ndarray
-    """int32 [14] left then right, or empty with fixed hands."""
-    hand_ctrl: np.ndarray
-    """int32 [14] left then right, or empty with fixed hands."""
-    bodies: tuple[int, ...] = ()
-    """MuJoCo body ids of every link."""
-    critical_bodies: tuple[int, ...] = ()
-    """Links that count for the fall rule's contact test."""
-
-
 def scene_path(task_or_path: str | Path) -> Path:
     """Path of the stage for a task name or a file.
 
     Raises:
         InputError: Neither a task's scene nor a readable file.
     """
-    built_in = SCENES / str(task_or_path) / "scene.usda"
+    name = str(task_or_path)
+    built_in = tasks.get(name).layer if name in tasks.names() else SCENES / name / "scene.usda"
     if built_in.is_file():
         return built_in
     path = Path(task_or_path)
@@ -252,9 +193,9 @@ class Scene:
             lowest = min(lowest, m.geom_pos[geom, 2] + upward @ centre - np.abs(upward) @ half)
         return float(lowest)
 
-    def frame(self, name_or_path: str) -> Frame:
+    def frame(self, name_or_path: str) -> BodyFrame:
         """A frame prim by path, or by its name under the robot, as a pose in the body that carries it."""
-        return Frame(*self._local_pose(self._find(name_or_path)))
+        return BodyFrame(*self._local_pose(self._find(name_or_path)))
 
     def marker(self, prim_path: str) -> Marker:
         """A marker prim as an oriented box in the body that carries it.
@@ -597,8 +538,8 @@ def load_scene(
     if latch is not None:
         scene.latch = _find_latch(scene, *latch)
     if rules is not None and scene.has_body(BALL):
-        scene.ball_restitution = rules.ball_restitution
-        set_restitution(scene, rules.ball_restitution, float(m.opt.timestep))
+        scene.ball_restitution = rules.bounce(str(task))
+        set_restitution(scene, scene.ball_restitution, float(m.opt.timestep))
     return scene
 
 

@@ -57,7 +57,7 @@ class BoxLike(Protocol):
 
 @dataclass(frozen=True)
 class Boxes:
-    """Oriented boxes on the device, one entry a marker."""
+    """Oriented boxes on the device, one entry per marker."""
 
     body: wp.array
     """Carrying body, 0 = world, int32, shape [boxes]."""
@@ -69,8 +69,8 @@ class Boxes:
     """Half extents [m], vec3, shape [boxes]."""
 
     @classmethod
-    def upload(cls, markers: Iterable[BoxLike], device: wp.DeviceLike = None) -> "Boxes":
-        """Copies markers to a device.
+    def from_boxes(cls, markers: Iterable[BoxLike], device: wp.DeviceLike = None) -> "Boxes":
+        """Boxes on a device.
 
         Args:
             markers: Objects with `body_id`, `pos` (3), `quat` (4, wxyz) and `half` (3).

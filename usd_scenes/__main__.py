@@ -64,14 +64,16 @@ def _new(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
+    from arena_newton import tasks
     from arena_newton.usd_scenes.build import FOLDER
-    from arena_newton.usd_scenes.validate import REQUIRED, differences, task_of, validate
+    from arena_newton.usd_scenes.validate import differences, task_of, validate
 
-    files = args.files or [name for name in REQUIRED if (FOLDER / name / "scene.usda").is_file()]
+    files = args.files or [name for name in tasks.names() if tasks.get(name).layer.is_file()]
     wrong = 0
     for name in files:
-        path = FOLDER / name / "scene.usda" if name in REQUIRED else Path(name)
-        problems, notes = validate(path, args.task), []
+        own_task = name if name in tasks.names() else None
+        path = tasks.get(name).layer if own_task else Path(name)
+        problems, notes = validate(path, args.task or own_task), []
         task = args.task or (None if problems else task_of(path))
         own = path.resolve().is_relative_to(FOLDER.resolve())
         if not problems and task is not None:
@@ -97,12 +99,11 @@ def _penetrations(path: Path, task: str) -> tuple[list["Problem"], list["Problem
 
 
 def _list(args: argparse.Namespace) -> int:
-    from arena_newton.usd_scenes.build import FOLDER
-    from arena_newton.usd_scenes.validate import REQUIRED
+    from arena_newton import tasks
 
-    for name in REQUIRED:
-        path = FOLDER / name / "scene.usda"
-        variants = sorted(p.stem for p in (FOLDER / name / "variants").glob("*.usda"))
+    for name in tasks.names():
+        path = tasks.get(name).layer
+        variants = sorted(p.stem for p in (path.parent / "variants").glob("*.usda"))
         state = path if path.is_file() else "not built"
         print(f"{name:12} {', '.join(['base', *variants]):36} {state}")
     return 0
@@ -111,13 +112,14 @@ def _list(args: argparse.Namespace) -> int:
 def _preview(args: argparse.Namespace) -> int:
     if args.size < 16:
         raise InputError(f"--size {args.size}: expected at least 16 pixels")
+    from arena_newton import tasks
+    from arena_newton.usd_scenes.dependencies import check_files
     from arena_newton.usd_scenes.preview import preview
-    from arena_newton.usd_scenes.validate import REQUIRED, check_files
 
     for target in args.targets:
-        if target not in REQUIRED:
+        if target not in tasks.names():
             check_files(target)
-    print(preview(args.targets or list(REQUIRED), args.out, args.size, args.mode))
+    print(preview(args.targets or list(tasks.names()), args.out, args.size, args.mode))
     return 0
 
 

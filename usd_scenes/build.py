@@ -1,18 +1,21 @@
-"""Build every layer of the project: textures, robot, one scene a task, and the lab."""
+"""Build every layer of the project: textures, robot, one scene per task, and the lab."""
 
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.validate import REQUIRED
 
-__all__ = ["FOLDER", "PARTS", "build_all"]
+__all__ = ["FOLDER", "build_all", "parts"]
 
 FOLDER = Path(__file__).resolve().parent
-"""Where the layers live in the project."""
-PARTS = ("textures", "g1", *REQUIRED, "lab")
-"""What can be built, in order."""
+"""Folder of the layers in the project."""
+
+
+def parts() -> tuple[str, ...]:
+    """What can be built, in order; a task that brings its own layer is not among them."""
+    return ("textures", "g1", *(name for name in tasks.names() if tasks.get(name).scene is None), "lab")
 
 
 def build_all(folder: Path = FOLDER, names: Sequence[str] = ()) -> list[Path]:
@@ -24,10 +27,10 @@ def build_all(folder: Path = FOLDER, names: Sequence[str] = ()) -> list[Path]:
         InputError: A name is no part.
     """
     for name in names:
-        if name not in PARTS:
-            raise InputError(f"unknown part {name!r}; parts are {', '.join(PARTS)}")
+        if name not in parts():
+            raise InputError(f"unknown part {name!r}; parts are {', '.join(parts())}")
     written = []
-    for name in names or PARTS:
+    for name in names or parts():
         target = folder / name
         target.mkdir(parents=True, exist_ok=True)
         if name == "textures":

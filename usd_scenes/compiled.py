@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from arena_newton import tasks
+
 if TYPE_CHECKING:
     from arena_newton.scene import Scene
 
 __all__ = ["Compiled", "Told", "compiled", "compiled_changes", "lost_contacts", "own_compiled", "release"]
 
-_SCENES = Path(__file__).resolve().parent
 _ROBOT = "/World/Robot"
 _GROUND = "Ground"
 """Name of the collider that every scene's robot stands on."""
@@ -209,10 +210,12 @@ def release() -> None:
     gc.collect()
 
 
-@functools.lru_cache(maxsize=4)
 def own_compiled(task: str, variant: str | None) -> Compiled:
     """The same of a task's own scene, which a process reads once."""
-    return compiled(_SCENES / task / "scene.usda", variant)
+    return _kept(tasks.get(task).layer, variant)
+
+
+_kept = functools.lru_cache(maxsize=4)(compiled)
 
 
 def _bodies(scene: Scene) -> Facts:

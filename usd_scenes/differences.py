@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.compiled import Told, compiled, compiled_changes, own_compiled, release
 from arena_newton.usd_scenes.shapes import open_stage
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["differences"]
 
-_SCENES = Path(__file__).resolve().parent
 _ROBOT = "/World/Robot"
 _MOST = 40
 """Sentences that are told; a scene with more is another scene."""
@@ -61,10 +61,7 @@ def differences(path: str | Path, task: str) -> list[str]:
     Raises:
         InputError: The layer cannot be composed or built, or there is no such task.
     """
-    from arena_newton.usd_scenes.validate import REQUIRED
-
-    built_in = _SCENES / task / "scene.usda"
-    if not built_in.is_file():
+    if task not in tasks.names() or not (built_in := tasks.get(task).layer).is_file():
         raise InputError(f"unknown task {task!r}: it has no scene")
     theirs, ours = open_stage(path), open_stage(built_in, checked=False)
     if Path(path).resolve() == built_in.resolve():
@@ -74,7 +71,7 @@ def differences(path: str | Path, task: str) -> list[str]:
     if own and own != _selection(ours):
         told[f"scene: selects the variant {own} by itself"] = None
         _select(ours, own)
-    needed = [item.path for item in REQUIRED[task]]
+    needed = [item.path for item in tasks.get(task).requires]
     for variant in ("base", "semantic"):
         selected = [own if own in _names(stage) else None for stage in (theirs, ours)]
         if variant != "base":

@@ -9,6 +9,8 @@ import numpy as np
 
 from arena_newton import robot as g1
 from arena_newton.errors import InputError
+from arena_newton.rules import LightRange
+from arena_newton.tasks.base import draw_light
 
 if TYPE_CHECKING:
     from arena_newton.scene import Scene
@@ -85,7 +87,7 @@ def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
     scene = load_scene(target, worlds=1, device="cpu", native=True, variant=_variant(target, mode))
     lights = WorldLights.allocate(1, scene.device, scene.stage)
     if mode == "visual":
-        lights.set(0, _light())
+        lights.set(0, draw_light(_LIGHT_SEED, LightRange()))
     state = _settled(scene)
     pictures = []
     for view, aspect in _VIEWS:
@@ -109,13 +111,6 @@ def _selected(target: str) -> str | None:
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
     return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None
-
-
-def _light() -> Any:
-    """Visual mode's light of one fixed seed; its ranges are the same for every task."""
-    from arena_newton import rule_sets, tasks
-
-    return tasks.get("football").draw(_LIGHT_SEED, "visual", rule_sets.get("paper")).light
 
 
 def _settled(scene: Scene) -> Any:

@@ -1,10 +1,11 @@
 """The first lines of a variant: a layer over a task's scene that may lie anywhere."""
 
+import os
 from pathlib import Path
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.dependencies import PACKAGE
-from arena_newton.usd_scenes.validate import REQUIRED
 
 __all__ = ["write"]
 
@@ -16,7 +17,7 @@ _TEXT = """#usda 1.0
     kilogramsPerUnit = 1
     upAxis = "Z"
     # Looked up in the installed package, so this file may lie anywhere.
-    subLayers = [@{package}{task}/scene.usda@]
+    subLayers = [@{scene}@]
 )
 
 over "World"
@@ -45,12 +46,14 @@ def write(task: str, path: str | Path) -> Path:
         InputError: Unknown task, another kind of file, or the file exists or cannot be written.
     """
     path = Path(path)
-    if task not in REQUIRED:
-        raise InputError(f"unknown task {task!r}; tasks are {', '.join(REQUIRED)}")
+    if task not in tasks.names():
+        raise InputError(f"unknown task {task!r}; tasks are {', '.join(tasks.names())}")
     if path.suffix != ".usda":
         raise InputError(f"{path}: expected a name that ends in .usda")
-    prims = "".join(f"    #   {item.path} ({item.kind})\n" for item in REQUIRED[task] if not item.variants)
-    text = _TEXT.format(task=task, package=PACKAGE, prims=prims, color=_light(task))
+    spec = tasks.get(task)
+    prims = "".join(f"    #   {item.path} ({item.kind})\n" for item in spec.requires if not item.variants)
+    scene = os.path.relpath(spec.scene, path.parent) if spec.scene else f"{PACKAGE}{task}/scene.usda"
+    text = _TEXT.format(task=task, scene=scene, prims=prims, color=_light(spec.layer))
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -61,11 +64,10 @@ def write(task: str, path: str | Path) -> Path:
     return path
 
 
-def _light(task: str) -> str:
+def _light(scene: Path) -> str:
     """Colour of the scene's light, as USD writes it."""
-    from arena_newton.usd_scenes.build import FOLDER
     from arena_newton.usd_scenes.shapes import open_stage
 
-    stage = open_stage(FOLDER / task / "scene.usda", checked=False)
+    stage = open_stage(scene, checked=False)
     color = stage.GetPrimAtPath("/World/Light").GetAttribute("inputs:color").Get()
     return f"({', '.join(f'{value:g}' for value in color)})"

@@ -1,17 +1,17 @@
 """Check a scene or variant layer, the project's own or a user's, before anything is built from it.
 
-`REQUIRED` is the one table of what each task needs; everything else follows from USD itself: units, mass and inertia
-of every rigid body, and that nothing is loaded from outside the folder tree or over a network.
+What a task needs is in `TaskSpec.requires`; everything else follows from USD itself: units, mass and inertia of every
+rigid body, and that nothing is loaded from outside the folder tree or over a network.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton import limits
+from arena_newton import limits, tasks
 from arena_newton.errors import InputError
+from arena_newton.tasks import Required
 from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
 from arena_newton.usd_scenes.dependencies import (
     Dependencies,
@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 __all__ = [
-    "REQUIRED",
     "Problem",
-    "Required",
     "check",
     "check_files",
     "differences",
@@ -39,17 +37,6 @@ __all__ = [
     "task_of",
     "validate",
 ]
-
-
-@dataclass(frozen=True)
-class Required:
-    """A prim that a task cannot do without."""
-
-    path: str
-    kind: str
-    """A key of `_KIND_WORDS`, which says what is expected."""
-    variants: tuple[str, ...] = ()
-    """Variants of `semantics` that need it; empty: all of them."""
 
 
 _FOLDER = Path(__file__).resolve().parent
@@ -60,58 +47,7 @@ COMMON = (
     Required("/World/WorldCamera", "camera"),
     Required("/World/Light", "light"),
 )
-
-REQUIRED: dict[str, tuple[Required, ...]] = {
-    "football": (
-        Required("/World/Ball", "body"),
-        Required("/World/Goal", "collider"),
-        Required("/World/Goal/Volume", "marker"),
-        Required("/World/Pitch", "marker"),
-        Required("/World/Distractor", "body", ("semantic_released",)),
-    ),
-    "double_desk": (
-        Required("/World/Hammer", "body"),
-        Required("/World/Basket", "fixture"),
-        Required("/World/Basket/Frame/Inside", "marker"),
-        Required("/World/RightDesk", "collider"),
-        Required("/World/LeftDesk", "collider"),
-        Required("/World/Sill", "collider"),
-    ),
-    "pp_box": (
-        Required("/World/Box", "body"),
-        Required("/World/Table", "collider"),
-        Required("/World/Shelf", "fixture"),
-        *(Required(f"/World/Shelf/Frame/{name}", "marker") for name in ("Deck_0", "Deck_1", "Deck_2", "Deck_3", "Top")),
-    ),
-    "open_door": (
-        Required("/World/Door", "fixture"),
-        Required("/World/Door/Frame/Doorway", "marker"),
-        Required("/World/Door/Leaf", "body"),
-        Required("/World/Door/Handle", "body"),
-        Required("/World/Door/LeafHinge", "latch"),
-        Required("/World/Door/HandleHinge", "hinge"),
-    ),
-    "sit_sofa": (
-        Required("/World/Sofa", "collider"),
-        Required("/World/Sofa/SeatCushion", "collider"),
-        Required("/World/Sofa/Seat", "marker"),
-        Required("/World/CoffeeTable", "collider"),
-        Required("/World/Carton_1", "body"),
-        Required("/World/Carton_2", "body"),
-    ),
-    "boxing": (
-        Required("/World/Bag_1", "collider"),
-        Required("/World/Bag_2", "collider"),
-        Required("/World/Target", "target"),
-        Required("/World/Target/Frame/Bounds", "marker"),
-    ),
-    "vis_navi": (
-        *(Required(f"/World/{name}_{letter}", "body") for name in ("Beam", "Block") for letter in "abc"),
-        Required("/World/TargetSign", "fixture"),
-        Required("/World/TargetSign/Frame/Zone", "marker"),
-    ),
-}
-"""What each task needs besides `COMMON`."""
+"""What every scene needs; `TaskSpec.requires` says what a task needs in addition."""
 
 
 def validate(path: str | Path, task: str | None = None) -> list[Problem]:
@@ -126,8 +62,8 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
     """
     from pxr import Tf, UsdUtils
 
-    if task is not None and task not in REQUIRED:
-        raise InputError(f"unknown task {task!r}; tasks are {', '.join(REQUIRED)}")
+    if task is not None and task not in tasks.names():
+        raise InputError(f"unknown task {task!r}; tasks are {', '.join(tasks.names())}")
     # Composition warnings repeat on stderr what is reported here; the delegate swallows them.
     silence = UsdUtils.CoalescingDiagnosticDelegate()
     try:
@@ -165,7 +101,7 @@ def _validate(file: Path, task: str | None) -> list[Problem]:
     task = task or _deduce(found.files)
     if task is None:
         problems.append(
-            Problem(str(file), "", f"cannot tell the task from the folders; pass --task ({', '.join(REQUIRED)})")
+            Problem(str(file), "", f"cannot tell the task from the folders; pass --task ({', '.join(tasks.names())})")
         )
     stage = Usd.Stage.Open(str(found.files[0]), search_context())
     problems += [*_units(stage, file), *_composition(stage, file)]
@@ -198,7 +134,7 @@ def _contacts(stage: "Usd.Stage", file: Path, found: Dependencies, task: str) ->
     for variant in dict.fromkeys((own, *sorted(choice.GetVariantNames()))):
         needed = [
             item.path
-            for item in REQUIRED[task]
+            for item in tasks.get(task).requires
             if item.kind in ("body", "fixture", "collider") and _wanted(item, variant or "base")
         ]
         try:
@@ -258,8 +194,8 @@ def _faults(stage: "Usd.Stage", task: str | None, variant: str) -> list[tuple[st
     if wrong:
         # The other tests read attributes as what they should be.
         return wrong
-    required = (_fault(stage, item) for item in (*COMMON, *(REQUIRED[task] if task else ())) if _wanted(item, variant))
-    missing = [fault for fault in required if fault]
+    needed = (*COMMON, *(tasks.get(task).requires if task else ()))
+    missing = [fault for item in needed if _wanted(item, variant) and (fault := _fault(stage, item))]
     return [*missing, *_masses(stage), *_selections(stage), *mesh_faults(stage), *shape_faults(stage)]
 
 
@@ -494,7 +430,7 @@ def _units(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
 def _deduce(files: list[Path]) -> str | None:
     """The one task among the names of the files' folders; the nearest file decides."""
     for file in files:
-        names = [part for part in reversed(file.parent.parts) if part in REQUIRED]
+        names = [part for part in reversed(file.parent.parts) if part in tasks.names()]
         if names:
             return names[0]
     return None

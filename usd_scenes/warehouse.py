@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
+from arena_newton.tasks.base import ROOM
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
@@ -27,10 +28,8 @@ __all__ = [
     "surface",
 ]
 
-FLOOR_X = (-7.2, 0.6)
-"""Extent of the room along x [m]."""
-FLOOR_Y = (-6.5, 5.2)
-"""Extent of the room along y [m]."""
+FLOOR_X, FLOOR_Y = zip(*ROOM, strict=True)
+"""Extent of the room along x and y [m]."""
 VARIANTS = ("base", "semantic")
 """Variants of these scenes; the first is selected."""
 _HEIGHT = 3.3

@@ -1,28 +1,58 @@
-"""The seven tasks: one file each."""
+"""The tasks: the paper's seven, one file each, and those that other packages register."""
 
-import functools
 import importlib
 
 from arena_newton.errors import InputError
-from arena_newton.tasks.base import Draws, Judge, LightDraw, ObjectSpec, Pose, TaskSpec
+from arena_newton.tasks.base import Draws, LightDraw, ObjectSpec, Pose, Required, TaskSpec
 
-__all__ = ["Draws", "Judge", "LightDraw", "ObjectSpec", "Pose", "TaskSpec", "get", "names"]
+__all__ = [
+    "Draws",
+    "LightDraw",
+    "ObjectSpec",
+    "Pose",
+    "Required",
+    "TaskSpec",
+    "get",
+    "names",
+    "register",
+    "unregister",
+]
 
 _NAMES = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
+_registered: dict[str, TaskSpec] = {}
 
 
 def names() -> tuple[str, ...]:
-    """Task names in the paper's order: three object tasks (HOI), four scene tasks (HSI)."""
-    return _NAMES
+    """Task names: the paper's in its order (three object tasks, four scene tasks), then those registered."""
+    return (*_NAMES, *_registered)
 
 
-@functools.cache
 def get(name: str) -> TaskSpec:
     """A task by name.
 
     Raises:
         InputError: Unknown task.
     """
+    if name in _registered:
+        return _registered[name]
     if name not in _NAMES:
-        raise InputError(f"--task {name}: unknown, choose from {', '.join(_NAMES)} or all")
+        raise InputError(f"--task {name}: unknown, choose from {', '.join(names())} or all")
     return importlib.import_module(f"arena_newton.tasks.{name}").TASK
+
+
+def register(spec: TaskSpec) -> None:
+    """Add a task in this process.
+
+    Raises:
+        InputError: The name is taken, or the task names no scene.
+    """
+    if spec.name in names() or spec.name == "all":
+        raise InputError(f"task {spec.name!r}: the name is taken; register yours under another name")
+    if spec.scene is None:
+        raise InputError(f"task {spec.name!r}: `scene` must name the layer of its scene")
+    _registered[spec.name] = spec
+
+
+def unregister(name: str) -> None:
+    """Remove a registered task; the paper's seven stay."""
+    _registered.pop(name, None)

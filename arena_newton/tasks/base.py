@@ -1,4 +1,4 @@
-"""What a task is: names, spawn, randomised objects, budgets and the judge that binds a built scene to a predicate.
+"""What a task is: one record of everything that the project knows about it.
 
 Drawing is pure: an episode's draws depend on its seed, its mode and the rule set, and on nothing else.
 """
@@ -6,12 +6,16 @@ Drawing is pure: an episode's draws depend on its seed, its mode and the rule se
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from arena_newton import seeding
 from arena_newton.errors import InputError
+from arena_newton.interfaces import Predicate
 from arena_newton.rules import (
     MODES,
     ByRules,
@@ -20,18 +24,33 @@ from arena_newton.rules import (
     LightRange,
     ObjectRule,
     PoseRange,
+    Range,
     RuleSet,
     SuccessRule,
     TaskRules,
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from arena_newton.physics import Physics
     from arena_newton.scene import Scene
+    from arena_newton.tasks.judge import Judge
 
-__all__ = ["DISTANT_LIGHT", "Draws", "Judge", "LightDraw", "ObjectSpec", "Overlap", "Pose", "TaskSpec", "widened"]
+__all__ = [
+    "DISTANT_LIGHT",
+    "LIFT",
+    "REACH",
+    "ROOM",
+    "SCENES",
+    "SUCCESS",
+    "TOUCH",
+    "Draws",
+    "LightDraw",
+    "ObjectSpec",
+    "Overlap",
+    "Pose",
+    "Required",
+    "TaskSpec",
+    "widened",
+]
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -41,15 +60,30 @@ IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 FACE_PLUS_Y: Quat = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 FACE_MINUS_Y: Quat = (math.sqrt(0.5), 0.0, 0.0, -math.sqrt(0.5))
 
-EXECUTION_SHARE = 1.45 / 1.2
+EXECUTION_WIDENING = 1.45 / 1.2
 """Football's execution range over its base range (±1.45 m over ±1.2 m): a range grows by 21 %."""
 
 DISTANT_LIGHT = FixedLight()
 """The distant light that two of the original's scenes carry in every mode."""
 
-
 SAME_HEIGHT = 1e-5
 """Difference of heights [m] that single precision makes."""
+
+SCENES = Path(__file__).resolve().parents[1] / "usd_scenes"
+"""Folder of the project's own scenes."""
+
+ROOM = ((-7.2, -6.5), (0.6, 5.2))
+"""Lower and upper corner (x, y) [m] of the warehouse room, in which OpenDoor, SitSofa, Boxing and VisNavi happen."""
+
+SUCCESS = Predicate("success", "the task's success condition holds")
+"""Last predicate of a task that names no other."""
+
+REACH = 0.8
+"""Distance of the root [m] from which a thing can be touched without a step: 0.6 m of arm, and a lean or a bend."""
+TOUCH = 0.08
+"""Distance of a palm's frame [m] to a thing that it holds or presses: the hand radius of Boxing's rule."""
+LIFT = 0.10
+"""Height [m] above its support from which a thing counts as lifted: more than tilting it on an edge gives."""
 
 
 @dataclass(frozen=True)
@@ -134,25 +168,25 @@ class ObjectSpec:
 
 
 def widened(bounds: tuple[float, float]) -> tuple[float, float]:
-    """A range about the same centre, wider by `EXECUTION_SHARE`."""
+    """A range about the same centre, wider by `EXECUTION_WIDENING`."""
     centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
-    return centre - half * EXECUTION_SHARE, centre + half * EXECUTION_SHARE
+    return centre - half * EXECUTION_WIDENING, centre + half * EXECUTION_WIDENING
 
 
 def paper_execution(base: PoseRange, original: PoseRange, void: bool) -> PoseRange:
     """Execution range under `paper`: the original's where that widens the base range, else the base range widened.
 
     An axis that the original leaves alone stays as it is. One that it shifts, or changes without effect, grows about
-    the base range by Football's share.
+    the base range by Football's factor.
     """
 
-    def axis(wanted: Any, given: Any) -> Any:
-        if given == wanted:
+    def axis(wanted: Range | None, given: Range | None) -> Range | None:
+        if given == wanted or given is None or wanted is None:
             return wanted
         contains = given[0] <= wanted[0] and given[1] >= wanted[1]
         return given if contains and not void else widened(wanted)
 
-    return PoseRange(*(axis(getattr(base, k), getattr(original, k)) for k in ("x", "y", "z", "yaw")))
+    return PoseRange(*(axis(getattr(base, k), getattr(original, k)) for k in ("x", "y", "z", "yaw")))  # type: ignore[arg-type]
 
 
 def draw_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
@@ -166,18 +200,20 @@ def sample_pose(rng: np.random.Generator, ranges: PoseRange, order: tuple[str, .
     return {k: draw_uniform(rng, getattr(ranges, k)) for k in order if getattr(ranges, k) is not None}
 
 
-def object_range(rule: ObjectRule, mode: str) -> Any:
-    """The range in force."""
+def object_range(rule: ObjectRule, mode: str) -> PoseRange | CylinderRange:
+    """The range that applies in a mode."""
     return rule.execution if mode == "execution" else rule.base
 
 
 def sample_objects(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:
     """Samples of every object, each from its own generator in the order yaw, x, y, z (original benchmark)."""
     master = seeding.object_seed(episode_seed)
-    return {
-        o.record: sample_pose(seeding.object_rng(master, o.record), object_range(o, mode), ("yaw", "x", "y", "z"))
-        for o in rules.objects
-    }
+    sampled = {}
+    for rule in rules.objects:
+        ranges = object_range(rule, mode)
+        assert isinstance(ranges, PoseRange)
+        sampled[rule.record] = sample_pose(seeding.object_rng(master, rule.record), ranges, ("yaw", "x", "y", "z"))
+    return sampled
 
 
 def yaw_quat(yaw: float) -> Quat:
@@ -251,76 +287,49 @@ class Overlap:
     """Which of the original's ranges meet."""
 
 
-class Judge:
-    """Success of every world, judged on the device once a tick.
+@dataclass(frozen=True)
+class Required:
+    """A prim that a task's scene must have."""
 
-    A subclass binds prim handles of a built scene to a kernel of `kernels.success`.
-    """
-
-    def __init__(self, scene: Scene):
-        """Allocate the outputs."""
-        import warp as wp
-
-        self.worlds = scene.worlds
-        self.device = wp.get_device(scene.device)
-        with wp.ScopedDevice(self.device):
-            self.success = wp.zeros(self.worlds, dtype=wp.int32)
-            """1 = success, shape [worlds]."""
-            self.margin = wp.zeros(self.worlds, dtype=wp.float32)
-            """Signed distance to success [m], at least 0 where the predicate holds at this instant, shape [worlds]."""
-            self.event = wp.zeros(self.worlds, dtype=wp.int32)
-            """0 nothing, 1 the ball left the field, shape [worlds]."""
-        self.counters: list[Any] = []
-        """int32 arrays [worlds] that a reset clears."""
-
-    def counter(self) -> Any:
-        """A new counter of ticks, cleared at reset, shape [worlds]."""
-        import warp as wp
-
-        self.counters.append(wp.zeros(self.worlds, dtype=wp.int32, device=self.device))
-        return self.counters[-1]
-
-    def outputs(self) -> dict[str, Any]:
-        """Keyword arguments that every kernel of `kernels.success` takes."""
-        return {"success": self.success, "margin": self.margin}
-
-    def bind(self, physics: Physics) -> None:
-        """Tell the physics what it must measure; called once before the first tick."""
-
-    def evaluate(self, physics: Physics) -> None:
-        """Fill `success`, `margin` and `event` for the state after this tick."""
-        raise TypeError("use TaskSpec.judge() for a task's judge")
-
-    def reset(self, mask: Any) -> None:
-        """Forget the past of some worlds.
-
-        Args:
-            mask: 1 = reset, int32 Warp array, shape [worlds].
-        """
-        from arena_newton.kernels import reset
-
-        for array in (*self.counters, self.success, self.event):
-            reset.launch_clear(mask, array)
+    path: str
+    kind: str
+    """What it must be: a key of the validator's table of kinds, such as `body`, `fixture`, `marker` or `collider`."""
+    variants: tuple[str, ...] = ()
+    """Variants of `semantics` that need it; empty: all of them."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TaskSpec:
-    """One task."""
+    """One task; everything that lists tasks or their parts reads it from here."""
 
     name: str
     gym_id: str
     """The original's id; it seeds episodes and is sent to remote policies, so its spelling matters."""
     instruction: str
+    suite: str | None = None
+    """Group of the paper's tables that averages it, `HOI` (human-object) or `HSI` (human-scene interaction); None: no
+    group, as of every task that is not the paper's."""
     spawn_position: Vec3
     """Robot root at spawn [m]."""
     spawn_quat: Quat
     """Robot root at spawn, wxyz."""
+    requires: tuple[Required, ...]
+    """Prims that its scene must have, besides robot, camera, light and physics scene."""
+    scene: Path | None = None
+    """Layer of its scene; None: `usd_scenes/<name>/scene.usda` of the project."""
     objects: tuple[ObjectSpec, ...]
     steps: ByRules[int]
     """Step budget [50 Hz ticks]."""
     success: ByRules[SuccessRule]
-    """The predicate's numbers and its sentence, one per rule set."""
-    make_judge: Callable[[Scene, RuleSet], Judge]
+    """The success condition's numbers and its sentence, one per rule set."""
+    judge: Callable[[Scene, RuleSet], Judge]
+    """Binds the success condition to a built scene; raises `InputError` where a prim or marker is missing."""
+    predicates: tuple[Predicate, ...] = (SUCCESS,)
+    """Steps on the way to success, in order; the last one is the success condition itself."""
+    events: Mapping[int, str] = field(default_factory=dict)
+    """The judge's event number → reason of the timeout that it causes."""
+    expert: str | None = None
+    """Class of its scripted expert as `module:attribute`; None: it has none."""
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
     overlaps: tuple[Overlap, ...] = ()
@@ -328,8 +337,13 @@ class TaskSpec:
     semantic_variant: ByRules[str] = field(default_factory=lambda: ByRules.same("semantic"))
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""
-    needs_forces: bool = False
-    """The predicate reads contact forces."""
+    mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)
+    """Mode → what it changes in this task in particular, in words, where the rule sets differ."""
+
+    @property
+    def layer(self) -> Path:
+        """The layer of its scene, which may not be built yet."""
+        return self.scene or SCENES / self.name / "scene.usda"
 
     @property
     def rules(self) -> ByRules[TaskRules]:
@@ -376,14 +390,6 @@ class TaskSpec:
         elif own.light is not None:
             light = LightDraw(light_direction(0.0, 0.0, 0.0), own.light.intensity, own.light.color)
         return Draws(sampled, placed, light)
-
-    def judge(self, scene: Scene, rules: RuleSet) -> Judge:
-        """The task's judge over a built scene.
-
-        Raises:
-            InputError: The scene misses a prim or marker that the predicate reads; the message names it.
-        """
-        return self.make_judge(scene, rules)
 
 
 def _check_mode(mode: str) -> None:

@@ -4,25 +4,45 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import warp as wp
 
 from arena_newton import seeding
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
 from arena_newton.rules import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
-from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, Sample, TaskSpec, draw_uniform, object_range
+from arena_newton.tasks.base import (
+    FACE_MINUS_Y,
+    REACH,
+    ObjectSpec,
+    Required,
+    Sample,
+    TaskSpec,
+    draw_uniform,
+    object_range,
+)
+from arena_newton.tasks.judge import PALMS, Judge, links, near, palms
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
     from arena_newton.scene import Scene
 
-__all__ = ["TASK", "BoxingJudge", "BoxingRule"]
+__all__ = ["PALMS", "TASK", "BoxingJudge", "BoxingRule"]
 
 TARGET = "/World/Target"
-PALMS = ("left_hand_palm_link", "right_hand_palm_link")
+BOUNDS = f"{TARGET}/Frame/Bounds"
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the target, seen from above"),
+    Predicate("contact", "a palm is at the target, as the rule set says"),
+)
 
 
 @dataclass(frozen=True)
 class BoxingRule(SuccessRule):
-    """Numbers of the predicate; the target's bounding radius comes from the marker `Target/Frame/Bounds`."""
+    """Numbers of the success condition; the target's bounding radius comes from the marker `Target/Frame/Bounds`."""
 
     min_radius: float
     """A target with a smaller bounding radius counts as this large [m]."""
@@ -41,21 +61,17 @@ class BoxingJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind target and palms."""
-        import warp as wp
-
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
+        target, hands = scene.marker(BOUNDS), palms(scene)
+        super().__init__(
+            scene, PREDICATES, {"approach": [near(links(scene, "pelvis"), target, REACH, horizontal=True)]}
+        )
         self.rule: BoxingRule = rules.task("boxing").success
-        palms = [scene.frame(name) for name in PALMS]
-        self.palm_body: Any = wp.array([p.body_id for p in palms], dtype=wp.int32, device=self.device)
-        self.palm_offset: Any = wp.array([wp.vec3(*p.pos) for p in palms], dtype=wp.vec3, device=self.device)
-        self.target = Boxes.upload([scene.marker(f"{TARGET}/Frame/Bounds")], self.device)
+        self.palm_body: wp.array = wp.array([p.body_id for p in hands], dtype=wp.int32, device=self.device)
+        self.palm_offset: wp.array = wp.array([wp.vec3(*p.pos) for p in hands], dtype=wp.vec3, device=self.device)
+        self.target = Boxes.from_boxes([target], self.device)
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         success.launch_boxing(
             physics.xpos,
             physics.xquat,
@@ -71,7 +87,8 @@ class BoxingJudge(Judge):
 def sample_target(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:
     """One generator draws bag, azimuth and height, in this order."""
     (rule,) = rules.objects
-    ranges: CylinderRange = object_range(rule, mode)
+    ranges = object_range(rule, mode)
+    assert isinstance(ranges, CylinderRange)
     rng = seeding.object_rng(seeding.object_seed(episode_seed), rule.record)
     bag = int(rng.integers(len(ranges.centers)))
     azimuth = draw_uniform(rng, ranges.azimuth)
@@ -87,8 +104,15 @@ TASK = TaskSpec(
     name="boxing",
     gym_id="Isaac-Move-Boxing-Bag-G129-Dex3-Wholebody",
     instruction="Strike the green markers on the punching bag.",
+    suite="HSI",
     spawn_position=(-1.6, -2.0, 0.8),
     spawn_quat=FACE_MINUS_Y,
+    requires=(
+        Required("/World/Bag_1", "collider"),
+        Required("/World/Bag_2", "collider"),
+        Required(TARGET, "target"),
+        Required(BOUNDS, "marker"),
+    ),
     objects=(
         ObjectSpec(
             record="boxing_target",
@@ -99,6 +123,8 @@ TASK = TaskSpec(
     ),
     steps=ByRules(paper=1500, released=900),
     success=ByRules(paper=BoxingRule(min_radius=0.0), released=BoxingRule(min_radius=0.10)),
-    make_judge=BoxingJudge,
+    judge=BoxingJudge,
+    predicates=PREDICATES,
+    expert="arena_newton.policies.experts.boxing:BoxingExpert",
     sample=sample_target,
 )

@@ -6,8 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
+from arena_newton.handles import BodyFrame
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, Judge, ObjectSpec, TaskSpec
+from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.judge import Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
@@ -17,11 +22,25 @@ __all__ = ["TASK", "DoubleDeskJudge", "DoubleDeskRule"]
 
 HAMMER = "/World/Hammer"
 BASKET = "/World/Basket"
+INSIDE = f"{BASKET}/Frame/Inside"
+RIGHT_DESK = "/World/RightDesk"
+
+OVER_CRATE = 0.3
+"""Distance to the crate, seen from above [m], from which a lifted hammer counts as carried over: the desks are 2.5 m
+apart, so that the robot stands at the left one."""
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the hammer, seen from above"),
+    Predicate("contact", f"a palm within {num(TOUCH)} m of the hammer's bounding box"),
+    Predicate("lift", f"the hammer's centre of mass {num(LIFT)} m above the right desk"),
+    Predicate("transport", f"so high, and within {num(OVER_CRATE)} m of the crate, seen from above"),
+    Predicate("place", "the hammer is in the crate, as the rule set says"),
+)
 
 
 @dataclass(frozen=True)
 class DoubleDeskRule(SuccessRule):
-    """Numbers of the predicate; the crate's box is the marker `Basket/Frame/Inside` of the stage."""
+    """Numbers of the success condition; the crate's box is the marker `Basket/Frame/Inside` of the stage."""
 
     crate_frame: bool
     """True: the box turns with the crate. False: the world-axis box around the turned crate."""
@@ -52,17 +71,25 @@ class DoubleDeskJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind hammer and crate."""
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
         self.rule: DoubleDeskRule = rules.task("double_desk").success
         self.hammer = scene.body_id(HAMMER)
-        self.inside = Boxes.upload([scene.marker(f"{BASKET}/Frame/Inside")], self.device)
+        inside, hammer = scene.marker(INSIDE), bounding_box(scene, HAMMER)
+        mass = BodyFrame(self.hammer, tuple(scene.mj_model.body_ipos[self.hammer]), IDENTITY)
+        lifted = above(mass, top(scene, RIGHT_DESK) + LIFT)
+        super().__init__(
+            scene,
+            PREDICATES,
+            {
+                "approach": [near(links(scene, "pelvis"), hammer, REACH, horizontal=True)],
+                "contact": [near(palms(scene), hammer, TOUCH)],
+                "lift": [lifted],
+                "transport": [lifted, near([mass], inside, OVER_CRATE, horizontal=True)],
+            },
+        )
+        self.inside = Boxes.from_boxes([inside], self.device)
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         state = (physics.xpos, physics.xquat, physics.xipos)
         common = {"hammer_body": self.hammer, "inside": self.inside, **self.outputs()}
         if self.rule.min_z is None:
@@ -75,8 +102,17 @@ TASK = TaskSpec(
     name="double_desk",
     gym_id="Isaac-Move-PickPlace-DoubleDesk-G129-Dex3-Wholebody",
     instruction="Put the hammer from the right table into the basket on the left table.",
+    suite="HOI",
     spawn_position=(-3.7, -2.2, 0.8),
     spawn_quat=IDENTITY,
+    requires=(
+        Required(HAMMER, "body"),
+        Required(BASKET, "fixture"),
+        Required(INSIDE, "marker"),
+        Required(RIGHT_DESK, "collider"),
+        Required("/World/LeftDesk", "collider"),
+        Required("/World/Sill", "collider"),
+    ),
     objects=(
         ObjectSpec(
             record="hammer",
@@ -101,6 +137,7 @@ TASK = TaskSpec(
         paper=DoubleDeskRule(crate_frame=True, min_z=None),
         released=DoubleDeskRule(crate_frame=False, min_z=0.445),
     ),
-    make_judge=DoubleDeskJudge,
+    judge=DoubleDeskJudge,
+    predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
 )

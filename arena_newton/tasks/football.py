@@ -5,8 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from arena_newton.handles import BodyFrame
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.kernels.predicates import TOWARD
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
+from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
@@ -17,11 +23,26 @@ __all__ = ["TASK", "FootballJudge", "FootballRule"]
 BALL = "/World/Ball"
 GOAL = "/World/Goal/Volume"
 PITCH = "/World/Pitch"
+FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
+
+TOE = (0.12, 0.0, -0.02)
+"""Front of a foot in its ankle link [m]: the sole ends 0.14 m ahead of it."""
+KICK = 0.06
+"""Distance of a toe to the ball's bounding box [m] that counts as contact: half a foot's width, and some motion."""
+ROLLING = 0.5
+"""Speed toward the goal [m/s] that tells a kicked ball from one that a passing foot brushed."""
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the ball, seen from above"),
+    Predicate("contact", f"a toe within {num(KICK)} m of the ball's bounding box"),
+    Predicate("transport", f"the ball moves toward the goal's centre with at least {num(ROLLING)} m/s"),
+    Predicate("goal", "the ball is in the goal, as the rule set says"),
+)
 
 
 @dataclass(frozen=True)
 class FootballRule(SuccessRule):
-    """Numbers of the predicate; the goal's box itself is the marker `Goal/Volume` of the stage."""
+    """Numbers of the success condition; the goal's box itself is the marker `Goal/Volume` of the stage."""
 
     rear_bound: bool
     """Whether a ball behind the net no longer counts."""
@@ -48,24 +69,35 @@ class FootballRule(SuccessRule):
             ("ball restitution", num(self.ball_restitution)),
         )
 
+    def bounce(self) -> float:
+        """See `SuccessRule.bounce`."""
+        return self.ball_restitution
+
 
 class FootballJudge(Judge):
     """The ball's centre in the goal's box."""
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind ball, goal and pitch."""
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
         self.rule: FootballRule = rules.task("football").success
         self.ball = scene.body_id(BALL)
-        self.goal = Boxes.upload([scene.marker(GOAL)], self.device)
-        self.pitch = Boxes.upload([scene.marker(PITCH)], self.device)
+        ball, goal = BodyFrame(self.ball, (0.0, 0.0, 0.0), IDENTITY), scene.marker(GOAL)
+        surface, speed = bounding_box(scene, BALL), scene.joint_qvel(BALL)
+        toes = [BodyFrame(foot.body_id, TOE, IDENTITY) for foot in links(scene, *FEET)]
+        super().__init__(
+            scene,
+            PREDICATES,
+            {
+                "approach": [near(links(scene, "pelvis"), surface, REACH, horizontal=True)],
+                "contact": [near(toes, surface, KICK)],
+                "transport": [Condition(TOWARD, ROLLING, (ball,), (goal,), horizontal=True, address=speed)],
+            },
+        )
+        self.goal = Boxes.from_boxes([goal], self.device)
+        self.pitch = Boxes.from_boxes([scene.marker(PITCH)], self.device)
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         success.launch_football(
             physics.xpos,
             physics.xquat,
@@ -84,8 +116,16 @@ TASK = TaskSpec(
     name="football",
     gym_id="Isaac-Move-Football-Single-G129-Dex3-Wholebody",
     instruction="Kick the soccer ball into the goal.",
+    suite="HOI",
     spawn_position=(0.0, -2.0, 0.8),
     spawn_quat=FACE_PLUS_Y,
+    requires=(
+        Required(BALL, "body"),
+        Required("/World/Goal", "collider"),
+        Required(GOAL, "marker"),
+        Required(PITCH, "marker"),
+        Required("/World/Distractor", "body", ("semantic_released",)),
+    ),
     objects=(
         ObjectSpec(
             record="football",
@@ -100,6 +140,15 @@ TASK = TaskSpec(
         paper=FootballRule(rear_bound=True, ball_out=True, ball_restitution=0.1),
         released=FootballRule(rear_bound=False, ball_out=False, ball_restitution=0.75),
     ),
-    make_judge=FootballJudge,
+    judge=FootballJudge,
+    predicates=PREDICATES,
+    events={1: "ball_out"},
     semantic_variant=ByRules(paper="semantic", released="semantic_released"),
+    mode_notes={
+        "semantic": ByRules(
+            paper="texture-modified goal",
+            released="texture-modified goal and a dynamic ball dropped beside the way (scene variant "
+            "`semantic_released`)",
+        )
+    },
 )

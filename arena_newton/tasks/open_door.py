@@ -6,8 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.kernels.predicates import ANGLE, UNLATCHED
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import FACE_PLUS_Y, Judge, ObjectSpec, TaskSpec
+from arena_newton.tasks.base import FACE_PLUS_Y, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, palms
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
@@ -16,6 +21,18 @@ if TYPE_CHECKING:
 __all__ = ["TASK", "DoorOpenRule", "DoorPassedRule", "OpenDoorJudge"]
 
 DOOR = "/World/Door"
+DOORWAY, LEAF, HANDLE = f"{DOOR}/Frame/Doorway", f"{DOOR}/LeafHinge", f"{DOOR}/Handle"
+
+OPEN_DEG = 60.0
+"""Angle of an open leaf [deg]: what the original's code asks for."""
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the doorway, seen from above"),
+    Predicate("contact", f"a palm within {num(TOUCH)} m of the handle's bounding box"),
+    Predicate("unlatch", "the pressed handle has released the latch"),
+    Predicate("open", f"the leaf is open by at least {num(OPEN_DEG)}°"),
+    Predicate("pass", "the rule set's condition: `paper` through the frame's plane, `released` leaf open; standing"),
+)
 
 
 @dataclass(frozen=True)
@@ -39,7 +56,7 @@ class DoorPassedRule(SuccessRule):
 class DoorOpenRule(SuccessRule):
     """The latch is released, the leaf is open and the robot stands."""
 
-    min_leaf_deg: float = 60.0
+    min_leaf_deg: float = OPEN_DEG
     """[deg]."""
 
     def sentence(self) -> str:
@@ -52,19 +69,24 @@ class OpenDoorJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind doorway, leaf, handle and root."""
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
+        doorway, self.leaf = scene.marker(DOORWAY), scene.joint_qpos(LEAF)
+        super().__init__(
+            scene,
+            PREDICATES,
+            {
+                "approach": [near(links(scene, "pelvis"), doorway, REACH, horizontal=True)],
+                "contact": [near(palms(scene), bounding_box(scene, HANDLE), TOUCH)],
+                "unlatch": [Condition(UNLATCHED)],
+                "open": [Condition(ANGLE, math.radians(OPEN_DEG), address=self.leaf)],
+            },
+        )
         self.rule: DoorPassedRule | DoorOpenRule = rules.task("open_door").success
         self.standing = rules.standing
         self.root = scene.robot.root_qpos
-        self.leaf = scene.joint_qpos(f"{DOOR}/LeafHinge")
-        self.doorway = Boxes.upload([scene.marker(f"{DOOR}/Frame/Doorway")], self.device)
+        self.doorway = Boxes.from_boxes([doorway], self.device)
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         common = {
             "root_qpos_adr": self.root,
             "stand_height": self.standing.min_root_z,
@@ -95,8 +117,17 @@ TASK = TaskSpec(
     name="open_door",
     gym_id="Isaac-Move-Open-Door-G129-Dex3-Wholebody",
     instruction="Open the door.",
+    suite="HSI",
     spawn_position=(-1.6, 0.2, 0.8),
     spawn_quat=FACE_PLUS_Y,
+    requires=(
+        Required(DOOR, "fixture"),
+        Required(DOORWAY, "marker"),
+        Required(f"{DOOR}/Leaf", "body"),
+        Required(HANDLE, "body"),
+        Required(LEAF, "latch"),
+        Required(f"{DOOR}/HandleHinge", "hinge"),
+    ),
     objects=(
         ObjectSpec(
             record="door",
@@ -109,5 +140,6 @@ TASK = TaskSpec(
     ),
     steps=ByRules.same(1800),
     success=ByRules(paper=DoorPassedRule(), released=DoorOpenRule()),
-    make_judge=OpenDoorJudge,
+    judge=OpenDoorJudge,
+    predicates=PREDICATES,
 )

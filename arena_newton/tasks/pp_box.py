@@ -2,26 +2,47 @@
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from arena_newton.errors import InputError
+from arena_newton.handles import BodyFrame, Marker
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.kernels.predicates import CLEAR, NEAR
 from arena_newton.robot import TICK
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, Judge, ObjectSpec, TaskSpec
+from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.judge import Condition, Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
-    from arena_newton.scene import Marker, Scene
+    from arena_newton.scene import Scene
 
 __all__ = ["TASK", "PPBoxAnyDeckRule", "PPBoxJudge", "PPBoxOneDeckRule"]
 
 BOX = "/World/Box"
+TABLE = "/World/Table"
 SHELF = "/World/Shelf"
 DECKS = tuple(f"{SHELF}/Frame/{name}" for name in ("Deck_0", "Deck_1", "Deck_2", "Deck_3", "Top"))
+
+
+OVER_SHELF = 0.05
+"""Distance of a lifted box's centre to a deck, seen from above [m], from which it is carried over: its edge, 0.105 m
+ahead, is then over the deck. On the table it starts 0.17 m away at the least."""
+ON_DECK = 0.06
+"""Largest distance of the box's bottom to a deck [m]: the tolerance of both rule sets."""
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the box, seen from above"),
+    Predicate("contact", f"a palm within {num(TOUCH)} m of the box"),
+    Predicate("lift", f"the box's bottom {num(LIFT)} m above the table"),
+    Predicate("transport", f"the box's centre within {num(OVER_SHELF)} m of the shelf's decks, seen from above"),
+    Predicate("place", f"the box's centre over a deck, its bottom within {num(ON_DECK)} m of it"),
+    Predicate("release", f"so placed, and no palm within {num(TOUCH)} m of the box"),
+    Predicate("hold", "the box stays on the shelf, as the rule set says"),
+)
 
 
 @dataclass(frozen=True)
@@ -61,31 +82,11 @@ class PPBoxOneDeckRule(SuccessRule):
         )
 
 
-def collider(scene: Scene, prim: str) -> Marker:
-    """The box around all collision geometry of a rigid prim, along the axes of its body.
-
-    Raises:
-        InputError: The prim is no rigid body or holds no collision geometry.
-    """
-    import mujoco
-
-    from arena_newton.scene import Marker
-
-    m, body = scene.mj_model, scene.body_id(prim)
-    corners = []
-    for geom in scene.geom_ids(prim):
-        if m.geom_bodyid[geom] != body or not (m.geom_contype[geom] or m.geom_conaffinity[geom]):
-            continue
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, m.geom_quat[geom])
-        centre, half = m.geom_aabb[geom, :3], m.geom_aabb[geom, 3:]
-        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-        corners.append(m.geom_pos[geom] + (centre + signs * half) @ turn.reshape(3, 3).T)
-    if not corners:
-        raise InputError(f"{scene.path}: prim {prim} holds no collision geometry")
-    points = np.concatenate(corners)
-    low, high = points.min(axis=0), points.max(axis=0)
-    return Marker(body, tuple(0.5 * (low + high)), (1.0, 0.0, 0.0, 0.0), tuple(0.5 * (high - low)))
+def on_deck(deck: Marker, half: float) -> Marker:
+    """Where the centre of a box of half height `half` [m] is while it stands on a deck."""
+    x, y, z = deck.pos
+    height = z + deck.half[2] + half
+    return dataclasses.replace(deck, pos=(x, y, height), half=(deck.half[0], deck.half[1], ON_DECK))
 
 
 class PPBoxJudge(Judge):
@@ -93,19 +94,30 @@ class PPBoxJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind box and decks."""
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
         self.rule: PPBoxAnyDeckRule | PPBoxOneDeckRule = rules.task("pp_box").success
-        self.box = Boxes.upload([collider(scene, BOX)], self.device)
+        box, decks = bounding_box(scene, BOX), tuple(scene.marker(path) for path in DECKS)
+        centre, half = BodyFrame(box.body_id, box.pos, IDENTITY), box.half[2]
+        bottom = BodyFrame(box.body_id, (box.pos[0], box.pos[1], box.pos[2] - half), IDENTITY)
+        placed = Condition(NEAR, 0.0, (centre,), tuple(on_deck(deck, half) for deck in decks))
+        super().__init__(
+            scene,
+            PREDICATES,
+            {
+                "approach": [near(links(scene, "pelvis"), box, REACH, horizontal=True)],
+                "contact": [near(palms(scene), box, TOUCH)],
+                "lift": [above(bottom, top(scene, TABLE) + LIFT)],
+                "transport": [near([centre], decks[0], OVER_SHELF, horizontal=True)],
+                "place": [placed],
+                "release": [placed, Condition(CLEAR, TOUCH, palms(scene), (box,))],
+            },
+        )
+        self.box = Boxes.from_boxes([box], self.device)
         self.box_qvel = scene.joint_qvel(BOX)
-        self.decks = Boxes.upload([scene.marker(path) for path in DECKS], self.device)
+        self.decks = Boxes.from_boxes(decks, self.device)
         self.slow = self.counter()
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         common = {"box": self.box, "decks": self.decks, **self.outputs()}
         if isinstance(self.rule, PPBoxAnyDeckRule):
             success.launch_pp_box_paper(
@@ -135,8 +147,15 @@ TASK = TaskSpec(
     name="pp_box",
     gym_id="Isaac-Move-PickPlace-Box-G129-Dex3-Wholedoby",
     instruction="Move the box from the table onto the shelf.",
+    suite="HOI",
     spawn_position=(-1.6, -5.0, 0.8),
     spawn_quat=IDENTITY,
+    requires=(
+        Required(BOX, "body"),
+        Required(TABLE, "collider"),
+        Required(SHELF, "fixture"),
+        *(Required(deck, "marker") for deck in DECKS),
+    ),
     objects=(
         ObjectSpec(
             record="box",
@@ -155,6 +174,7 @@ TASK = TaskSpec(
     ),
     steps=ByRules(paper=2000, released=1450),
     success=ByRules(paper=PPBoxAnyDeckRule(), released=PPBoxOneDeckRule()),
-    make_judge=PPBoxJudge,
+    judge=PPBoxJudge,
+    predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
 )

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import warp as wp
+
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.kernels.predicates import AWAY, MARGIN
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import FACE_MINUS_Y, Judge, ObjectSpec, Overlap, TaskSpec, widened
+from arena_newton.tasks.base import FACE_MINUS_Y, REACH, ObjectSpec, Overlap, Required, TaskSpec, widened
+from arena_newton.tasks.judge import Condition, Judge, links, near
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
@@ -16,6 +23,17 @@ __all__ = ["TASK", "SeatPressedRule", "SeatTouchedRule", "SitSofaJudge"]
 
 SEAT = "/World/Sofa/Seat"
 CUSHION = "/World/Sofa/SeatCushion"
+CARTONS = ("/World/Carton_1", "/World/Carton_2")
+
+TURNED = 0.7071
+"""Cosine of 45°: how far from straight the robot's back may point at the seat and still sit down on it."""
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the seat, seen from above"),
+    Predicate("turn", "so near, with the back to the seat's centre within 45°"),
+    Predicate("contact", "the rule set's condition holds at this tick"),
+    Predicate("sit", "for as long as the rule set asks"),
+)
 
 _HIPS = tuple(f"{side}_hip_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll", "yaw"))
 PRESSING_LINKS = ("pelvis", *_HIPS)
@@ -70,19 +88,25 @@ class SitSofaJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind seat, cushion and links."""
-        import warp as wp
-
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
+        root, seat = links(scene, "pelvis"), scene.marker(SEAT)
+        approached = near(root, seat, REACH, horizontal=True)
+        super().__init__(
+            scene,
+            PREDICATES,
+            {
+                "approach": [approached],
+                "turn": [approached, Condition(AWAY, TURNED, root, (seat,), horizontal=True)],
+                "contact": [Condition(MARGIN)],
+            },
+        )
         self.rule: SeatPressedRule | SeatTouchedRule = rules.task("sit_sofa").success
         self.root = scene.robot.root_qpos
-        self.seat = Boxes.upload([scene.marker(SEAT)], self.device)
+        self.seat = Boxes.from_boxes([seat], self.device)
         self.cushion_geoms = scene.geom_ids(CUSHION)
         pressing = {scene.link(name) for name in PRESSING_LINKS}
         self.pressing_geoms = [g for g, b in enumerate(scene.mj_model.geom_bodyid) if int(b) in pressing]
         touching = [scene.link(name) for name in TOUCHING_LINKS]
-        self.touching: Any = wp.array(touching, dtype=wp.int32, device=self.device)
+        self.touching: wp.array = wp.array(touching, dtype=wp.int32, device=self.device)
         self.seated = self.counter()
         self._bound: Physics | None = None
 
@@ -96,10 +120,8 @@ class SitSofaJudge(Judge):
             physics.want_forces = True
         self._bound = physics
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         self.bind(physics)
         if isinstance(self.rule, SeatPressedRule):
             success.launch_sit_sofa_paper(
@@ -126,15 +148,22 @@ class SitSofaJudge(Judge):
             )
 
 
-CARTONS = ("/World/Carton_1", "/World/Carton_2")
 _NEAR = "carton_obstacle_01 begins at y 0.6 m, carton_obstacle_02 ends at y 0.4 m, and both are 0.42 m wide"
 
 TASK = TaskSpec(
     name="sit_sofa",
     gym_id="Isaac-Move-Sit-Sofa-G129-Dex3-Wholebody",
     instruction="Sit on the sofa.",
+    suite="HSI",
     spawn_position=(-1.6, 2.0, 0.8),
     spawn_quat=FACE_MINUS_Y,
+    requires=(
+        Required("/World/Sofa", "collider"),
+        Required(CUSHION, "collider"),
+        Required(SEAT, "marker"),
+        Required("/World/CoffeeTable", "collider"),
+        *(Required(carton, "body") for carton in CARTONS),
+    ),
     objects=(
         ObjectSpec(
             record="carton_obstacle_01",
@@ -157,7 +186,8 @@ TASK = TaskSpec(
     ),
     steps=ByRules(paper=1050, released=2000),
     success=ByRules(paper=SeatPressedRule(), released=SeatTouchedRule()),
-    make_judge=SitSofaJudge,
+    judge=SitSofaJudge,
+    predicates=PREDICATES,
     overlaps=(
         Overlap(*CARTONS, ("paper", "released"), ("base", "semantic", "visual"), 14, 0.187, _NEAR),
         Overlap(*CARTONS, ("paper",), ("execution",), 13, 0.235, _NEAR),
@@ -171,5 +201,4 @@ TASK = TaskSpec(
             "carton_obstacle_02 begins at x −2.4 m, its side at −2.61 m, and the table ends at −2.54 m",
         ),
     ),
-    needs_forces=True,
 )

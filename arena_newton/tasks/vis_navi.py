@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
 from arena_newton import seeding
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import success
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
     FACE_PLUS_Y,
-    Judge,
+    REACH,
     ObjectSpec,
     Overlap,
+    Required,
     Sample,
     TaskSpec,
     object_range,
     sample_pose,
 )
+from arena_newton.tasks.judge import Judge, links, near
 
 if TYPE_CHECKING:
     from arena_newton.physics import Physics
@@ -27,7 +33,15 @@ if TYPE_CHECKING:
 __all__ = ["TASK", "VisNaviJudge", "VisNaviRule"]
 
 SIGN = "/World/TargetSign"
+ZONE = f"{SIGN}/Frame/Zone"
 FEET = tuple(f"{side}_ankle_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll"))
+
+
+PREDICATES = (
+    Predicate("approach", f"root within {num(REACH)} m of the marked area, seen from above"),
+    Predicate("enter", "an ankle link over the marked area's box"),
+    Predicate("stand", "both feet in the marked area, standing, as the rule set says"),
+)
 
 
 @dataclass(frozen=True)
@@ -50,23 +64,24 @@ class VisNaviJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind area, feet and root."""
-        import warp as wp
-
-        from arena_newton.kernels.success import Boxes
-
-        super().__init__(scene)
         rule: VisNaviRule = rules.task("vis_navi").success
+        zone, feet = scene.marker(ZONE), links(scene, *rule.feet)
+        super().__init__(
+            scene,
+            PREDICATES,
+            {
+                "approach": [near(links(scene, "pelvis"), zone, REACH, horizontal=True)],
+                "enter": [near(feet, zone, 0.0, horizontal=True)],
+            },
+        )
         self.standing = rules.standing
         self.root = scene.robot.root_qpos
-        self.feet: Any = wp.array([scene.link(name) for name in rule.feet], dtype=wp.int32, device=self.device)
-        zone = scene.marker(f"{SIGN}/Frame/Zone")
-        self.zone = Boxes.upload([zone], self.device)
+        self.feet: wp.array = wp.array([foot.body_id for foot in feet], dtype=wp.int32, device=self.device)
+        self.zone = Boxes.from_boxes([zone], self.device)
         self.round = zone.round and rule.round_signs
 
-    def evaluate(self, physics: Physics) -> None:
-        """See `Judge.evaluate`."""
-        from arena_newton.kernels import success
-
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
         success.launch_vis_navi(
             physics.xpos,
             physics.xquat,
@@ -88,6 +103,7 @@ def sample_layout(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, S
     sampled = {}
     for rule in rules.objects:
         ranges = object_range(rule, mode)
+        assert isinstance(ranges, PoseRange)
         if rule.record.startswith("obstacle_"):
             sampled[rule.record] = sample_pose(layout, ranges, ("x", "y", "z", "yaw"))
         else:
@@ -121,8 +137,14 @@ TASK = TaskSpec(
     name="vis_navi",
     gym_id="Isaac-Move-SmallWarehouse-VisionNavigation-G129-Dex3-Wholebody",
     instruction="Avoid obstacles and move to the yellow marked area.",
+    suite="HSI",
     spawn_position=(-1.90, -5.20, 0.80),
     spawn_quat=FACE_PLUS_Y,
+    requires=(
+        *(Required(f"/World/{name}_{letter}", "body") for name in ("Beam", "Block") for letter in "abc"),
+        Required(SIGN, "fixture"),
+        Required(ZONE, "marker"),
+    ),
     objects=(
         _obstacle("obstacle_01_a", "/World/Beam_a", (-0.5, -0.4), 0.16),
         _obstacle("obstacle_01_b", "/World/Beam_b", (-2.2, -1.7), 0.56),
@@ -143,7 +165,15 @@ TASK = TaskSpec(
     ),
     steps=ByRules.same(1800),
     success=ByRules(paper=VisNaviRule(round_signs=False), released=VisNaviRule(round_signs=True)),
-    make_judge=VisNaviJudge,
+    judge=VisNaviJudge,
+    predicates=PREDICATES,
+    expert="arena_newton.policies.experts.vis_navi:VisNaviExpert",
+    mode_notes={
+        "visual": ByRules(
+            paper="light only",
+            released="the original also swaps the room's asset; recorded here, the scene stays",
+        )
+    },
     overlaps=(
         Overlap(*_HIGH_BLOCKS, ("paper", "released"), ("base", "semantic", "visual"), 2, 0.21, _SIDE_BY_SIDE),
         Overlap(*_HIGH_BLOCKS, ("paper", "released"), ("execution",), 2, 0.182, _SIDE_BY_SIDE),

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import Floor, plan, signed_distance
+from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import PALMS, TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.frames import wrap_angle
@@ -23,8 +24,6 @@ from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, 
 __all__ = ["BoxingExpert"]
 
 BAGS = ("/World/Bag_1", "/World/Bag_2")
-ROOM = ((-7.2, -6.5), (0.6, 5.2))
-"""Corners of the room [m]."""
 FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
 """Bearing of the target from the bag's axis, against that of the robot [rad]: positive lies on the robot's right."""
 BEST_FLANK = math.radians(60)

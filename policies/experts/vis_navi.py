@@ -10,6 +10,7 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
+from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.vis_navi import SIGN
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.frames import heading
@@ -18,8 +19,6 @@ from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, 
 __all__ = ["VisNaviExpert"]
 
 OBSTACLES = ("Beam_a", "Beam_b", "Beam_c", "Block_a", "Block_b", "Block_c")
-ROOM = ((-7.2, -6.5), (0.6, 5.2))
-"""Corners of the warehouse room [m]."""
 FEET = 0.2
 """Half of what both feet and the wander of a stop need of the area [m]."""
 APART = 0.42

@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 from pxr import Sdf
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.__main__ import main
 from arena_newton.usd_scenes.build import FOLDER
-from arena_newton.usd_scenes.validate import REQUIRED, check, layers, task_of, validate
+from arena_newton.usd_scenes.validate import check, layers, task_of, validate
 
 AUTHORING = Path(__file__).parents[2] / "docs" / "authoring.md"
 SNIPPETS = re.findall(r"^```usda\n(.*?)^```", AUTHORING.read_text(), flags=re.DOTALL | re.MULTILINE)
@@ -52,7 +53,7 @@ def only(path: Path, *words: str) -> None:
         assert word in found[0], found[0]
 
 
-@pytest.mark.parametrize("task", REQUIRED)
+@pytest.mark.parametrize("task", tasks.names())
 def test_own_scenes_and_variants_are_sound(task):
     """Every scene and variant of the project passes."""
     files = [FOLDER / task / "scene.usda", *(FOLDER / task / "variants").glob("*.usda")]
@@ -70,10 +71,10 @@ def test_a_layer_over_a_scene_is_of_its_task(tmp_path):
     check(path)
 
 
-@pytest.mark.parametrize("task", REQUIRED)
+@pytest.mark.parametrize("task", tasks.names())
 def test_every_required_prim_is_missed(tmp_path, task):
     """Switching off any required prim is noticed and the prim is named."""
-    for item in REQUIRED[task]:
+    for item in tasks.get(task).requires:
         if item.variants:
             continue
         parts = item.path.strip("/").split("/")
@@ -471,7 +472,7 @@ def test_bad_input_ends_with_code_2_and_one_line(arguments, capsys):
 def test_list_names_every_task(capsys):
     """`list` shows the seven tasks."""
     assert main(["list"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(REQUIRED)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(tasks.names())
 
 
 def test_help_is_quick():

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.tasks.boxing import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
 from arena_newton.usd_scenes.solids import Solids
 
@@ -62,11 +62,10 @@ def _bag(stage, name: str, centre, skin, metal, rough) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
-    r = float(np.sqrt(0.5))
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(-1.6, -2.0, SPAWN_HEIGHT),
-        facing=(r, 0.0, 0.0, -r),
+        spawn=TASK.spawn_position,
+        facing=TASK.spawn_quat,
         eye=(-4.39689, -2.7965, 2.15956),
         gaze=(0.62349, 0.41055, -0.34404, -0.56951),
         variants=warehouse.VARIANTS,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd
 
+from arena_newton.tasks.double_desk import TASK
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.solids import Solids
 
@@ -104,8 +105,8 @@ def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(-3.7, -2.2, 0.8),
-        facing=(1, 0, 0, 0),
+        spawn=TASK.spawn_position,
+        facing=TASK.spawn_quat,
         eye=(-0.55955, -2.63763, 2.16241),
         gaze=(0.70287, 0.42371, 0.29498, 0.48932),
         variants=("base", "semantic"),

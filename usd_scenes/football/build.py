@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pxr import Usd
 
+from arena_newton.tasks.football import TASK
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.solids import Solids
 
@@ -114,8 +115,8 @@ def build(folder: Path) -> None:
     variants = ("base", "semantic", "semantic_released")
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(0, -2.0, 0.8),
-        facing=(0.7071068, 0, 0, 0.7071068),
+        spawn=TASK.spawn_position,
+        facing=tuple(round(value, 7) for value in TASK.spawn_quat),  # as the layer has always been written
         eye=(3.00604, -1.18692, 1.99495),
         gaze=(0.70141, 0.51577, 0.29143, 0.39632),
         variants=variants,

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdPhysics
 
-from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.tasks.open_door import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
 
 POSITION = (-1.614, 2.314, 0.002)
@@ -184,11 +184,10 @@ def _back_room(stage) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
-    r = float(np.sqrt(0.5))
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(-1.6, 0.2, SPAWN_HEIGHT),
-        facing=(r, 0.0, 0.0, r),
+        spawn=TASK.spawn_position,
+        facing=TASK.spawn_quat,
         eye=(0.26556, 1.33827, 3.77471),
         gaze=(0.6811, 0.21343, 0.20944, 0.66834),
         variants=warehouse.VARIANTS,

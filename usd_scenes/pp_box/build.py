@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pxr import Usd
 
+from arena_newton.tasks.pp_box import TASK
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.solids import Solids
 
@@ -119,8 +120,8 @@ def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(-1.6, -5.0, 0.8),
-        facing=(1, 0, 0, 0),
+        spawn=TASK.spawn_position,
+        facing=TASK.spawn_quat,
         eye=(0.08792, -4.59362, 2.05127),
         gaze=(0.63441, 0.29145, 0.29887, 0.65058),
         variants=("base", "semantic"),

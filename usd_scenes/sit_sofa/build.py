@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.tasks.sit_sofa import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
 
 SOFA_X = (-4.34, -2.28)
@@ -102,11 +102,10 @@ def _carton(stage, name: str, position, looks, rough) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
-    r = float(np.sqrt(0.5))
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(-1.6, 2.0, SPAWN_HEIGHT),
-        facing=(r, 0.0, 0.0, -r),
+        spawn=TASK.spawn_position,
+        facing=TASK.spawn_quat,
         eye=(-5.00612, 1.22158, 2.27319),
         gaze=(-0.43051, -0.25339, 0.43941, 0.74657),
         variants=warehouse.VARIANTS,

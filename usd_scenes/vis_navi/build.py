@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf
 
-from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.tasks.vis_navi import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
 from arena_newton.usd_scenes.solids import Solids
 
@@ -105,11 +105,10 @@ def _ring_sign(stage, parent: str) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
-    r = float(np.sqrt(0.5))
     stage = rooms.task_stage(
         folder / "scene.usda",
-        spawn=(-1.90, -5.20, SPAWN_HEIGHT),
-        facing=(r, 0.0, 0.0, r),
+        spawn=TASK.spawn_position,
+        facing=TASK.spawn_quat,
         eye=(0.45796, -1.01443, 2.42268),
         gaze=(0.50211, 0.27898, 0.39756, 0.71555),
         variants=warehouse.VARIANTS,

@@ -1,0 +1,203 @@
+"""The judge of a task: binds prims of a built scene to a success kernel and to conditions of predicates."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from arena_newton.errors import InputError
+from arena_newton.handles import BodyFrame, Marker
+from arena_newton.interfaces import Predicate
+from arena_newton.kernels import predicates as kinds
+from arena_newton.kernels import reset
+from arena_newton.kernels.boxes import Boxes
+from arena_newton.tasks.base import IDENTITY, SUCCESS
+
+if TYPE_CHECKING:
+    from arena_newton.physics import Physics
+    from arena_newton.scene import Scene
+
+__all__ = ["PALMS", "Condition", "Judge", "above", "bounding_box", "links", "near", "palms", "top"]
+
+PALMS = ("left_hand_palm_link", "right_hand_palm_link")
+_ABOVE = 50.0
+"""Half extent of the box that stands for all above a height [m]: larger than any scene."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One measured quantity against a limit; a predicate holds where all of its conditions do."""
+
+    kind: int
+    """One of the kinds of `kernels.predicates`."""
+    limit: float = 0.0
+    """In the unit of the kind."""
+    points: Sequence[BodyFrame] = ()
+    boxes: Sequence[Marker] = ()
+    horizontal: bool = False
+    """Seen from above: heights do not count."""
+    address: int = 0
+    """In qpos or qvel, for kinds that read it."""
+
+
+def near(points: Iterable[BodyFrame], box: Marker, limit: float, *, horizontal: bool = False) -> Condition:
+    """One of some points is within `limit` [m] of a box."""
+    return Condition(kinds.NEAR, limit, tuple(points), (box,), horizontal)
+
+
+def above(point: BodyFrame, height: float) -> Condition:
+    """A point is higher than `height` [m]."""
+    half = (_ABOVE, _ABOVE, _ABOVE)
+    return Condition(kinds.NEAR, 0.0, (point,), (Marker(0, (0.0, 0.0, height + _ABOVE), IDENTITY, half),))
+
+
+def links(scene: Scene, *names: str) -> tuple[BodyFrame, ...]:
+    """Origins of some robot links."""
+    return tuple(BodyFrame(scene.link(name), (0.0, 0.0, 0.0), IDENTITY) for name in names)
+
+
+def palms(scene: Scene) -> tuple[BodyFrame, ...]:
+    """Both palms."""
+    return tuple(scene.frame(name) for name in PALMS)
+
+
+def bounding_box(scene: Scene, prim: str) -> Marker:
+    """The box around all collision geometry of a rigid or static prim, along the axes of its body.
+
+    Raises:
+        InputError: The prim holds no collision geometry.
+    """
+    model, body = scene.mj_model, scene.body_ids.get(prim, 0)
+    corners = []
+    for geom in scene.geom_ids(prim):
+        if model.geom_bodyid[geom] != body or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        corners.append(model.geom_pos[geom] + (centre + signs * half) @ turn.reshape(3, 3).T)
+    if not corners:
+        raise InputError(f"{scene.path}: prim {prim} holds no collision geometry")
+    points = np.concatenate(corners)
+    low, high = points.min(axis=0), points.max(axis=0)
+    return Marker(body, tuple(0.5 * (low + high)), IDENTITY, tuple(0.5 * (high - low)))
+
+
+def top(scene: Scene, prim: str) -> float:
+    """Height of the highest point of a static prim's collision geometry [m]."""
+    box = bounding_box(scene, prim)
+    return box.pos[2] + box.half[2]
+
+
+class Judge:
+    """Success of every world, judged on the device once per tick.
+
+    A subclass binds prims of a built scene to a kernel of `kernels.success` in `decide`.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        predicates: Sequence[Predicate] = (SUCCESS,),
+        conditions: Mapping[str, Sequence[Condition]] | None = None,
+    ):
+        """Allocate the outputs.
+
+        Args:
+            scene: The built scene.
+            predicates: Those of the task; the last one is success.
+            conditions: Conditions of every predicate but the last, by its name.
+
+        Raises:
+            InputError: Conditions and predicates do not match.
+        """
+        conditions = conditions or {}
+        names = [predicate.name for predicate in predicates]
+        if names[:-1] != list(conditions):
+            raise InputError(f"predicates {', '.join(names)}: conditions are given for {', '.join(conditions)}")
+        self.worlds = scene.worlds
+        self.device = wp.get_device(scene.device)
+        with wp.ScopedDevice(self.device):
+            self.success = wp.zeros(self.worlds, dtype=wp.int32)
+            """1 = success, shape [worlds]."""
+            self.margin = wp.zeros(self.worlds, dtype=wp.float32)
+            """Signed distance to success [m], at least 0 where the predicate holds at this instant, shape [worlds]."""
+            self.event = wp.zeros(self.worlds, dtype=wp.int32)
+            """0 nothing, otherwise one of `TaskSpec.events`, shape [worlds]."""
+            self.predicates = wp.zeros((self.worlds, len(names)), dtype=wp.int32)
+            """1 where a predicate of the task holds at this tick, shape [worlds, n]."""
+        self.counters: list[wp.array] = [self.predicates[:, k] for k in range(len(names))]
+        """int32 arrays [worlds] that a reset clears."""
+        self._upload(list(conditions.values()))
+
+    def _upload(self, predicates: Sequence[Sequence[Condition]]) -> None:
+        """Copy the conditions' table to the device."""
+        points: list[BodyFrame] = []
+        boxes: list[Marker] = []
+        rows = []
+        for condition in itertools.chain.from_iterable(predicates):
+            ranges = (len(points), len(points) + len(condition.points), len(boxes), len(boxes) + len(condition.boxes))
+            rows.append((condition.kind, int(condition.horizontal), condition.address, *ranges))
+            points += condition.points
+            boxes += condition.boxes
+        limits = [condition.limit for condition in itertools.chain.from_iterable(predicates)]
+        first = np.cumsum([0, *(len(conditions) for conditions in predicates)])
+
+        def up(values: object, dtype: type) -> wp.array:
+            return wp.array(values, dtype=dtype, device=self.device)
+
+        self._conditions = {
+            "first": up(first, wp.int32),
+            "terms": up(np.array(rows, dtype=np.int32).reshape(-1, len(kinds.TERM)), wp.int32),
+            "limits": up(limits, wp.float32),
+            "point_body": up([point.body_id for point in points], wp.int32),
+            "point_pos": up([wp.vec3(*point.pos) for point in points], wp.vec3),
+            "boxes": Boxes.from_boxes(boxes, self.device),
+        }
+
+    def counter(self) -> wp.array:
+        """A new counter of ticks, cleared at reset, int32, shape [worlds]."""
+        self.counters.append(wp.zeros(self.worlds, dtype=wp.int32, device=self.device))
+        return self.counters[-1]
+
+    def outputs(self) -> dict[str, wp.array]:
+        """Keyword arguments that every kernel of `kernels.success` takes."""
+        return {"success": self.success, "margin": self.margin}
+
+    def bind(self, physics: Physics) -> None:
+        """Tell the physics what it must measure; called once before the first tick."""
+
+    def decide(self, physics: Physics) -> None:
+        """Fill `success`, `margin` and `event` for the state after this tick; a subclass says how."""
+        raise NotImplementedError
+
+    def evaluate(self, physics: Physics) -> None:
+        """Fill `success`, `margin`, `event` and `predicates` for the state after this tick."""
+        self.decide(physics)
+        kinds.launch_predicates(
+            physics.xpos,
+            physics.xquat,
+            physics.qpos,
+            physics.qvel,
+            physics.latch_locked,
+            self.success,
+            self.margin,
+            **self._conditions,
+            predicates=self.predicates,
+        )
+
+    def reset(self, mask: wp.array) -> None:
+        """Forget the past of some worlds.
+
+        Args:
+            mask: 1 = reset, int32, shape [worlds].
+        """
+        for array in (*self.counters, self.success, self.event):
+            reset.launch_clear(mask, array)

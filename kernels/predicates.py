@@ -1,0 +1,182 @@
+"""Predicates on the way to success: which of a task's predicates hold at this tick, all of them in one launch.
+
+A predicate is the conjunction of conditions, each of which compares one measured quantity with a limit. Points and
+boxes are fixed to bodies. Nothing here is differentiable; the margins in `success` are.
+"""
+
+# ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
+
+import warp as wp
+
+from arena_newton.kernels.boxes import FAR, Boxes, body_position, body_rotation, box_centre, box_rotation
+from arena_newton.kernels.launching import launch_again
+
+__all__ = ["ANGLE", "AWAY", "CLEAR", "MARGIN", "NEAR", "TERM", "TOWARD", "UNLATCHED", "launch_predicates"]
+
+wp.set_module_options({"enable_backward": False})
+
+NEAR = wp.constant(0)
+"""A point is at most `limit` [m] away from a box; 0 m inside it."""
+CLEAR = wp.constant(1)
+"""Every point is farther than `limit` [m] from every box."""
+ANGLE = wp.constant(2)
+"""A hinge has turned at least `limit` [rad] either way."""
+TOWARD = wp.constant(3)
+"""A free body moves toward a box's centre with at least `limit` [m/s]."""
+AWAY = wp.constant(4)
+"""A body's x-axis points away from a box's centre: the cosine of the angle is at least `limit`."""
+UNLATCHED = wp.constant(5)
+"""The door's latch is released."""
+MARGIN = wp.constant(6)
+"""The success condition holds at this instant."""
+
+TERM = ("kind", "horizontal", "address", "first_point", "end_point", "first_box", "end_box")
+"""Columns of a condition: kind, whether heights are ignored, address in qpos or qvel, ranges of points and of boxes."""
+
+
+@wp.func
+def level(v: wp.vec3, horizontal: int) -> wp.vec3:
+    """A vector, without its height where heights are ignored."""
+    z = v[2]
+    if horizontal != 0:
+        z = 0.0
+    return wp.vec3(v[0], v[1], z)
+
+
+@wp.func
+def distance_to_box(v: wp.vec3, half: wp.vec3, horizontal: int) -> float:
+    """Distance [m] of a point to a centred box; inside, minus the distance to its nearest face."""
+    d = wp.vec3(wp.abs(v[0]) - half[0], wp.abs(v[1]) - half[1], wp.abs(v[2]) - half[2])
+    if horizontal != 0:
+        d = wp.vec3(d[0], d[1], wp.max(d[0], d[1]))
+    inside = wp.min(wp.max(d[0], wp.max(d[1], d[2])), 0.0)
+    outside = wp.vec3(wp.max(d[0], 0.0), wp.max(d[1], 0.0), wp.max(d[2], 0.0))
+    if horizontal != 0:
+        outside = wp.vec3(outside[0], outside[1], 0.0)
+    return wp.length(outside) + inside
+
+
+@wp.kernel
+def predicates_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    latched: wp.array[int],
+    success: wp.array[int],
+    margin: wp.array[float],
+    first: wp.array[int],
+    terms: wp.array2d[int],
+    limits: wp.array[float],
+    point_body: wp.array[int],
+    point_pos: wp.array[wp.vec3],
+    box_body: wp.array[int],
+    box_pos: wp.array[wp.vec3],
+    box_quat: wp.array[wp.vec4],
+    box_half: wp.array[wp.vec3],
+    predicates: wp.array2d[int],
+):
+    """One thread per world and predicate; the last predicate is the success flag."""
+    w, k = wp.tid()
+    if k == predicates.shape[1] - 1:
+        predicates[w, k] = success[w]
+        return
+    every = int(1)
+    for t in range(first[k], first[k + 1]):
+        kind = terms[t, 0]
+        horizontal = terms[t, 1]
+        address = terms[t, 2]
+        p0 = terms[t, 3]
+        b0 = terms[t, 5]
+        limit = limits[t]
+        ok = int(0)
+        if kind == NEAR or kind == CLEAR:
+            nearest = float(FAR)
+            for p in range(p0, terms[t, 4]):
+                body = point_body[p]
+                point = body_position(xpos, w, body) + wp.quat_rotate(body_rotation(xquat, w, body), point_pos[p])
+                for b in range(b0, terms[t, 6]):
+                    offset = point - box_centre(xpos, xquat, box_body, box_pos, w, b)
+                    v = wp.quat_rotate_inv(box_rotation(xquat, box_body, box_quat, w, b), offset)
+                    nearest = wp.min(nearest, distance_to_box(v, box_half[b], horizontal))
+            if kind == NEAR:
+                ok = wp.where(nearest <= limit, 1, 0)
+            else:
+                ok = wp.where(nearest > limit, 1, 0)
+        elif kind == ANGLE:
+            ok = wp.where(wp.abs(qpos[w, address]) >= limit, 1, 0)
+        elif kind == TOWARD or kind == AWAY:
+            body = point_body[p0]
+            turn = body_rotation(xquat, w, body)
+            point = body_position(xpos, w, body) + wp.quat_rotate(turn, point_pos[p0])
+            goal = level(box_centre(xpos, xquat, box_body, box_pos, w, b0) - point, horizontal)
+            if kind == TOWARD:
+                v = wp.vec3(qvel[w, address], qvel[w, address + 1], qvel[w, address + 2])
+                ok = wp.where(wp.dot(level(v, horizontal), wp.normalize(goal)) >= limit, 1, 0)
+            else:
+                ahead = level(wp.quat_rotate(turn, wp.vec3(1.0, 0.0, 0.0)), horizontal)
+                ok = wp.where(-wp.dot(wp.normalize(ahead), wp.normalize(goal)) >= limit, 1, 0)
+        elif kind == UNLATCHED:
+            ok = wp.where(latched[w] == 0, 1, 0)
+        elif kind == MARGIN:
+            ok = wp.where(margin[w] >= 0.0, 1, 0)
+        every = wp.min(every, ok)
+    predicates[w, k] = every
+
+
+def launch_predicates(
+    xpos: wp.array,
+    xquat: wp.array,
+    qpos: wp.array,
+    qvel: wp.array,
+    latched: wp.array,
+    success: wp.array,
+    margin: wp.array,
+    *,
+    first: wp.array,
+    terms: wp.array,
+    limits: wp.array,
+    point_body: wp.array,
+    point_pos: wp.array,
+    boxes: Boxes,
+    predicates: wp.array,
+) -> None:
+    """Which predicates hold at this tick; launch after the task's success kernel.
+
+    Args:
+        xpos: Body positions [m], shape [worlds, nbody, 3].
+        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
+        qpos: Positions, MuJoCo layout, shape [worlds, nq].
+        qvel: Velocities, MuJoCo layout, shape [worlds, nv].
+        latched: 1 = the latch holds the leaf, int32, shape [worlds].
+        success: 1 = success, int32, shape [worlds]; becomes the last predicate.
+        margin: Signed distance to success, shape [worlds].
+        first: First condition of each predicate but the last, and the number of conditions, int32, shape [n].
+        terms: Conditions, columns as `TERM`, int32, shape [conditions, 7].
+        limits: Their limits, shape [conditions].
+        point_body: Bodies that carry the points, int32, shape [points].
+        point_pos: Points in those bodies' frames [m], vec3, shape [points].
+        boxes: Boxes, at least one.
+        predicates: Output, 1 = holds, int32, shape [worlds, n].
+    """
+    launch_again(
+        predicates_kernel,
+        dim=predicates.shape,
+        inputs=[
+            xpos,
+            xquat,
+            qpos,
+            qvel,
+            latched,
+            success,
+            margin,
+            first,
+            terms,
+            limits,
+            point_body,
+            point_pos,
+            *boxes.arrays,
+        ],
+        outputs=[predicates],
+        device=predicates.device,
+    )
