@@ -58,8 +58,9 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         InputError: The checkpoint is unfit, or a file cannot be written.
     """
     from arena_newton.robot import PhysicsRate
+    from arena_newton.trackers import interface
     from arena_newton.trackers.front_end import ActionForm
-    from arena_newton.trackers.inference import networks, weights_file
+    from arena_newton.trackers.inference import weights_file
     from arena_newton.trackers.train.runner import read_checkpoint
 
     if options.out.suffix != ".safetensors":
@@ -71,7 +72,7 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         raise InputError(f"--out {options.out}: its card would overwrite {taken[0]}, which is not of these weights")
     state = read_checkpoint(checkpoint)
     card = dict(state["card"])
-    network = networks.make(card["tracker"], state["network"])
+    network = interface.get(card["tracker"]).make_network(state["network"])
     prefix = "net."
     tensors = {k[len(prefix) :]: v for k, v in state["actor_state_dict"].items() if k.startswith(prefix)}
     try:

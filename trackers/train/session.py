@@ -236,7 +236,7 @@ def build(options: TrainOptions) -> TrackerRunner:
     check(options)
     import torch
 
-    from arena_newton.trackers.inference import networks
+    from arena_newton.trackers.interface import get
     from arena_newton.trackers.train.rewards import REWARDS
     from arena_newton.trackers.train.runner import TrackerRunner
     from arena_newton.trackers.train.simulation import share_stream
@@ -289,7 +289,7 @@ def build(options: TrainOptions) -> TrackerRunner:
         "physics": dataclasses.asdict(rate),
         "rewards": {n: t.weight for n, t in rewards.items()},
     }
-    config = runner_config(options, networks.make(options.tracker).config(), card)
+    config = runner_config(options, get(options.tracker).make_network().config(), card)
     log_dir = None if options.bench else str(options.log_dir)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints both networks layer by layer
         runner = TrackerRunner(env, config, log_dir, device)
