@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arena_newton import robot as g1
+from arena_newton.canonical import STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeResult, Observation, RobotState, TrackerCommand
 
@@ -27,15 +28,6 @@ __all__ = ["STAND_ACTION", "ArenaEnv", "Spawn"]
 
 Spawn = Callable[[int], tuple[Sequence[float], Sequence[float]]]
 """Episode seed → the robot's root position [m] and orientation wxyz at the reset."""
-
-STAND_ACTION = np.array(
-    [0.0, 0.0, g1.SPAWN_HEIGHT, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0]
-    + [g1.DEFAULT_POSE[i] for i in g1.CANONICAL_TO_MUJOCO]
-    + [0.0, 0.0],
-    dtype=np.float32,
-)
-"""Canonical action of standing still: TWIST2's command when there is no input (root z 0.8 m, default pose)."""
-
 
 EVENTS = {1: "ball_out"}
 """A judge's event number → reason of the timeout."""
@@ -428,6 +420,7 @@ class ArenaEnv:
             self._hand_ctrl,
             self._hand_open,
             self._hand_close,
+            mask,
             p.ctrl,
         )
         p.set_active(self.active)

@@ -1,4 +1,4 @@
-"""Per-tick bookkeeping: joint targets into actuators, one status code a world."""
+"""Per-tick bookkeeping: joint targets into actuators, one status code per world."""
 
 import warp as wp
 
@@ -17,14 +17,14 @@ __all__ = [
     "launch_write_ctrl",
 ]
 
-RUNNING = 0
-SUCCESS = 1
-FALL = 2
-ERROR_STATE = 3
-ERROR_ACTION = 4
-ERROR_TARGETS = 5
-EVENT = 8
-"""Codes from EVENT on carry a judge's event number."""
+RUNNING = wp.constant(0)
+SUCCESS = wp.constant(1)
+FALL = wp.constant(2)
+ERROR_STATE = wp.constant(3)
+ERROR_ACTION = wp.constant(4)
+ERROR_TARGETS = wp.constant(5)
+EVENT = wp.constant(8)
+"""Codes above EVENT carry a judge's event number."""
 
 
 @wp.kernel
@@ -35,9 +35,12 @@ def _write_ctrl(
     hand_ctrl: wp.array[wp.int32],
     hand_open: wp.array[wp.float32],
     hand_close: wp.array[wp.float32],
+    mask: wp.array[wp.int32],
     ctrl: wp.array2d[wp.float32],
 ):
     world, i = wp.tid()
+    if mask[world] == 0:
+        return
     joints = joint_ctrl.shape[0]
     if i < joints:
         ctrl[world, joint_ctrl[i]] = targets[world, i]
@@ -50,10 +53,30 @@ def _write_ctrl(
             ctrl[world, hand_ctrl[finger]] = hand_open[finger]
 
 
-def launch_write_ctrl(targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close, ctrl) -> None:
-    """Write joint targets [worlds, 29] and binary hands [worlds, 2] into actuator targets `ctrl` [worlds, nu]."""
+def launch_write_ctrl(
+    targets: wp.array,
+    joint_ctrl: wp.array,
+    hands: wp.array,
+    hand_ctrl: wp.array,
+    hand_open: wp.array,
+    hand_close: wp.array,
+    mask: wp.array,
+    ctrl: wp.array,
+) -> None:
+    """Write joint targets and binary hands of the masked worlds into the actuator targets.
+
+    Args:
+        targets: Joint targets [rad], shape [worlds, 29].
+        joint_ctrl: Actuator of each joint, int32, shape [29].
+        hands: Left and right hand, from 0.5 on closed, shape [worlds, 2].
+        hand_ctrl: Actuator of each finger joint, left hand first, int32, shape [14], or [0] with fixed hands.
+        hand_open: Finger targets of open hands [rad], shape as `hand_ctrl`.
+        hand_close: Finger targets of closed hands [rad], shape as `hand_ctrl`.
+        mask: 1 = write this world, int32, shape [worlds].
+        ctrl: Actuator targets [rad], written, shape [worlds, nu].
+    """
     dim = (ctrl.shape[0], joint_ctrl.shape[0] + hand_ctrl.shape[0])
-    inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close]
+    inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close, mask]
     launch_again(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
 
 
@@ -108,23 +131,23 @@ def _status(
     status: wp.array[wp.int32],
 ):
     world = wp.tid()
-    code = wp.int32(0)
+    code = wp.int32(RUNNING)
     if event[world] != 0:
-        code = wp.int32(8) + event[world]
+        code = EVENT + event[world]
     if fallen[world] != 0:
-        code = wp.int32(2)
+        code = FALL
     if success[world] != 0:
-        code = wp.int32(1)
+        code = SUCCESS
     if bad_state[world] != 0:
-        code = wp.int32(3)
+        code = ERROR_STATE
     if bad_targets[world] != 0:
-        code = wp.int32(5)
+        code = ERROR_TARGETS
     if bad_action[world] != 0:
-        code = wp.int32(4)
+        code = ERROR_ACTION
     status[world] = code
 
 
 def launch_status(success, fallen, event, bad_state, bad_action, bad_targets, status) -> None:
-    """One code a world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
+    """One code per world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
     inputs = [success, fallen, event, bad_state, bad_action, bad_targets]
     launch_again(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)
