@@ -38,7 +38,7 @@ def contact_force_kernel(
     net_force: wp.array2d[wp.vec3],
     pair_force: wp.array[float],
 ):
-    """One thread a contact."""
+    """One thread per contact."""
     i = wp.tid()
     if i >= contact_count[0]:
         return
@@ -58,7 +58,7 @@ def contact_force_kernel(
         if address < rows:
             f[0] = efc_force[w, address]
     elif pyramidal != 0:
-        # Two opposite edges a friction direction; torsion and rolling (k > 1) press too but push nowhere.
+        # Two opposite edges per friction direction; torsion and rolling (k > 1) add to the normal force alone.
         for k in range(condim - 1):
             row = address + 2 * k
             plus = float(0.0)
@@ -86,7 +86,7 @@ def contact_force_kernel(
 
 @wp.kernel
 def force_norm_kernel(net_force: wp.array2d[wp.vec3], force_norm: wp.array2d[float]):
-    """One thread a world and body."""
+    """One thread per world and body."""
     w, b = wp.tid()
     force_norm[w, b] = wp.length(net_force[w, b])
 

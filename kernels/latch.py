@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def release_kernel(qpos: wp.array2d[float], handle_qpos_adr: int, release_angle: float, locked: wp.array[int]):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     if qpos[w, handle_qpos_adr] <= release_angle:
         locked[w] = 0
@@ -35,7 +35,7 @@ def launch_release(qpos: wp.array, handle_qpos_adr: int, release_angle: float, l
 
 @wp.kernel
 def lock_kernel(mask: wp.array[int], locked: wp.array[int]):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     if mask[w] != 0:
         locked[w] = 1

@@ -1,8 +1,10 @@
-"""Between the solver's batch and the rest: body poses for rendering, latch flags, overflow flags."""
+"""Between the solver's batch and the rest: body poses for rendering, latch and overflow flags, idle worlds."""
+
+from typing import Any
 
 import warp as wp
 
-__all__ = ["launch_body_q", "launch_latch", "launch_overflow"]
+__all__ = ["launch_body_q", "launch_latch", "launch_overflow", "launch_put_back"]
 
 
 @wp.kernel
@@ -50,3 +52,15 @@ LOST_CONTACTS = 0b10111111
 def launch_overflow(mask: wp.array, seen: wp.array) -> None:
     """Remember in `seen` [worlds] that a contact or constraint buffer overflowed since the last reset."""
     wp.launch(_overflow, dim=seen.shape[0], inputs=[mask, LOST_CONTACTS], outputs=[seen], device=seen.device)
+
+
+@wp.kernel
+def _put_back(mask: wp.array[wp.int32], saved: wp.array2d[Any], rows: wp.array2d[Any]):
+    world, column = wp.tid()
+    if mask[world] != 0:
+        rows[world, column] = saved[world, column]
+
+
+def launch_put_back(mask: wp.array, saved: wp.array, rows: wp.array) -> None:
+    """Copy the rows of the masked worlds (int32, 1 = copy) from `saved` into `rows`, both [worlds, n]."""
+    wp.launch(_put_back, dim=rows.shape, inputs=[mask, saved], outputs=[rows], device=rows.device)
