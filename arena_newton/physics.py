@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from arena_newton.ball import set_restitution
 from arena_newton.errors import InputError
-from arena_newton.scene import set_restitution
 
 if TYPE_CHECKING:
     from arena_newton.robot import PhysicsRate
