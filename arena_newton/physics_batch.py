@@ -15,8 +15,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from arena_newton.ball import set_restitution
 from arena_newton.kernels import latch, newton_state
-from arena_newton.scene import Scene, set_restitution
+from arena_newton.scene import Scene
 
 if TYPE_CHECKING:
     from arena_newton.robot import PhysicsRate

@@ -11,10 +11,11 @@ import mujoco_warp
 import numpy as np
 import warp as wp
 
+from arena_newton.ball import set_restitution
 from arena_newton.kernels import contact, latch, newton_state
 from arena_newton.physics_batch import Physics
 from arena_newton.robot import PhysicsRate
-from arena_newton.scene import Scene, set_restitution
+from arena_newton.scene import Scene
 
 __all__ = ["PER_WORLD_FIELDS", "WarpPhysics"]
 

@@ -213,6 +213,19 @@ def markdown() -> str:
         "|---|---|---|",
         *("| " + " | ".join(row) + " |" for row in _departures()),
         "",
+        "## Steps on the way to success",
+        "",
+        "Predicates say how far an episode came; they decide nothing. Every tick tests all of them, each by itself.",
+        "The last one of a task is its success.",
+        "",
+        "| task | predicate | holds when |",
+        "|---|---|---|",
+        *(
+            f"| {spec.name} | {predicate.name} | {predicate.sentence} |"
+            for spec in map(tasks.get, (t.task for t in sets[0].tasks))
+            for predicate in spec.predicates
+        ),
+        "",
         "## Where objects are put",
         "",
         "Ranges of the sampled pose, in m and rad. A sample is drawn once from the episode's seed; the placement above",

@@ -11,15 +11,24 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import mujoco
+import mujoco_warp
+import newton
 import numpy as np
+import warp as wp
+from newton.solvers import mujoco as newton_mujoco
+from pxr import Gf, Usd, UsdGeom
 
+import arena_newton.kernels  # noqa: F401  (quiets Warp's module log)
 from arena_newton import robot as g1
 from arena_newton import tasks
+from arena_newton.ball import BALL, BALL_SKIN, add_skin, set_restitution
 from arena_newton.errors import InputError
 from arena_newton.handles import BodyFrame, Latch, Marker, RobotHandles
-from arena_newton.tasks.base import SCENES
+from arena_newton.tasks.base import SCENES, Quat, Vec3
+from arena_newton.usd_scenes.shapes import check_buildable, open_stage
 
 if TYPE_CHECKING:
     from arena_newton.rules import RuleSet
@@ -27,28 +36,11 @@ if TYPE_CHECKING:
 __all__ = [
     "SCENES",
     "Scene",
-    "ball_solref",
     "load_scene",
     "scene_path",
-    "set_restitution",
 ]
 
 ROBOT = "/World/Robot"
-BALL = "/World/Ball"
-BALL_SPRING = 0.025
-"""Part of a ball's penetration that the spring of its contact undoes in one physics step: the bounce grows by up to as
-much with the depth at which a step finds the ball, and a sunk ball at rest rises within some 1/BALL_SPRING steps."""
-BALL_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
-"""Constraint impedance of the ball: constant and near 1, so that the contact does what its solref says."""
-BALL_SKIN = f"{BALL}/Skin"
-"""Label of the sphere around a ball on which it lies and rolls, see `_add_skin`."""
-SKIN_HEIGHT = 0.001
-"""How much larger that sphere is [m]: its contact carries a ball at rest before the inner one is touched."""
-SKIN_SOLREF = (-0.01, -0.01)
-SKIN_SOLIMP = (0.9, 0.001, 0.002, 0.5, 2.0)
-"""Stiffness 10,000/s² and damping 10/s, times the last impedance by which MuJoCo divides them; the impedance fades from
-0.9 at the surface to nothing 2 mm deep, so that an impact, which is deeper, feels the inner contact alone."""
-
 LATCH = "arena:latch"
 """Label of the equality constraint that is the latch."""
 LATCH_RELEASE_DEG = 20.0
@@ -74,37 +66,21 @@ def scene_path(task_or_path: str | Path) -> Path:
     raise InputError(f"{task_or_path}: no such scene file (expected a task name or an existing .usda file)")
 
 
-def ball_solref(restitution: float, dt: float) -> tuple[float, float]:
-    """MuJoCo direct-form solref (−stiffness, −damping) of a contact with the given coefficient of restitution.
-
-    The contact turns the velocity round within the physics step that finds it, as the original's engine does: a damper
-    of (1 + e)/dt takes the approach u away and adds e·u. It then does not pull the ball back, since a contact only
-    pushes; the closed form of a spring with damping, which pulls too, bounces 0.25 where 0.1 is asked. The weak spring
-    lifts the ball out; it adds at most BALL_SPRING·u. MuJoCo divides the stiffness by the impedance's square and the
-    damping by the impedance, and multiplies the stiffness by it. Such a damper is for contacts without friction alone:
-    in the pyramidal cone it also acts on half of the speed of sliding and throws a sliding ball up (`_add_skin`).
-
-    Args:
-        restitution: Speed of parting over speed of approach, 0 to 1.
-        dt: Physics step [s].
-    """
-    impedance = BALL_SOLIMP[1]
-    return -BALL_SPRING / dt**2 * impedance, -(1.0 + float(restitution)) / dt * impedance
-
-
 @dataclass
 class Scene:
     """A built scene: Newton model, MuJoCo model, and handles by prim path."""
 
     path: Path
-    variant: str
     hands: str
+    """`dex3` or `fixed`."""
     worlds: int
-    device: Any
-    stage: Any
-    model: Any
-    solver: Any
-    mj_model: Any
+    device: wp.Device
+    stage: Usd.Stage
+    model: newton.Model
+    """All worlds."""
+    solver: newton.solvers.SolverMuJoCo
+    mj_model: mujoco.MjModel
+    """One world, as both engines step it."""
     body_ids: dict[str, int]
     """Prim path → MuJoCo body."""
     joint_ids: dict[str, int]
@@ -211,11 +187,9 @@ class Scene:
         x, y, z = (0.5 * float(v) for v in size)
         return Marker(body, pos, quat, (x, y, z), bool(prim.GetAttribute("arena:round").Get()))
 
-    def _find(self, name_or_path: str) -> Any:
+    def _find(self, name_or_path: str) -> Usd.Prim:
         prim = self.stage.GetPrimAtPath(name_or_path) if name_or_path.startswith("/") else None
         if prim is None or not prim:
-            from pxr import Usd
-
             base = self.stage.GetPrimAtPath(ROBOT)
             prim = None
             if not name_or_path.startswith("/") and base:
@@ -224,9 +198,7 @@ class Scene:
             raise InputError(f"{self.path}: prim {name_or_path} is missing")
         return prim
 
-    def _local_pose(self, prim: Any) -> tuple[int, tuple, tuple]:
-        from pxr import Gf, UsdGeom
-
+    def _local_pose(self, prim: Usd.Prim) -> tuple[int, Vec3, Quat]:
         cache = UsdGeom.XformCache()
         carrier = prim
         while carrier and str(carrier.GetPath()) not in self.body_ids:
@@ -296,9 +268,7 @@ def _naming(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be built ({type(error).__name__}: {reason})") from error
 
 
-def _open_stage(path: Path, variant: str | None, hands: str) -> Any:
-    from arena_newton.usd_scenes.shapes import open_stage
-
+def _open_stage(path: Path, variant: str | None, hands: str) -> Usd.Stage:
     stage = open_stage(path, checked=not _is_own(path))
     stage.SetEditTarget(stage.GetSessionLayer())
     robot_prim = stage.GetPrimAtPath(ROBOT)
@@ -318,9 +288,7 @@ def _open_stage(path: Path, variant: str | None, hands: str) -> Any:
     return stage
 
 
-def _set_drives(builder: Any, drive: g1.DriveGains) -> None:
-    from newton import JointTargetMode
-
+def _set_drives(builder: newton.ModelBuilder, drive: g1.DriveGains) -> None:
     gains: dict[str, tuple[float, float, float, float | None]] = {
         n: (drive.kp[i], drive.kd[i], drive.effort[i], None) for i, n in enumerate(g1.MUJOCO_JOINTS)
     }
@@ -332,7 +300,7 @@ def _set_drives(builder: Any, drive: g1.DriveGains) -> None:
             continue
         dof = builder.joint_qd_start[joint]
         kp, kd, effort, armature = gains[name]
-        builder.joint_target_mode[dof] = int(JointTargetMode.POSITION)
+        builder.joint_target_mode[dof] = int(newton.JointTargetMode.POSITION)
         builder.joint_target_ke[dof] = kp
         builder.joint_target_kd[dof] = kd
         builder.joint_effort_limit[dof] = effort
@@ -340,19 +308,15 @@ def _set_drives(builder: Any, drive: g1.DriveGains) -> None:
             builder.joint_armature[dof] = armature
 
 
-def _free_fixtures(builder: Any) -> None:
+def _free_fixtures(builder: newton.ModelBuilder) -> None:
     """Flag bodies that hang on the world by a fixed joint as kinematic, so that each world can pose its own."""
-    from newton import BodyFlags, JointType
-
     for joint, kind in enumerate(builder.joint_type):
-        if kind == JointType.FIXED and builder.joint_parent[joint] == -1:
-            builder.body_flags[builder.joint_child[joint]] = int(BodyFlags.KINEMATIC)
+        if kind == newton.JointType.FIXED and builder.joint_parent[joint] == -1:
+            builder.body_flags[builder.joint_child[joint]] = int(newton.BodyFlags.KINEMATIC)
 
 
-def _add_latch(builder: Any, stage: Any) -> tuple[int, float] | None:
+def _add_latch(builder: newton.ModelBuilder, stage: Usd.Stage) -> tuple[int, float] | None:
     """Add the equality that locks a latched leaf; the handle's joint in the builder and its release angle [deg]."""
-    from newton.solvers import mujoco
-
     for prim in stage.Traverse():
         if prim.HasAttribute("arena:latch") and prim.GetAttribute("arena:latch").Get():
             leaf = builder.joint_label.index(str(prim.GetPath()))
@@ -367,7 +331,7 @@ def _add_latch(builder: Any, stage: Any) -> tuple[int, float] | None:
             if handle is None:
                 raise InputError(f"{stage.GetRootLayer().identifier}: {prim.GetPath()} has a latch but no HandleHinge")
             # leaf = 0 + 0·handle: the leaf is held at its closed angle while the equality is active.
-            mujoco.add_equality_joint(
+            newton_mujoco.add_equality_joint(
                 builder, leaf, handle, polycoef=(0.0, 0.0), label=LATCH, enabled=True, solimp=LATCH_SOLIMP
             )
             own = prim.GetAttribute("arena:releaseAngle").Get()
@@ -383,49 +347,6 @@ def _find_latch(scene: Scene, handle: int, release_deg: float) -> Latch:
     address = scene.joint_qpos(scene.solver.model.joint_label[handle])
     rest = float(scene.mj_model.qpos0[address])
     return Latch(equality, address, rest - math.radians(release_deg))
-
-
-def _add_skin(builder: Any) -> None:
-    """Give a round ball two contacts: its own, now without friction, bounces; a sphere 1 mm larger lies and rolls.
-
-    One contact cannot do both. MuJoCo's pyramidal cone couples the damping that a bounce needs to the speed of sliding:
-    a ball kicked to 6 m/s along the grass would hop 15 cm, and a glancing bounce would be several times as high as it
-    should be. A ball of another shape keeps its one contact.
-    """
-    from newton import GeoType, ModelBuilder, ShapeFlags
-
-    if BALL not in builder.body_label:
-        return
-    body = builder.body_label.index(BALL)
-    shapes = [s for s, b in enumerate(builder.shape_body) if b == body]
-    solid = [s for s in shapes if builder.shape_flags[s] & ShapeFlags.COLLIDE_SHAPES]
-    if len(solid) != 1 or builder.shape_type[solid[0]] != GeoType.SPHERE:
-        return
-    (shape,) = solid
-    attributes = {name: builder.custom_attributes[f"mujoco:{name}"].values for name in ("condim", "geom_priority")}
-    condim = int(attributes["condim"].get(shape) or 3)
-    if condim == 1:
-        return
-    builder.add_shape_sphere(
-        body,
-        xform=builder.shape_transform[shape],
-        radius=float(builder.shape_scale[shape][0]) + SKIN_HEIGHT,
-        cfg=ModelBuilder.ShapeConfig(
-            density=0.0,
-            mu=builder.shape_material_mu[shape],
-            mu_torsional=builder.shape_material_mu_torsional[shape],
-            mu_rolling=builder.shape_material_mu_rolling[shape],
-            collision_group=builder.shape_collision_group[shape],
-            gap=0.0,
-            is_visible=False,
-        ),
-        label=BALL_SKIN,
-        custom_attributes={
-            "mujoco:condim": condim,
-            "mujoco:geom_priority": int(attributes["geom_priority"].get(shape) or 0),
-        },
-    )
-    attributes["condim"][shape] = 1
 
 
 def load_scene(
@@ -460,12 +381,6 @@ def load_scene(
     Raises:
         InputError: The stage cannot be read or misses a prim that the robot needs.
     """
-    import newton
-    import warp as wp
-
-    import arena_newton.kernels  # noqa: F401  (quiets Warp's module log)
-    from arena_newton.usd_scenes.shapes import check_buildable
-
     path = scene_path(variant_file or task)
     stage = _open_stage(path, variant, hands)
     template = newton.ModelBuilder()
@@ -479,9 +394,9 @@ def load_scene(
     _free_fixtures(template)
     latch = _add_latch(template, stage)
     if rules is not None:
-        _add_skin(template)
+        add_skin(template)
 
-    def finalize(count: int) -> Any:
+    def finalize(count: int) -> newton.Model:
         builder = newton.ModelBuilder()
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
         builder.rigid_gap = 0.0
@@ -521,7 +436,6 @@ def load_scene(
 
     scene = Scene(
         path=path,
-        variant=variant or "own",
         hands=hands,
         worlds=worlds,
         device=model.device,
@@ -543,40 +457,10 @@ def load_scene(
     return scene
 
 
-def _collide_boxes_as_mujoco(warp_model: Any) -> None:
+def _collide_boxes_as_mujoco(warp_model: mujoco_warp.Model) -> None:
     """Let mujoco_warp collide boxes by its port of MuJoCo's own routine.
 
     By default it treats them as any convex shapes, and the normal of a foot that grazes an edge at a few degrees is
     then the foot's instead of the obstacle's: with it a walk along a sill fell in 10 % of the rollouts, against 3 %.
     """
-    import mujoco
-
     warp_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-
-
-def set_restitution(scene: Scene, restitution: float, dt: float, *models: Any) -> None:
-    """Give the ball's contacts a coefficient of restitution at a physics step.
-
-    Args:
-        scene: Scene with a `/World/Ball`.
-        restitution: Speed of parting over speed of approach, 0 to 1.
-        dt: Physics step of the engine that will step the models [s].
-        models: MuJoCo or mujoco_warp models of this scene to change; the scene's own when none is named.
-
-    Raises:
-        InputError: The ball has no collision geometry.
-    """
-    contacts = {g: (ball_solref(restitution, dt), BALL_SOLIMP) for g in scene.geom_ids(BALL)}
-    for geom, label in enumerate(scene.geom_labels):
-        if label == BALL_SKIN:
-            contacts[geom] = SKIN_SOLREF, SKIN_SOLIMP
-    for model in models or (scene.mj_model, getattr(scene.solver, "mjw_model", None)):
-        for k, name in enumerate(("geom_solref", "geom_solimp")):
-            array = getattr(model, name, None)
-            if array is None:
-                continue
-            values = array if isinstance(array, np.ndarray) else array.numpy()
-            for geom, contact in contacts.items():
-                values[..., geom, :] = contact[k]
-            if values is not array:
-                array.assign(values)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.textures import write_all
 
 __all__ = ["FOLDER", "build_all", "parts"]
 
@@ -34,8 +35,6 @@ def build_all(folder: Path = FOLDER, names: Sequence[str] = ()) -> list[Path]:
         target = folder / name
         target.mkdir(parents=True, exist_ok=True)
         if name == "textures":
-            from arena_newton.usd_scenes.textures import write_all
-
             write_all(target)
             written.append(target)
         elif name == "g1":

@@ -12,9 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
+from pxr import Usd, UsdPhysics
 
 from arena_newton import tasks
+from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
     from arena_newton.scene import Scene
@@ -158,10 +161,6 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
     Raises:
         InputError: The scene cannot be built.
     """
-    import mujoco
-    from pxr import Usd, UsdPhysics
-
-    from arena_newton.quiet import quiet_warp
     from arena_newton.scene import load_scene
 
     quiet_warp()
@@ -247,8 +246,6 @@ def _joints(scene: Scene) -> Facts:
 
 def _meets(scene: Scene) -> frozenset[tuple[str, str]]:
     """MuJoCo's own filter: contact bits, excluded bodies, welded bodies, parent and child."""
-    import mujoco
-
     m = scene.mj_model
     body, weld = m.geom_bodyid, m.body_weldid[m.geom_bodyid]
     above = m.body_weldid[m.body_parentid[weld]]

@@ -14,17 +14,15 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
+from pxr import Ar, Gf, Sdf, Tf
 
 import arena_newton
 from arena_newton import limits, probe
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
-
-if TYPE_CHECKING:
-    from pxr import Ar, Sdf
 
 __all__ = [
     "IMAGES",
@@ -188,17 +186,13 @@ def collect(path: Path) -> Dependencies:
     return found
 
 
-def search_context() -> "Ar.DefaultResolverContext":
+def search_context() -> Ar.DefaultResolverContext:
     """What a stage is opened with so that USD finds asset paths that begin with `PACKAGE`."""
-    from pxr import Ar
-
     return Ar.DefaultResolverContext([str(_ROOT)])
 
 
 def _read_layer(place: Place, shown: str, found: Dependencies, *, built_on: bool) -> Contents:
     """What a layer names; faults of its units and numbers go to `found`."""
-    from pxr import Sdf, Tf
-
     _check_layer(place)
     try:
         layer = Sdf.Layer.FindOrOpen(str(place))
@@ -289,8 +283,6 @@ def _read(place: Place, most: int) -> bytes | bytearray:
 
 def _read_image(place: Place, pixels: int) -> int:
     """Read an image of at most so many pixels, and count them."""
-    from PIL import Image
-
     data = _read(place, limits.IMAGE_BYTES)
     try:
         with warnings.catch_warnings():
@@ -312,10 +304,8 @@ def _read_image(place: Place, pixels: int) -> int:
         raise _Unreadable(f"not a readable image: expected one of {', '.join(IMAGES)}") from None
 
 
-def _open_package(file: Path) -> "Sdf.ZipFile":
+def _open_package(file: Path) -> Sdf.ZipFile:
     """A .usdz package as USD reads it."""
-    from pxr import Sdf, Tf
-
     try:
         package = Sdf.ZipFile.Open(str(file))
         names = package.GetFileNames() if package else []
@@ -396,10 +386,8 @@ def _suffix_fault(name: str, kinds: tuple[str, ...], ending: str | None = None) 
     return None if good else f"{name if ending else 'file'} is not {wanted}: expected one of {', '.join(kinds)}"
 
 
-def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
+def _contents(layer: Sdf.Layer) -> tuple[Contents, list[tuple[str, str]]]:
     """Every prim and asset path of a layer, and what must not be in it, as (where, message)."""
-    from pxr import Sdf
-
     contents = Contents(layer.defaultPrim, sublayers=[Arc("", asset) for asset in layer.subLayerPaths if asset])
     faults: list[tuple[str, str]] = []
     if layer.pseudoRoot.HasInfo("relocates"):
@@ -407,7 +395,7 @@ def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
 
     deep: list[Sdf.Path] = []
 
-    def visit(path: "Sdf.Path") -> None:
+    def visit(path: Sdf.Path) -> None:
         # Asked before anything else is: text of a path takes as long as the path is deep.
         if path.pathElementCount > 2 * limits.NESTING:
             deep[:] = [path]
@@ -452,7 +440,7 @@ def _contents(layer: "Sdf.Layer") -> tuple[Contents, list[tuple[str, str]]]:
     return contents, list(dict.fromkeys(faults))
 
 
-def _names_file(spec: "Sdf.AttributeSpec") -> bool:
+def _names_file(spec: Sdf.AttributeSpec) -> bool:
     """Whether text stands where a shader looks for a texture; the importer would open it, URLs too, unchecked."""
     if str(spec.typeName).removesuffix("[]") not in ("string", "token") or not spec.name.startswith(_SHADER):
         return False
@@ -463,8 +451,6 @@ def _names_file(spec: "Sdf.AttributeSpec") -> bool:
 
 def _not_finite(value: object) -> float | None:
     """The first component that is no finite single-precision number; `None` if all are, or it is not about numbers."""
-    from pxr import Gf, Sdf
-
     if isinstance(value, Gf.Quatf | Gf.Quatd | Gf.Quath):
         value = (value.real, *value.imaginary)
     elif isinstance(value, Sdf.TimeCode):
@@ -482,7 +468,6 @@ def _not_finite(value: object) -> float | None:
 
 
 def _assets_in(value: object) -> Iterator[str]:
-    from pxr import Sdf
 
     if isinstance(value, Sdf.AssetPath):
         yield value.path
@@ -490,7 +475,7 @@ def _assets_in(value: object) -> Iterator[str]:
         yield from (item.path for item in value)
 
 
-def _units(layer: "Sdf.Layer", shown: str) -> Iterator[Problem]:
+def _units(layer: Sdf.Layer, shown: str) -> Iterator[Problem]:
     """A layer that is built on must not speak other units: USD does not convert them."""
     info = layer.pseudoRoot
     for key, wanted in (("metersPerUnit", 1.0), ("upAxis", "Z"), ("kilogramsPerUnit", 1.0)):

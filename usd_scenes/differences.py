@@ -4,17 +4,15 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.compiled import Told, compiled, compiled_changes, own_compiled, release
 from arena_newton.usd_scenes.shapes import open_stage
-
-if TYPE_CHECKING:
-    from pxr import Usd
 
 __all__ = ["differences"]
 
@@ -108,19 +106,18 @@ def _authored(theirs: dict[str, _Part], ours: dict[str, _Part], same_gravity: bo
     return sentences
 
 
-def _names(stage: "Usd.Stage") -> list[str]:
+def _names(stage: Usd.Stage) -> list[str]:
     """Variants of `semantics`."""
     world = stage.GetPrimAtPath("/World")
     return list(world.GetVariantSet("semantics").GetVariantNames()) if world else []
 
 
-def _selection(stage: "Usd.Stage") -> str:
+def _selection(stage: Usd.Stage) -> str:
     world = stage.GetPrimAtPath("/World")
     return world.GetVariantSet("semantics").GetVariantSelection() if world else ""
 
 
-def _select(stage: "Usd.Stage", variant: str) -> None:
-    from pxr import Usd
+def _select(stage: Usd.Stage, variant: str) -> None:
 
     world = stage.GetPrimAtPath("/World")
     if world and variant in world.GetVariantSet("semantics").GetVariantNames():
@@ -128,10 +125,8 @@ def _select(stage: "Usd.Stage", variant: str) -> None:
             world.GetVariantSet("semantics").SetVariantSelection(variant)
 
 
-def _parts(stage: "Usd.Stage") -> dict[str, _Part]:
+def _parts(stage: Usd.Stage) -> dict[str, _Part]:
     """Every prim that counts, by its path."""
-    from pxr import Usd, UsdGeom, UsdPhysics
-
     poses = UsdGeom.XformCache()
     parts: dict[str, _Part] = {}
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
@@ -182,10 +177,8 @@ def _parts(stage: "Usd.Stage") -> dict[str, _Part]:
     return parts
 
 
-def _pose(prim: "Usd.Prim", poses: Any) -> tuple[float, ...]:
+def _pose(prim: Usd.Prim, poses: Any) -> tuple[float, ...]:
     """Matrix of a prim in the body that carries it, or in the world; a body of the robot in the robot."""
-    from pxr import UsdPhysics
-
     carrier = prim.GetParent()
     inside = str(prim.GetPath()).startswith(_ROBOT)
     while carrier and not (inside and str(carrier.GetPath()) == _ROBOT):
@@ -239,8 +232,6 @@ def _unscaled(new: dict[str, Any], old: dict[str, Any]) -> str:
 
 def _numbers(value: Any) -> np.ndarray | None:
     """The value as numbers, None if it is not about numbers."""
-    from pxr import Gf
-
     if isinstance(value, Gf.Quatf | Gf.Quatd | Gf.Quath):
         value = (value.real, *value.imaginary)
     if value is None or isinstance(value, str | bool):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mujoco
 import numpy as np
+from PIL import Image, ImageDraw
 
 from arena_newton import robot as g1
 from arena_newton.errors import InputError
+from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.rules import LightRange
+from arena_newton.scene import Scene, load_scene, scene_path
 from arena_newton.tasks.base import draw_light
-
-if TYPE_CHECKING:
-    from arena_newton.scene import Scene
+from arena_newton.usd_scenes.shapes import open_stage
 
 __all__ = ["MODES", "preview"]
 
@@ -46,8 +48,6 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
     Raises:
         InputError: Unknown mode, size, or a target that is no scene.
     """
-    from PIL import Image, ImageDraw
-
     if mode != "all" and mode not in MODES:
         raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
     if size < 16:
@@ -81,9 +81,6 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
 
 def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
     """Pictures of one scene in one mode, uint8 [height, width, 3] each."""
-    from arena_newton.pictures.camera import Camera, WorldLights
-    from arena_newton.scene import load_scene
-
     scene = load_scene(target, worlds=1, device="cpu", native=True, variant=_variant(target, mode))
     lights = WorldLights.allocate(1, scene.device, scene.stage)
     if mode == "visual":
@@ -105,9 +102,6 @@ def _variant(target: str, mode: str) -> str:
 
 def _selected(target: str) -> str | None:
     """The variant that a scene selects by itself, None if it has none."""
-    from arena_newton.scene import scene_path
-    from arena_newton.usd_scenes.shapes import open_stage
-
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
     return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None
@@ -115,8 +109,6 @@ def _selected(target: str) -> str | None:
 
 def _settled(scene: Scene) -> Any:
     """Newton state with the robot in its spawn pose and every object at rest where it fell."""
-    import mujoco
-
     m = scene.mj_model
     data = mujoco.MjData(m)
     handles = scene.robot

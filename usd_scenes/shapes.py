@@ -4,16 +4,13 @@ import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from pxr import Tf, Usd, UsdGeom, UsdLux, UsdPhysics
 
 from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.dependencies import check_files, reason, search_context
-
-if TYPE_CHECKING:
-    from pxr import Usd
 
 __all__ = ["check_buildable", "mesh_faults", "open_stage", "shape_faults", "type_faults"]
 
@@ -37,7 +34,7 @@ _GRAVITY = 100.0
 """Largest gravity [m/s²]."""
 
 
-def open_stage(path: str | Path, *, checked: bool = True) -> "Usd.Stage":
+def open_stage(path: str | Path, *, checked: bool = True) -> Usd.Stage:
     """Open a stage that somebody else made, or the project's own.
 
     Args:
@@ -47,8 +44,6 @@ def open_stage(path: str | Path, *, checked: bool = True) -> "Usd.Stage":
     Raises:
         InputError: The stage cannot or must not be composed.
     """
-    from pxr import Tf, Usd
-
     if checked:
         check_files(path)
     try:
@@ -57,7 +52,7 @@ def open_stage(path: str | Path, *, checked: bool = True) -> "Usd.Stage":
         raise InputError(f"{path}: not a readable USD layer ({reason(error)})") from None
 
 
-def check_buildable(stage: "Usd.Stage", path: str | Path) -> None:
+def check_buildable(stage: Usd.Stage, path: str | Path) -> None:
     """Raise if the stage, with the variants that are selected now, would crash or exhaust the importer.
 
     Raises:
@@ -67,10 +62,8 @@ def check_buildable(stage: "Usd.Stage", path: str | Path) -> None:
         raise InputError(f"{path}: {prim}: {message}")
 
 
-def type_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+def type_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
     """Attributes whose value is not of their schema's type, as (prim path, message); USD hands them on as they are."""
-    from pxr import Usd
-
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         schema = prim.GetPrimDefinition()
         for attribute in prim.GetAuthoredAttributes():
@@ -97,13 +90,11 @@ def _family(name: str) -> str:
     return name.replace(plain, plain[:-1], 1) if plain.startswith(("Vec", "Quat", "Matrix")) else name
 
 
-def mesh_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+def mesh_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
     """Meshes whose indices lead out of their points or that are too large, and unknown kinds, as (prim path, message).
 
     The importer's compiled code follows indices on trust.
     """
-    from pxr import Usd, UsdGeom
-
     points = 0
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         kind = prim.GetTypeName()
@@ -121,7 +112,7 @@ def mesh_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
             return
 
 
-def _mesh_fault(mesh: "Usd.Typed") -> tuple[str | None, int]:
+def _mesh_fault(mesh: Usd.Typed) -> tuple[str | None, int]:
     """What is wrong with a mesh, and how many points it has."""
     points, counts, indices = (
         attribute.Get()
@@ -147,10 +138,8 @@ def _mesh_fault(mesh: "Usd.Typed") -> tuple[str | None, int]:
     return _primvar_fault(mesh, many, corners, len(sides)), many
 
 
-def _primvar_fault(mesh: "Usd.Typed", points: int, corners: int, faces: int) -> str | None:
+def _primvar_fault(mesh: Usd.Typed, points: int, corners: int, faces: int) -> str | None:
     """Texture coordinates and normals: their number and their indices."""
-    from pxr import UsdGeom
-
     wanted = {"constant": 1, "uniform": faces, "varying": points, "vertex": points, "faceVarying": corners}
     for primvar in UsdGeom.PrimvarsAPI(mesh.GetPrim()).GetPrimvars():
         name, value = primvar.GetName(), primvar.Get()
@@ -175,10 +164,8 @@ def _primvar_fault(mesh: "Usd.Typed", points: int, corners: int, faces: int) -> 
     return None
 
 
-def shape_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+def shape_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
     """Sizes, poses, lights, gravity and inertias that are none, as (prim path, message)."""
-    from pxr import Usd, UsdGeom, UsdLux, UsdPhysics
-
     poses = UsdGeom.XformCache()
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         faults: list[str | None] = []
@@ -199,7 +186,7 @@ def shape_faults(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
         yield from ((str(prim.GetPath()), fault) for fault in faults if fault)
 
 
-def _size_fault(prim: "Usd.Prim") -> str | None:
+def _size_fault(prim: Usd.Prim) -> str | None:
     for name in _LENGTHS.get(prim.GetTypeName(), ()):
         value = prim.GetAttribute(name).Get()
         # A plane of width 0 has no end.
@@ -209,8 +196,7 @@ def _size_fault(prim: "Usd.Prim") -> str | None:
     return None
 
 
-def _pose_fault(prim: "Usd.Prim", poses: object) -> str | None:
-    from pxr import UsdGeom
+def _pose_fault(prim: Usd.Prim, poses: object) -> str | None:
 
     for operation in UsdGeom.Xformable(prim).GetOrderedXformOps():
         value = operation.Get()
@@ -231,10 +217,8 @@ def _pose_fault(prim: "Usd.Prim", poses: object) -> str | None:
     return None
 
 
-def _flat_fault(prim: "Usd.Prim") -> str | None:
+def _flat_fault(prim: Usd.Prim) -> str | None:
     """The hull of points that lie in a plane or on a line has no inside that could carry a contact."""
-    from pxr import UsdGeom
-
     points = np.asarray(UsdGeom.Mesh(prim).GetPointsAttr().Get() or (), dtype=np.float64)
     if len(points) < 4:
         return f"is a collision mesh of {len(points)} points, which is flat: expected a solid, as a thin Cube"
@@ -244,8 +228,7 @@ def _flat_fault(prim: "Usd.Prim") -> str | None:
     return None
 
 
-def _light_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdLux
+def _light_fault(prim: Usd.Prim) -> str | None:
 
     light = UsdLux.LightAPI(prim)
     intensity, color = light.GetIntensityAttr().Get(), light.GetColorAttr().Get()
@@ -254,8 +237,7 @@ def _light_fault(prim: "Usd.Prim") -> str | None:
     return None if color is None or min(color) >= 0.0 else f"inputs:color is {tuple(color)}: expected at least 0"
 
 
-def _joint_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdPhysics
+def _joint_fault(prim: Usd.Prim) -> str | None:
 
     joint = UsdPhysics.Joint(prim)
     for attribute in (joint.GetLocalRot0Attr(), joint.GetLocalRot1Attr()):
@@ -265,16 +247,14 @@ def _joint_fault(prim: "Usd.Prim") -> str | None:
     return None
 
 
-def _gravity_fault(prim: "Usd.Prim") -> str | None:
+def _gravity_fault(prim: Usd.Prim) -> str | None:
     attribute = prim.GetAttribute("physics:gravityMagnitude")
     value = attribute.Get() if attribute.HasAuthoredValue() else None
     return None if value is None or 0.0 <= value <= _GRAVITY else f"{attribute.GetName()} is {value:g}: expected m/s²"
 
 
-def _inertia_fault(prim: "Usd.Prim") -> str | None:
+def _inertia_fault(prim: Usd.Prim) -> str | None:
     """Inertia that no body of this mass can have; missing values are told elsewhere."""
-    from pxr import UsdPhysics
-
     api = UsdPhysics.MassAPI(prim)
     mass, inertia = api.GetMassAttr().Get(), api.GetDiagonalInertiaAttr().Get()
     if mass and mass > 0 and not _MASSES[0] <= mass <= _MASSES[1]:
@@ -294,10 +274,8 @@ def _inertia_fault(prim: "Usd.Prim") -> str | None:
     return None
 
 
-def _reach(prim: "Usd.Prim") -> float:
+def _reach(prim: Usd.Prim) -> float:
     """Farthest that a body's geometry may be from its centre of mass [m]; 0 without geometry."""
-    from pxr import Usd, UsdGeom
-
     box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default", "render", "proxy", "guide"])
     bounds = box.ComputeLocalBound(prim).ComputeAlignedRange() if not prim.IsPseudoRoot() else None
     if bounds is None or bounds.IsEmpty():

@@ -6,6 +6,7 @@ from pathlib import Path
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.dependencies import PACKAGE
+from arena_newton.usd_scenes.shapes import open_stage
 
 __all__ = ["write"]
 
@@ -66,8 +67,6 @@ def write(task: str, path: str | Path) -> Path:
 
 def _light(scene: Path) -> str:
     """Colour of the scene's light, as USD writes it."""
-    from arena_newton.usd_scenes.shapes import open_stage
-
     stage = open_stage(scene, checked=False)
     color = stage.GetPrimAtPath("/World/Light").GetAttribute("inputs:color").Get()
     return f"({', '.join(f'{value:g}' for value in color)})"

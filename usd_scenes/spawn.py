@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from arena_newton import limits
+import mujoco
+
+from arena_newton import limits, rule_sets, tasks
 from arena_newton import robot as g1
 from arena_newton.rules import MODES
+from arena_newton.scene import Scene, load_scene, scene_path
 from arena_newton.usd_scenes.dependencies import Problem
-
-if TYPE_CHECKING:
-    from arena_newton.scene import Scene
 
 __all__ = ["penetrations"]
 
@@ -33,8 +33,6 @@ def penetrations(path: str | Path, task: str) -> tuple[list[Problem], list[Probl
     Raises:
         InputError: The scene cannot be built.
     """
-    from arena_newton.scene import scene_path
-
     found = _pairs(path, task)
     if not found:
         return [], []
@@ -48,9 +46,6 @@ def penetrations(path: str | Path, task: str) -> tuple[list[Problem], list[Probl
 
 def _pairs(path: str | Path, task: str) -> dict[tuple[str, str], tuple[float, list[str]]]:
     """(prim, prim) → depth [m] and the modes in which they start so."""
-    from arena_newton import rule_sets, tasks
-    from arena_newton.scene import load_scene
-
     spec, rules = tasks.get(task), rule_sets.get("paper")
     scenes: dict[str | None, Scene] = {}
     found: dict[tuple[str, str], tuple[float, list[str]]] = {}
@@ -67,8 +62,6 @@ def _pairs(path: str | Path, task: str) -> dict[tuple[str, str], tuple[float, li
 
 def _inside(scene: Scene, draws: Any, spec: Any) -> dict[tuple[str, str], float]:
     """Pairs of prims of one episode's first instant, with their depth [m]."""
-    import mujoco
-
     m = scene.mj_model
     data = mujoco.MjData(m)
     handles = scene.robot

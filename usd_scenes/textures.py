@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 __all__ = ["TEXTURES", "write_all"]
 
@@ -219,8 +220,6 @@ TEXTURES: dict[str, Callable[[], np.ndarray]] = {
 
 def write_all(folder: Path = FOLDER) -> list[Path]:
     """Write every texture as `<folder>/<name>.png`; the bytes are the same on every run."""
-    from PIL import Image
-
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, draw in TEXTURES.items():

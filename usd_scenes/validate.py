@@ -7,7 +7,8 @@ rigid body, and that nothing is loaded from outside the folder tree or over a ne
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdUtils
 
 from arena_newton import limits, tasks
 from arena_newton.errors import InputError
@@ -24,9 +25,6 @@ from arena_newton.usd_scenes.dependencies import (
 )
 from arena_newton.usd_scenes.differences import differences
 from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
-
-if TYPE_CHECKING:
-    from pxr import Usd
 
 __all__ = [
     "Problem",
@@ -60,8 +58,6 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
     Raises:
         InputError: `task` is no task.
     """
-    from pxr import Tf, UsdUtils
-
     if task is not None and task not in tasks.names():
         raise InputError(f"unknown task {task!r}; tasks are {', '.join(tasks.names())}")
     # Composition warnings repeat on stderr what is reported here; the delegate swallows them.
@@ -92,7 +88,6 @@ def task_of(path: str | Path) -> str | None:
 
 
 def _validate(file: Path, task: str | None) -> list[Problem]:
-    from pxr import Usd
 
     found = collect(file)
     if found.fatal:
@@ -121,7 +116,7 @@ _COLLISION_WORDS = ("filter", "group", "colli", "contype", "conaffinity", "enabl
 """Parts of names of attributes and relationships that decide which colliders meet."""
 
 
-def _contacts(stage: "Usd.Stage", file: Path, found: Dependencies, task: str) -> Iterator[Problem]:
+def _contacts(stage: Usd.Stage, file: Path, found: Dependencies, task: str) -> Iterator[Problem]:
     """Needed things that no longer meet each other; built, since groups and filters have no simpler answer.
 
     Only a layer that says something of collisions itself is built.
@@ -149,15 +144,14 @@ def _contacts(stage: "Usd.Stage", file: Path, found: Dependencies, task: str) ->
     release()
 
 
-def _speaks_of_collisions(stage: "Usd.Stage", found: Dependencies) -> bool:
-    from pxr import Sdf
+def _speaks_of_collisions(stage: Usd.Stage, found: Dependencies) -> bool:
 
     layers = {layer.identifier: layer for layer in stage.GetUsedLayers() if not layer.anonymous}
     files = (path for path in found.files if path.suffix in (".usda", ".usd", ".usdc", ".usdz"))
     layers |= {layer.identifier: layer for path in files if (layer := Sdf.Layer.FindOrOpen(str(path)))}
     names: list[str] = []
 
-    def note(path: "Sdf.Path") -> None:
+    def note(path: Sdf.Path) -> None:
         if path.IsPropertyPath():
             names.append(path.name.lower())
 
@@ -167,10 +161,8 @@ def _speaks_of_collisions(stage: "Usd.Stage", found: Dependencies) -> bool:
     return any(word in name for name in names for word in _COLLISION_WORDS)
 
 
-def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem]:
+def _prims(stage: Usd.Stage, file: Path, task: str | None) -> Iterator[Problem]:
     """Faults of the prims, in the authored selection and in every variant of `semantics`."""
-    from pxr import Usd
-
     seen: set[tuple[str, str]] = set(_selections(stage))
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         choice = stage.GetPrimAtPath("/World").GetVariantSets().GetVariantSet("semantics")
@@ -188,7 +180,7 @@ def _prims(stage: "Usd.Stage", file: Path, task: str | None) -> Iterator[Problem
                 seen.add((prim, message))
 
 
-def _faults(stage: "Usd.Stage", task: str | None, variant: str) -> list[tuple[str, str]]:
+def _faults(stage: Usd.Stage, task: str | None, variant: str) -> list[tuple[str, str]]:
     """Faults of the prims as they are selected now, as (prim path, message)."""
     wrong = list(type_faults(stage))
     if wrong:
@@ -203,7 +195,7 @@ def _wanted(item: Required, variant: str) -> bool:
     return not item.variants or variant in item.variants
 
 
-def _selections(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+def _selections(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
     """Variant selections that name no variant; USD would silently compose the prim without any."""
     for prim in stage.TraverseAll():
         sets = prim.GetVariantSets()
@@ -217,14 +209,14 @@ def _selections(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
                 yield str(prim.GetPath()), f'variant {name} = "{selected}" is unknown: expected {wanted}'
 
 
-def _composition(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
+def _composition(stage: Usd.Stage, file: Path) -> Iterator[Problem]:
     """What USD could not compose: a reference to a prim that is not there, a cycle."""
     for error in stage.GetCompositionErrors():
         where = error.rootSite.path
         yield Problem(str(file), "" if where.IsAbsoluteRootPath() else str(where), reason(error))
 
 
-def _strangers(stage: "Usd.Stage", file: Path, found: Dependencies) -> Iterator[Problem]:
+def _strangers(stage: Usd.Stage, file: Path, found: Dependencies) -> Iterator[Problem]:
     """Layers that the stage uses and the search did not look at; there should be none."""
     for layer in stage.GetUsedLayers():
         path = layer.realPath.split("[", 1)[0]
@@ -232,7 +224,7 @@ def _strangers(stage: "Usd.Stage", file: Path, found: Dependencies) -> Iterator[
             yield Problem(str(file), "", f"is composed from @{layer.identifier}@, which no asset path in it names")
 
 
-def _fault(stage: "Usd.Stage", item: Required) -> tuple[str, str] | None:
+def _fault(stage: Usd.Stage, item: Required) -> tuple[str, str] | None:
     """What a required prim lacks, as (prim path, message)."""
     prim = stage.GetPrimAtPath(item.path)
     wanted = _KIND_WORDS[item.kind]
@@ -257,8 +249,7 @@ _KIND_WORDS = {
 }
 
 
-def _collides(prim: "Usd.Prim") -> bool:
-    from pxr import Usd, UsdPhysics
+def _collides(prim: Usd.Prim) -> bool:
 
     return any(
         p.HasAPI(UsdPhysics.CollisionAPI) and UsdPhysics.CollisionAPI(p).GetCollisionEnabledAttr().Get()
@@ -266,26 +257,22 @@ def _collides(prim: "Usd.Prim") -> bool:
     )
 
 
-def _body_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdPhysics
+def _body_fault(prim: Usd.Prim) -> str | None:
 
     if not prim.HasAPI(UsdPhysics.RigidBodyAPI):
         return "is not a rigid body"
     return _held_fault(prim) or (None if _collides(prim) else "has no collision geom")
 
 
-def _held_fault(prim: "Usd.Prim") -> str | None:
+def _held_fault(prim: Usd.Prim) -> str | None:
     """A rigid body that does not move by itself."""
-    from pxr import UsdPhysics
-
     body = UsdPhysics.RigidBodyAPI(prim)
     if not body.GetRigidBodyEnabledAttr().Get():
         return "physics:rigidBodyEnabled is false"
     return "physics:kinematicEnabled is true" if body.GetKinematicEnabledAttr().Get() else None
 
 
-def _target_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdPhysics
+def _target_fault(prim: Usd.Prim) -> str | None:
 
     frame, joint = prim.GetChild("Frame"), prim.GetChild("anchor")
     if not prim.HasAPI(UsdPhysics.ArticulationRootAPI):
@@ -298,12 +285,11 @@ def _target_fault(prim: "Usd.Prim") -> str | None:
     return None if frame.GetPath() in held else "its anchor does not hold Frame"
 
 
-def _fixture_fault(prim: "Usd.Prim") -> str | None:
+def _fixture_fault(prim: Usd.Prim) -> str | None:
     return _target_fault(prim) or (None if _collides(prim.GetChild("Frame")) else "has no collision geom")
 
 
-def _hinge_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdPhysics
+def _hinge_fault(prim: Usd.Prim) -> str | None:
 
     if not prim.IsA(UsdPhysics.RevoluteJoint):
         return "is not a revolute joint"
@@ -312,12 +298,12 @@ def _hinge_fault(prim: "Usd.Prim") -> str | None:
     return None if both else "does not join two bodies"
 
 
-def _latch_fault(prim: "Usd.Prim") -> str | None:
+def _latch_fault(prim: Usd.Prim) -> str | None:
     latch = prim.GetAttribute("arena:latch")
     return _hinge_fault(prim) or (None if latch and latch.Get() else "has no attribute arena:latch = true")
 
 
-def _marker_fault(prim: "Usd.Prim") -> str | None:
+def _marker_fault(prim: Usd.Prim) -> str | None:
     attribute = prim.GetAttribute("arena:size")
     size = attribute.Get() if attribute else None
     if size is None:
@@ -330,34 +316,29 @@ def _marker_fault(prim: "Usd.Prim") -> str | None:
     return None if good else f"arena:size is {tuple(lengths)}"
 
 
-def _collider_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdPhysics
+def _collider_fault(prim: Usd.Prim) -> str | None:
 
     if prim.HasAPI(UsdPhysics.RigidBodyAPI):
         return "is a rigid body"
     return None if _collides(prim) else "has no collision geom"
 
 
-def _camera_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdGeom
+def _camera_fault(prim: Usd.Prim) -> str | None:
 
     return None if prim.IsA(UsdGeom.Camera) else f"is a {prim.GetTypeName() or 'typeless prim'}"
 
 
-def _light_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdLux
+def _light_fault(prim: Usd.Prim) -> str | None:
 
     return None if prim.HasAPI(UsdLux.LightAPI) else f"is a {prim.GetTypeName() or 'typeless prim'}"
 
 
-def _physics_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import UsdPhysics
+def _physics_fault(prim: Usd.Prim) -> str | None:
 
     return None if prim.IsA(UsdPhysics.Scene) else f"is a {prim.GetTypeName() or 'typeless prim'}"
 
 
-def _robot_fault(prim: "Usd.Prim") -> str | None:
-    from pxr import Usd, UsdPhysics
+def _robot_fault(prim: Usd.Prim) -> str | None:
 
     bodies = [p for p in Usd.PrimRange(prim) if p.HasAPI(UsdPhysics.RigidBodyAPI)]
     if all(p.GetName() != "pelvis" for p in bodies):
@@ -380,10 +361,8 @@ _KIND_TESTS = {
 }
 
 
-def _masses(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
+def _masses(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
     """Rigid bodies whose mass, inertia, centre of mass or principal axes are not authored."""
-    from pxr import UsdPhysics
-
     for prim in stage.Traverse():
         if not prim.HasAPI(UsdPhysics.RigidBodyAPI):
             continue
@@ -412,8 +391,7 @@ def _masses(stage: "Usd.Stage") -> Iterator[tuple[str, str]]:
             yield path, f"physics:principalAxes has length {axes.GetLength():g}: expected a unit quaternion"
 
 
-def _units(stage: "Usd.Stage", file: Path) -> Iterator[Problem]:
-    from pxr import UsdGeom, UsdPhysics
+def _units(stage: Usd.Stage, file: Path) -> Iterator[Problem]:
 
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         yield Problem(str(file), "", "metersPerUnit is missing (USD then means 0.01): expected 1")

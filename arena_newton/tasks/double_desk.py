@@ -33,7 +33,7 @@ PREDICATES = (
     Predicate("approach", f"root within {num(REACH)} m of the hammer, seen from above"),
     Predicate("contact", f"a palm within {num(TOUCH)} m of the hammer's bounding box"),
     Predicate("lift", f"the hammer's centre of mass {num(LIFT)} m above the right desk"),
-    Predicate("transport", f"so high, and within {num(OVER_CRATE)} m of the crate, seen from above"),
+    Predicate("transport", f"at that height, and within {num(OVER_CRATE)} m of the crate, seen from above"),
     Predicate("place", "the hammer is in the crate, as the rule set says"),
 )
 

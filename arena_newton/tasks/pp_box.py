@@ -40,7 +40,7 @@ PREDICATES = (
     Predicate("lift", f"the box's bottom {num(LIFT)} m above the table"),
     Predicate("transport", f"the box's centre within {num(OVER_SHELF)} m of the shelf's decks, seen from above"),
     Predicate("place", f"the box's centre over a deck, its bottom within {num(ON_DECK)} m of it"),
-    Predicate("release", f"so placed, and no palm within {num(TOUCH)} m of the box"),
+    Predicate("release", f"the same, and no palm within {num(TOUCH)} m of the box"),
     Predicate("hold", "the box stays on the shelf, as the rule set says"),
 )
 

@@ -30,9 +30,9 @@ TURNED = 0.7071
 
 PREDICATES = (
     Predicate("approach", f"root within {num(REACH)} m of the seat, seen from above"),
-    Predicate("turn", "so near, with the back to the seat's centre within 45°"),
+    Predicate("turn", "at that distance, with the back turned to the seat's centre within 45°"),
     Predicate("contact", "the rule set's condition holds at this tick"),
-    Predicate("sit", "for as long as the rule set asks"),
+    Predicate("sit", "that condition has held for as long as the rule set asks"),
 )
 
 _HIPS = tuple(f"{side}_hip_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll", "yaw"))
