@@ -23,6 +23,7 @@ from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.blocks import BlockRunner
 from arena_newton.trackers.inference.networks import Symmetric
+from arena_newton.trackers.inference.onnx_session import OnnxSession
 from arena_newton.trackers.interface import JOINTS, ActionForm, residual_form
 
 __all__ = ["JOINTS", "ActionForm", "FrontEnd", "Mirror", "NetworkTracker", "column", "plain", "residual_form", "store"]
@@ -186,7 +187,7 @@ class NetworkTracker(Tracker):
     def __init__(
         self,
         front_end: FrontEnd,
-        network: Callable[[torch.Tensor], torch.Tensor],
+        network: torch.nn.Module,
         *,
         checkpoint: str | None = None,
         checkpoint_hash: str = "none",
@@ -195,7 +196,7 @@ class NetworkTracker(Tracker):
 
         Args:
             front_end: Makes observations and targets.
-            network: Maps [rows, obs_width] to [rows, action_width], each row by itself; modules move to the device.
+            network: Maps [rows, obs_width] to [rows, action_width], each row by itself; `bind` moves it to the device.
             checkpoint: File the weights came from.
             checkpoint_hash: First 12 hexadecimal digits of its SHA-256.
         """
@@ -225,8 +226,9 @@ class NetworkTracker(Tracker):
         """Allocate observation buffers for `worlds` worlds on `device`."""
         super().bind(worlds, device)
         device = torch.device(device)
-        if isinstance(self.network, torch.nn.Module):
-            self.network.to(device)
+        for session in [module for module in self.network.modules() if isinstance(module, OnnxSession)]:
+            session.convert(device)
+        self.network.to(device)
         self._runner = BlockRunner(self.network, self.front_end.obs_width, worlds, device)
         self.front_end.bind(worlds, device, self._runner.input)
         self._graph = _TickGraph(self._tick, worlds, device) if device.type == "cuda" and self._graphable else None
@@ -241,16 +243,12 @@ class NetworkTracker(Tracker):
         runner = getattr(self, "_runner", None)
         if runner is None:
             return None
-        if runner.fixed:
-            runner.plan()
         return f"{runner.path}, CUDA graph" if self._graph is not None else runner.path
 
     @property
     def _graphable(self) -> bool:
         """Whether a CUDA graph may hold a tick: everything runs on the device, by the same operations each time."""
-        if not (self.front_end.graphable and isinstance(self.network, torch.nn.Module)):
-            return False
-        return not any(getattr(module, "on_host", False) for module in self.network.modules())
+        return self.front_end.graphable and not any(getattr(m, "on_host", False) for m in self.network.modules())
 
     @property
     def last_action(self) -> torch.Tensor:

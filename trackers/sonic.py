@@ -20,8 +20,9 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, SONIC_DRIVE, PhysicsRate
 from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
-from arena_newton.trackers.inference import onnx_session, weights_file
+from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, PartialNetwork, TrackerNetwork, folded, mlp, shrink_last
+from arena_newton.trackers.inference.onnx_session import OnnxSession
 from arena_newton.trackers.inference.quadratic import Quadratic, products
 from arena_newton.trackers.interface import JOINTS, ActionForm, Interface, slices
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
@@ -356,8 +357,8 @@ class SonicTracker(NetworkTracker):
         """
         encoder, decoder = official_pair(checkpoint)
         networks = (
-            onnx_session.load_any(encoder, in_width=ENCODER_INPUT, out_width=LATENT),
-            onnx_session.load_any(decoder, in_width=LATENT + PROPRIOCEPTION, out_width=JOINTS),
+            OnnxSession(encoder, in_width=ENCODER_INPUT, out_width=LATENT),
+            OnnxSession(decoder, in_width=LATENT + PROPRIOCEPTION, out_width=JOINTS),
         )
         digest = hashlib.sha256(encoder.read_bytes() + decoder.read_bytes()).hexdigest()
         return cls(SonicFrontEnd(), EncoderDecoder(*networks), checkpoint=str(checkpoint), checkpoint_hash=digest[:12])

@@ -19,8 +19,9 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
 from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
-from arena_newton.trackers.inference import onnx_mlp, weights_file
+from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, folded, mlp, shrink_last
+from arena_newton.trackers.inference.onnx_session import OnnxSession
 from arena_newton.trackers.inference.quadratic import Quadratic, products
 from arena_newton.trackers.interface import JOINTS, ActionForm, Interface, slices
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
@@ -173,7 +174,7 @@ class Twist2Tracker(NetworkTracker):
         Raises:
             InputError: The file is absent or not a network of TWIST2's widths.
         """
-        network = onnx_mlp.load(checkpoint, in_width=OBSERVATION, out_width=JOINTS)
+        network = OnnxSession(checkpoint, in_width=OBSERVATION, out_width=JOINTS)
         tracker = cls(Twist2FrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
         tracker.original_drive = TWIST2_HUMANOIDARENA_DRIVE
         return tracker

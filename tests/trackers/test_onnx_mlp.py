@@ -45,6 +45,26 @@ def test_same_operators(tmp_path):
     assert difference(small, 459, 5) < 1e-5
 
 
+def test_torch_modules_run_the_rows_of_a_gpu(tmp_path):
+    """What is converted for a GPU computes what the session does; back on the CPU the session runs again."""
+    session = onnx_session.OnnxSession(twist2_like(tmp_path / "a.onnx"), in_width=1432, out_width=29)
+    x = torch.randn(5, 1432)
+    expected = session(x)
+    session.convert(torch.device("cuda"))
+    assert isinstance(session.twin, onnx_mlp.OnnxNetwork) and not session.on_host
+    torch.testing.assert_close(session(x), expected, atol=1e-5, rtol=1e-4)
+    session.convert(torch.device("cpu"))
+    assert session.on_host and torch.equal(session(x), expected)
+
+
+def test_fused_and_plain_modules_agree(tmp_path):
+    """Without fused calls the torch modules compute the same."""
+    path, x = twist2_like(tmp_path / "a.onnx"), torch.randn(5, 1432)
+    plain, fused = (onnx_mlp.load(path, in_width=1432, out_width=29, fuse=fuse) for fuse in (False, True))
+    assert len(plain.layers) > len(fused.layers)
+    torch.testing.assert_close(plain(x), fused(x), atol=1e-5, rtol=1e-4)
+
+
 def test_shape_arithmetic_is_gone(tmp_path):
     """Activations and layer norm are one call each; no shape arithmetic is left."""
     network = onnx_mlp.load(twist2_like(tmp_path / "a.onnx"), in_width=1432, out_width=29)
@@ -72,12 +92,12 @@ def test_wrong_width(tmp_path):
 
 
 def test_unknown_operator(tmp_path):
-    """An operator that cannot be read is named."""
+    """An operator that has no torch module is named."""
     b = Builder()
     b.add("Selu", "input", output="output")
-    path = b.save(tmp_path / "odd.onnx", 1432, 1432)
+    path = b.save(tmp_path / "odd.onnx", 12, 12)
     with pytest.raises(InputError, match="Selu"):
-        trackers.get("twist2", path)
+        onnx_mlp.load(path, in_width=12, out_width=12)
 
 
 def test_weights_elsewhere(tmp_path):
@@ -131,7 +151,7 @@ def test_graphs_that_would_take_memory(tmp_path, graph):
 
 
 def test_a_runtime_is_probed_first(tmp_path):
-    """What only onnxruntime could run is opened by another process first: its memory is not ours."""
+    """A file is opened by another process first: its memory is not ours."""
     b = Builder()
     zeros = b.add("ConstantOfShape", b.constant(np.array([2**33])))
     x = b.add("Add", b.add("MatMul", "input", b.weight(12, 4)), b.add("ReduceMean", zeros, axes=[0], keepdims=0))
@@ -141,5 +161,5 @@ def test_a_runtime_is_probed_first(tmp_path):
         onnx_session.OnnxSession(path, in_width=12, out_width=4)
     b = Builder()
     b.add("Selu", b.add("MatMul", "input", b.weight(12, 4)), output="output")
-    session = onnx_session.load_any(b.save(tmp_path / "good.onnx", 12, 4), in_width=12, out_width=4)
+    session = onnx_session.OnnxSession(b.save(tmp_path / "good.onnx", 12, 4), in_width=12, out_width=4)
     assert session(torch.zeros(3, 12)).shape == (3, 4)

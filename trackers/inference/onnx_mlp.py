@@ -1,4 +1,4 @@
-"""A small feed-forward ONNX network as a torch module: weights and structure are read from the file.
+"""A small feed-forward ONNX network as a torch module, for CUDA graphs: weights and structure come from the file.
 
 The graph is evaluated once, node by node, on a probe batch. That fixes every shape, so the shape arithmetic that
 exporters leave in the graph disappears; what remains becomes a short list of torch modules in which common groups are
@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import onnx
 import torch
 from torch.nn import functional
 
@@ -21,7 +22,7 @@ from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.foreign import read_bytes
 
-__all__ = ["OnnxNetwork", "load"]
+__all__ = ["OnnxNetwork", "load", "read"]
 
 _PROBE_ROWS = 7
 """Rows of the probe batch; a prime, so that a reshaped first dimension shows how it depends on the batch."""
@@ -126,9 +127,8 @@ class OnnxNetwork(torch.nn.Module):
 class _Graph:
     """One ONNX graph with its probe values, and the list of modules made from it."""
 
-    def __init__(self, model: Any, in_width: int):
-        import onnx
-
+    def __init__(self, model: onnx.ModelProto, in_width: int, *, fuse: bool = True):
+        self._fuse = fuse
         graph = model.graph
         if len(graph.node) > limits.NETWORK_NODES:
             raise _Unfit(f"it has {len(graph.node)} nodes, expected at most {limits.NETWORK_NODES}")
@@ -193,7 +193,7 @@ class _Graph:
         return all(math.isinf(b) for b in bounds)
 
     def _module(self, op, inputs, output, attributes) -> tuple[torch.nn.Module, tuple[str, ...], str]:
-        fused = self._silu(op, inputs) or self._layer_norm(op, inputs)
+        fused = (self._silu(op, inputs) or self._layer_norm(op, inputs)) if self._fuse else None
         if fused is not None:
             return (*fused, output)
         dynamic = tuple(name for name in inputs if name in self.dynamic)
@@ -206,7 +206,7 @@ class _Graph:
             module = _Linear(weight * attributes.get("alpha", 1.0), bias)
         elif op == "MatMul" and 1 in static and static[1].dim() == 2:
             module = _Linear(static[1].t(), None)
-        elif op == "Conv" and len(dynamic) == 1 and inputs[0] in self.dynamic:
+        elif op == "Conv" and self._fuse and len(dynamic) == 1 and inputs[0] in self.dynamic:
             module = self._convolution(inputs, static, attributes, shape)
         elif op in ("Reshape", "Flatten") or (op in ("Squeeze", "Unsqueeze") and shape[0] == _PROBE_ROWS):
             module, dynamic = _Call(lambda x, rest=shape[1:]: x.reshape(-1, *rest)), dynamic[:1]
@@ -287,8 +287,6 @@ def _probe(rows: int, width: int) -> torch.Tensor:
 
 
 def _attributes(node: Any) -> dict[str, Any]:
-    import onnx
-
     values = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
     if "value" in values:
         values["value"] = torch.from_numpy(onnx.numpy_helper.to_array(values["value"]).copy())
@@ -401,21 +399,17 @@ def _evaluate(op: str, x: list[Any], attributes: dict[str, Any]) -> torch.Tensor
     raise _Unfit(f"operator {op} with these arguments is not supported")
 
 
-@torch.inference_mode()
-def load(path: str | Path, *, in_width: int, out_width: int, flag: str = "--checkpoint") -> OnnxNetwork:
-    """Read a feed-forward network from an ONNX file.
+def read(path: str | Path, *, in_width: int, flag: str = "--checkpoint") -> tuple[onnx.ModelProto, bytes]:
+    """The graph of an ONNX file that holds all of its weights, and the file's content.
 
     Args:
         path: The file.
         in_width: Observation width that the caller needs.
-        out_width: Output width that the caller needs.
         flag: Command-line flag that errors name.
 
     Raises:
-        InputError: The file is absent, is no ONNX network, holds an unknown operator, or has other widths.
+        InputError: The file is absent, not an ONNX network, keeps weights in another file, or has another input width.
     """
-    import onnx
-
     where = f"{flag} {path}"
     data = read_bytes(path, limits.NETWORK_BYTES, where=where)
     try:
@@ -423,11 +417,41 @@ def load(path: str | Path, *, in_width: int, out_width: int, flag: str = "--chec
         if not model.graph.output:
             raise _Unfit("it holds no graph")
         if any(i.data_location == onnx.TensorProto.EXTERNAL for i in model.graph.initializer):
-            raise _Unfit("its weights lie in another file")
+            raise _Unfit("its weights are in another file")
         width = [d.dim_value for i in model.graph.input for d in i.type.tensor_type.shape.dim][-1:]
-        if width and width[0] not in (0, in_width):
-            raise InputError(f"{where}: the network takes {width[0]} numbers, expected {in_width}")
-        graph = _Graph(model, in_width)
+    except Exception as error:  # a damaged file fails anywhere inside protobuf
+        raise InputError(f"{where}: {_reason(error)}") from error
+    if width and width[0] not in (0, in_width):
+        raise InputError(f"{where}: the network takes {width[0]} numbers, expected {in_width}")
+    return model, data
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, _Unfit):
+        return f"not a network that this reader can use: {error}"
+    return f"not a usable ONNX file ({type(error).__name__}: {' '.join(str(error).split())[:160]})"
+
+
+@torch.inference_mode()
+def load(
+    path: str | Path, *, in_width: int, out_width: int, flag: str = "--checkpoint", fuse: bool = True
+) -> OnnxNetwork:
+    """Read a feed-forward network from an ONNX file.
+
+    Args:
+        path: The file.
+        in_width: Observation width that the caller needs.
+        out_width: Output width that the caller needs.
+        flag: Command-line flag that errors name.
+        fuse: Whether `x * sigmoid(x)`, layer normalisation and convolutions become one call each.
+
+    Raises:
+        InputError: The file is absent, not an ONNX network, holds an unknown operator, or has other widths.
+    """
+    where = f"{flag} {path}"
+    model, data = read(path, in_width=in_width, flag=flag)
+    try:
+        graph = _Graph(model, in_width, fuse=fuse)
         network = OnnxNetwork(graph).eval()
         x = _probe(_CHECK_ROWS, graph.in_width)
         got, expected = network(x), graph.evaluate(x, {})
@@ -438,10 +462,7 @@ def load(path: str | Path, *, in_width: int, out_width: int, flag: str = "--chec
             raise _Unfit("its result depends on the batch size or is not finite")
     except InputError:
         raise
-    except _Unfit as error:
-        raise InputError(f"{where}: not a network that this reader can use: {error}") from error
-    except Exception as error:  # a damaged file fails anywhere inside protobuf, numpy or torch
-        reason = " ".join(str(error).split())[:160]
-        raise InputError(f"{where}: not a usable ONNX file ({type(error).__name__}: {reason})") from error
+    except Exception as error:  # a damaged graph fails anywhere inside numpy or torch
+        raise InputError(f"{where}: {_reason(error)}") from error
     network.sha256 = hashlib.sha256(data).hexdigest()
     return network

@@ -12,7 +12,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker, column, store
-from arena_newton.trackers.inference import onnx_mlp
+from arena_newton.trackers.inference.onnx_session import OnnxSession
 
 FRAMES, FRAME = 5, 115
 LEG = (-0.1, 0.0, 0.0, 0.3, -0.2, 0.0)
@@ -97,5 +97,5 @@ class FalconTracker(NetworkTracker):
     def __init__(self, checkpoint: Path | None):
         if checkpoint is None:
             raise InputError("--tracker falcon: pass --checkpoint with FALCON's g1_29dof.onnx")
-        network = onnx_mlp.load(checkpoint, in_width=FRAMES * FRAME, out_width=29)
+        network = OnnxSession(checkpoint, in_width=FRAMES * FRAME, out_width=29)
         super().__init__(FalconFrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
