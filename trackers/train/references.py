@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from arena_newton import rotations
 from arena_newton.trackers.motions import frames, kinematics
-from arena_newton.trackers.train import rotations
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.library import DeviceLibrary

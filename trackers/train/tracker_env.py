@@ -16,11 +16,12 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from arena_newton import rotations
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
 from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
 from arena_newton.trackers.motions import frames
-from arena_newton.trackers.train import events, rotations
+from arena_newton.trackers.train import events
 from arena_newton.trackers.train.graphs import captured
 from arena_newton.trackers.train.motion import Motion
 from arena_newton.trackers.train.references import FEET, KEY_LINKS, Frame, ReferenceBank

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from arena_newton.trackers.motions import frames, kinematics
-from arena_newton.trackers.train import events, rotations
+from arena_newton import rotations
+from arena_newton.trackers.motions import kinematics
+from arena_newton.trackers.train import events
 from arena_newton.trackers.train.motion import Motion
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS
@@ -116,15 +117,11 @@ def test_pushes_strike_as_often_and_as_hard_as_set():
 
 def test_key_links_are_seen_from_the_heading_frame(library):
     """Key links do not change when a clip is moved and turned on the floor."""
+    yaw = rotations.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4)
     turned = dataclasses.replace(
         library,
-        root_pos=frames.quat_apply(
-            frames.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4), torch.tensor(library.root_pos)
-        ).numpy()
-        + [3.0, -2.0, 0.0],
-        root_quat=frames.quat_multiply(
-            frames.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4), torch.tensor(library.root_quat)
-        ).numpy(),
+        root_pos=rotations.quat_apply(yaw, torch.tensor(library.root_pos)).numpy() + [3.0, -2.0, 0.0],
+        root_quat=rotations.quat_multiply(yaw, torch.tensor(library.root_quat)).numpy(),
     )
     here, there = (
         ReferenceBank(lib.to("cpu"), "cpu").gather(torch.tensor([70, 220])).keys for lib in (library, turned)
@@ -136,13 +133,13 @@ def test_key_links_are_seen_from_the_heading_frame(library):
 
 def test_turning_a_quaternion_by_a_small_vector():
     """`turned_by` turns in the body's frame, so that gravity seen from the body moves by the vector's length."""
-    quat = frames.quat_from_yaw(torch.tensor([0.7]))
+    quat = rotations.quat_from_yaw(torch.tensor([0.7]))
     turned = rotations.turned_by(quat, torch.tensor([[0.02, 0.0, 0.0]]))
-    assert torch.allclose(frames.roll_pitch(turned), torch.tensor([[0.02, 0.0]]), atol=1e-5)
-    assert torch.allclose(frames.heading(turned), torch.tensor([0.7]), atol=1e-5)
+    assert torch.allclose(rotations.roll_pitch(turned), torch.tensor([[0.02, 0.0]]), atol=1e-5)
+    assert torch.allclose(rotations.heading(turned), torch.tensor([0.7]), atol=1e-5)
     assert torch.allclose(
         rotations.gravity_in_body(turned),
-        frames.quat_apply(frames.quat_conjugate(turned), torch.tensor([[0.0, 0.0, -1.0]])),
+        rotations.quat_apply(rotations.quat_conjugate(turned), torch.tensor([[0.0, 0.0, -1.0]])),
         atol=1e-6,
     )
 
