@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+import tyro
+
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.trackers.train.options import TrainOptions
+from arena_newton.trackers.train.options import CurveOptions, ExportCommand, TrainOptions
 
 __all__ = ["main"]
 
@@ -23,8 +25,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0 done, 1 training failed, 2 bad input, 130 interrupted.
     """
-    import tyro
-
     arguments = list(sys.argv[1:] if argv is None else argv)
 
     def work() -> None:
@@ -42,25 +42,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _export(arguments: Sequence[str]) -> None:
-    import tyro
-
-    from arena_newton.trackers.train.export import ExportCommand, export
-
     if not arguments:
         raise InputError(f"export: name the checkpoint: {PROG} export CHECKPOINT --out FILE.safetensors")
     options = tyro.cli(ExportCommand, args=list(arguments), prog=f"{PROG} export")
+    from arena_newton.trackers.train.export import export
+
     out = export(options.checkpoint, options)
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB) and its card")
 
 
 def _curves(arguments: Sequence[str]) -> None:
-    import tyro
-
-    from arena_newton.trackers.train.curves import CurveOptions, draw
-
     options = tyro.cli(CurveOptions, args=list(arguments), prog=f"{PROG} curves")
     if not options.runs:
         raise InputError(f"curves: name the folders of trainings: {PROG} curves RUN [RUN ...] --out FILE.png")
+    from arena_newton.trackers.train.curves import draw
+
     print(f"wrote {draw(options.runs, options.out)}")
 
 

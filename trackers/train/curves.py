@@ -5,18 +5,17 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
+import numpy as np
 
 from arena_newton.errors import InputError
 
-__all__ = ["PANELS", "CurveOptions", "draw", "read"]
+__all__ = ["PANELS", "draw", "read"]
 
 PANELS: tuple[tuple[str, str, bool], ...] = (
-    ("Train/reward_per_s", "reward a second", False),
+    ("Train/reward_per_s", "reward per second", False),
     ("Train/seconds_between_ends", "time between early ends [s]", True),
     ("Error/legs_rad", "leg joints, RMS error [rad]", False),
     ("Error/velocity_m_s", "root velocity error [m/s]", False),
@@ -26,16 +25,6 @@ PANELS: tuple[tuple[str, str, bool], ...] = (
 """What is drawn: name in the log, title, logarithmic or not."""
 _SMOOTH = 15
 """Points of the running mean."""
-
-
-@dataclass(frozen=True)
-class CurveOptions:
-    """Draw the curves of trainings over each other."""
-
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of trainings (their --log-dir), or progress.jsonl files."""
-    out: Path = Path("curves.png")
-    """Picture: .png, .svg or .pdf."""
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
@@ -65,10 +54,10 @@ def read(folder: Path) -> list[dict[str, Any]]:
             raise InputError(f"curves {path}: a logged iteration lacks {missing[0]}")
         wrong = [name for name in ("iteration", *needed) if not isinstance(row.get(name, 0), int | float)]
         if wrong:
-            raise InputError(f"curves {path}: {wrong[0]} of a logged iteration is no number")
+            raise InputError(f"curves {path}: {wrong[0]} of a logged iteration is not a number")
     if not rows:
         raise InputError(f"curves {path}: no logged iterations")
-    # A training that went on from an older checkpoint logged some iterations twice: the later ones count.
+    # A training that was resumed from an older checkpoint logged some iterations twice: the later ones count.
     kept: list[dict[str, Any]] = []
     for row in rows:
         while kept and kept[-1].get("iteration", 0) >= row.get("iteration", 1):
@@ -85,7 +74,7 @@ def draw(folders: Sequence[Path], out: Path) -> Path:
         out: Picture, `.png`, `.svg` or `.pdf`.
 
     Raises:
-        InputError: A log or the picture's path is unfit.
+        InputError: A log or the picture's path does not fit.
     """
     if out.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(f"--out {out}: expected .png, .svg or .pdf")
@@ -95,7 +84,6 @@ def draw(folders: Sequence[Path], out: Path) -> Path:
     if importlib.util.find_spec("matplotlib") is None:
         raise InputError("curves: needs matplotlib: install `arena-newton[plots]`")
     import matplotlib as mpl
-    import numpy as np
 
     mpl.use("Agg")
     from matplotlib import pyplot

@@ -3,45 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import tyro
+from typing import Any
 
 from arena_newton.errors import InputError
+from arena_newton.files import replace_atomically
+from arena_newton.robot import DriveGains, PhysicsRate
+from arena_newton.trackers import interface
+from arena_newton.trackers.front_end import ActionForm
+from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.train.checkpoint import Checkpoint
+from arena_newton.trackers.train.options import ExportOptions
 
-if TYPE_CHECKING:
-    from arena_newton.robot import DriveGains
-    from arena_newton.trackers.inference.weights_file import Weights
-
-__all__ = ["ExportCommand", "ExportOptions", "export", "write"]
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """Write a tracker's weights file and its card."""
-
-    out: Path
-    """The file, `.safetensors`; the card goes beside it as .json and .md."""
-    metrics: Path | None = None
-    """JSON file of an evaluation, for the card."""
-    note: str = ""
-    """A sentence for the card."""
-    hardware: str = ""
-    """What it was trained on, for the card."""
-    symmetric: bool = True
-    """The tracker answers the mean of an action and the mirrored action of the mirrored observation: training leaves a
-    preferred side, and a walk whose command has no heading turns that way."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportCommand(ExportOptions):
-    """Write a tracker's weights file and its card."""
-
-    checkpoint: tyro.conf.Positional[Path]
-    """Checkpoint of a training, such as runs/tracker/model_last.pt."""
+__all__ = ["export", "write"]
 
 
 def export(checkpoint: Path, options: ExportOptions) -> Path:
@@ -57,12 +31,6 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     Raises:
         InputError: The checkpoint is unfit, or a file cannot be written.
     """
-    from arena_newton.robot import PhysicsRate
-    from arena_newton.trackers import interface
-    from arena_newton.trackers.front_end import ActionForm
-    from arena_newton.trackers.inference import weights_file
-    from arena_newton.trackers.train.runner import read_checkpoint
-
     if options.out.suffix != ".safetensors":
         raise InputError(f"--out {options.out}: expected a .safetensors file")
     if options.metrics is not None and options.metrics.resolve() == options.out.with_suffix(".json").resolve():
@@ -70,23 +38,22 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     cards = [options.out.with_suffix(suffix) for suffix in (".json", ".md")]
     if not options.out.exists() and (taken := [c for c in cards if c.exists()]):
         raise InputError(f"--out {options.out}: its card would overwrite {taken[0]}, which is not of these weights")
-    state = read_checkpoint(checkpoint)
-    card = dict(state["card"])
-    network = interface.get(card["tracker"]).make_network(state["network"])
+    state = Checkpoint.read(checkpoint)
+    network = interface.get(state.card.tracker).make_network(state.network)
     prefix = "net."
-    tensors = {k[len(prefix) :]: v for k, v in state["actor_state_dict"].items() if k.startswith(prefix)}
+    tensors = {k[len(prefix) :]: v for k, v in state.actor_state_dict.items() if k.startswith(prefix)}
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
-        raise InputError(f"{checkpoint}: its network does not fit interface {card['tracker']}") from error
-    form, drive, physics = card.pop("action_form"), card.pop("drive"), card.pop("physics")
-    card |= {
-        "iterations": state["iter"],
-        "samples": state["samples"],
-        "minutes": round(state["seconds"] / 60.0, 2),
+        raise InputError(f"{checkpoint}: its network does not fit interface {state.card.tracker}") from error
+    card = state.card.to_dict() | {
+        "iterations": state.iter,
+        "samples": state.samples,
+        "minutes": round(state.seconds / 60.0, 2),
         "gpu_minutes": round(_process_seconds(state) / 60.0, 2),
-        "training": {k: round(v, 5) for k, v in state["last"].items() if "/" in k},
+        "training": {k: round(v, 5) for k, v in state.last.items() if "/" in k},
     }
+    form, drive, physics = card.pop("action_form"), card.pop("drive"), card.pop("physics")
     if options.note:
         card["note"] = options.note
     if options.hardware:
@@ -105,31 +72,31 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     return write(weights, options.out)
 
 
-def write(weights: Weights, out: Path) -> Path:
-    """Write a weights file and its card beside it, as .json and .md; returns the file.
+def write(weights: weights_file.Weights, out: Path) -> Path:
+    """Write a weights file and its card next to it, as .json and .md; returns the file.
 
     Raises:
         InputError: A file cannot be written.
     """
-    from arena_newton.trackers.inference import weights_file
-
-    text = _markdown(dict(weights.card))
+    data = json.dumps(weights.card, indent=2, sort_keys=True)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         weights_file.save(out, weights)
-        out.with_suffix(".json").write_text(json.dumps(weights.card, indent=2, sort_keys=True) + "\n")
-        out.with_suffix(".md").write_text(text)
+        for suffix, text in ((".json", data + "\n"), (".md", _markdown(dict(weights.card)))):
+            with replace_atomically(out.with_suffix(suffix)) as file:
+                file.write(text.encode())
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return out
 
 
-def _process_seconds(state: Mapping[str, Any]) -> float:
+def _process_seconds(checkpoint: Checkpoint) -> float:
     """Seconds of training times the processes that trained, over all parts of a training that was resumed."""
+    parts = [(part["seconds"], part["processes"]) for part in checkpoint.card.earlier]
     total, before = 0.0, 0.0
-    for part in (*state["card"].get("earlier", ()), state["card"] | {"seconds": state["seconds"]}):
-        total += (part["seconds"] - before) * part["processes"]
-        before = part["seconds"]
+    for seconds, processes in (*parts, (checkpoint.seconds, checkpoint.card.processes)):
+        total += (seconds - before) * processes
+        before = seconds
     return total
 
 
@@ -155,8 +122,6 @@ def _figures(path: Path, interface: str) -> dict[str, Any]:
 
 
 def _drive(value: dict[str, Any]) -> DriveGains:
-    from arena_newton.robot import DriveGains
-
     fields: dict[str, Any] = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in value.items()}
     return DriveGains(**fields)
 

@@ -1,17 +1,43 @@
-"""Options of a training and rsl-rl's configuration made of them."""
+"""Options of the command line, the bounds of their numbers, and rsl_rl's configuration made of them.
+
+This module loads nothing heavy: `--help` answers at once.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-__all__ = ["FAMILY_WEIGHTS", "TrainOptions", "runner_config"]
+import tyro
+
+from arena_newton.errors import InputError
+
+__all__ = [
+    "FAMILY_WEIGHTS",
+    "CurveOptions",
+    "ExportCommand",
+    "ExportOptions",
+    "TrainOptions",
+    "check",
+    "runner_config",
+]
 
 FAMILY_WEIGHTS: dict[str, float] = {"clips": 40.0}
-"""Weights of families in the sampling, per second of motion: a few minutes of captured motion stand beside hours that
-were generated."""
+"""Sampling weights of families per second of motion: there are minutes of captured motion, hours of generated one."""
+
+
+def within(low: float, high: float) -> dict[str, tuple[float, float]]:
+    """Metadata of an option whose number, or each of whose numbers, is within these bounds."""
+    return {"bounds": (low, high)}
+
+
+def at_least(low: float) -> dict[str, tuple[float, float]]:
+    """Metadata of an option whose number, or each of whose numbers, is finite and at least `low`."""
+    return within(low, math.inf)
 
 
 @dataclass(frozen=True)
@@ -20,115 +46,176 @@ class TrainOptions:
 
     tracker: Literal["twist2", "sonic"] = "twist2"
     """Interface to train."""
-    worlds: int = 8192
+    worlds: int = field(default=8192, metadata=at_least(1))
     """Parallel worlds of each process."""
     device: str = "auto"
     """cpu, cuda or cuda:N; with torchrun each process takes its own GPU."""
-    minutes: float = 0.0
-    """Most minutes to train, 0 = no limit."""
-    iterations: int = 100000
-    """Most iterations of this call."""
-    seed: int = 0
-    """Seed; every process of torchrun adds its rank."""
+    minutes: float = field(default=0.0, metadata=at_least(0))
+    """Time limit [min], 0 = none."""
+    iterations: int = field(default=100000, metadata=at_least(1))
+    """Largest number of iterations of this call."""
+    seed: int = field(default=0, metadata=within(0, 2**31))
+    """Seed; each process of torchrun adds its rank."""
     resume: Path | None = None
-    """Checkpoint of a training to go on with."""
+    """Checkpoint of a training to continue."""
     start_from: Path | None = None
-    """Weights file (.safetensors) whose network a new training begins with."""
+    """Weights file (.safetensors) with the initial network of a new training."""
     library: Path | None = None
     """Motion library (NPZ); without it, references are generated."""
-    families: dict[str, int] = field(default_factory=dict)
-    """Generated clips of each family, e.g. `--families walk 900 squat 200`; the generator's mix by default."""
+    families: dict[str, int] = field(default_factory=dict, metadata=at_least(1))
+    """Number of generated clips per family, e.g. `--families walk 900 squat 200`; the generator's mix by default."""
     clips: tuple[Path, ...] = ()
-    """More motion files of any format that `motions convert` reads."""
+    """Further motion files of any format that `motions convert` reads."""
     clips_licence: str = "unknown"
     """Licence of those files, for the card."""
     clips_source: str = "unknown"
     """Origin of those files, for the card."""
     mirror: bool = True
     """Add the mirror image of every clip."""
-    family_weights: dict[str, float] = field(default_factory=dict)
-    """Weights of families in the sampling, per second of motion; 40 for clips and 1 for the others where not named."""
+    family_weights: dict[str, float] = field(default_factory=dict, metadata=at_least(0))
+    """Sampling weights of families per second of motion; by default 40 for `clips`, 1 for the others."""
     log_dir: Path = Path("runs/tracker")
     """Folder for checkpoints, progress.jsonl and TensorBoard."""
     logger: Literal["tensorboard", "wandb"] = "tensorboard"
-    """Where curves go."""
+    """Service that shows the curves."""
     action_form: Literal["auto", "residual", "default"] = "auto"
-    """Raw actions correct the reference (residual, auto) or a default pose."""
-    rewards: dict[str, float] = field(default_factory=dict)
-    """Other weights for reward terms, by name."""
+    """Raw actions are offsets from the reference (residual, auto) or from a default pose."""
+    rewards: dict[str, float] = field(default_factory=dict, metadata=within(-1e6, 1e6))
+    """Weights of reward terms by name, where not those of the table, e.g. `--rewards heading 1.0`."""
+    reward_scales: dict[str, float] = field(default_factory=dict, metadata=within(1e-6, 1e6))
+    """Scales of tracking rewards exp(-error² / scale²) by name, e.g. `--reward-scales legs 0.1`."""
     randomise: bool = True
-    """Randomisation, noise and pushes."""
-    adaptive: float = 0.25
-    """Share of the episodes that start where the tracker fails."""
-    episode_s: float = 10.0
-    """Longest episode [s]."""
-    steps: int = 16
-    """Ticks of an iteration."""
-    epochs: int = 5
-    """Passes over an iteration's samples."""
+    """Domain randomisation, observation noise and pushes."""
+    adaptive: float = field(default=0.25, metadata=within(0, 1))
+    """Fraction of the episodes that start where the tracker fails."""
+    episode_s: float = field(default=10.0, metadata=within(0.1, 3600))
+    """Maximum length of an episode [s]."""
+    steps: int = field(default=16, metadata=at_least(2))
+    """Ticks per iteration."""
+    epochs: int = field(default=5, metadata=at_least(1))
+    """Passes over the samples of an iteration."""
     minibatches: int = 4
-    """Minibatches of a pass."""
-    learning_rate: float = 3e-4
-    """Learning rate at the start."""
-    desired_kl: float = 0.02
-    """Divergence of an iteration that the learning rate aims at."""
-    entropy: float = 0.0015
-    """Weight of the entropy."""
-    settle: float = 0.0
-    """Share of `--minutes` at whose end the aimed divergence and the entropy's weight fall to a tenth."""
-    init_std: float = 0.5
-    """Standard deviation of the action noise at the start."""
-    mirror_loss: float = 0.0
-    """Weight of the difference between the action of a mirrored observation and the mirrored action."""
-    save_interval: int = 200
+    """Minibatches per pass."""
+    learning_rate: float = field(default=3e-4, metadata=within(1e-8, 1))
+    """Initial learning rate."""
+    desired_kl: float = field(default=0.02, metadata=within(1e-6, 10))
+    """Target KL divergence per iteration (adaptive learning rate)."""
+    entropy: float = field(default=0.0015, metadata=at_least(0))
+    """Entropy coefficient."""
+    settle: float = field(default=0.0, metadata=within(0, 1))
+    """Final fraction of `--minutes` over which target KL and entropy coefficient are annealed to 10 %."""
+    init_std: float = field(default=0.5, metadata=within(1e-3, 10))
+    """Initial standard deviation of the action noise."""
+    mirror_loss: float = field(default=0.0, metadata=at_least(0))
+    """Weight of the squared difference between the action of a mirrored observation and the mirrored action."""
+    save_interval: int = field(default=200, metadata=at_least(1))
     """Iterations between checkpoints."""
-    keep_last: int = 3
-    """Latest checkpoints that stay, 0 = all."""
-    keep_every: int = 10
-    """Of the older ones, every so many-th stays, 0 = none."""
-    print_interval: int = 20
-    """Iterations between lines on the screen."""
-    log_interval: int = 5
+    keep_last: int = field(default=3, metadata=at_least(0))
+    """Number of latest checkpoints that are kept, 0 = all."""
+    keep_every: int = field(default=10, metadata=at_least(0))
+    """Of the older ones every n-th is kept, 0 = none."""
+    print_interval: int = field(default=20, metadata=at_least(1))
+    """Iterations between printed lines."""
+    log_interval: int = field(default=5, metadata=at_least(1))
     """Iterations between points of the curves."""
-    contacts_per_world: int = 48
-    """Contact buffer."""
-    constraints_per_world: int = 160
-    """Constraint buffer."""
+    contacts_per_world: int = field(default=48, metadata=at_least(1))
+    """Size of the contact buffer."""
+    constraints_per_world: int = field(default=160, metadata=at_least(1))
+    """Size of the constraint buffer."""
     graph: bool = True
-    """Capture the physics of a tick on CUDA."""
+    """Capture the physics of a tick in a CUDA graph."""
     tick_graph: bool = True
-    """Capture what a tick does around the physics on CUDA."""
+    """Capture the rest of a tick in CUDA graphs."""
     update_graph: bool = True
-    """Capture PPO's work on a minibatch on CUDA."""
+    """Capture PPO's work on a minibatch in CUDA graphs."""
     bench: bool = False
-    """Only measure: train for `--minutes` (one by default), write nothing, print samples/s."""
+    """Measure only: train for `--minutes` (one by default), write nothing, print samples/s."""
+    verbose: bool = False
+    """Print the tables of reward terms and of the critic's observation first."""
     commit: str = ""
-    """Commit for the card, where git is not at hand."""
+    """Commit for the card where git is not available."""
 
 
-def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str, Any]) -> dict[str, Any]:
-    """rsl-rl's configuration.
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write a tracker's weights file and its card."""
+
+    out: Path
+    """The file, `.safetensors`; the card is written next to it as .json and .md."""
+    metrics: Path | None = None
+    """JSON file of an evaluation, for the card."""
+    note: str = ""
+    """A sentence for the card."""
+    hardware: str = ""
+    """Hardware of the training, for the card."""
+    symmetric: bool = True
+    """Average the action and the mirrored action of the mirrored observation (left-right symmetric policy): training
+    leaves a preferred side, and a walk whose command has no heading turns that way."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportCommand(ExportOptions):
+    """Write a tracker's weights file and its card."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """Checkpoint of a training, such as runs/tracker/model_last.pt."""
+
+
+@dataclass(frozen=True)
+class CurveOptions:
+    """Draw the curves of trainings over each other."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of trainings (their --log-dir), or progress.jsonl files."""
+    out: Path = Path("curves.png")
+    """Picture: .png, .svg or .pdf."""
+
+
+def check(options: TrainOptions) -> None:
+    """Refuse numbers that no training can use, before anything is made.
+
+    Raises:
+        InputError: A flag's number is out of range.
+    """
+    for option in dataclasses.fields(options):
+        if "bounds" in option.metadata:
+            _refuse_outside(_flag(option.name), getattr(options, option.name), *option.metadata["bounds"])
+    _refuse_outside("--minibatches", options.minibatches, 1, options.worlds * options.steps)
+    if options.settle > 0.0 and options.minutes <= 0.0:
+        raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")
+    if options.resume is not None and options.start_from is not None:
+        raise InputError("--resume continues a training, --start-from begins one: pass one of the two")
+    if options.library is not None and options.families:
+        raise InputError("--families generates references, --library reads them: pass one of the two")
+    for flag, file in (("--resume", options.resume), ("--start-from", options.start_from)):
+        if file is not None and not file.is_file():
+            raise InputError(f"{flag} {file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _refuse_outside(flag: str, value: float | Mapping[str, float], low: float, high: float) -> None:
+    if isinstance(value, Mapping):
+        for name, number in value.items():
+            _refuse_outside(f"{flag} {name}", number, low, high)
+    elif not (low <= value <= high and math.isfinite(value)):
+        until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
+        raise InputError(f"{flag} {value}: expected a number {until}")
+
+
+def runner_config(options: TrainOptions, network: dict[str, Any]) -> dict[str, Any]:
+    """rsl_rl's configuration.
 
     Args:
         options: The user's options.
         network: Widths of the tracker's network.
-        card: What the weights' card will say about this training.
     """
-    hidden = [512, 512, 256]
-    logger: Any = options.logger
-    if options.logger == "wandb":
-        logger = {"class_name": "WandbLogWriter", "project_name": "arena-newton-trackers"}
+    wandb = {"class_name": "WandbLogWriter", "project_name": "arena-newton-trackers"}
     return {
-        "seed": options.seed,
+        "logger": wandb if options.logger == "wandb" else options.logger,
         "num_steps_per_env": options.steps,
-        "save_interval": options.save_interval,
-        "keep_last": options.keep_last,
-        "keep_every": options.keep_every,
-        "print_interval": options.print_interval,
-        "log_interval": options.log_interval,
-        "logger": logger,
-        "card": card,
-        "options": {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(options).items()},
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
         "actor": {
             "class_name": "arena_newton.trackers.train.model:TrackerActor",
@@ -136,17 +223,14 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "network": network,
             "init_std": options.init_std,
         },
-        "settle": options.settle,
-        "fit_steps": 300,
-        "critic_iterations": 20,
         "critic": {
             "class_name": "arena_newton.trackers.train.model:TrackerCritic",
-            "hidden_dims": hidden,
+            "hidden_dims": [512, 512, 256],
             "activation": "elu",
             "obs_normalization": True,
         },
         "algorithm": {
-            "class_name": "arena_newton.trackers.train.ppo:IterationPPO",
+            "class_name": "arena_newton.trackers.train.ppo:TrackerPPO",
             "num_learning_epochs": options.epochs,
             "num_mini_batches": options.minibatches,
             "learning_rate": options.learning_rate,
@@ -160,7 +244,7 @@ def runner_config(options: TrainOptions, network: dict[str, Any], card: dict[str
             "max_grad_norm": 1.0,
             "mirror_loss": options.mirror_loss,
             "graph": options.update_graph,
-            # Returns are about 16; clipping value steps to 0.2 would slow the critic down by that much.
+            # Returns are about 16: clipping value steps to 0.2 would make the critic slower by that factor.
             "use_clipped_value_loss": False,
         },
     }

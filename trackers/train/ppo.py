@@ -1,16 +1,16 @@
-"""rsl-rl's PPO with one change of rule: the learning rate follows the KL divergence once an iteration.
+"""rsl_rl's PPO with one modification: the learning rate follows the KL divergence once per iteration.
 
-rsl-rl changes the rate after every minibatch, when the policy has hardly moved; the divergence of the last epoch tells
-how far the whole iteration went. The update waits for the device once, where the original reads three losses a
-minibatch. On CUDA a minibatch is two graphs, its gradients and the step, instead of some three hundred launches;
-between them processes average the gradients.
+rsl_rl changes the rate after every minibatch, when the policy has hardly moved; the divergence of the last epoch
+measures the whole iteration. The update waits for the device once, where the original reads three losses per minibatch.
+On CUDA a minibatch is two graphs, its gradients and the step, instead of about three hundred launches; between them the
+processes average the gradients.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -18,51 +18,57 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
 
+from arena_newton.trackers.front_end import Mirror
 from arena_newton.trackers.train.graphs import captured
 
-if TYPE_CHECKING:
-    from arena_newton.trackers.front_end import Mirror
-
-__all__ = ["IterationPPO"]
+__all__ = ["TrackerPPO"]
 
 _WARM = 3
 """Minibatches before a capture: libraries allocate what they need, the optimiser its moments."""
+_LARGEST_CUT, _LARGEST_RISE = 0.6, 1.15
+"""Bounds of the factor on the learning rate: the divergence of one iteration is a noisy measure."""
+_MIRRORED = 4
+"""One row in so many is mirrored for the mirror loss: a second pass of the actor costs time."""
 
 
-class IterationPPO(PPO):
-    """PPO whose learning rate is set once an iteration from the mean divergence of its last epoch."""
+class TrackerPPO(PPO):
+    """PPO whose learning rate is set once per iteration from the mean divergence of its last epoch."""
 
     learning_rate: float
-    """Present learning rate."""
+    """Current learning rate."""
     lowest_rate: float = 2e-5
     """Lower bound of the learning rate."""
     highest_rate: float = 1e-3
     """Upper bound of the learning rate."""
 
     def __init__(self, *args: Any, mirror_loss: float, graph: bool, **kwargs: Any):
-        """Take rsl-rl's arguments and two of our own.
+        """Take rsl_rl's arguments and two of our own.
 
         Args:
-            args: rsl-rl's.
+            args: rsl_rl's.
             mirror_loss: Weight of the squared difference between the action of a mirrored observation and the mirrored
                 action.
-            graph: Ask for CUDA graphs.
-            kwargs: rsl-rl's; `schedule` is `adaptive` or `fixed`, `desired_kl` the divergence aimed at.
+            graph: Use CUDA graphs on a GPU.
+            kwargs: rsl_rl's; `schedule` is `adaptive` or `fixed`, `desired_kl` the target divergence.
         """
         self.mirror_loss = mirror_loss
         self.mirrors: tuple[Mirror, Mirror] | None = None
         """Mirror images of the actor's observation and of the action."""
         super().__init__(*args, **kwargs)
         self.last_kl = 0.0
-        self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self._stream = torch.cuda.Stream(self.device) if str(self.device).startswith("cuda") else None
-        self._want_graph = graph and self._stream is not None
-        self._captured: _Captured | None = None
+        self.parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        """What learns, the actor first."""
+        self.stream = torch.cuda.Stream(self.device) if str(self.device).startswith("cuda") else None
+        """Stream of the updates on CUDA."""
+        self.use_graphs = graph and self.stream is not None
+        """Whether a minibatch is captured."""
+        self.captured: _Captured | None = None
+        """A minibatch's graphs, once they are recorded."""
         self._entropy_weight = torch.zeros((), device=self.device)
         self._fit_optimizer()
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take up a checkpoint of this or another kind of device; see rsl-rl."""
+        """Load a checkpoint of this or another kind of device; see rsl_rl."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         self.learning_rate = float(self.learning_rate)
         self._fit_optimizer()
@@ -70,8 +76,8 @@ class IterationPPO(PPO):
 
     def _fit_optimizer(self) -> None:
         """On CUDA the optimiser keeps its rate and its counts there, so that a graph can hold a step; elsewhere not."""
-        self._captured = None
-        on_cuda = self._stream is not None
+        self.captured = None
+        on_cuda = self.stream is not None
         for group in self.optimizer.param_groups:
             rate = torch.tensor(self.learning_rate, device=self.device) if on_cuda else self.learning_rate
             group.update(capturable=on_cuda, fused=True if on_cuda else None, lr=rate)
@@ -102,28 +108,28 @@ class IterationPPO(PPO):
     @contextlib.contextmanager
     def _own_stream(self) -> Iterator[None]:
         """A graph of gradients must be recorded on the stream on which the parameters met autograd before."""
-        if self._stream is None:
+        if self.stream is None:
             yield
             return
         outside = torch.cuda.current_stream(self.device)
-        self._stream.wait_stream(outside)
-        with torch.cuda.stream(self._stream):
+        self.stream.wait_stream(outside)
+        with torch.cuda.stream(self.stream):
             yield
-        outside.wait_stream(self._stream)
+        outside.wait_stream(self.stream)
 
     def _descend(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Step along all minibatches; sums of value loss, surrogate loss and entropy, and of the last epoch's KL."""
         last_epoch = (self.num_learning_epochs - 1) * self.num_mini_batches
         totals, divergence = torch.zeros(3, device=self.device), torch.zeros((), device=self.device)
-        learning = [parameter.requires_grad for parameter in self._parameters]
-        if self._captured is not None and self._captured.learning != learning:
-            self._captured = None
+        learning = [parameter.requires_grad for parameter in self.parameters]
+        if self.captured is not None and self.captured.learning != learning:
+            self.captured = None
         for k, batch in enumerate(self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs)):
-            if self._captured is None:
+            if self.captured is None:
                 self.optimizer.zero_grad(set_to_none=True)
-                if self._want_graph and k == _WARM:
-                    self._captured = _Captured(self, batch, learning)
-            work = self._captured or self
+                if self.use_graphs and k == _WARM:
+                    self.captured = _Captured(self, batch, learning)
+            work = self.captured or self
             losses = work.gradients(batch)
             if self.is_multi_gpu:
                 self.reduce_parameters()
@@ -164,9 +170,9 @@ class IterationPPO(PPO):
         self.optimizer.step()
 
     def _asymmetry(self, observations: TensorDict) -> torch.Tensor:
-        """Mean squared difference between both ways to a mirrored action, on a quarter of the rows."""
+        """Mean squared difference between the action of mirrored observations and the mirrored action, on some rows."""
         assert self.mirrors is not None
-        rows = len(observations) // 4
+        rows = len(observations) // _MIRRORED
         mirror_obs, mirror_action = self.mirrors
         straight = self.actor.output_mean[:rows]
         mirrored = self.actor(TensorDict({"actor": mirror_obs(observations["actor"][:rows])}, batch_size=[rows]))
@@ -176,12 +182,12 @@ class IterationPPO(PPO):
         """Every process computes the same rate, for the divergence is the mean of all."""
         if self.schedule != "adaptive" or self.desired_kl is None:
             return
-        # Divergence grows with the square of the rate; one iteration's is a noisy measure, so changes are bounded.
-        factor = min(max((self.desired_kl / max(divergence, 1e-8)) ** 0.5, 0.6), 1.15)
+        # Divergence grows with the square of the rate.
+        factor = min(max((self.desired_kl / max(divergence, 1e-8)) ** 0.5, _LARGEST_CUT), _LARGEST_RISE)
         self.set_learning_rate(min(max(self.learning_rate * factor, self.lowest_rate), self.highest_rate))
 
     def set_learning_rate(self, rate: float) -> None:
-        """Use this rate from now on."""
+        """Set the rate of the optimiser."""
         self.learning_rate = rate
         for group in self.optimizer.param_groups:
             if isinstance(group["lr"], torch.Tensor):
@@ -193,7 +199,7 @@ class IterationPPO(PPO):
 class _Captured:
     """A minibatch's work in CUDA graphs, for one set of parameters that learn."""
 
-    def __init__(self, ppo: IterationPPO, batch: RolloutStorage.Batch, learning: list[bool]):
+    def __init__(self, ppo: TrackerPPO, batch: RolloutStorage.Batch, learning: list[bool]):
         """Capture it.
 
         Args:
@@ -212,17 +218,17 @@ class _Captured:
         def gradients() -> None:
             self._losses = ppo.gradients(mine)
 
-        self._gradients = captured(gradients, "update-graph", ppo._stream)
-        self._step = captured(ppo.step, "update-graph", ppo._stream)
+        self._gradients = captured(gradients, "update-graph", ppo.stream)
+        self._step = captured(ppo.step, "update-graph", ppo.stream)
 
     def gradients(self, batch: RolloutStorage.Batch) -> torch.Tensor:
-        """As `IterationPPO.gradients`; the result's buffer is reused by the next call."""
+        """As `TrackerPPO.gradients`; the result's buffer is reused by the next call."""
         torch._foreach_copy_(self._inputs, _tensors(batch))
         self._gradients.replay()
         return self._losses
 
     def step(self) -> None:
-        """As `IterationPPO.step`."""
+        """As `TrackerPPO.step`."""
         self._step.replay()
 
 

@@ -1,86 +1,80 @@
-"""rsl-rl's runner with a time limit, a clean end on SIGTERM and complete checkpoints.
-
-Its log keeps statistics on the device and fetches them once an iteration.
-"""
+"""rsl_rl's runner with a time limit, a clean end on SIGTERM and complete checkpoints."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import signal
-import statistics
 import threading
 import time
-import warnings
-from collections import deque
-from collections.abc import Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
-from rsl_rl.utils.logger import Logger
 from tensordict import TensorDict
 
 from arena_newton.errors import InputError, naming
+from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.train.checkpoint import Card, Checkpoint
+from arena_newton.trackers.train.logger import DeviceLogger, IterationTimes
 from arena_newton.trackers.train.model import TrackerActor
-from arena_newton.trackers.train.ppo import IterationPPO
+from arena_newton.trackers.train.options import TrainOptions, runner_config
+from arena_newton.trackers.train.ppo import TrackerPPO
+from arena_newton.trackers.train.rewards import maximum
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 
-__all__ = ["TrackerRunner"]
+__all__ = ["CriticWarmUp", "TrackerRunner", "annealed"]
 
-_SETTLED = 0.1
-"""What is left of the aimed divergence and of the entropy's weight at the end of a time limit."""
-_PART = ("command", "commit", "worlds", "processes", "seed", "data", "licences")
-"""What the card tells of each part of a training that was resumed."""
-_CARD = {*_PART, "tracker", "action_form", "drive", "physics"}
-_KEPT = {
-    "actor_state_dict", "critic_state_dict", "iter", "network", "norm_counts", "learning_rate", "samples", "seconds",
-    "families", "sampler", "rng", "cuda_rng", "card", "last",
-}  # fmt: skip
-"""What every checkpoint holds."""
+_ANNEALED = 0.1
+"""What is left of target KL and entropy coefficient at the end of a time limit."""
 _STRIDE = 7919
-"""Between the seeds of the further processes of trainings that are resumed at successive iterations."""
+"""Difference of the seeds of the further processes of trainings that are resumed at successive iterations."""
 _SEEN = 1e9
-"""Observations that the input statistics of a weights file stand for: a training that starts from it leaves them."""
+"""Observations that the input statistics of a weights file stand for: a training that starts from it keeps them."""
+_PROBE = 0.3
+"""Standard deviation of the raw actions around the reference in the rollout before the first iteration."""
+_FIT_STEPS, _FIT_ROWS, _FIT_RATE = 300, 8192, 1e-3
+"""Steps, rows per step and initial learning rate of the fit to the reference."""
 
 
-class DeviceLogger(Logger):
-    """rsl-rl's log whose episode statistics stay on the device until an iteration ends."""
+class CriticWarmUp:
+    """The first iterations of a training that starts from given weights: the critic learns, the network does not."""
 
-    def __init__(self, **settings: Any):
-        """Take rsl-rl's settings; means are over the episodes of ten iterations."""
-        super().__init__(**settings)
-        self.rewbuffer, self.lenbuffer = deque(maxlen=10), deque(maxlen=10)
-        self._ended = torch.zeros(3, device=self.device)  # episodes, their rewards, their lengths
+    def __init__(self, algorithm: TrackerPPO, alone: int, first: int, rate: float):
+        """Freeze the network, if the training begins within the warm-up.
 
-    def _store_code_state(self) -> list[str]:
-        """Nothing: the card names the commit, and nobody asked for a copy of his changed sources."""
-        return []
+        Args:
+            algorithm: The learner.
+            alone: Iterations of the critic alone, 0 = none.
+            first: Iteration at which the training begins or is resumed.
+            rate: Learning rate after the warm-up: during it nothing diverges, and the adaptive rate only grows.
+        """
+        self.algorithm, self.alone = algorithm, alone
+        self.rate = rate if first < alone else algorithm.learning_rate
+        self._learn(first >= alone)
 
-    def process_env_step(self, rewards, dones, extras, intrinsic_rewards=None) -> None:
-        """Count one tick."""
-        if self.disable_logs:
-            return
-        self.cur_reward_sum += rewards
-        self.cur_episode_length += 1
-        done = (dones > 0).float()
-        self._ended += torch.stack(
-            (done.sum(), (self.cur_reward_sum * done).sum(), (self.cur_episode_length * done).sum())
-        )
-        keep = 1.0 - done
-        self.cur_reward_sum *= keep
-        self.cur_episode_length *= keep
+    def begin(self, iteration: int) -> None:
+        """Let the network learn from the iteration on at which the critic knows it."""
+        if iteration == self.alone > 0:
+            self._learn(True)
+            self.algorithm.set_learning_rate(self.rate)
 
-    def fetch(self) -> None:
-        """Bring the statistics over; once an iteration."""
-        count, reward, length = self._ended.tolist()
-        self._ended.zero_()
-        if count:
-            self.rewbuffer.append(reward / count)
-            self.lenbuffer.append(length / count)
+    def _learn(self, learns: bool) -> None:
+        for parameter in self.algorithm.get_policy().parameters():
+            parameter.requires_grad_(learns)
+
+
+def annealed(elapsed: float, final: float) -> float:
+    """What is left of target KL and entropy coefficient, from 1 down to `_ANNEALED`.
+
+    Args:
+        elapsed: Fraction of the time limit that has passed.
+        final: Fraction of the time limit, at its end, over which they fall; 0 = never.
+    """
+    return min(max((1.0 - elapsed) / final, _ANNEALED), 1.0) if final else 1.0
 
 
 class TrackerRunner(OnPolicyRunner):
@@ -88,36 +82,56 @@ class TrackerRunner(OnPolicyRunner):
 
     env: TrackerEnv
     current_learning_iteration: int
-    alg: IterationPPO
+    alg: TrackerPPO
 
-    def __init__(self, env: TrackerEnv, train_cfg: dict, log_dir: str | None = None, device: str = "cpu"):
-        """See rsl-rl's runner."""
-        super().__init__(env, train_cfg, log_dir, device)
+    def __init__(
+        self, env: TrackerEnv, options: TrainOptions, network: dict[str, Any], card: Card, log_dir: Path | None = None
+    ):
+        """Make networks, algorithm and log.
+
+        Args:
+            env: The worlds.
+            options: The user's options.
+            network: Widths of the tracker's network.
+            card: What the weights' card will say about this training.
+            log_dir: Folder of checkpoints and log; nothing is written without one.
+        """
+        folder = None if log_dir is None else str(log_dir)
+        super().__init__(env, runner_config(options, network), folder, env.device)
+        self.options, self.card = options, card
         self.logger: DeviceLogger = DeviceLogger(
-            log_dir=log_dir,
+            options,
+            maximum(env.rewards),
+            log_dir=folder,
             cfg=self.cfg,
-            env_cfg=env.cfg,
+            env_cfg=options,
             num_envs=env.num_envs,
             is_distributed=self.is_distributed,
             gpu_world_size=self.gpu_world_size,
             gpu_global_rank=self.gpu_global_rank,
-            device=device,
+            device=env.device,
         )
+        self.folder = Path(folder or ".")
+        """Folder of checkpoints and log."""
         if self.alg.mirror_loss > 0.0:
             self.alg.mirrors = (env.front_end.mirror_obs(), env.front_end.mirror_action())
         self.samples = 0
         """Samples of all processes since the training began, before resuming included."""
         self.seconds = 0.0
         """Seconds of training, before resuming included."""
-        self.history: list[dict[str, float]] = []
-        """What each logged iteration measured."""
+        self.critic_iterations = 20
+        """Iterations of the critic alone, in a training that starts from given weights."""
         self._stop = False
-        self._logged: float = 0
         self._started = False
         self._resumed: Path | None = None
 
+    @property
+    def history(self) -> list[dict[str, float]]:
+        """What each iteration measured."""
+        return self.logger.history
+
     def _configure_multi_gpu(self) -> None:
-        """As rsl-rl, which knows GPUs only; processes on the CPU talk through gloo."""
+        """As rsl_rl, which knows GPUs only; processes on the CPU talk through gloo."""
         processes = int(os.environ.get("WORLD_SIZE", "1"))
         if processes == 1 or self.device != "cpu":
             super()._configure_multi_gpu()
@@ -130,34 +144,38 @@ class TrackerRunner(OnPolicyRunner):
         torch.distributed.init_process_group(backend="gloo", rank=self.gpu_global_rank, world_size=processes)
 
     def start_from(self, path: Path) -> None:
-        """Begin with the network of a weights file; its critic is learnt anew before the network changes.
+        """Begin with the network of a weights file; a new critic learns alone before the network changes.
 
         Raises:
             InputError: The file is absent, of another interface or of other widths.
         """
-        from arena_newton.trackers.inference import weights_file
-
-        actor = self.alg.get_policy()
-        interface = str(self.cfg["card"]["tracker"])
-        weights = weights_file.load(path, interface, flag="--start-from")
+        actor = self._actor()
+        weights = weights_file.load(path, self.card.tracker, flag="--start-from")
         if weights.network.config() != actor.net.config():
             raise InputError(f"--start-from {path}: a network of other widths than this training's")
-        form = self.cfg["card"]["action_form"]
-        if weights.action_form.kind != form["kind"]:
-            raise InputError(f"--start-from {path}: its action form is {weights.action_form.kind}, not {form['kind']}")
+        kind = self.card.action_form["kind"]
+        if weights.action_form.kind != kind:
+            raise InputError(f"--start-from {path}: its action form is {weights.action_form.kind}, not {kind}")
         actor.net.load_state_dict(weights.network.state_dict())
         for count in actor.counts().values():
             count.fill_(_SEEN)
-        self.cfg["card"]["started_from"] = weights.card.get("commit", path.name)
+        self.card.started_from = weights.card.get("commit", path.name)
         self._started = True
+
+    def _actor(self) -> TrackerActor:
+        actor = self.alg.get_policy()
+        assert isinstance(actor, TrackerActor)
+        return actor
+
+    # -- learning ---------------------------------------------------------------------------------------------------
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False, minutes: float = 0.0) -> None:
         """Train.
 
         Args:
-            num_learning_iterations: Most iterations to run.
+            num_learning_iterations: Largest number of iterations.
             init_at_random_ep_len: Unused; episodes start at random frames.
-            minutes: Most minutes to run, 0 = no limit. The last iteration is finished.
+            minutes: Time limit [min], 0 = none. The last iteration is finished.
         """
         main = threading.current_thread() is threading.main_thread()
         signals = (signal.SIGTERM, signal.SIGINT) if main else ()
@@ -168,48 +186,13 @@ class TrackerRunner(OnPolicyRunner):
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
-    def _prepare(self) -> None:
-        """Before the first iteration: see what observations look like and ask for the reference.
-
-        A rollout fills the input statistics, which would otherwise jump after the first update. Where the raw action is
-        no correction of the reference, the network is fitted to ask for the reference itself, for a few hundred steps:
-        the start then is as good as that of a residual.
-        """
-        seen: list[TensorDict] = []
-        wanted: list[torch.Tensor] = []
-        with torch.no_grad():
-            for _ in range(self.cfg["num_steps_per_env"]):
-                seen.append(self.env.get_observations())
-                target = self.alg.actor(seen[-1]) if self._started else self.env.reference_action()
-                wanted.append(target)
-                self.env.step(target + 0.3 * torch.randn_like(target))
-            observations: TensorDict = torch.cat(seen)  # type: ignore[arg-type,assignment]
-            self.alg.actor.update_normalization(observations)
-            self.alg.critic.update_normalization(observations)
-        steps = self.cfg["fit_steps"]
-        if self._started or self.env.front_end.action_form.kind == "residual" or not steps:
-            return
-        targets = torch.cat(wanted)
-        actor = self.alg.actor
-        optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-        loss = torch.zeros(())
-        for k in range(steps):
-            optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - k / steps)
-            rows = torch.randint(len(targets), (min(len(targets), 8192),), device=targets.device)
-            loss = (actor(observations[rows]) - targets[rows]).square().mean()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-        if not self.logger.disable_logs:
-            print(f"fitted to the reference: {float(loss.detach()) ** 0.5:.3f} RMS of raw action", flush=True)
-
-    def _on_signal(self, number: int, _: Any) -> None:
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
         """SIGTERM and Ctrl-C end the training after this iteration; a second Ctrl-C ends it at once."""
         if self._stop and number == signal.SIGINT:
             raise KeyboardInterrupt
         self._stop = True
         if number == signal.SIGINT and not self.logger.disable_logs:
-            print("\nstopping after this iteration; Ctrl-C once more stops without writing", flush=True)
+            print("\nstopping after this iteration; a second Ctrl-C stops without writing", flush=True)
 
     def _learn(self, iterations: int, minutes: float) -> None:
         self.alg.train_mode()
@@ -218,287 +201,232 @@ class TrackerRunner(OnPolicyRunner):
         if self.is_distributed:
             self.alg.broadcast_parameters()
         self.logger.init_logging_writer()
-        steps = self.cfg["num_steps_per_env"]
-        batch = steps * self.env.num_envs * self.gpu_world_size
         obs = self.env.get_observations()
         first = self.current_learning_iteration
-        learning = list(self.alg.get_policy().parameters())
-        alone = self.cfg["critic_iterations"] if self._started else 0
-        # While the critic learns alone nothing diverges, and the rate only grows.
-        rate = self.cfg["algorithm"]["learning_rate"] if first < alone else self.alg.learning_rate
-        for parameter in learning:
-            parameter.requires_grad_(first >= alone)
+        warm_up = CriticWarmUp(
+            self.alg, self.critic_iterations if self._started else 0, first, self.options.learning_rate
+        )
         began = mark = time.monotonic()
         for it in range(first, first + iterations):
-            if it == alone > 0:  # the critic knows the network by now
-                for parameter in learning:
-                    parameter.requires_grad_(True)
-                self.alg.set_learning_rate(rate)
+            warm_up.begin(it)
+            obs, metrics = self._roll_out(obs)
+            collected = time.monotonic()
             with torch.no_grad():
-                for _ in range(steps):
-                    obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
-                    self.alg.process_env_step(obs, rewards, dones, extras)
-                    self.logger.process_env_step(rewards, dones, extras)
-                # Everything so far was only queued: this reads the rollout's statistics and so ends its time.
-                metrics = self.env.collect()
-                self.logger.fetch()
-                collected = time.monotonic()
                 self.alg.compute_returns(obs)
             losses = self.alg.update()
             now = time.monotonic()
-            self.current_learning_iteration = it + 1
-            self.samples += batch
-            self.seconds += now - mark
-            self._report(it, first, iterations, collected - mark, now - collected, losses, metrics, batch)
+            self._count(IterationTimes(collected - mark, now - collected, self._batch), losses, metrics, first)
             mark = now
             stop, elapsed = self._agree((now - began) / (60.0 * minutes) if minutes > 0.0 else 0.0)
             if stop:
                 break
-            self._settle(elapsed)
-            if self._writes and (it + 1) % self.cfg["save_interval"] == 0:
-                self.save(str(Path(self.logger.log_dir or ".") / f"model_{it + 1}.pt"))
+            self.anneal(elapsed)
+            if self.logger.writes and (it + 1) % self.options.save_interval == 0:
+                self.save(str(self.folder / f"model_{it + 1}.pt"))
                 self._prune()
                 mark = time.monotonic()
-        if self._writes:
-            if self.history and self.history[-1]["iteration"] != self._logged:
-                self._log(self.history[-1])
-            self.save(str(Path(self.logger.log_dir or ".") / "model_last.pt"))
-            self.save(str(Path(self.logger.log_dir or ".") / "model_slim.pt"), slim=True)
-            self.logger.stop_logging_writer()
-
-    def _prune(self) -> None:
-        """Delete older checkpoints of this training; the one that it was resumed from stays."""
-        last, every = self.cfg["keep_last"], self.cfg["keep_every"]
-        if not last:
-            return
-        folder = Path(self.logger.log_dir or ".")
-        names = [re.fullmatch(r"model_(\d+)", path.stem) for path in folder.glob("model_*.pt")]
-        saved = sorted(int(name[1]) for name in names if name)
-        for number in [n for n in saved if n <= self.current_learning_iteration][:-last]:
-            path = folder / f"model_{number}.pt"
-            if path.resolve() != self._resumed and not (every and number // self.cfg["save_interval"] % every == 0):
-                with contextlib.suppress(OSError):  # a training does not end over a file that stays
-                    path.unlink()
+        if self.logger.writes:
+            self.logger.finish()
+            self.save(str(self.folder / "model_last.pt"))
+            self.save(str(self.folder / "model_slim.pt"), slim=True)
 
     @property
-    def _writes(self) -> bool:
-        return self.logger.log_dir is not None and not self.logger.disable_logs
+    def _batch(self) -> int:
+        """Samples per iteration of all processes."""
+        return self.options.steps * self.env.num_envs * self.gpu_world_size
 
-    def _agree(self, elapsed: float) -> tuple[bool, float]:
-        """Whether to stop, and the share of the time limit that has passed: the same answer in every process."""
-        shares = torch.tensor([float(self._stop), elapsed], dtype=torch.float64, device=self.device)
-        if self.is_distributed:
-            torch.distributed.all_reduce(shares, torch.distributed.ReduceOp.MAX)
-            stop, elapsed = shares.tolist()
-        else:
-            stop = float(self._stop)
-        return bool(stop > 0.0 or elapsed >= 1.0), elapsed
+    @torch.no_grad()
+    def _roll_out(self, obs: TensorDict) -> tuple[TensorDict, dict[str, float]]:
+        """Fill the storage; the last observation and the environment's means."""
+        for _ in range(self.options.steps):
+            obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
+            self.alg.process_env_step(obs, rewards, dones, extras)
+            self.logger.process_env_step(rewards, dones, extras)
+        # Everything so far was only queued: this reads the rollout's statistics and so ends its time.
+        metrics = self.env.collect()
+        self.logger.fetch()
+        return obs, metrics
 
-    def _settle(self, elapsed: float) -> None:
-        """Towards the end of a time limit smaller and smaller steps, and less noise: what is learnt settles."""
-        share = self.cfg["settle"]
-        if not share:
-            return
-        left = min(max((1.0 - elapsed) / share, _SETTLED), 1.0)
-        self.alg.desired_kl = self.cfg["algorithm"]["desired_kl"] * left
-        self.alg.entropy_coef = self.cfg["algorithm"]["entropy_coef"] * left
-
-    def _report(
-        self,
-        it: int,
-        first: int,
-        iterations: int,
-        collect_time: float,
-        learn_time: float,
-        losses: dict[str, float],
-        metrics: dict[str, float],
-        batch: int,
-    ) -> None:
-        if self.logger.disable_logs:
-            return
-        std = self.alg.get_policy().distribution.log_std_param.detach().exp()
-        row = {
-            "iteration": it + 1,
+    def _count(self, times: IterationTimes, losses: dict[str, float], metrics: dict[str, float], first: int) -> None:
+        """Count an iteration and log it."""
+        self.current_learning_iteration += 1
+        self.samples += times.samples
+        self.seconds += times.collect + times.learn
+        std = self._actor().distribution.log_std_param.detach().exp()
+        progress = {
+            "iteration": self.current_learning_iteration,
             "samples": self.samples,
-            "seconds": round(self.seconds, 2),
-            "samples_per_s": round(batch / (collect_time + learn_time)),
-            "collect_s": round(collect_time, 4),
-            "learn_s": round(learn_time, 4),
+            "seconds": self.seconds,
             "learning_rate": self.alg.learning_rate,
             "std": float(std.mean()),
-            "episode_reward": statistics.mean(self.logger.rewbuffer) if self.logger.rewbuffer else 0.0,
-            "episode_length": statistics.mean(self.logger.lenbuffer) if self.logger.lenbuffer else 0.0,
-            **{f"Loss/{k}": v for k, v in losses.items()},
-            **metrics,
         }
-        self.history.append(row)
-        if it == first or (it + 1) % self.cfg["print_interval"] == 0:
-            print(
-                f"it {it + 1:5d}  {self.samples / 1e6:8.2f}M  {self.seconds:7.1f} s  {row['samples_per_s']:7d}/s "
-                f"({collect_time:.3f}+{learn_time:.3f})  reward/s {metrics['Train/reward_per_s']:6.3f}  "
-                f"mtbe {metrics['Train/seconds_between_ends']:7.2f} s  vel {metrics['Error/velocity_m_s']:.3f}  "
-                f"legs {metrics['Error/legs_rad']:.3f}  lr {self.alg.learning_rate:.1e}  kl {losses['kl']:.4f}  "
-                f"std {row['std']:.2f}  value {losses['value']:.3f}",
-                flush=True,
-            )
-        if self.logger.writer is not None and (it == first or (it + 1) % self.cfg["log_interval"] == 0):
-            self._log(row)
+        measured = {f"Loss/{name}": value for name, value in losses.items()} | metrics
+        self.logger.record(progress, times, measured, first=self.current_learning_iteration == first + 1)
 
-    def _log(self, row: dict[str, float]) -> None:
-        """Add an iteration to progress.jsonl and to the curves."""
-        self._logged = row["iteration"]
-        with (Path(self.logger.log_dir) / "progress.jsonl").open("a") as file:
-            file.write(json.dumps(row) + "\n")
-        for name, value in row.items():
-            if name != "iteration":
-                self.logger.writer.add_scalar(name if "/" in name else f"Train/{name}", value, int(row["iteration"]))
+    def _prepare(self) -> None:
+        """Fill the input statistics by a rollout, and fit the network to the reference where it needs that.
 
-    def save(self, path: str, infos: dict | None = None, *, slim: bool = False) -> None:
+        Without the rollout the statistics would jump after the first update. A raw action that is not an offset from
+        the reference is fitted to the reference's joints: the start then is as good as that of a residual.
+        """
+        seen: list[TensorDict] = []
+        wanted: list[torch.Tensor] = []
+        with torch.no_grad():
+            for _ in range(self.options.steps):
+                seen.append(self.env.get_observations())
+                target = self.alg.actor(seen[-1]) if self._started else self.env.reference_action()
+                wanted.append(target)
+                self.env.step(target + _PROBE * torch.randn_like(target))
+            observations: TensorDict = torch.cat(seen)  # type: ignore[arg-type,assignment]
+            self.alg.actor.update_normalization(observations)
+            self.alg.critic.update_normalization(observations)
+        if self._started or self.env.front_end.action_form.kind == "residual":
+            return
+        error = self._fit(observations, torch.cat(wanted))
+        if not self.logger.disable_logs:
+            print(f"fitted to the reference: {error:.3f} RMS of raw action", flush=True)
+
+    def _fit(self, observations: TensorDict, targets: torch.Tensor) -> float:
+        """Fit the network to raw actions; the RMS error of the last step."""
+        actor = self.alg.actor
+        optimizer = torch.optim.Adam(actor.parameters(), lr=_FIT_RATE)
+        loss = torch.zeros(())
+        for k in range(_FIT_STEPS):
+            optimizer.param_groups[0]["lr"] = _FIT_RATE * (1.0 - k / _FIT_STEPS)
+            rows = torch.randint(len(targets), (min(len(targets), _FIT_ROWS),), device=targets.device)
+            loss = (actor(observations[rows]) - targets[rows]).square().mean()
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+        return float(loss.detach()) ** 0.5
+
+    def _agree(self, elapsed: float) -> tuple[bool, float]:
+        """Whether to stop, and the fraction of the time limit that has passed: the same answer in every process."""
+        stop = float(self._stop)
+        if self.is_distributed:
+            answers = torch.tensor([stop, elapsed], dtype=torch.float64, device=self.device)
+            torch.distributed.all_reduce(answers, torch.distributed.ReduceOp.MAX)
+            stop, elapsed = answers.tolist()
+        return stop > 0.0 or elapsed >= 1.0, elapsed
+
+    def anneal(self, elapsed: float) -> None:
+        """Reduce target KL and entropy coefficient towards the end of a time limit.
+
+        Args:
+            elapsed: Fraction of the time limit that has passed.
+        """
+        left = annealed(elapsed, self.options.settle)
+        self.alg.desired_kl = self.options.desired_kl * left
+        self.alg.entropy_coef = self.options.entropy * left
+
+    # -- checkpoints ------------------------------------------------------------------------------------------------
+
+    def save(self, path: str, infos: dict[str, Any] | None = None, *, slim: bool = False) -> None:
         """Write everything that a resumed training needs.
 
         Args:
             path: The file.
             infos: Anything the caller wants back from `load`.
-            slim: Leave out the optimiser's moments, two thirds of the file; a resumed training builds them anew.
+            slim: Leave out the optimiser's moments, two thirds of the file; a resumed training estimates them again.
         """
-        cuda = torch.cuda.get_rng_state(self.device) if str(self.device).startswith("cuda") else None
-        actor = self.alg.get_policy()
-        state = self.alg.save() | {
-            "iter": self.current_learning_iteration,
-            "infos": infos,
-            "network": actor.net.config() if isinstance(actor, TrackerActor) else {},
-            "norm_counts": actor.counts() if isinstance(actor, TrackerActor) else {},
-            "learning_rate": self.alg.learning_rate,
-            "samples": self.samples,
-            "seconds": self.seconds,
-            "started": self._started,
-            "families": list(self.env.bank.family_names),
-            "sampler": self.env.sampler.state_dict(),
-            "rng": torch.get_rng_state(),
-            "cuda_rng": cuda,
-            "card": self.cfg.get("card", {}),
-            "last": self.history[-1] if self.history else {},
-        }
-        if slim:
-            del state["optimizer_state_dict"]
-        temporary = Path(path).with_suffix(".part")
-        torch.save(state, temporary)
-        temporary.replace(path)
+        on_cuda = str(self.device).startswith("cuda")
+        actor = self._actor()
+        networks = self.alg.save()
+        Checkpoint(
+            **networks | ({"optimizer_state_dict": None} if slim else {}),
+            iter=self.current_learning_iteration,
+            infos=infos,
+            network=actor.net.config(),
+            norm_counts=actor.counts(),
+            learning_rate=self.alg.learning_rate,
+            samples=self.samples,
+            seconds=self.seconds,
+            started=self._started,
+            families=list(self.env.bank.family_names),
+            critic_widths=self.env.critic_widths,
+            sampler=self.env.sampler.state_dict(),
+            rng=torch.get_rng_state(),
+            cuda_rng=torch.cuda.get_rng_state(self.device) if on_cuda else None,
+            card=self.card,
+            last=self.history[-1] if self.history else {},
+        ).write(path)
         self.logger.save_model(path, self.current_learning_iteration)
+
+    def _prune(self) -> None:
+        """Delete older checkpoints of this training; the one that it was resumed from stays."""
+        last, every = self.options.keep_last, self.options.keep_every
+        if not last:
+            return
+        names = [re.fullmatch(r"model_(\d+)", path.stem) for path in self.folder.glob("model_*.pt")]
+        saved = sorted(int(name[1]) for name in names if name)
+        for number in [n for n in saved if n <= self.current_learning_iteration][:-last]:
+            path = self.folder / f"model_{number}.pt"
+            if path.resolve() != self._resumed and not (every and number // self.options.save_interval % every == 0):
+                with contextlib.suppress(OSError):  # a file that cannot be deleted does not end a training
+                    path.unlink()
 
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
-    ) -> dict:
-        """Take up a checkpoint.
+    ) -> dict[str, Any]:
+        """Continue the training of a checkpoint.
 
         Raises:
-            InputError: The file is absent or no checkpoint of this training.
+            InputError: The file is absent or not a checkpoint of this training.
         """
         with naming("--resume"):
-            return self.take_up(read_checkpoint(path, map_location or str(self.device)), path, load_cfg, strict)
+            return self.resume(Checkpoint.read(path, map_location or str(self.device)), path, load_cfg, strict)
 
-    def take_up(
-        self, state: dict[str, Any], path: str | Path, load_cfg: dict | None = None, strict: bool = True
+    def resume(
+        self, checkpoint: Checkpoint, path: str | Path, load_cfg: dict | None = None, strict: bool = True
     ) -> dict[str, Any]:
-        """Go on with the training of a checkpoint.
+        """Continue the training of a checkpoint.
 
         Args:
-            state: What `read_checkpoint` gave.
+            checkpoint: The checkpoint.
             path: Its file, for errors.
-            load_cfg: rsl-rl's choice of parts; all by default.
+            load_cfg: rsl_rl's choice of parts; all by default.
             strict: Whether every parameter must be there.
 
         Raises:
             InputError: It is of another training.
         """
-        card = self.cfg["card"]
-        check_same(state["card"], card["tracker"], card["action_form"]["kind"], path)
-        if state["families"] != self.env.bank.family_names:
-            theirs, ours = ", ".join(state["families"]), ", ".join(self.env.bank.family_names)
-            raise InputError(f"{path}: its references are of the families {theirs}; these are {ours}")
-        if state["network"] != self.alg.get_policy().net.config():
-            raise InputError(f"{path}: a network of other widths than this training's")
-        self._started, self._resumed = bool(state.get("started", False)), Path(path).resolve()
-        parts = {"actor": True, "critic": True, "optimizer": "optimizer_state_dict" in state, "iteration": True}
+        self._check_fits(checkpoint, path)
+        self._started, self._resumed = checkpoint.started, Path(path).resolve()
+        optimizer = checkpoint.optimizer_state_dict is not None
+        parts = {"actor": True, "critic": True, "optimizer": optimizer, "iteration": True}
         try:
-            self.alg.load(state, load_cfg or parts, strict)
+            self.alg.load(vars(checkpoint), load_cfg or parts, strict)
         except (RuntimeError, KeyError) as error:
             raise InputError(f"{path}: a checkpoint of another version of this training") from error
-        self.alg.set_learning_rate(state["learning_rate"])
-        for name, count in self.alg.get_policy().counts().items():
-            count.copy_(state["norm_counts"][name])
-        self.current_learning_iteration = state["iter"]
-        self.samples, self.seconds = state["samples"], state["seconds"]
-        rank = getattr(self, "gpu_global_rank", 0)
-        if not self.env.sampler.load_state_dict(state["sampler"]) and rank == 0:
-            print(f"--resume {path}: other references, so where the tracker fails is found out anew")
-        card |= resumed_card(state, card)
-        if rank > 0:
-            torch.manual_seed(self.cfg["seed"] + rank + _STRIDE * state["iter"])
+        self.alg.set_learning_rate(checkpoint.learning_rate)
+        for name, count in self._actor().counts().items():
+            count.copy_(checkpoint.norm_counts[name])
+        self.current_learning_iteration = checkpoint.iter
+        self.samples, self.seconds = checkpoint.samples, checkpoint.seconds
+        if not self.env.sampler.load_state_dict(checkpoint.sampler) and self.gpu_global_rank == 0:
+            print(f"--resume {path}: other references, so adaptive sampling starts without evidence")
+        self.card.resume(checkpoint)
+        if self.gpu_global_rank > 0:
+            torch.manual_seed(self.options.seed + self.gpu_global_rank + _STRIDE * checkpoint.iter)
         else:
-            torch.set_rng_state(state["rng"].cpu())
-            if state["cuda_rng"] is not None and str(self.device).startswith("cuda"):
-                torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
-        return state["infos"] or {}
+            torch.set_rng_state(checkpoint.rng.cpu())
+            if checkpoint.cuda_rng is not None and str(self.device).startswith("cuda"):
+                torch.cuda.set_rng_state(checkpoint.cuda_rng.cpu(), self.device)
+        return checkpoint.infos or {}
 
-
-def resumed_card(state: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
-    """What the card of a training gains when it goes on with another: its parts before, and all of their licences.
-
-    Args:
-        state: The checkpoint.
-        card: The card of this part.
-    """
-    previous = state["card"]
-    part = {name: previous[name] for name in _PART} | {name: state[name] for name in ("iter", "samples", "seconds")}
-    gained = {
-        "earlier": [*previous.get("earlier", []), part],
-        "licences": {**previous["licences"], **card["licences"]},
-    }
-    if "started_from" in previous:
-        gained["started_from"] = previous["started_from"]
-    return gained
-
-
-def check_same(card: Mapping[str, Any], tracker: str, kind: str, path: str | Path) -> None:
-    """Refuse to go on with the training of another tracker or action form.
-
-    Args:
-        card: The card of the checkpoint.
-        tracker: Interface of this training.
-        kind: Kind of this training's action form.
-        path: The checkpoint's file, for errors.
-
-    Raises:
-        InputError: They differ.
-    """
-    if card["tracker"] != tracker:
-        raise InputError(f"{path}: a training of {card['tracker']}, not of {tracker}")
-    if card["action_form"]["kind"] != kind:
-        raise InputError(f"{path}: its action form is {card['action_form']['kind']}, not {kind}")
-
-
-def read_checkpoint(path: str | Path, device: str = "cpu") -> dict[str, Any]:
-    """Read a training checkpoint: tensors and plain containers only.
-
-    Args:
-        path: The file.
-        device: Where its tensors go.
-
-    Raises:
-        InputError: The file is absent or no checkpoint of this training.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of files that are something else altogether
-            state = torch.load(path, weights_only=True, map_location=device)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such checkpoint") from None
-    except Exception as error:
-        raise InputError(f"{path}: not a training checkpoint ({type(error).__name__})") from error
-    if not isinstance(state, dict) or not isinstance(state.get("card"), dict):
-        raise InputError(f"{path}: not a checkpoint of this training")
-    missing = sorted((_KEPT - set(state)) | (_CARD - set(state["card"])))
-    if missing:
-        raise InputError(f"{path}: not a checkpoint of this training, it lacks {', '.join(missing)}")
-    return state
+    def _check_fits(self, checkpoint: Checkpoint, path: str | Path) -> None:
+        checkpoint.check_same(self.card.tracker, self.card.action_form["kind"], path)
+        if checkpoint.families != self.env.bank.family_names:
+            theirs, ours = ", ".join(checkpoint.families), ", ".join(self.env.bank.family_names)
+            raise InputError(f"{path}: its references are of the families {theirs}; these are {ours}")
+        if checkpoint.network != self._actor().net.config():
+            raise InputError(f"{path}: a network of other widths than this training's")
+        here = self.env.critic_widths
+        there = checkpoint.critic_widths or here
+        for name in {**there, **here}:
+            if there.get(name, 0) != here.get(name, 0):
+                raise InputError(
+                    f"{path}: its critic term {name} has width {there.get(name, 0)}, here it has {here.get(name, 0)}"
+                )
+        if list(there) != list(here):
+            raise InputError(f"{path}: its critic terms are in another order than this training's")

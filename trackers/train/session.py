@@ -1,4 +1,4 @@
-"""One training from options to checkpoint: references, environment, runner."""
+"""One training from options to weights: references, environment, runner, export."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import importlib.util
 import io
-import math
 import os
 import shlex
 import subprocess
@@ -14,20 +13,28 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from arena_newton.errors import InputError, naming
-from arena_newton.trackers.train.options import FAMILY_WEIGHTS, TrainOptions, runner_config
+from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, DriveGains, PhysicsRate
+from arena_newton.trackers import interface, sonic, twist2
+from arena_newton.trackers.front_end import ActionForm, FrontEnd, residual_form
+from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.motions import programs
+from arena_newton.trackers.motions.formats import read_library
+from arena_newton.trackers.motions.library import MotionLibrary
+from arena_newton.trackers.train.checkpoint import Card, Checkpoint
+from arena_newton.trackers.train.export import export
+from arena_newton.trackers.train.options import FAMILY_WEIGHTS, ExportOptions, TrainOptions, check
+from arena_newton.trackers.train.rewards import configured, maximum
+from arena_newton.trackers.train.runner import TrackerRunner
+from arena_newton.trackers.train.simulation import share_stream
+from arena_newton.trackers.train.tracker_env import TrackerEnv
 
-if TYPE_CHECKING:
-    from arena_newton.robot import DriveGains, PhysicsRate
-    from arena_newton.trackers.front_end import ActionForm, FrontEnd
-    from arena_newton.trackers.motions.library import MotionLibrary
-    from arena_newton.trackers.train.runner import TrackerRunner
-
-__all__ = ["build", "front_end", "make_library", "train"]
+__all__ = ["build", "check_folder", "front_end", "make_library", "train"]
 
 
 def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveGains, PhysicsRate]:
@@ -40,16 +47,12 @@ def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveG
     Raises:
         InputError: Another interface or form.
     """
-    from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
-    from arena_newton.trackers import sonic, twist2
-    from arena_newton.trackers.front_end import residual_form
-
     kinds: dict[str, tuple[type[FrontEnd], DriveGains, ActionForm]] = {
         "twist2": (twist2.Twist2FrontEnd, TWIST2_DRIVE, twist2.OFFICIAL_FORM),
         "sonic": (sonic.SonicFrontEnd, SONIC_DRIVE, sonic.SONIC_FORM),
     }
     if tracker not in kinds:
-        raise InputError(f"--tracker {tracker}: no interface that is trained here; there are {', '.join(kinds)}")
+        raise InputError(f"--tracker {tracker}: not an interface that can be trained; there are {', '.join(kinds)}")
     if action_form not in ("auto", "residual", "default"):
         raise InputError(f"--action-form {action_form}: expected auto, residual or default")
     kind, drive, default = kinds[tracker]
@@ -63,23 +66,13 @@ def make_library(options: TrainOptions, device: str, seed: int) -> MotionLibrary
     Raises:
         InputError: A file cannot be read, or a family is unknown.
     """
-    from arena_newton.trackers.motions.formats import read_library
-    from arena_newton.trackers.motions.library import MotionLibrary
-
-    if options.resume is not None and options.start_from is not None:
-        raise InputError("--resume goes on with a training, --start-from begins one: pass one of the two")
-    if options.library is not None and options.families:
-        raise InputError("--families makes references, --library reads them: pass one of the two")
-    parts = []
     if options.library is not None:
         with naming("--library"):
-            parts.append(MotionLibrary.load(options.library))
+            parts = [MotionLibrary.load(options.library)]
     else:
-        from arena_newton.trackers.motions import programs
-
         wanted: dict[str, Any] = {"families": options.families} if options.families else {}
         with naming("--families"):
-            parts.append(MotionLibrary.from_random(programs.random_clips(**wanted, seed=seed, device=device)))
+            parts = [MotionLibrary.from_random(programs.random_clips(**wanted, seed=seed, device=device))]
     if options.clips:
         with naming("--clips"):
             more, reports = read_library(
@@ -90,6 +83,21 @@ def make_library(options: TrainOptions, device: str, seed: int) -> MotionLibrary
         parts.append(more)
     library = MotionLibrary.concatenate(parts) if len(parts) > 1 else parts[0]
     return MotionLibrary.concatenate([library, library.mirrored()]) if options.mirror else library
+
+
+def _family_weights(options: TrainOptions, library: MotionLibrary) -> dict[str, float]:
+    """Sampling weights of families.
+
+    Raises:
+        InputError: The options name a family that the library lacks, or leave none to sample.
+    """
+    names = [str(name) for name in library.family_names]
+    if unknown := sorted(set(options.family_weights) - set(names)):
+        raise InputError(f"--family-weights {unknown[0]}: no such family in the library; there are {', '.join(names)}")
+    weights = FAMILY_WEIGHTS | options.family_weights
+    if not any(weights.get(name, 1.0) > 0.0 for name in names):
+        raise InputError("--family-weights: every family of the library has weight 0")
+    return weights
 
 
 def _commit(given: str) -> str:
@@ -103,7 +111,7 @@ def _commit(given: str) -> str:
         return "unknown"
 
 
-def _card(options: TrainOptions, library: MotionLibrary, processes: int) -> dict[str, Any]:
+def _card(options: TrainOptions, library: MotionLibrary, env: TrackerEnv, processes: int) -> Card:
     """What a training can say about itself before it starts."""
     seconds = library.seconds
     families = {
@@ -113,69 +121,28 @@ def _card(options: TrainOptions, library: MotionLibrary, processes: int) -> dict
         }
         for i, name in enumerate(library.family_names)
     }
-    licences = {str(n): int(c) for n, c in zip(*np.unique(library.licence, return_counts=True), strict=True)}
-    sources = sorted({str(s) for s in library.source})
-    return {
-        "tracker": options.tracker,
-        "command": "python -m arena_newton.trackers.train " + shlex.join(sys.argv[1:]),
-        "commit": _commit(options.commit),
-        "processes": processes,
-        "worlds": options.worlds,
-        "seed": options.seed,
-        "data": {"clips": library.clips, "families": families, "mirrored": options.mirror, "sources": sources[:64]},
-        "licences": licences,
-    }
-
-
-def check(options: TrainOptions) -> None:
-    """Refuse numbers that no training can use, before anything is made.
-
-    Raises:
-        InputError: A flag's number is out of range.
-    """
-    bounds: tuple[tuple[str, float, float, float], ...] = (
-        ("--worlds", options.worlds, 1, math.inf),
-        ("--minutes", options.minutes, 0, math.inf),
-        ("--iterations", options.iterations, 1, math.inf),
-        ("--adaptive", options.adaptive, 0, 1),
-        ("--episode-s", options.episode_s, 0.1, 3600),
-        ("--seed", options.seed, 0, 2**31),
-        ("--steps", options.steps, 2, math.inf),
-        ("--epochs", options.epochs, 1, math.inf),
-        ("--minibatches", options.minibatches, 1, options.worlds * options.steps),
-        ("--learning-rate", options.learning_rate, 1e-8, 1),
-        ("--desired-kl", options.desired_kl, 1e-6, 10),
-        ("--entropy", options.entropy, 0, math.inf),
-        ("--settle", options.settle, 0, 1),
-        ("--init-std", options.init_std, 1e-3, 10),
-        ("--mirror-loss", options.mirror_loss, 0, math.inf),
-        ("--save-interval", options.save_interval, 1, math.inf),
-        ("--keep-last", options.keep_last, 0, math.inf),
-        ("--keep-every", options.keep_every, 0, math.inf),
-        ("--print-interval", options.print_interval, 1, math.inf),
-        ("--log-interval", options.log_interval, 1, math.inf),
-        ("--contacts-per-world", options.contacts_per_world, 1, math.inf),
-        ("--constraints-per-world", options.constraints_per_world, 1, math.inf),
-        *((f"--families {name}", count, 1, math.inf) for name, count in options.families.items()),
-        *((f"--family-weights {name}", w, 0, math.inf) for name, w in options.family_weights.items()),
-        *((f"--rewards {name}", w, -1e6, 1e6) for name, w in options.rewards.items()),
+    sources = sorted({str(source) for source in library.source})
+    return Card(
+        tracker=options.tracker,
+        command="python -m arena_newton.trackers.train " + shlex.join(sys.argv[1:]),
+        commit=_commit(options.commit),
+        processes=processes,
+        worlds=options.worlds,
+        seed=options.seed,
+        data={"clips": library.clips, "families": families, "mirrored": options.mirror, "sources": sources[:64]},
+        licences={str(n): int(c) for n, c in zip(*np.unique(library.licence, return_counts=True), strict=True)},
+        action_form=dataclasses.asdict(env.front_end.action_form),
+        drive=dataclasses.asdict(env.drive),
+        physics=dataclasses.asdict(env.sim.rate),
+        rewards={name: term.weight for name, term in env.rewards.items()},
     )
-    for flag, value, low, high in bounds:
-        if not (low <= value <= high and math.isfinite(value)):
-            until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
-            raise InputError(f"{flag} {value}: expected a number {until}")
-    if options.settle > 0.0 and options.minutes <= 0.0:
-        raise InputError(f"--settle {options.settle}: a share of --minutes, which is not given")
-    for flag, file in (("--resume", options.resume), ("--start-from", options.start_from)):
-        if file is not None and not file.is_file():
-            raise InputError(f"{flag} {file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
 
 
 def check_folder(options: TrainOptions) -> None:
-    """Make the log folder; refuse one that cannot be written, or whose files are another training's.
+    """Make the log folder; refuse one that cannot be written or that contains another training.
 
     Raises:
-        InputError: The folder is no place for this training.
+        InputError: The folder does not fit this training.
     """
     folder = options.log_dir
     if folder.exists() and not folder.is_dir():
@@ -184,7 +151,8 @@ def check_folder(options: TrainOptions) -> None:
         used = [f for kind in ("model_*.pt", "progress.jsonl", "*.safetensors") for f in sorted(folder.glob(kind))]
         if used:
             raise InputError(
-                f"--log-dir {folder}: holds {used[0].name}; --resume a checkpoint of that training, or name another"
+                f"--log-dir {folder}: already contains a training run ({used[0].name}): "
+                "use --resume to continue it, or another folder"
             )
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -194,30 +162,25 @@ def check_folder(options: TrainOptions) -> None:
         raise InputError(f"--log-dir {folder}: cannot be written ({error.strerror})") from None
 
 
-def _checkpoint(options: TrainOptions) -> tuple[dict[str, Any] | None, str]:
-    """The checkpoint that a training goes on with, if any, and the action form: the checkpoint's, if there is one.
+def _checkpoint(options: TrainOptions) -> tuple[Checkpoint | None, str]:
+    """The checkpoint that a training continues, if any, and the action form: the checkpoint's, if there is one.
 
     Raises:
         InputError: The file to begin with is unfit, or of another tracker or form than asked for.
     """
-    from arena_newton.trackers.inference import weights_file
-    from arena_newton.trackers.train.runner import check_same, read_checkpoint
-
     if options.start_from is not None:
         weights_file.load(options.start_from, options.tracker, flag="--start-from")
     if options.resume is None:
         return None, options.action_form
     with naming("--resume"):
-        state = read_checkpoint(options.resume)
-        kind = str(state["card"]["action_form"]["kind"])
+        checkpoint = Checkpoint.read(options.resume)
+        kind = str(checkpoint.card.action_form["kind"])
         asked = kind if options.action_form == "auto" else options.action_form
-        check_same(state["card"], options.tracker, asked, options.resume)
-    return state, kind
+        checkpoint.check_same(options.tracker, asked, options.resume)
+    return checkpoint, kind
 
 
 def _device(name: str) -> str:
-    import torch
-
     if name != "cpu" and "LOCAL_RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         name = f"cuda:{os.environ['LOCAL_RANK']}"
     if name == "auto":
@@ -234,21 +197,11 @@ def build(options: TrainOptions) -> TrackerRunner:
         InputError: An option does not fit.
     """
     check(options)
-    import torch
-
-    from arena_newton.trackers.interface import get
-    from arena_newton.trackers.train.rewards import REWARDS
-    from arena_newton.trackers.train.runner import TrackerRunner
-    from arena_newton.trackers.train.simulation import share_stream
-    from arena_newton.trackers.train.tracker_env import EnvConfig, TrackerEnv
-
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
-    unknown = sorted(set(options.rewards) - set(REWARDS))
-    if unknown:
-        raise InputError(f"--rewards {unknown[0]}: no such term; known are {', '.join(REWARDS)}")
+    rewards = configured(options.rewards, options.reward_scales)
     device = _device(options.device)
-    state, form = _checkpoint(options)
+    checkpoint, form = _checkpoint(options)
     if not options.bench:
         check_folder(options)
     rank, processes = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
@@ -257,74 +210,67 @@ def build(options: TrainOptions) -> TrackerRunner:
     torch.manual_seed(options.seed + rank)
     began = time.monotonic()
     library = make_library(options, device, options.seed + 1000 * rank)
-    told = time.monotonic()
-    weights = FAMILY_WEIGHTS | options.family_weights
-    unknown = sorted(set(options.family_weights) - {str(name) for name in library.family_names})
-    if unknown:
-        known = ", ".join(str(name) for name in library.family_names)
-        raise InputError(f"--family-weights {unknown[0]}: no such family in the library; there are {known}")
-    if not any(weights.get(str(name), 1.0) > 0.0 for name in library.family_names):
-        raise InputError("--family-weights: every family of the library has weight 0")
+    generated = time.monotonic()
     front, drive, rate = front_end(options.tracker, form)
-    rewards = {n: dataclasses.replace(t, weight=options.rewards.get(n, t.weight)) for n, t in REWARDS.items()}
-    env = TrackerEnv(
-        front,
-        drive,
-        rate,
-        library.to(device),
-        EnvConfig.of(options),
-        device,
-        rewards=rewards,
-        family_weights=weights,
-    )
+    weights = _family_weights(options, library)
+    env = TrackerEnv(front, drive, rate, library.to(device), options, device, rewards=rewards, family_weights=weights)
     if rank == 0:
         print(
-            f"{library.clips} clips, {library.seconds.sum() / 60.0:.1f} min of motion in {told - began:.1f} s; "
-            f"{options.worlds} worlds on {device} in {time.monotonic() - told:.1f} s",
+            f"{library.clips} clips, {library.seconds.sum() / 60.0:.1f} min of motion in {generated - began:.1f} s; "
+            f"{options.worlds} worlds on {device} in {time.monotonic() - generated:.1f} s",
             flush=True,
         )
-    card = _card(options, library, processes) | {
-        "action_form": dataclasses.asdict(front.action_form),
-        "drive": dataclasses.asdict(drive),
-        "physics": dataclasses.asdict(rate),
-        "rewards": {n: t.weight for n, t in rewards.items()},
-    }
-    config = runner_config(options, get(options.tracker).make_network().config(), card)
-    log_dir = None if options.bench else str(options.log_dir)
-    with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints both networks layer by layer
-        runner = TrackerRunner(env, config, log_dir, device)
-    if state is not None:
+        if options.verbose:
+            print(_tables(env), flush=True)
+    return _runner(env, options, _card(options, library, env, processes), checkpoint)
+
+
+def _runner(env: TrackerEnv, options: TrainOptions, card: Card, checkpoint: Checkpoint | None) -> TrackerRunner:
+    """The runner, at the state from which it is to go on."""
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints both networks layer by layer
+        runner = TrackerRunner(
+            env,
+            options,
+            interface.get(options.tracker).make_network().config(),
+            card,
+            None if options.bench else options.log_dir,
+        )
+    if checkpoint is not None:
         with naming("--resume"):
-            runner.take_up(state, str(options.resume))
+            runner.resume(checkpoint, str(options.resume))
     elif options.start_from is not None:
         runner.start_from(options.start_from)
     return runner
 
 
+def _tables(env: TrackerEnv) -> str:
+    """Reward terms and critic terms of a training, as text."""
+    lines = [f"reward per second, at most {maximum(env.rewards):.2f}:"]
+    for name, term in env.rewards.items():
+        lines.append(f"  {name:20} weight {term.weight:<8g}" + (f" scale {term.scale:g}" if term.scale else ""))
+    lines.append(f"observation of the critic, {sum(env.critic_widths.values())} numbers:")
+    return "\n".join(lines + [f"  {name:20} {width}" for name, width in env.critic_widths.items()])
+
+
 def train(options: TrainOptions) -> TrackerRunner:
     """Train to the end of the limits."""
     runner = build(options)
-    minutes = options.minutes or (1.0 if options.bench else 0.0)
-    runner.learn(options.iterations, minutes=minutes)
+    runner.learn(options.iterations, minutes=options.minutes or (1.0 if options.bench else 0.0))
     if runner.is_distributed:
-        import torch
-
         torch.distributed.destroy_process_group()
-    if not options.bench and not runner.logger.disable_logs:
-        from arena_newton.trackers.train.export import ExportOptions, export
-
+    if runner.logger.disable_logs:
+        return runner
+    if options.bench:
+        print(_bench_line(runner, options))
+    else:
         out = options.log_dir / f"{options.tracker}.safetensors"
         export(options.log_dir / "model_last.pt", ExportOptions(out))
         print(f"wrote {out} and its card")
-    if options.bench and not runner.logger.disable_logs:
-        print(_bench_line(runner, options))
     return runner
 
 
 def _bench_line(runner: TrackerRunner, options: TrainOptions) -> str:
-    """What a training has shown of its speed, and the share of the physics in a tick."""
-    import torch
-
+    """Speed of a training, and the time of the physics in a tick."""
     # The first iterations warm up allocators and libraries.
     rows = runner.history[3:] or runner.history
     total = sum(r["samples"] for r in rows[-1:]) - (rows[0]["samples"] if len(rows) > 1 else 0)

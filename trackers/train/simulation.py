@@ -5,25 +5,23 @@ All views are zero-copy. Nothing here waits for the device.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
+import mujoco_warp
 import numpy as np
 import torch
+import warp as wp
 
 from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.scene import load_scene
 from arena_newton.trackers.motions.library import FIXTURES
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from arena_newton.trackers.train.references import KEY_LINKS
 
 __all__ = ["Simulation", "share_stream"]
 
 
 def share_stream(device: str) -> None:
     """Let torch work on Warp's stream of a CUDA device: kernels of both then run in the order of their launches."""
-    import warp as wp
-
     if device.startswith("cuda"):
         wp.set_device(device)
         torch.cuda.set_device(torch.device(device))
@@ -63,9 +61,6 @@ class Simulation:
             constraints_per_world: Constraint buffer.
             graph: Capture the tick on CUDA.
         """
-        import mujoco_warp
-        import warp as wp
-
         self.worlds, self.device, self.rate = worlds, device, rate
         self.scene = load_scene(
             "lab",
@@ -76,9 +71,9 @@ class Simulation:
             contacts_per_world=contacts_per_world,
             constraints_per_world=constraints_per_world,
         )
-        self._mjw, self._m, self._d = mujoco_warp, self.scene.solver.mjw_model, self.scene.solver.mjw_data
+        self._m, self._d = self.scene.solver.mjw_model, self.scene.solver.mjw_data
         self._m.opt.timestep.fill_(rate.dt)
-        # A full contact buffer would print a line a world and step; it is counted by `overflow` instead.
+        # A full contact buffer would print a line per world and step; it is counted by `overflow` instead.
         self._m.opt.warn_overflow = 0
         host, handles, d, m = self.scene.mj_model, self.scene.robot, self._d, self._m
         self.mj_model = host
@@ -99,7 +94,7 @@ class Simulation:
         self.joint_acc = self.acceleration[:, joints_v]
         self.torque = view(d.qfrc_actuator)[:, joints_v]
         self.targets = self.ctrl[:, _span(handles.joint_ctrl)]
-        # Model fields, one row a world: Newton allocates them so, writing them is enough.
+        # Model fields, one row per world as Newton allocates them: writing them is enough.
         self.body_mass, self.body_inertia, self.body_com = view(m.body_mass), view(m.body_inertia), view(m.body_ipos)
         self.geom_friction = view(m.geom_friction)
         self.gain, self.bias = view(m.actuator_gainprm), view(m.actuator_biasprm)
@@ -113,25 +108,24 @@ class Simulation:
             n: self.scene.link(n) for n in (p.rsplit("/", 1)[1] for p in self.scene.body_ids if "/Robot/" in p)
         }
         """Link name to body index."""
-        self.fixtures = torch.tensor([self.scene.mocap_id(f"/World/{n}") for n in FIXTURES], device=device)
-        """Mocap index of seat, sill and platform, shape [3]."""
-        order = self.fixtures.tolist()
-        self.parked_pos, self.parked_quat = self.mocap_pos[:, order].clone(), self.mocap_quat[:, order].clone()
-        self._graph: Any = None
+        self._key_bodies = torch.tensor([self.bodies[name] for name in KEY_LINKS], device=device)
+        self._on_ground = torch.tensor((1.0, 1.0, 0.0), device=device)
+        self._fixtures = [self.scene.mocap_id(f"/World/{name}") for name in FIXTURES]
+        self._parked_pos = self.mocap_pos[:, self._fixtures].clone()
+        self._parked_quat = self.mocap_quat[:, self._fixtures].clone()
+        self._graph: wp.Graph | None = None
         self._want_graph = graph and device.startswith("cuda")
 
     def _launch(self) -> None:
         for _ in range(self.rate.substeps):
-            self._mjw.step(self._m, self._d)
+            mujoco_warp.step(self._m, self._d)
         # Body poses of the new state: `step` leaves those of the last substep's start.
-        self._mjw.kinematics(self._m, self._d)
+        mujoco_warp.kinematics(self._m, self._d)
 
     def finish(self) -> None:
         """Derive what depends on changed masses and capture the tick; call once, after the model's fields are set."""
-        import warp as wp
-
         with wp.ScopedDevice(self.device):
-            self._mjw.set_const(self._m, self._d)
+            mujoco_warp.set_const(self._m, self._d)
             if not self._want_graph:
                 return
             self._launch()
@@ -141,33 +135,28 @@ class Simulation:
 
     def step(self) -> None:
         """Advance all worlds by one 50 Hz tick."""
-        import warp as wp
-
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
         with wp.ScopedDevice(self.device):
             self._launch()
 
-    def place_supports(self, mask: torch.Tensor, kind: torch.Tensor, box: torch.Tensor, quat: torch.Tensor) -> None:
-        """Pose the fixtures of the masked worlds: the clip's one under the robot's way, the others out of reach.
+    def key_links(self) -> torch.Tensor:
+        """`KEY_LINKS` relative to the ground below the pelvis, world axes [m], shape [worlds, links, 3]."""
+        return self.body_pos.index_select(1, self._key_bodies) - (self.root_pos * self._on_ground)[:, None]
+
+    def place_supports(self, mask: torch.Tensor, kind: torch.Tensor, top: torch.Tensor, quat: torch.Tensor) -> None:
+        """Pose the fixtures of the masked worlds: the clip's one where the clip needs it, the others out of reach.
 
         Args:
             mask: Worlds to change, bool, shape [worlds].
             kind: 0 none, 1 seat, 2 sill, 3 platform, shape [worlds].
-            box: Centre of the support's top face [m], shape [worlds, 3].
+            top: Centre of the support's top face [m], shape [worlds, 3].
             quat: Orientation of the support wxyz, shape [worlds, 4].
         """
-        for i in range(len(FIXTURES)):
+        row = mask[:, None]
+        for i, fixture in enumerate(self._fixtures):
             used = (kind == i + 1)[:, None]
-            place = torch.where(used, box, self.parked_pos[:, i])
-            facing = torch.where(used, quat, self.parked_quat[:, i])
-            row = mask[:, None]
-            pos, rot = self.mocap_pos[:, self._fixture(i)], self.mocap_quat[:, self._fixture(i)]
-            pos.copy_(torch.where(row, place, pos))
-            rot.copy_(torch.where(row, facing, rot))
-
-    def _fixture(self, i: int) -> int:
-        if not hasattr(self, "_fixture_order"):
-            self._fixture_order = self.fixtures.tolist()
-        return self._fixture_order[i]
+            pos, rot = self.mocap_pos[:, fixture], self.mocap_quat[:, fixture]
+            pos.copy_(torch.where(row, torch.where(used, top, self._parked_pos[:, i]), pos))
+            rot.copy_(torch.where(row, torch.where(used, quat, self._parked_quat[:, i]), rot))

@@ -8,7 +8,7 @@ import torch
 
 from arena_newton.errors import ArenaError
 from arena_newton.robot import TICK
-from arena_newton.trackers.train.motion import Motion
+from arena_newton.trackers.train.measurement import TickMeasurement
 
 __all__ = ["ERRORS", "Tally", "TrainingError"]
 
@@ -21,10 +21,10 @@ def _rms(difference: torch.Tensor) -> torch.Tensor:
     return difference.square().mean(1).sqrt()
 
 
-ERRORS: dict[str, Callable[[Motion], torch.Tensor]] = {
+ERRORS: dict[str, Callable[[TickMeasurement], torch.Tensor]] = {
     "velocity_m_s": lambda m: m.velocity_error[:, :2].norm(dim=1),
-    "legs_rad": lambda m: _rms((m.joint_pos - m.reference.joint_pos)[:, :12]),
-    "arms_rad": lambda m: _rms((m.joint_pos - m.reference.joint_pos)[:, 15:]),
+    "legs_rad": lambda m: _rms((m.state.joint_pos - m.reference.joint_pos)[:, :12]),
+    "arms_rad": lambda m: _rms((m.state.joint_pos - m.reference.joint_pos)[:, 15:]),
     "links_m": lambda m: (m.keys - m.reference.keys).norm(dim=2).mean(1),
     "height_m": lambda m: m.position_error[:, 2].abs(),
     "position_m": lambda m: m.position_error[:, :2].norm(dim=1),
@@ -57,7 +57,7 @@ class Tally:
 
     def add(
         self,
-        motion: Motion,
+        motion: TickMeasurement,
         earned: torch.Tensor,
         ends: torch.Tensor,
         failed: torch.Tensor,

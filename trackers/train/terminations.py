@@ -1,4 +1,4 @@
-"""When an episode ends early: one function a term, all listed with their bounds in `TERMINATIONS`."""
+"""When an episode ends early: one function per term, all listed with their bounds in `TERMINATIONS`."""
 
 from __future__ import annotations
 
@@ -7,52 +7,52 @@ from dataclasses import dataclass
 
 import torch
 
-from arena_newton.trackers.train.motion import Motion
+from arena_newton.trackers.train.measurement import TickMeasurement
 from arena_newton.trackers.train.references import FEET
 
 __all__ = ["TERMINATIONS", "Bound"]
 
 RECOVERY = 1.5
-"""So long after a push the feet may leave their reference [s]."""
+"""For this time after a push the feet may leave their reference [s]."""
 
 
 @dataclass(frozen=True)
 class Bound:
     """One termination term."""
 
-    value: Callable[[Motion], torch.Tensor]
+    value: Callable[[TickMeasurement], torch.Tensor]
     """Maps the tick to non-negative values, shape [worlds]."""
     limit: float
     """The episode ends when the value exceeds this."""
 
 
-def height(m: Motion) -> torch.Tensor:
+def height(m: TickMeasurement) -> torch.Tensor:
     """Error of the pelvis' height [m]."""
     return m.position_error[:, 2].abs()
 
 
-def tilt(m: Motion) -> torch.Tensor:
+def tilt(m: TickMeasurement) -> torch.Tensor:
     """Error of the pelvis' tilt [rad]."""
     return m.tilt_error
 
 
-def position(m: Motion) -> torch.Tensor:
-    """Error of the root's place on the ground [m]."""
+def position(m: TickMeasurement) -> torch.Tensor:
+    """Error of the root's position on the ground [m]."""
     return m.position_error[:, :2].norm(dim=1)
 
 
-def heading(m: Motion) -> torch.Tensor:
+def heading(m: TickMeasurement) -> torch.Tensor:
     """Error of the heading [rad]."""
     return m.heading_error.abs()
 
 
-def feet(m: Motion) -> torch.Tensor:
+def feet(m: TickMeasurement) -> torch.Tensor:
     """Distance of the farther foot from its reference in the heading frame [m]; 0 while a push may ask for steps."""
     error = (m.keys[:, FEET] - m.reference.keys[:, FEET]).norm(dim=2).amax(1)
     return torch.where(m.since_push > RECOVERY, error, 0.0)
 
 
-def nonfinite(m: Motion) -> torch.Tensor:
+def nonfinite(m: TickMeasurement) -> torch.Tensor:
     """1 where the physics state is not finite."""
     return (~m.finite).float()
 

@@ -3,12 +3,13 @@
 A tick: raw actions become joint targets through the tracker's own front end, the physics advances 20 ms, the new state
 is rewarded against the reference frame that was commanded, worlds that ended start again elsewhere in the library, and
 the front end makes the next observation of the next command. Everything is masked writes over all worlds; nothing
-waits for the device.
+waits for the device. The evaluation's tick (`arena_newton.tracking`) is not used here: its masks are read on the host,
+which would synchronise the GPU and break the CUDA graphs, and its command is integrated from actions where this one is
+read from the library.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -20,10 +21,10 @@ from arena_newton import rotations
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
 from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
-from arena_newton.trackers.motions import frames
-from arena_newton.trackers.train import events
+from arena_newton.trackers.train import critic, events
 from arena_newton.trackers.train.graphs import captured
-from arena_newton.trackers.train.motion import Motion
+from arena_newton.trackers.train.measurement import TickMeasurement
+from arena_newton.trackers.train.options import TrainOptions
 from arena_newton.trackers.train.references import FEET, KEY_LINKS, Frame, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS, TERMINATION_REWARD, Term
 from arena_newton.trackers.train.sampling import ClipSampler
@@ -34,49 +35,28 @@ from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
     from arena_newton.trackers.motions.library import DeviceLibrary
-    from arena_newton.trackers.train.options import TrainOptions
 
-__all__ = ["EnvConfig", "TrackerEnv"]
+__all__ = ["TrackerEnv"]
 
 _PREFILL = 0.5
-"""Share of the episodes that start with a history of the present frame; the others start with an empty one."""
-_LOOKAHEAD = (4, 10, 25)
-"""Frames ahead of the state whose commands the critic sees."""
+"""Fraction of the episodes that start with a history of the current frame; the others start with an empty one."""
 NO_PUSH = 1e3
 """`since_push` of an episode in which none has struck yet [s]."""
-_VALUE_CLIP = 50.0
-"""Largest magnitude of a critic observation."""
-
-
-@dataclasses.dataclass(frozen=True)
-class EnvConfig:
-    """What shapes the environment; `TrainOptions` has the defaults."""
-
-    worlds: int
-    """Parallel worlds."""
-    episode_s: float
-    """Longest episode [s]."""
-    adaptive: float
-    """Share of the episodes that start where the tracker fails, the others start anywhere."""
-    randomise: bool
-    """Run the events and noise of `events.py`."""
-    contacts_per_world: int
-    """Contact buffer."""
-    constraints_per_world: int
-    """Constraint buffer."""
-    graph: bool
-    """Capture the physics of a tick on CUDA."""
-    tick_graph: bool
-    """Capture the rest of a tick on CUDA."""
-
-    @classmethod
-    def of(cls, options: TrainOptions) -> EnvConfig:
-        """The part of a training's options that the environment reads, by the same names."""
-        return cls(**{field.name: getattr(options, field.name) for field in dataclasses.fields(cls)})
 
 
 class TrackerEnv(VecEnv):
     """References tracked in the lab by a front end's robot."""
+
+    front_end: FrontEnd
+    """Observation and action of the tracker."""
+    ahead: Frame
+    """The reference frame that is commanded next."""
+    delay: torch.Tensor
+    """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
+    default_pose: torch.Tensor
+    """The robot's default joint positions [rad], shape [29]."""
+    randomised: torch.Tensor
+    """What the start events drew, shape [worlds, n]."""
 
     def __init__(
         self,
@@ -84,12 +64,13 @@ class TrackerEnv(VecEnv):
         drive: DriveGains,
         rate: PhysicsRate,
         library: DeviceLibrary,
-        config: EnvConfig,
+        options: TrainOptions,
         device: str = "cpu",
         *,
         rewards: Mapping[str, Term] = REWARDS,
         terminations: Mapping[str, Bound] = TERMINATIONS,
         randomisation: Mapping[str, events.Event] = events.EVENTS,
+        critic_terms: Mapping[str, critic.CriticTerm] = critic.CRITIC,
         family_weights: Mapping[str, float] | None = None,
     ):
         """Build the worlds.
@@ -99,30 +80,35 @@ class TrackerEnv(VecEnv):
             drive: Gains of the tracker.
             rate: Physics rate of the tracker.
             library: References on `device`.
-            config: Sizes and switches.
+            options: Number of worlds, length of the episodes, buffers and switches.
             device: `cpu` or `cuda:N`.
             rewards: Reward terms by name.
             terminations: Termination terms by name.
             randomisation: Events by name.
+            critic_terms: The critic's observation by name.
             family_weights: Weights of families in the sampling, 1 where not named.
         """
-        self.cfg = config
-        self.num_envs = worlds = config.worlds
+        self.cfg = options
+        self.num_envs = worlds = options.worlds
         self.device = device
         self.num_actions = front_end.action_width
-        self.max_episode_length = round(config.episode_s / TICK)
-        self.front_end, self.rewards, self.terminations = front_end, dict(rewards), dict(terminations)
-        self.events = dict(randomisation) if config.randomise else {}
+        self.max_episode_length = round(options.episode_s / TICK)
+        self.front_end, self.drive = front_end, drive
+        self.rewards, self.terminations = dict(rewards), dict(terminations)
+        self.events = dict(randomisation) if options.randomise else {}
+        self.critic = dict(critic_terms)
+        self.critic_widths: dict[str, int] = {}
+        """Width of each critic term."""
         self.bank = ReferenceBank(library, device)
-        self.sampler = ClipSampler(self.bank, config.adaptive, dict(family_weights or {}))
+        self.sampler = ClipSampler(self.bank, options.adaptive, dict(family_weights or {}))
         self.sim = Simulation(
             worlds,
             device,
             drive,
             rate,
-            contacts_per_world=config.contacts_per_world,
-            constraints_per_world=config.constraints_per_world,
-            graph=config.graph,
+            contacts_per_world=options.contacts_per_world,
+            constraints_per_world=options.constraints_per_world,
+            graph=options.graph,
         )
         self._every = torch.ones(worlds, dtype=torch.bool, device=device)
         self.delay = torch.zeros(worlds, dtype=torch.bool, device=device)
@@ -135,14 +121,15 @@ class TrackerEnv(VecEnv):
             "motor_strength": zero.repeat(1, 29),
         }
         events.apply(self, "start", self._every, self.events)
-        self._constants = torch.cat(list(self.privileged.values()), 1)
+        self.randomised = torch.cat(list(self.privileged.values()), 1)
         self.sim.finish()
-        self._pushed_links = [self.sim.bodies[n] for n in (*events.HANDS, "torso_link")]
-        self._key_bodies = torch.tensor([self.sim.bodies[n] for n in KEY_LINKS], device=device)
-        self._default = torch.tensor(DEFAULT_POSE, device=device)
-        self._on_ground = torch.tensor((1.0, 1.0, 0.0), device=device)
-        self._families = torch.eye(len(self.bank.family_names), device=device)
-        self._kinds = torch.arange(1, 4, device=device)
+        self.pushed_links = [self.sim.bodies[name] for name in (*events.HANDS, "torso_link")]
+        """Bodies on which events apply forces."""
+        self._foot_bodies = torch.tensor([self.sim.bodies[name] for name in KEY_LINKS[FEET]], device=device)
+        self.default_pose = torch.tensor(DEFAULT_POSE, device=device)
+        self.families = torch.eye(len(self.bank.family_names), device=device)
+        """One-hot rows of the families."""
+        self.support_kinds = torch.arange(1, 4, device=device)
 
         front_end.bind(worlds, device)
         self._pose = torch.tensor(front_end.default_pose, device=device)
@@ -150,15 +137,13 @@ class TrackerEnv(VecEnv):
         numbers = torch.arange(self.num_actions, device=device)[None]
         self._raw_order = torch.argsort(front_end.to_mujoco(numbers)[0])
         self._allocate()
-        with torch.no_grad():
-            self._restart(self._every)
-            self._observe(self._every)
+        self.reset()
         self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
-        if config.tick_graph and device.startswith("cuda"):
+        if options.tick_graph and device.startswith("cuda"):
             self._capture()
 
     def _allocate(self) -> None:
-        """Buffers that keep their place, so that a CUDA graph can hold a tick."""
+        """Buffers that keep their addresses, so that a CUDA graph can hold a tick."""
         worlds, device = self.num_envs, self.device
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -169,7 +154,7 @@ class TrackerEnv(VecEnv):
         self._targets = zeros(worlds, 29)
         self._feet, self._foot_vel = zeros(worlds, 2, 3), zeros(worlds, 2, 3)
         self._next_rows = zeros(worlds, self.bank.data.shape[1])
-        self._next = self.bank.split(self._next_rows)
+        self.ahead = self.bank.split(self._next_rows)
         self.since_push = zeros(worlds)
         self._reward, self._done = zeros(worlds), zeros(worlds, dtype=torch.long)
         self._time_out = zeros(worlds, dtype=torch.bool)
@@ -187,8 +172,7 @@ class TrackerEnv(VecEnv):
         for name, work in (("before", self._before), ("after", self._after)):
             self._graphs[name] = captured(work, "tick-graph")
         torch.cuda.synchronize(self.device)
-        self._restart(self._every)
-        self._observe(self._every)
+        self.reset()
         self.sampler.clear()
         self.tally.clear()
 
@@ -202,11 +186,21 @@ class TrackerEnv(VecEnv):
     # -- rsl-rl's interface -----------------------------------------------------------------------------------------
 
     def get_observations(self) -> TensorDict:
-        """Observations of the present state: groups `actor` and `critic`."""
+        """Observations of the current state: groups `actor` and `critic`."""
         assert self._critic_obs is not None
         return TensorDict(
             {"actor": self.front_end.obs.clone(), "critic": self._critic_obs.clone()}, batch_size=[self.num_envs]
         )
+
+    @torch.no_grad()
+    def reset(self, frame: torch.Tensor | None = None) -> None:
+        """Start an episode in every world.
+
+        Args:
+            frame: Frames of the library to start in, shape [worlds]; sampled ones by default.
+        """
+        self._restart(self._every, frame)
+        self._observe(self._every)
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
@@ -236,8 +230,8 @@ class TrackerEnv(VecEnv):
         self.frame.add_(1)
         self.episode_length_buf.add_(1)
         self.since_push.add_(TICK)
-        motion = self._measure(self._next)
-        reward, failed = self._judge(motion)
+        self._track_feet()
+        reward, failed = self._judge(self._measure(self.ahead))
         over = (self.frame >= self.bank.last.index_select(0, self.frame)) | (
             self.episode_length_buf >= self.max_episode_length
         )
@@ -255,7 +249,7 @@ class TrackerEnv(VecEnv):
         form = self.front_end.action_form
         if form.kind == "residual":
             return torch.zeros(self.num_envs, self.num_actions, device=self.device)
-        asked = (self._next.joint_pos - self._pose) / self._scale
+        asked = (self.ahead.joint_pos - self._pose) / self._scale
         return asked.index_select(1, self._raw_order)
 
     def collect(self) -> dict[str, float]:
@@ -269,64 +263,38 @@ class TrackerEnv(VecEnv):
 
     # -- parts of a tick --------------------------------------------------------------------------------------------
 
-    def _measure(self, reference: Frame) -> Motion:
-        """Compare the measured state with a reference frame."""
-        sim = self.sim
-        finite = torch.isfinite(sim.qpos).all(1) & torch.isfinite(sim.qvel).all(1)
-        quat = sim.root_quat
-        heading, wanted = frames.heading(quat), frames.heading(reference.root_quat)
-        velocity = rotations.turn(-heading, sim.root_vel)
-        gravity, down = rotations.gravity_in_body(quat), rotations.gravity_in_body(reference.root_quat)
-        key_pos = sim.body_pos.index_select(1, self._key_bodies)
-        below = sim.root_pos * self._on_ground
-        first = self.episode_length_buf <= 1
-        moved = torch.where(first[:, None, None], 0.0, (key_pos[:, FEET] - self._feet) / TICK).clamp(-10.0, 10.0)
-        self._feet.copy_(key_pos[:, FEET])
-        self._foot_vel.copy_(moved)
-        return Motion(
-            reference=reference,
-            root_pos=sim.root_pos,
-            heading=heading,
-            heading_error=frames.wrap_angle(wanted - heading),
-            position_error=rotations.turn(-heading, reference.root_pos - sim.root_pos),
-            velocity=velocity,
-            velocity_error=rotations.turn(-wanted, reference.lin_vel) - velocity,
-            yaw_rate_error=-((reference.ang_vel * down).sum(1) - (sim.root_ang_vel * gravity).sum(1)),
-            tilt_error=torch.atan2(torch.linalg.cross(gravity, down).norm(dim=1), (gravity * down).sum(1)),
-            gravity=gravity,
-            ang_vel=sim.root_ang_vel,
-            joint_pos=sim.joint_pos,
-            joint_vel=sim.joint_vel,
-            joint_acc=sim.joint_acc,
-            torque=sim.torque,
-            joint_range=sim.joint_range,
-            keys=rotations.turn(-heading[:, None], key_pos - below[:, None]),
-            foot_vel=moved,
-            action=self._action,
-            last_action=self._last_action,
-            since_push=self.since_push,
-            finite=finite,
-            first=first,
-        )
+    def clip(self) -> torch.Tensor:
+        """Clip that each world follows, shape [worlds]."""
+        return self.bank.clip_of.index_select(0, self.frame)
 
-    def _judge(self, motion: Motion) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, reference: Frame) -> TickMeasurement:
+        return TickMeasurement(self.sim, reference, self._foot_vel, self._action, self._last_action, self.since_push)
+
+    def _track_feet(self) -> None:
+        """Velocities of the feet over the tick; zero on an episode's first, whose start is not measured."""
+        feet = self.sim.body_pos.index_select(1, self._foot_bodies)
+        first = (self.episode_length_buf <= 1)[:, None, None]
+        self._foot_vel.copy_(torch.where(first, 0.0, (feet - self._feet) / TICK).clamp(-10.0, 10.0))
+        self._feet.copy_(feet)
+
+    def _judge(self, m: TickMeasurement) -> tuple[torch.Tensor, torch.Tensor]:
         """Reward [worlds] and early ends [worlds] of a tick; adds to the counters."""
-        values = torch.stack([term.value(motion) for term in self.rewards.values()], 1)
+        values = torch.stack([term.value(m) for term in self.rewards.values()], 1)
         # What a broken physics state spoils is no fault of a term: the world ends and earns nothing.
-        values = torch.where(motion.finite[:, None], values, 0.0)
+        values = torch.where(m.finite[:, None], values, 0.0)
         assert self._critic_obs is not None
         self.tally.guard(values, self.front_end.obs, self._critic_obs, self._action)
-        ends = torch.stack([bound.value(motion) for bound in self.terminations.values()], 1) > self._limits
-        failed = ends.any(1) | ~motion.finite
+        ends = torch.stack([bound.value(m) for bound in self.terminations.values()], 1) > self._limits
+        failed = ends.any(1) | ~m.finite
         earned = values * (self._weights * TICK)
-        family = self.bank.family.index_select(0, self.bank.clip_of.index_select(0, self.frame))
-        self.tally.add(motion, earned, ends, failed, family, self.sim.overflow & LOST_CONTACTS)
+        family = self.bank.family.index_select(0, self.clip())
+        self.tally.add(m, earned, ends, failed, family, self.sim.overflow & LOST_CONTACTS)
         return earned.sum(1) + TERMINATION_REWARD * failed, failed
 
-    def _restart(self, mask: torch.Tensor) -> None:
-        """Put the masked worlds into a random frame of a sampled clip, at the reference's state with a little noise."""
+    def _restart(self, mask: torch.Tensor, frame: torch.Tensor | None = None) -> None:
+        """Put the masked worlds into a sampled (or given) frame, at the reference's state with a little noise."""
         sim, worlds, row = self.sim, self.num_envs, mask[:, None]
-        self.frame.copy_(torch.where(mask, self.sampler.sample(worlds), self.frame))
+        self.frame.copy_(torch.where(mask, self.sampler.sample(worlds) if frame is None else frame, self.frame))
         start = self.bank.gather(self.frame)
         noise = events.START_NOISE if self.cfg.randomise else dict.fromkeys(events.START_NOISE, 0.0)
 
@@ -336,8 +304,8 @@ class TrackerEnv(VecEnv):
         xy = around(start.root_pos[:, :2], "xy")
         z = start.root_pos[:, 2:] + noise["z"] * torch.rand(worlds, 1, device=self.device)
         tilt = noise["tilt"] * (2.0 * torch.rand(worlds, 3, device=self.device) - 1.0)
-        turned = frames.quat_from_yaw(noise["heading"] * (2.0 * torch.rand(worlds, device=self.device) - 1.0))
-        quat = rotations.turned_by(frames.quat_multiply(turned, start.root_quat), tilt)
+        turned = rotations.quat_from_yaw(noise["heading"] * (2.0 * torch.rand(worlds, device=self.device) - 1.0))
+        quat = rotations.turned_by(rotations.quat_multiply(turned, start.root_quat), tilt)
 
         def put(view: torch.Tensor, value: torch.Tensor | float) -> None:
             view.copy_(torch.where(row, value, view))
@@ -356,8 +324,7 @@ class TrackerEnv(VecEnv):
         sim.overflow.masked_fill_(mask, 0)
         self.episode_length_buf.masked_fill_(mask, 0)
         self.since_push.masked_fill_(mask, NO_PUSH)
-        clip = self.bank.clip_of.index_select(0, self.frame)
-        bank = self.bank
+        bank, clip = self.bank, self.clip()
         sim.place_supports(
             mask,
             bank.support_kind.index_select(0, clip),
@@ -366,29 +333,32 @@ class TrackerEnv(VecEnv):
         )
         events.apply(self, "reset", mask, self.events)
 
-    def _observe(self, fresh: torch.Tensor) -> None:
-        """Make the observations of the present state and the next frame's command.
+    def _observe(self, first: torch.Tensor) -> None:
+        """Make the observations of the current state and the next frame's command.
 
         Args:
-            fresh: Worlds whose episode starts, bool, shape [worlds].
+            first: Worlds whose episode starts, bool, shape [worlds].
         """
         now = self.bank.gather(self.frame)
         self._next_rows.copy_(self.bank.rows(torch.minimum(self.frame + 1, self.bank.last.index_select(0, self.frame))))
-        ahead = self._next
+        ahead = self.ahead
         command = TrackerCommand(
             mimic=ahead.mimic, joints=ahead.joint_pos, joint_vel=ahead.joint_vel, quat=ahead.root_quat
         )
         state = self._noisy_state()
-        self.front_end.reset(fresh)
+        self.front_end.reset(first)
         if self.cfg.randomise:
-            fresh = fresh & (torch.rand(self.num_envs, device=self.device) < _PREFILL)
-        self.front_end.prefill(command, state, fresh)
+            first = first & (torch.rand(self.num_envs, device=self.device) < _PREFILL)
+        self.front_end.prefill(command, state, first)
         self.front_end.observe(command, state)
-        critic = self._critic(now)
+        exact = self._measure(now)
+        # Body positions of worlds that just started again are those before the start: take the reference's.
+        exact.keys = torch.where((self.episode_length_buf == 0)[:, None, None], now.keys, exact.keys)
+        observation = critic.observe(self, exact)
         if self._critic_obs is None:
-            self._critic_obs = critic.clone()
+            self._critic_obs = observation
         else:
-            self._critic_obs.copy_(critic)
+            self._critic_obs.copy_(observation)
 
     def _noisy_state(self) -> RobotState:
         sim = self.sim
@@ -402,48 +372,3 @@ class TrackerEnv(VecEnv):
             joint_pos=sim.joint_pos + half["joint_pos"] * noise[:, 6:35],
             joint_vel=sim.joint_vel + half["joint_vel"] * noise[:, 35:64],
         )
-
-    def _critic(self, now: Frame) -> torch.Tensor:
-        """What only the critic sees, shape [worlds, n]: the exact state, all errors, the future, the randomisation."""
-        sim, bank = self.sim, self.bank
-        heading, wanted = frames.heading(sim.root_quat), frames.heading(now.root_quat)
-        velocity = rotations.turn(-heading, sim.root_vel)
-        position_error = rotations.turn(-heading, now.root_pos - sim.root_pos)
-        turn_error = frames.wrap_angle(wanted - heading)
-        key_pos = sim.body_pos.index_select(1, self._key_bodies)
-        keys = rotations.turn(-heading[:, None], key_pos - (sim.root_pos * self._on_ground)[:, None])
-        # Body poses of worlds that just started again are those before the start: the reference's stand in.
-        fresh = (self.episode_length_buf == 0)[:, None, None]
-        keys = torch.where(fresh, now.keys, keys)
-        last = bank.last.index_select(0, self.frame)
-        future = [bank.mimic.index_select(0, torch.minimum(self.frame + k, last)) for k in _LOOKAHEAD]
-        clip = bank.clip_of.index_select(0, self.frame)
-        kind = bank.support_kind.index_select(0, clip)
-        support = rotations.turn(-heading, bank.support_pos.index_select(0, clip) - sim.root_pos)
-        force = torch.cat([sim.body_force[:, link, :3] for link in self._pushed_links], 1)
-        parts = (
-            0.25 * sim.root_ang_vel,
-            rotations.gravity_in_body(sim.root_quat),
-            sim.joint_pos - self._default,
-            sim.joint_pos - now.joint_pos,
-            0.05 * sim.joint_vel,
-            self.front_end.last_action,
-            self._next.mimic,
-            velocity,
-            rotations.turn(-wanted, now.lin_vel) - velocity,
-            sim.root_pos[:, 2:],
-            position_error,
-            torch.stack((torch.sin(turn_error), torch.cos(turn_error)), 1),
-            keys.flatten(1),
-            (now.keys - keys).flatten(1),
-            rotations.turn(-heading[:, None], self._foot_vel).flatten(1),
-            *future[:-1],
-            future[-1][:, :6],
-            self._families.index_select(0, bank.family.index_select(0, clip)),
-            torch.where((kind > 0)[:, None], support, 0.0),
-            (kind[:, None] == self._kinds).float(),
-            rotations.turn(-heading[:, None], force.unflatten(1, (-1, 3))).flatten(1) * 0.1,
-            self.delay[:, None].float(),
-            self._constants,
-        )
-        return torch.cat(parts, 1).clamp(-_VALUE_CLIP, _VALUE_CLIP)

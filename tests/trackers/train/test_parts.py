@@ -1,17 +1,19 @@
 """Parts of the training that need no physics."""
 
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from arena_newton import rotations
+from arena_newton.errors import InputError
 from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.train import events
-from arena_newton.trackers.train.motion import Motion
+from arena_newton.trackers.train.measurement import TickMeasurement
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
-from arena_newton.trackers.train.rewards import REWARDS
+from arena_newton.trackers.train.rewards import REWARDS, configured, maximum
 from arena_newton.trackers.train.sampling import ClipSampler
 from arena_newton.trackers.train.tally import Tally, TrainingError
 from arena_newton.trackers.train.terminations import TERMINATIONS
@@ -22,76 +24,85 @@ def bank(library):
     return ReferenceBank(library.to("cpu"), "cpu")
 
 
-def perfect(bank: ReferenceBank, frame: torch.Tensor) -> Motion:
-    """A tick in which the robot does what it was asked for."""
+def perfect(bank: ReferenceBank, frame: torch.Tensor) -> TickMeasurement:
+    """A tick in which the robot does what it was asked for: the measured state is the reference's own."""
     reference = bank.gather(frame)
-    n = len(frame)
-    zero = torch.zeros(n)
-    return Motion(
-        reference=reference,
+    n, heading = len(frame), rotations.heading(reference.root_quat)[:, None]
+    state = SimpleNamespace(
+        qpos=torch.zeros(n, 36),
+        qvel=torch.zeros(n, 35),
         root_pos=reference.root_pos,
-        heading=zero,
-        heading_error=zero,
-        position_error=torch.zeros(n, 3),
-        velocity=reference.lin_vel,
-        velocity_error=torch.zeros(n, 3),
-        yaw_rate_error=zero,
-        tilt_error=zero,
-        gravity=torch.tensor([[0.0, 0.0, -1.0]]).repeat(n, 1),
-        ang_vel=torch.zeros(n, 3),
+        root_quat=reference.root_quat,
+        root_vel=reference.lin_vel,
+        root_ang_vel=reference.ang_vel,
         joint_pos=reference.joint_pos,
         joint_vel=reference.joint_vel,
         joint_acc=torch.zeros(n, 29),
         torque=torch.zeros(n, 29),
         joint_range=torch.tensor([[-3.0, 3.0]]).repeat(29, 1),
-        keys=reference.keys,
+        key_links=lambda: rotations.turn(heading, reference.keys),
+    )
+    return TickMeasurement(
+        state=state,
+        reference=reference,
         foot_vel=torch.zeros(n, 2, 3),
         action=torch.zeros(n, 29),
         last_action=torch.zeros(n, 29),
         since_push=torch.full((n,), 1e3),
-        finite=torch.ones(n, dtype=torch.bool),
-        first=torch.zeros(n, dtype=torch.bool),
     )
 
 
 def test_perfect_tracking_earns_every_positive_weight(bank):
-    """Each positive weight is what perfect tracking earns a second, penalties are zero, and nothing ends."""
+    """Each positive weight is what perfect tracking earns per second, penalties are zero, and nothing ends."""
     motion = perfect(bank, torch.tensor([10, 200, 250]))
     for name, term in REWARDS.items():
         expected = 1.0 if term.weight > 0.0 else 0.0
         assert torch.allclose(term.value(motion), torch.full((3,), expected)), name
     assert not any((bound.value(motion) > bound.limit).any() for bound in TERMINATIONS.values())
+    assert maximum(REWARDS) == pytest.approx(sum(t.weight * float(t.value(motion)[0]) for t in REWARDS.values()))
 
 
-@pytest.mark.parametrize(
-    ("field", "error", "lost"),
-    [
-        ("joint_pos", 0.2, {"joint_position", "legs"}),
-        ("velocity_error", 0.25, {"velocity"}),
-        ("heading_error", 0.35, {"heading"}),
-        ("tilt_error", 0.15, {"tilt"}),
-        ("yaw_rate_error", 0.5, {"yaw_rate"}),
-    ],
-)
-def test_an_error_costs_its_own_term(bank, field, error, lost):
-    """An error of one quantity lowers the term of that quantity and no other tracking term."""
-    motion = perfect(bank, torch.tensor([10, 200]))
-    worse = dataclasses.replace(motion, **{field: getattr(motion, field) + error})
+@pytest.mark.parametrize("error", ["velocity_error", "heading_error", "tilt_error", "yaw_rate_error"])
+def test_an_error_costs_its_own_term(bank, error):
+    """An error of the size of its term's scale lowers the term to 1/e, and no other tracking term."""
+    worse, name = perfect(bank, torch.tensor([10, 200])), error.removesuffix("_error")
+    setattr(worse, error, torch.zeros_like(getattr(worse, error)))
+    getattr(worse, error).view(2, -1)[:, 0] = REWARDS[name].scale
+    values = {n: t.value(worse) for n, t in REWARDS.items() if t.scale is not None}
+    assert values.pop(name).tolist() == pytest.approx([math.exp(-1.0)] * 2)
+    assert all((value > 0.99).all() for value in values.values())
+
+
+def test_joint_errors_cost_all_joints_and_the_legs(bank):
+    """An error of every joint lowers the terms of joint positions and legs and no other tracking term."""
+    worse = perfect(bank, torch.tensor([10, 200]))
+    worse.state.joint_pos = worse.state.joint_pos + 0.2
     fallen = {n for n, t in REWARDS.items() if t.weight > 0.0 and (t.value(worse) < 0.99).any()}
-    assert fallen == lost
+    assert fallen == {"joint_position", "legs"}
+
+
+def test_weights_and_scales_are_options():
+    """Terms take another weight or scale by name; a name without one is refused with its flag."""
+    changed = configured({"alive": 2.0}, {"legs": 0.1})
+    assert changed["alive"].weight == 2.0 and changed["legs"].scale == 0.1
+    assert changed["legs"].weight == REWARDS["legs"].weight and changed["feet"] == REWARDS["feet"]
+    for arguments, words in (
+        (({"leg": 1.0}, {}), "--rewards leg: no such"),
+        (({}, {"alive": 1.0}), "--reward-scales a"),
+    ):
+        with pytest.raises(InputError, match=words):
+            configured(*arguments)
 
 
 def test_a_foot_that_stays_behind_ends_the_episode_unless_a_push_may_ask_for_steps(bank):
     """A kick that is left out ends the episode; a foot that catches a push does not."""
     motion = perfect(bank, torch.tensor([10, 200]))
-    keys = motion.keys.clone()
-    keys[1, 0, 0] -= 0.3
-    worse = dataclasses.replace(motion, keys=keys)
+    motion.keys[1, 0, 0] -= 0.3
     bound = TERMINATIONS["feet"]
-    assert (bound.value(worse) > bound.limit).tolist() == [False, True]
-    assert (REWARDS["feet"].value(worse) < 0.5).tolist() == [False, True]
-    pushed = dataclasses.replace(worse, since_push=torch.tensor([0.1, 0.1]))
-    assert not (bound.value(pushed) > bound.limit).any()
+    assert (bound.value(motion) > bound.limit).tolist() == [False, True]
+    assert (REWARDS["feet"].value(motion) < 0.5).tolist() == [False, True]
+    motion.since_push = torch.tensor([0.1, 0.1])
+    assert not (bound.value(motion) > bound.limit).any()
 
 
 def test_pushes_strike_as_often_and_as_hard_as_set():

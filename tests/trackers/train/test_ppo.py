@@ -12,13 +12,13 @@ from torch.utils._pytree import tree_leaves
 
 from arena_newton.trackers.train import ppo as ppo_module
 from arena_newton.trackers.train.model import TrackerActor, TrackerCritic
-from arena_newton.trackers.train.ppo import IterationPPO
+from arena_newton.trackers.train.ppo import TrackerPPO
 
 WORLDS, STEPS = 16, 8
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 
 
-def learner(device: str, graph: bool = False) -> IterationPPO:
+def learner(device: str, graph: bool = False) -> TrackerPPO:
     """PPO of a small twist2 network with the same start on every device."""
     torch.manual_seed(0)
     obs = TensorDict({"actor": torch.zeros(WORLDS, 1432), "critic": torch.zeros(WORLDS, 40)}, batch_size=[WORLDS])
@@ -27,10 +27,10 @@ def learner(device: str, graph: bool = False) -> IterationPPO:
     critic = TrackerCritic(obs, groups, "critic", 1, hidden_dims=[32], activation="elu", obs_normalization=True)
     storage = RolloutStorage("rl", WORLDS, STEPS, obs, [29], device)
     settings = {"entropy_coef": 0.01, "use_clipped_value_loss": False, "mirror_loss": 0.0, "graph": graph}
-    return IterationPPO(actor, critic, storage, **settings, device=device)
+    return TrackerPPO(actor, critic, storage, **settings, device=device)
 
 
-def update(ppo: IterationPPO, seed: int) -> dict[str, float]:
+def update(ppo: TrackerPPO, seed: int) -> dict[str, float]:
     """Roll out noise and learn from it; the numbers are drawn on the CPU, so that devices agree."""
     rng = torch.Generator().manual_seed(seed)
 
@@ -52,9 +52,9 @@ def update(ppo: IterationPPO, seed: int) -> dict[str, float]:
         return ppo.update()
 
 
-def weights(ppo: IterationPPO) -> torch.Tensor:
+def weights(ppo: TrackerPPO) -> torch.Tensor:
     """All parameters in a row."""
-    return torch.cat([p.detach().flatten().cpu() for p in ppo._parameters])
+    return torch.cat([p.detach().flatten().cpu() for p in ppo.parameters])
 
 
 def carried(state: dict, device: str) -> dict:
@@ -81,14 +81,14 @@ def test_a_minibatch_learns_only_what_may_learn():
     actor = [*ppo.actor.parameters()]
     for parameter in actor:
         parameter.requires_grad_(False)
-    before = [p.detach().clone() for p in ppo._parameters]
+    before = [p.detach().clone() for p in ppo.parameters]
     update(ppo, 1)
-    moved = [not torch.equal(p, b) for p, b in zip(ppo._parameters, before, strict=True)]
+    moved = [not torch.equal(p, b) for p, b in zip(ppo.parameters, before, strict=True)]
     assert moved == [False] * len(actor) + [True] * (len(moved) - len(actor))
     for parameter in actor:
         parameter.requires_grad_(True)
     update(ppo, 2)
-    assert not any(torch.equal(p, b) for p, b in zip(ppo._parameters, before, strict=True))
+    assert not any(torch.equal(p, b) for p, b in zip(ppo.parameters, before, strict=True))
 
 
 class Tape(TorchDispatchMode):
@@ -113,22 +113,22 @@ class Tape(TorchDispatchMode):
                         old.copy_(new)
 
 
-def recorded(ppo: IterationPPO, work) -> Tape:
+def recorded(ppo: TrackerPPO, work) -> Tape:
     """A tape of work that leaves parameters and optimiser as they were, as recording a CUDA graph does."""
-    kept = [p.detach().clone() for p in ppo._parameters]
+    kept = [p.detach().clone() for p in ppo.parameters]
     moments = copy.deepcopy(ppo.optimizer.state_dict()["state"])
     with Tape() as tape:
         work()
     with torch.no_grad():
-        for parameter, before in zip(ppo._parameters, kept, strict=True):
+        for parameter, before in zip(ppo.parameters, kept, strict=True):
             parameter.copy_(before)
         for k, state in moments.items():
             for name, before in state.items():
-                ppo.optimizer.state[ppo._parameters[k]][name].copy_(before)
+                ppo.optimizer.state[ppo.parameters[k]][name].copy_(before)
     return tape
 
 
-def compare(graphed: IterationPPO, plain: IterationPPO) -> None:
+def compare(graphed: TrackerPPO, plain: TrackerPPO) -> None:
     """Updates of both agree, also when the parameters that learn, the rate and the entropy's weight change."""
     for ppo in (graphed, plain):
         for parameter in ppo.actor.parameters():
@@ -142,7 +142,7 @@ def compare(graphed: IterationPPO, plain: IterationPPO) -> None:
                 ppo.set_learning_rate(1e-4)
                 ppo.entropy_coef = 0.5
         losses = [update(ppo, seed) for ppo in (graphed, plain)]
-        assert graphed._captured is not None and plain._captured is None
+        assert graphed.captured is not None and plain.captured is None
         assert losses[0] == pytest.approx(losses[1], rel=1e-3, abs=1e-4)
     assert torch.allclose(weights(graphed), weights(plain), atol=1e-4)
 
@@ -151,7 +151,7 @@ def test_an_update_can_be_replayed(monkeypatch):
     """Done again on the same tensors, a minibatch is a minibatch: nothing that it reads or writes has moved."""
     graphed, plain = learner("cpu"), learner("cpu")
     monkeypatch.setattr(ppo_module, "captured", lambda work, option, stream: recorded(graphed, work))
-    graphed._want_graph = True
+    graphed.use_graphs = True
     for ppo in (graphed, plain):
         # As on CUDA: the optimiser's counts and rate are tensors.
         ppo.optimizer.param_groups[0].update(fused=True, lr=torch.tensor(ppo.learning_rate))

@@ -22,12 +22,15 @@ from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
-from arena_newton.trackers.train.export import ExportOptions, export
-from arena_newton.trackers.train.options import TrainOptions, runner_config
+from arena_newton.trackers.train.checkpoint import Card, Checkpoint
+from arena_newton.trackers.train.critic import CRITIC
+from arena_newton.trackers.train.export import export
+from arena_newton.trackers.train.options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.train.rewards import Term
-from arena_newton.trackers.train.runner import TrackerRunner, read_checkpoint
+from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
-from arena_newton.trackers.train.tracker_env import EnvConfig, TrackerEnv
+from arena_newton.trackers.train.tally import TrainingError
+from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.twist2 import Twist2FrontEnd, Twist2Tracker
 
 WORLDS = 8
@@ -38,27 +41,27 @@ def env(library):
     """Eight worlds with all of the randomisation."""
     torch.manual_seed(0)
     front, drive, rate = session.front_end("twist2")
-    made = TrackerEnv(front, drive, rate, library.to("cpu"), EnvConfig.of(TrainOptions(worlds=WORLDS)), "cpu")
+    made = TrackerEnv(front, drive, rate, library.to("cpu"), TrainOptions(worlds=WORLDS), "cpu")
     made.library = library.to("cpu")
     return made
 
 
 def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
     options = TrainOptions(worlds=WORLDS, device="cpu", steps=8, print_interval=1000, **changes)
-    card = {
-        "tracker": "twist2",
-        "command": "test",
-        "commit": "none",
-        "worlds": WORLDS,
-        "processes": 1,
-        "seed": 0,
-        "data": {"clips": 2, "families": {"stand": {"clips": 1, "minutes": 0.1}}, "sources": ["test"]},
-        "licences": {"Apache-2.0": 2},
-        "action_form": dataclasses.asdict(env.front_end.action_form),
-        "drive": dataclasses.asdict(TWIST2_DRIVE),
-        "physics": dataclasses.asdict(PhysicsRate(0.005, 4)),
-    }
-    return TrackerRunner(env, runner_config(options, {"hidden": [64, 64]}, card), log_dir, env.device)
+    card = Card(
+        tracker="twist2",
+        command="test",
+        commit="none",
+        worlds=WORLDS,
+        processes=1,
+        seed=0,
+        data={"clips": 2, "families": {"stand": {"clips": 1, "minutes": 0.1}}, "sources": ["test"]},
+        licences={"Apache-2.0": 2},
+        action_form=dataclasses.asdict(env.front_end.action_form),
+        drive=dataclasses.asdict(TWIST2_DRIVE),
+        physics=dataclasses.asdict(PhysicsRate(0.005, 4)),
+    )
+    return TrackerRunner(env, options, {"hidden": [64, 64]}, card, log_dir)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -66,7 +69,7 @@ def test_a_rollout_does_not_wait_for_the_device(library):
     """Torch reports each wait as an error: from observation to action to reward there is none."""
     share_stream("cuda:0")
     front, drive, rate = session.front_end("twist2")
-    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), EnvConfig.of(TrainOptions(worlds=WORLDS)), "cuda:0")
+    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), TrainOptions(worlds=WORLDS), "cuda:0")
     algorithm = make_runner(env).alg
     obs = env.get_observations()
     try:
@@ -94,7 +97,7 @@ def test_worlds_differ_and_the_critic_knows(env):
 
 def test_episodes_start_on_the_reference_beside_its_support(env, library):
     """A restarted world stands in its frame within the noise; the seat stands where its clip says, or out of reach."""
-    env._restart(env._every)
+    env.reset()
     now = env.bank.gather(env.frame)
     noise = events.START_NOISE
     assert ((env.sim.joint_pos - now.joint_pos).abs() <= noise["joint_pos"] + 1e-6).all()
@@ -123,14 +126,7 @@ def test_a_broken_world_ends_and_starts_again(env):
 
 def test_time_outs_are_no_falls(env):
     """An episode that reaches its clip's end ends without the penalty of a fall."""
-    env._restart(env._every)
-    env._observe(env._every)
-    env.frame.copy_(env.bank.last[env.frame] - 1)
-    env._next_rows.copy_(env.bank.rows(env.frame + 1))
-    now = env.bank.gather(env.frame)
-    env.sim.root_pos.copy_(now.root_pos)
-    env.sim.joint_pos.copy_(now.joint_pos)
-    env.sim.root_quat.copy_(now.root_quat)
+    env.reset(env.bank.last[env.frame] - 1)
     _, reward, done, extras = env.step(torch.zeros(WORLDS, 29))
     assert done.all() and extras["time_outs"].all() and (reward > 0.0).all()
     assert (env.episode_length_buf == 0).all()
@@ -147,6 +143,15 @@ def pointers(thing: object, depth: int = 2) -> dict[str, int]:
         elif depth and hasattr(value, "__dict__") and not callable(value):
             found |= {f"{name}.{k}": v for k, v in pointers(value, depth - 1).items()}
     return found
+
+
+def test_the_critics_terms_are_named(env, library, monkeypatch):
+    """The observation is the terms in the table's order; a term of a wrong shape is refused by its name."""
+    assert list(env.critic_widths) == list(CRITIC)
+    assert env.get_observations()["critic"].shape == (WORLDS, sum(env.critic_widths.values()))
+    monkeypatch.setitem(env.critic, "height", lambda env, m: m.state.root_pos[:, 2])
+    with pytest.raises(TrainingError, match=r"critic term height: shape \[8\], expected \[8, 1\]"):
+        env.reset()
 
 
 def test_a_tick_keeps_its_buffers(env):
@@ -168,7 +173,7 @@ def test_reward_improves(env):
         TWIST2_DRIVE,
         PhysicsRate(0.005, 4),
         env.library,
-        EnvConfig.of(TrainOptions(worlds=WORLDS, randomise=False)),
+        TrainOptions(worlds=WORLDS, randomise=False),
         "cpu",
         rewards={"wanted": wanted},
     )
@@ -182,14 +187,14 @@ def test_reward_improves(env):
 
 def test_resume_goes_on_as_before(env, tmp_path):
     """A checkpoint brings back networks, input statistics, sampling, learning rate and random numbers."""
-    first = make_runner(env, str(tmp_path / "a"), minutes=0.0)
+    first = make_runner(env, tmp_path / "a", minutes=0.0)
     first.learn(2)
     path = tmp_path / "a" / "model_last.pt"
     second = make_runner(env, None)
     state = torch.get_rng_state()
     second.load(str(path))
-    expected = read_checkpoint(path)
-    assert torch.equal(torch.get_rng_state(), expected["rng"]) and not torch.equal(torch.get_rng_state(), state)
+    expected = Checkpoint.read(path)
+    assert torch.equal(torch.get_rng_state(), expected.rng) and not torch.equal(torch.get_rng_state(), state)
     observations = env.get_observations()
     assert torch.equal(first.alg.actor(observations), second.alg.actor(observations))
     assert torch.equal(first.alg.critic(observations), second.alg.critic(observations))
@@ -197,7 +202,7 @@ def test_resume_goes_on_as_before(env, tmp_path):
     assert first.alg.actor.counts().keys() == second.alg.actor.counts().keys()
     for name, count in first.alg.actor.counts().items():
         assert count == second.alg.actor.counts()[name] > 0
-    assert torch.equal(env.sampler.cumulative, expected["sampler"]["cumulative"])
+    assert torch.equal(env.sampler.cumulative, expected.sampler["cumulative"])
     second.learn(1)
     assert second.current_learning_iteration == 3 and second.history[-1]["iteration"] == 3
 
@@ -208,13 +213,13 @@ def test_old_checkpoints_are_deleted(env, tmp_path):
     def files() -> set[str]:
         return {path.name.removeprefix("model_").removesuffix(".pt") for path in tmp_path.glob("model_*.pt")}
 
-    make_runner(env, str(tmp_path), save_interval=1, keep_last=1, keep_every=2).learn(3)
+    make_runner(env, tmp_path, save_interval=1, keep_last=1, keep_every=2).learn(3)
     assert files() == {"2", "3", "last", "slim"}
-    again = make_runner(env, str(tmp_path), save_interval=1, keep_last=1, keep_every=0)
+    again = make_runner(env, tmp_path, save_interval=1, keep_last=1, keep_every=0)
     again.load(str(tmp_path / "model_2.pt"))
     again.learn(2)
     assert files() == {"2", "4", "last", "slim"}
-    kept = make_runner(env, str(tmp_path), save_interval=1, keep_last=0)
+    kept = make_runner(env, tmp_path, save_interval=1, keep_last=0)
     kept.load(str(tmp_path / "model_2.pt"))
     kept.learn(1)
     assert files() == {"2", "3", "4", "last", "slim"}
@@ -222,7 +227,7 @@ def test_old_checkpoints_are_deleted(env, tmp_path):
 
 def test_export_is_what_was_trained(env, tmp_path):
     """The weights file makes the actions of the trained actor, and its card says how it came to be."""
-    runner = make_runner(env, str(tmp_path))
+    runner = make_runner(env, tmp_path)
     runner.learn(1)
     out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w" / "twist2.safetensors", note="A test."))
     weights = weights_file.load(out, "twist2")
@@ -236,16 +241,15 @@ def test_export_is_what_was_trained(env, tmp_path):
 
 def test_exported_tracker_has_no_preferred_side(env, tmp_path):
     """In a mirrored world the exported tracker gives the mirrored targets, though its network alone does not."""
-    runner = make_runner(env, str(tmp_path))
+    runner = make_runner(env, tmp_path)
     runner.learn(1)
     for symmetric in (True, False):
         out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
         tracker = Twist2Tracker(out)
         mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
         seen = env.get_observations()["actor"]
-        tracker.bind(2 * WORLDS)
-        tracker.observation().copy_(torch.cat([seen, mirror[0](seen)]))
-        straight, mirrored = tracker._runner.run().chunk(2)
+        with torch.no_grad():
+            straight, mirrored = tracker.network(torch.cat([seen, mirror[0](seen)])).chunk(2)
         difference = (mirror[1](straight) - mirrored).abs().max()
         assert (difference < 1e-5) if symmetric else (difference > 1e-3)
         assert ("mean of both ways" in out.with_suffix(".md").read_text()) == symmetric
@@ -253,7 +257,7 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
 
 def test_export_takes_fitting_figures_only(env, tmp_path):
     """Figures of another tracker or no figures at all are refused, nothing is written then or overwritten."""
-    runner = make_runner(env, str(tmp_path))
+    runner = make_runner(env, tmp_path)
     runner.learn(1)
     checkpoint, metrics, out = tmp_path / "model_last.pt", tmp_path / "evaluation.json", tmp_path / "w.safetensors"
     figure = {"name": "falls", "bar": "no", "value": "0/8", "verdict": "pass"}
@@ -287,6 +291,11 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
         (lambda state: state.update(families=["walk"]), "of the families walk; these are stand, squat"),
         (lambda state: state.update(critic_state_dict={"old": torch.zeros(1)}), "a checkpoint of another version"),
         (lambda state: state.update(network={"hidden": [8]}), "a network of other widths"),
+        (lambda state: state["critic_widths"].update(height=2), "its critic term height has width 2, here it has 1"),
+        (
+            lambda state: state["critic_widths"].update(new=state["critic_widths"].pop("height")),
+            "term height has width 0",
+        ),
         (lambda state: state.pop("rng"), "it lacks rng"),
         (lambda state: state["card"].pop("licences"), "it lacks licences"),
         (lambda state: state.update(card=5), "not a checkpoint of this training"),
@@ -294,7 +303,7 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
 )
 def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, tmp_path, change, words):
     """Every difference that would change what is learnt is refused in words."""
-    runner = make_runner(env, str(tmp_path))
+    runner = make_runner(env, tmp_path)
     runner.save(str(tmp_path / "last.pt"))
     state = torch.load(tmp_path / "last.pt", weights_only=True)
     change(state)
@@ -303,13 +312,35 @@ def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, tmp_path, ch
         make_runner(env).load(str(tmp_path / "other.pt"))
 
 
+def test_checkpoints_of_earlier_versions_are_taken(env, tmp_path):
+    """The keys of a file's first version are enough to resume and to export."""
+    runner = make_runner(env, tmp_path)
+    runner.learn(1)
+    state = torch.load(tmp_path / "model_last.pt", weights_only=True)
+    first = (
+        "actor_state_dict critic_state_dict optimizer_state_dict iter infos network norm_counts learning_rate samples"
+    )
+    kept = [*first.split(), "seconds", "families", "sampler", "rng", "cuda_rng", "card", "last"]
+    card = "tracker command commit processes worlds seed data licences action_form drive physics rewards".split()
+    assert set(card) == set(state["card"]), "a card without earlier parts"
+    torch.save({name: state[name] for name in kept}, tmp_path / "first.pt")
+    resumed = make_runner(env)
+    resumed.load(str(tmp_path / "first.pt"))
+    assert resumed.current_learning_iteration == 1 and resumed.samples == 8 * WORLDS
+    out = [
+        export(tmp_path / f"{name}.pt", ExportOptions(tmp_path / f"{name}.safetensors"))
+        for name in ("first", "model_last")
+    ]
+    assert out[0].read_bytes() == out[1].read_bytes()
+
+
 def test_a_resumed_training_tells_of_all_its_parts(env, tmp_path, capsys):
     """Card and weights keep the licences, commands and processes of the parts before, and what they started from."""
-    first = make_runner(env, str(tmp_path / "a"))
-    first.cfg["card"] |= {"licences": {"CC-BY-NC": 5}, "processes": 2, "started_from": "abc"}
+    first = make_runner(env, tmp_path / "a")
+    first.card.licences, first.card.processes, first.card.started_from = {"CC-BY-NC": 5}, 2, "abc"
     first.seconds = 60.0
     first.save(str(tmp_path / "a.pt"))
-    second = make_runner(env, str(tmp_path / "b"))
+    second = make_runner(env, tmp_path / "b")
     second.load(str(tmp_path / "a.pt"))
     second.seconds = 180.0
     second.save(str(tmp_path / "b.pt"))
@@ -324,7 +355,7 @@ def test_a_resumed_training_tells_of_all_its_parts(env, tmp_path, capsys):
 
 def test_other_references_start_without_evidence(env, tmp_path, capsys):
     """What was learnt about one library's clips says nothing about another's of the same shape."""
-    runner = make_runner(env, str(tmp_path))
+    runner = make_runner(env, tmp_path)
     runner.save(str(tmp_path / "last.pt"))
     state = torch.load(tmp_path / "last.pt", weights_only=True)
     state["sampler"] |= {"library": "another", "seconds": state["sampler"]["seconds"] + 1e6}
@@ -333,18 +364,24 @@ def test_other_references_start_without_evidence(env, tmp_path, capsys):
     assert "other references" in capsys.readouterr().out and (env.sampler.seconds < 1e5).all()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_training_with_its_files(env, tmp_path, number):
-    """The iteration in flight is finished, logged and written."""
-    runner = make_runner(env, str(tmp_path), log_interval=100)
-    report = runner._report
+def signalled(env, monkeypatch, *numbers: int) -> None:
+    """At the end of the second rollout these signals arrive."""
+    collect, calls = env.collect, []
 
-    def interrupt(it, *rest) -> None:
-        report(it, *rest)
-        if it == 1:
+    def collect_and_signal() -> dict[str, float]:
+        calls.append(1)
+        for number in numbers if len(calls) == 2 else ():
             os.kill(os.getpid(), number)
+        return collect()
 
-    runner._report = interrupt
+    monkeypatch.setattr(env, "collect", collect_and_signal)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_training_with_its_files(env, tmp_path, number, monkeypatch):
+    """The iteration in flight is finished, logged and written."""
+    runner = make_runner(env, tmp_path, log_interval=100)
+    signalled(env, monkeypatch, number)
     runner.learn(50)
     assert runner.current_learning_iteration == 2 and (tmp_path / "model_last.pt").is_file()
     assert [json.loads(line)["iteration"] for line in (tmp_path / "progress.jsonl").read_text().splitlines()] == [1, 2]
@@ -352,12 +389,12 @@ def test_a_signal_ends_the_training_with_its_files(env, tmp_path, number):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_interrupt_stops_at_once(env):
-    """Who presses Ctrl-C twice does not want to wait."""
+def test_a_second_interrupt_stops_at_once(env, monkeypatch):
+    """A second Ctrl-C does not wait for the end of the iteration."""
     runner = make_runner(env)
-    runner._on_signal(signal.SIGINT, None)
+    signalled(env, monkeypatch, signal.SIGINT, signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        runner._on_signal(signal.SIGINT, None)
+        runner.learn(50)
 
 
 def test_export_overwrites_nothing_foreign_and_needs_every_tensor(env, tmp_path):
@@ -376,30 +413,27 @@ def test_export_overwrites_nothing_foreign_and_needs_every_tensor(env, tmp_path)
 
 @pytest.mark.parametrize("held", ["twist2.safetensors", "model_5.pt", "progress.jsonl"])
 def test_a_folder_with_a_training_or_weights_is_left_alone(held, tmp_path):
-    """A new training wants a folder of its own; one that goes on from a checkpoint of the folder writes there."""
+    """A new run needs an empty folder; one that is resumed from a checkpoint of the folder writes there."""
     (tmp_path / held).write_text("mine")
-    with pytest.raises(InputError, match=f"--log-dir .*: holds {held}"):
+    with pytest.raises(InputError, match=rf"--log-dir .*: already contains a training run \({held}\)"):
         session.check_folder(TrainOptions(log_dir=tmp_path))
     (tmp_path / "model_7.pt").write_text("checkpoint")
     session.check_folder(TrainOptions(log_dir=tmp_path, resume=tmp_path / "model_7.pt"))
 
 
-def test_time_limit_lets_the_training_settle(env):
-    """Towards the end of `--minutes` the aimed divergence and the entropy fall to a tenth; without it they stay."""
+def test_the_end_of_a_time_limit_is_annealed(env):
+    """Towards the end of `--minutes` target KL and entropy coefficient fall to a tenth, without `--settle` not."""
+    assert [annealed(elapsed, 0.5) for elapsed in (0.2, 0.75, 0.99)] == pytest.approx([1.0, 0.5, 0.1])
+    assert annealed(0.99, 0.0) == 1.0
     runner = make_runner(env, settle=0.5, desired_kl=0.02, entropy=0.01)
-    for elapsed, left in ((0.2, 1.0), (0.75, 0.5), (0.99, 0.1)):
-        runner._settle(elapsed)
-        assert runner.alg.desired_kl == pytest.approx(0.02 * left)
-        assert runner.alg.entropy_coef == pytest.approx(0.01 * left)
-    plain = make_runner(env, desired_kl=0.02)
-    plain._settle(0.99)
-    assert plain.alg.desired_kl == 0.02
+    runner.anneal(0.75)
+    assert (runner.alg.desired_kl, runner.alg.entropy_coef) == pytest.approx((0.01, 0.005))
 
 
 def test_two_processes_train_one_network(library, tmp_path):
     """Torchrun on the CPU: both processes end after the same iteration with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
-    flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "2", "--no-mirror"]
+    flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "1", "--no-mirror"]
     flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
     script = tmp_path / "train.py"
     script.write_text(
@@ -426,7 +460,7 @@ def test_two_processes_train_one_network(library, tmp_path):
 
 def test_curves(env, tmp_path, capsys):
     """A picture of one training or several; a folder without a log is named."""
-    runner = make_runner(env, str(tmp_path / "a"), log_interval=1)
+    runner = make_runner(env, tmp_path / "a", log_interval=1)
     runner.learn(2)
     out = tmp_path / "curves.png"
     assert command_line.main(["curves", str(tmp_path / "a"), str(tmp_path / "a"), "--out", str(out)]) == 0
@@ -445,7 +479,7 @@ def test_curves(env, tmp_path, capsys):
 
 def test_start_from_weights(env, tmp_path):
     """A new training begins with the network of a weights file, and keeps it while the critic learns."""
-    first = make_runner(env, str(tmp_path))
+    first = make_runner(env, tmp_path)
     first.learn(1)
     file = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "weights.safetensors"))
     weights = {k: v.clone() for k, v in first.alg.get_policy().net.state_dict().items() if not k.endswith("count")}
@@ -453,7 +487,7 @@ def test_start_from_weights(env, tmp_path):
     second = make_runner(env)
     second.start_from(file)
     critic = [p.detach().clone() for p in second.alg.critic.parameters()]
-    second.cfg["critic_iterations"] = 2
+    second.critic_iterations = 2
     second.learn(2)
     for name, value in second.alg.get_policy().net.state_dict().items():
         if name in weights:
@@ -493,7 +527,7 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
     with pytest.raises(InputError, match="pass one of the two"):
-        session.make_library(TrainOptions(library=tmp_path / "a.npz", families={"walk": 1}), "cpu", 0)
+        check(TrainOptions(library=tmp_path / "a.npz", families={"walk": 1}))
 
 
 def test_what_is_no_interface_is_refused():
@@ -518,9 +552,6 @@ def test_training_options_have_one_default():
             given = inspect.signature(function).parameters.values()
             found += [f"{module.name}: {p.name}" for p in given if p.name in plain and p.default is not p.empty]
     assert not found
-    assert EnvConfig.of(TrainOptions()).adaptive == TrainOptions().adaptive
-    with pytest.raises(TypeError, match="missing"):
-        EnvConfig(worlds=8)
 
 
 @pytest.mark.parametrize(
