@@ -11,29 +11,21 @@ from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk
 from arena_newton.kernels import tick as codes
+from arena_newton.policies.base import Policy
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, SONIC_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+from arena_newton.rollout import Rollout
 
 STEPS = 30
 
 
-class Sway:
+class Sway(Policy):
     """A policy whose action depends on the world's own state, so that any mixing of worlds shows."""
-
-    needs_image = False
-
-    def __init__(self, worlds=1):
-        self.bad = {}
-        self.calls = 0
-
-    def reset(self, seeds, tasks, mask):
-        pass
 
     def act(self, observation):
         state = observation.state
         actions = torch.from_numpy(STAND_ACTION).repeat(len(state), 5, 1)
         actions[:, :, 9:38] += 0.05 * torch.sin(10.0 * state[:, None, 6:35])
         actions[:, :, 0] = 0.004
-        self.calls += 1
         return Chunk(actions)
 
 
@@ -42,7 +34,7 @@ class Network(trackers.base.Tracker):
 
     name = "network"
 
-    def bind(self, worlds, device="cpu", scene=None):
+    def bind(self, worlds, device="cpu"):
         from arena_newton.trackers.inference.blocks import BlockRunner
 
         torch.manual_seed(0)
@@ -78,7 +70,7 @@ def _run(worlds, episodes):
         expected = env.spec.draw(result.episode.episode_seed, "base", env.rules)
         return next(d for w, d in enumerate(env.draws) if d == expected)
 
-    results = env.run_episodes(Sway(), episodes, on_finish=keep, max_steps=STEPS)
+    results = Rollout(env, Sway(), episodes, on_finish=keep, max_steps=STEPS).run()
     return {r.episode.index: (r.outcome, r.steps, r.margin, finals[r.episode.index].tobytes()) for r in results}
 
 
@@ -107,7 +99,7 @@ def test_bad_action_ends_only_its_world(env):
             chunk.actions[0, 2, 12] = float("nan")
             return chunk
 
-    first, second = env.run_episodes(OneBad(), _episodes(2), max_steps=8)
+    first, second = Rollout(env, OneBad(), _episodes(2), max_steps=8).run()
     assert (first.outcome, first.reason, first.steps) == ("error", "bad_action", 3)
     assert second.outcome == "timeout" and second.steps == 8
 
@@ -121,7 +113,7 @@ def test_policy_error_ends_only_its_world(env):
             chunk.errors = {1: "server said no"} if observation.mask[1] else {}
             return chunk
 
-    first, second = env.run_episodes(Half(), _episodes(2), max_steps=8)
+    first, second = Rollout(env, Half(), _episodes(2), max_steps=8).run()
     assert first.outcome == "timeout"
     assert (second.outcome, second.error) == ("error", "server said no")
 
@@ -135,7 +127,7 @@ def test_nonfinite_state_is_an_error(env):
             done.append(1)
             env.physics._data[0].qpos[:] = np.nan
 
-    first, second = env.run_episodes(Sway(), _episodes(2), on_tick=poison, max_steps=8)
+    first, second = Rollout(env, Sway(), _episodes(2), on_tick=poison, max_steps=8).run()
     assert (first.outcome, first.reason) == ("error", "nonfinite_state")
     assert second.outcome == "timeout"
 
@@ -153,7 +145,7 @@ def test_startup_fall_is_told_apart():
             return target
 
     env = ArenaEnv("football", tracker=Drop(), worlds=1, engine="mujoco", device="cpu", fast_physics=True)
-    (result,) = env.run_episodes(Sway(), _episodes(1), max_steps=8)
+    (result,) = Rollout(env, Sway(), _episodes(1), max_steps=8).run()
     assert result.outcome == "fall" and result.startup_fall and result.steps == 0
 
 
@@ -192,7 +184,7 @@ def test_nonfinite_targets_are_the_trackers_error(env, monkeypatch, value):
         return targets
 
     monkeypatch.setattr(env, "tracker", _broken(env, spoil))
-    first, second = env.run_episodes(Sway(), _episodes(2), max_steps=8)
+    first, second = Rollout(env, Sway(), _episodes(2), max_steps=8).run()
     assert (first.outcome, first.reason, first.steps) == ("error", "tracker", 4)
     assert "tracker broken" in first.error
     assert second.outcome == "timeout" and second.steps == 8
@@ -212,7 +204,7 @@ def test_targets_of_another_kind_are_refused(env, monkeypatch, spoil, said):
     """An answer of another shape or type stops the run with one line that names the tracker."""
     monkeypatch.setattr(env, "tracker", _broken(env, spoil))
     with pytest.raises(InputError, match=f"tracker broken: joint targets are .*{said}"):
-        env.run_episodes(Sway(), _episodes(2), max_steps=8)
+        Rollout(env, Sway(), _episodes(2), max_steps=8).run()
 
 
 def test_startup_gives_no_success(env, monkeypatch):
@@ -299,7 +291,7 @@ def test_released_asks_at_the_spawn_pose(env):
     other = ArenaEnv("football", tracker=trackers.get("pd"), worlds=2, engine="mujoco", rules="released")
     assert (other.startup_ticks, env.startup_ticks) == (0, 50)
     policy = First()
-    results = other.run_episodes(policy, _episodes(2), max_steps=3)
+    results = Rollout(other, policy, _episodes(2), max_steps=3).run()
     assert [r.steps for r in results] == [3, 3] and results[0].sim_s == pytest.approx(0.06)
     spawn = np.array(DEFAULT_POSE, np.float32)[list(CANONICAL_TO_MUJOCO)]
     assert np.array_equal(policy.state[0, 6:35].numpy(), spawn)
@@ -370,7 +362,7 @@ def test_errors_of_worlds_that_did_not_ask_are_ignored(env):
             chunk.errors = {w: "not asked" for w in range(2) if not observation.mask[w]}
             return chunk
 
-    results = env.run_episodes(Loud(), _episodes(3), max_steps=7)
+    results = Rollout(env, Loud(), _episodes(3), max_steps=7).run()
     assert [r.outcome for r in results] == ["timeout"] * 3
 
 
@@ -387,4 +379,4 @@ def test_chunks_of_another_shape_are_refused(env, cut):
             return chunk
 
     with pytest.raises(InputError, match=r"policy cut: a chunk of shape .*expected \[2, n, 40\]"):
-        env.run_episodes(Cut(), _episodes(2), max_steps=7)
+        Rollout(env, Cut(), _episodes(2), max_steps=7).run()
