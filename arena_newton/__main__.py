@@ -36,12 +36,12 @@ class Command:
 COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to mend"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
-    Command("eval oracle", "arena_newton.eval.oracle", "official TWIST2 here beside its own MJCF in plain MuJoCo"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
     Command("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
+    Command("trackers oracle", "arena_newton.trackers.oracle", "compare official TWIST2 with its own MJCF in MuJoCo"),
     Command("trackers motions", "arena_newton.trackers.motions.__main__", "convert, inspect, render, generate motions"),
 )
 

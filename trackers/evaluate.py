@@ -157,7 +157,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from arena_newton.trackers.evaluation import chart, tracker_report
     from arena_newton.trackers.evaluation.figures import Result
     from arena_newton.trackers.evaluation.inference_times import inference
-    from arena_newton.trackers.evaluation.rollout import plan, run
+    from arena_newton.trackers.evaluation.rollout import make_plan, play
     from arena_newton.trackers.evaluation.tracker_film import film
 
     resolve_engine(args.engine, args.device)
@@ -166,13 +166,13 @@ def _evaluate(args: argparse.Namespace) -> int:
             args.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"--out {args.out}: cannot be made ({error.strerror})") from None
-    played = plan(_cells(args), rollouts, args.seed)
+    played = make_plan(_cells(args), rollouts, args.seed)
     options = {"engine": args.engine, "device": args.device, "fast_physics": args.fast_physics, "threads": args.threads}
     results = []
     for entry in args.trackers:
         print(f"{entry.label}: {len(played.cells)} cells, {len(played.cell)} rollouts", file=sys.stderr, flush=True)
         tracker = entry.make()
-        outcome = run(tracker, played, **options)
+        outcome = play(tracker, played, **options)
         times = inference(entry.make) if args.bench else {}
         facts = tracker.describe() | {"drive": tracker.drive.name}
         result = Result(entry.label, tracker.name, entry.official, facts, played, outcome, inference=times)

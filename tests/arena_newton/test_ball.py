@@ -53,14 +53,14 @@ def bounce(drops, restitution: float, dt: float, steps: int) -> np.ndarray:
     physics.reset_worlds(worlds, qpos, *none)
     if engine == "mujoco":
         for w in worlds:
-            physics._data[w].qvel[v + 2] = -speed[w]
+            physics.data[w].qvel[v + 2] = -speed[w]
     else:
         qvel = physics.qvel.numpy()
         qvel[:, v + 2] = -speed
         physics.qvel.assign(qvel)
     fastest, slowest = np.full(physics.worlds, -np.inf), np.zeros(physics.worlds)
     for _ in range(steps):
-        physics.bare_step()
+        physics.step()
         vertical = physics.qvel.numpy()[:, v + 2]
         fastest, slowest = np.maximum(fastest, vertical), np.minimum(slowest, vertical)
     return (fastest / -slowest).reshape(len(HEIGHTS), len(PHASES))

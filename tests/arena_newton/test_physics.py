@@ -1,13 +1,17 @@
-"""The two engines step the same model and agree; worlds do not touch each other."""
+"""The two engines step the same model and agree; worlds do not disturb each other; states come back bit for bit."""
 
+import copy
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
+import warp as wp
 
 from arena_newton.errors import InputError
 from arena_newton.physics import make_physics, resolve_engine
 from arena_newton.robot import DEFAULT_POSE, PhysicsRate
+from arena_newton.scene import load_scene
 
 
 def _standing(physics):
@@ -30,37 +34,26 @@ def both(football_native, football_warp):
     return make_physics(football_native, rate, "mujoco"), make_physics(football_warp, rate, "warp")
 
 
-def test_same_torques_same_motion(both):
-    """With the same torques the two engines' roots stay within 1e-5 m for 200 steps of 1 ms."""
-    import mujoco
-
-    native, batched = both
-    rng = np.random.default_rng(0)
-    torque = np.zeros(native.nv)
-    torque[native.scene.robot.joint_qvel] = rng.uniform(-3, 3, 29)
+def test_same_forces_same_motion(football_native, football_warp, monkeypatch):
+    """Under the same torques on trunk and knees the two engines' roots stay within 1e-5 m for 200 steps of 1 ms."""
     off = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-    saved = native._m.opt.disableflags, batched._m.opt.disableflags
-    native._m.opt.disableflags |= off
-    batched._m.opt.disableflags |= off
-    try:
-        for physics in both:
-            _standing(physics)
-        for data in native._data:
-            data.qfrc_applied[:] = torque
-        batched._d.qfrc_applied.assign(np.tile(torque.astype(np.float32), (batched.worlds, 1)))
+    torque = np.random.default_rng(0).uniform(-3, 3, (4, 3))
+    roots = []
+    for scene, engine in ((football_native, "mujoco"), (football_warp, "warp")):
+        for options in (scene.mj_model.opt, getattr(scene.solver.mjw_model, "opt", None)):
+            if options is not None:
+                monkeypatch.setattr(options, "disableflags", options.disableflags | off)
+        physics = make_physics(scene, PhysicsRate(0.001, 20), engine)
+        _standing(physics)
+        links = [scene.link(name) for name in ("pelvis", "torso_link", "left_knee_link", "right_knee_link")]
+        force = physics.external_force.numpy()
+        force[:, links, 3:] = torque
+        physics.external_force.assign(force)
         for _ in range(10):
-            for physics in both:
-                physics.step()
-        root = native.scene.robot.root_qpos
-        a = native.qpos.numpy()[0, root : root + 3]
-        b = batched.qpos.numpy()[:, root : root + 3]
-        assert a[2] < 0.75, "the robot should have fallen freely for a while"
-        assert np.abs(b - a).max() < 1e-5
-    finally:
-        native._m.opt.disableflags, batched._m.opt.disableflags = saved
-        for data in native._data:
-            data.qfrc_applied[:] = 0
-        batched._d.qfrc_applied.zero_()
+            physics.step()
+        roots.append(physics.qpos.numpy()[:, scene.robot.root_qpos :][:, :3].copy())
+    assert roots[0][0, 2] < 0.75, "the robot should have fallen freely for a while"
+    assert np.abs(roots[1] - roots[0][0]).max() < 1e-5
 
 
 def test_closed_loop_posture_agrees(both):
@@ -97,7 +90,7 @@ def test_nan_stays_in_its_world(both):
     """A NaN in one world leaves the others as they were (engine mujoco)."""
     native, _ = both
     _standing(native)
-    native._data[1].qpos[:] = np.nan
+    native.data[1].qpos[:] = np.nan
     for _ in range(3):
         native.step()
     q = native.qpos.numpy()
@@ -120,56 +113,37 @@ def test_contact_forces_carry_the_robot(both):
         physics.want_forces = False
 
 
-def test_native_forces_match_mujoco(both):
-    """The vectorised net contact forces equal those from MuJoCo's own mj_contactForce."""
-    import mujoco
-
-    native, _ = both
-    _standing(native)
-    for _ in range(15):
-        native.step()
-    data, wrench = native._data[0], np.zeros(6)
-    total = np.zeros((native.nbody, 3))
-    for c in range(data.ncon):
-        assert data.contact[c].dim == 3
-        mujoco.mj_contactForce(native._m, data, c, wrench)
-        force = data.contact[c].frame.reshape(3, 3).T @ wrench[:3]
-        total[native._m.geom_bodyid[data.contact[c].geom[1]]] += force
-        total[native._m.geom_bodyid[data.contact[c].geom[0]]] -= force
-    assert data.ncon > 4
-    assert np.allclose(native._body_forces(data), np.linalg.norm(total, axis=1), atol=1e-9)
-
-
-@pytest.mark.parametrize("condim", [1, 3, 4, 6])
-def test_native_forces_match_for_every_condim(football_native, condim):
-    """Contacts without friction, with torsion and with rolling give MuJoCo's forces too, also where kinds are mixed."""
-    import copy
-
-    import mujoco
-
+@pytest.mark.parametrize("condim", [None, 1, 3, 4, 6])
+def test_native_forces_match_mujoco(football_native, condim):
+    """Net contact forces and their normals are those of MuJoCo's mj_contactForce, for every kind of contact."""
     scene = dataclasses.replace(football_native, mj_model=copy.copy(football_native.mj_model))
     feet = {scene.link("left_ankle_roll_link"), scene.link("right_ankle_roll_link")}
     geoms = [g for g, body in enumerate(scene.mj_model.geom_bodyid) if body in feet]
     ground = [g for g, body in enumerate(scene.mj_model.geom_bodyid) if body == 0]
-    scene.mj_model.geom_condim[ground] = 1
-    scene.mj_model.geom_condim[geoms[: len(geoms) // 2]] = condim
-    scene.mj_model.geom_condim[geoms[len(geoms) // 2 :]] = 3
+    if condim is not None:
+        scene.mj_model.geom_condim[ground] = 1
+        scene.mj_model.geom_condim[geoms[: len(geoms) // 2]] = condim
+        scene.mj_model.geom_condim[geoms[len(geoms) // 2 :]] = 3
     native = make_physics(scene, PhysicsRate(0.005, 4), "mujoco")
+    native.watch_pair(geoms, ground)
+    native.want_forces = True
     _standing(native)
     for _ in range(8):
         native.step()
-    data, wrench = native._data[0], np.zeros(6)
+    data, wrench = native.data[0], np.zeros(6)
     total, normals = np.zeros((native.nbody, 3)), []
-    assert condim in {data.contact[c].dim for c in range(data.ncon)}
+    assert data.ncon > 4 and (condim or 3) in {data.contact[c].dim for c in range(data.ncon)}
     for c in range(data.ncon):
-        mujoco.mj_contactForce(native._m, data, c, wrench)
-        normals.append(wrench[0])
+        mujoco.mj_contactForce(native.models[0], data, c, wrench)
         force = data.contact[c].frame.reshape(3, 3).T @ wrench[:3]
-        total[native._m.geom_bodyid[data.contact[c].geom[1]]] += force
-        total[native._m.geom_bodyid[data.contact[c].geom[0]]] -= force
+        bodies = native.models[0].geom_bodyid[data.contact[c].geom]
+        total[bodies[1]] += force
+        total[bodies[0]] -= force
+        if feet & set(bodies.tolist()):
+            normals.append(wrench[0])
     assert np.linalg.norm(total, axis=1).max() > 50.0
-    assert np.allclose(native._body_forces(data), np.linalg.norm(total, axis=1), atol=1e-9)
-    assert np.allclose(native._contact_forces(data, slice(None))[0], normals, atol=1e-9)
+    np.testing.assert_allclose(native.contact_force.numpy()[0], np.linalg.norm(total, axis=1), rtol=1e-6, atol=1e-4)
+    assert native.pair_force.numpy()[0] == pytest.approx(sum(normals), rel=1e-6)
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
@@ -190,44 +164,122 @@ def test_two_physics_over_one_scene(football_native, football_warp, engine):
     assert np.array_equal(run(False), run(True))
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_the_physics_releases_the_latch(door, engine):
+@pytest.fixture(scope="module", params=["mujoco", "warp"])
+def door(request):
+    """OpenDoor, two worlds."""
+    scene = load_scene("open_door", worlds=2, device="cpu", native=request.param == "mujoco")
+    return make_physics(scene, PhysicsRate(0.005, 4), request.param)
+
+
+def _closed(physics):
+    """Put the door at rest, closed and locked."""
+    fixtures = (np.tile(physics.mocap_pos0, (2, 1, 1)), np.tile(physics.mocap_quat0, (2, 1, 1)))
+    physics.reset_worlds(np.arange(2), physics.qpos0, *fixtures)
+
+
+def _turn(physics, hinge, torque, worlds):
+    """Let a torque [N·m] act about a hinge of the door in the listed worlds, from now on."""
+    scene, at_rest = physics.scene, mujoco.MjData(physics.models[0])
+    mujoco.mj_kinematics(physics.models[0], at_rest)
+    joint = scene.joint(f"/World/Door/{hinge}")
+    force = physics.external_force.numpy()
+    force[worlds, scene.mj_model.jnt_bodyid[joint], 3:] = torque * at_rest.xaxis[joint]
+    physics.external_force.assign(force)
+
+
+def _bits(physics):
+    """Copies of everything that a physics publishes per world."""
+    views = "qpos qvel ctrl xpos xquat xipos contact_force pair_force latch_locked external_force"
+    return {name: getattr(physics, name).numpy().copy() for name in views.split()}
+
+
+def _same(a, b, worlds):
+    return all(np.array_equal(a[name][worlds], b[name][worlds]) for name in a)
+
+
+def test_the_physics_releases_the_latch(door):
     """A pressed handle unlocks the leaf without any judge, in its own world only, until it is locked again."""
-    import warp as wp
-
-    scene = door[engine]
-    physics = make_physics(scene, PhysicsRate(0.005, 4), engine)
-    mocap = (np.tile(physics.mocap_pos0, (2, 1, 1)), np.tile(physics.mocap_quat0, (2, 1, 1)))
-    physics.reset_worlds(np.arange(2), physics.qpos0, *mocap)
-    force = np.zeros((2, physics.nv), np.float32)
-    force[:, scene.joint_qvel("/World/Door/LeafHinge")] = 10.0
-    force[1, scene.joint_qvel("/World/Door/HandleHinge")] = -5.0
-    if engine == "mujoco":
-        for data, row in zip(physics._data, force, strict=True):
-            data.qfrc_applied[:] = row
-    else:
-        physics._d.qfrc_applied.assign(force)
+    _closed(door)
+    _turn(door, "LeafHinge", 10.0, [0, 1])
+    _turn(door, "HandleHinge", -5.0, [1])
     for _ in range(10):
-        physics.step()
-    leaf = physics.qpos.numpy()[:, scene.joint_qpos("/World/Door/LeafHinge")]
-    assert physics.latch_locked.numpy().tolist() == [1, 0]
+        door.step()
+    leaf = door.qpos.numpy()[:, door.scene.joint_qpos("/World/Door/LeafHinge")]
+    assert door.latch_locked.numpy().tolist() == [1, 0]
     assert abs(leaf[0]) < 0.005 < 0.02 < leaf[1]
-    physics.lock_latch(wp.array([0, 1], dtype=wp.int32, device=physics.device))
-    assert physics.latch_locked.numpy().tolist() == [1, 1]
+    door.lock_latch(wp.array([0, 1], dtype=wp.int32, device=door.device))
+    assert door.latch_locked.numpy().tolist() == [1, 1]
 
 
-@pytest.fixture(scope="module")
-def door():
-    """OpenDoor for both engines, two worlds."""
-    from arena_newton.scene import load_scene
+def test_a_snapshot_brings_everything_back(door):
+    """After a restore a world repeats its ticks bit for bit, latch and forces included; the others go on."""
+    _closed(door)
+    _turn(door, "LeafHinge", 10.0, [0, 1])
+    for _ in range(3):
+        door.step()
+    _turn(door, "HandleHinge", -5.0, [0, 1])
+    kept, before = door.snapshot(), _bits(door)
+    runs = []
+    for _ in range(2):
+        for _ in range(5):
+            door.step()
+        runs.append(_bits(door))
+        door.add_velocity(np.ones((2, 6)))
+        door.external_force.zero_()
+        door.step()
+        door.restore(kept)
+        assert _same(_bits(door), before, [0, 1])
+    assert _same(*runs, [0, 1]) and runs[0]["latch_locked"].tolist() == [0, 0]
+    assert before["latch_locked"].tolist() == [1, 1], "the handle is pressed between snapshot and end"
+    for _ in range(5):
+        door.step()
+    door.restore(kept, np.array([False, True]))
+    now = _bits(door)
+    assert _same(now, runs[0], [0]) and _same(now, before, [1])
 
-    return {"mujoco": load_scene("open_door", worlds=2, native=True), "warp": load_scene("open_door", worlds=2)}
+
+def test_an_idle_world_keeps_every_bit(door):
+    """A world that is not active stands still bit for bit, later runs as if nothing had been, and disturbs nobody."""
+    _closed(door)
+    _turn(door, "LeafHinge", 10.0, [0, 1])
+    _turn(door, "HandleHinge", -5.0, [1])
+    for _ in range(3):
+        door.step()
+    kept, before = door.snapshot(), _bits(door)
+    for _ in range(4):
+        door.step()
+    together = _bits(door)
+    door.restore(kept)
+    door.set_active(np.array([True, False]))
+    for _ in range(4):
+        door.step()
+    apart = _bits(door)
+    assert _same(apart, together, [0]) and _same(apart, before, [1])
+    door.set_active(np.array([False, True]))
+    for _ in range(4):
+        door.step()
+    assert _same(_bits(door), together, [0, 1])
+    door.set_active(np.array([True, True]))
+
+
+def test_velocity_is_added_in_the_masked_worlds(both):
+    """The root of the masked worlds alone moves off, at the speed that was added, on both engines."""
+    for physics in both:
+        _standing(physics)
+        before, root = physics.qvel.numpy().copy(), physics.scene.robot.root_qvel
+        change = np.tile([0.5, 0.0, 0.0, 0.0, 0.0, 0.0], (physics.worlds, 1))
+        mask = np.arange(physics.worlds) == 1
+        physics.add_velocity(change, mask)
+        added = physics.qvel.numpy() - before
+        assert np.array_equal(added[:, root : root + 6], change * mask[:, None])
+        x = physics.qpos.numpy()[:, physics.scene.robot.root_qpos].copy()
+        physics.step()
+        moved = physics.qpos.numpy()[:, physics.scene.robot.root_qpos] - x
+        assert moved[1] > 0.005 and abs(moved[0]) < 0.001
 
 
 def test_the_latch_is_found_by_its_label(tmp_path):
     """An equality that a layer brings with it is not taken for the latch, and stays active."""
-    from arena_newton.scene import load_scene
-
     path = tmp_path / "door.usda"
     path.write_text(
         """#usda 1.0
@@ -253,8 +305,6 @@ over "World"
     )
     scene = load_scene("open_door", native=True, variant_file=path)
     assert scene.mj_model.neq == 2 and scene.latch.equality == 1, "the layer's weld comes first"
-    import mujoco
-
     held = [int(scene.mj_model.eq_type[e]) for e in range(scene.mj_model.neq)]
     assert held[scene.latch.equality] == mujoco.mjtEq.mjEQ_JOINT
     assert int(scene.mj_model.eq_obj1id[scene.latch.equality]) == scene.joint("/World/Door/LeafHinge")
@@ -264,15 +314,13 @@ def test_an_unstable_world_writes_no_file(football_native, tmp_path, monkeypatch
     """MuJoCo's warning of a broken state leaves no log file in the working folder."""
     monkeypatch.chdir(tmp_path)
     physics = make_physics(football_native, PhysicsRate(0.005, 4), "mujoco")
-    physics._data[0].qpos[:] = np.nan
+    physics.data[0].qpos[:] = np.nan
     physics.step()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_overflow_is_reported(football_warp):
     """A constraint buffer that is too small is flagged in the world that overflowed."""
-    from arena_newton.scene import load_scene
-
     scene = load_scene("football", worlds=2, device="cpu", constraints_per_world=8, contacts_per_world=4)
     physics = make_physics(scene, PhysicsRate(0.005, 4), "warp")
     _standing(physics)

@@ -17,8 +17,8 @@ from arena_newton.trackers.evaluation import chart
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
 from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
-from arena_newton.trackers.evaluation.meter import FEET, LINKS, Meter, Reference
-from arena_newton.trackers.evaluation.rollout import Outcome, plan, run, sill_place
+from arena_newton.trackers.evaluation.meter import FEET, LINKS, Meter, TickReference
+from arena_newton.trackers.evaluation.rollout import Outcome, find_sill, make_plan, play
 from arena_newton.trackers.evaluation.suite import Cell, Navigation
 from arena_newton.trackers.motions import primitives
 from arena_newton.trackers.train.curves import PANELS, draw
@@ -64,10 +64,10 @@ def test_goals_depend_on_the_seed_alone():
 def test_draws_of_a_cell_do_not_depend_on_the_others():
     """A cell alone gets the draws that it gets within the suite."""
     cells = suite("quick")
-    whole, alone = plan(cells, 3, 7), plan([cells[2]], 3, 7)
+    whole, alone = make_plan(cells, 3, 7), make_plan([cells[2]], 3, 7)
     for name, values in alone.noise.items():
         assert np.array_equal(values, whole.noise[name][whole.cell == 2])
-    assert not np.array_equal(alone.noise["joints"], plan([cells[2]], 3, 8).noise["joints"])
+    assert not np.array_equal(alone.noise["joints"], make_plan([cells[2]], 3, 8).noise["joints"])
 
 
 def test_wilson_is_the_interval_of_the_benchmark():
@@ -85,11 +85,11 @@ def test_a_sill_stands_where_the_feet_clear_it():
     feet[..., 0] = x[:, None]
     feet[..., 2] = 0.035
     feet[(x > 0.6) & (x < 1.1), :, 2] = 0.20
-    place, clearance = sill_place(feet)
+    place, clearance = find_sill(feet)
     assert 0.6 + 0.17 <= place <= 1.1 - 0.10 + 0.01
     assert clearance == pytest.approx(0.165)
     feet[(x > 0.6) & (x < 1.1), 1, 2] = 0.035
-    assert sill_place(feet)[1] == pytest.approx(0.0)
+    assert find_sill(feet)[1] == pytest.approx(0.0)
 
 
 class _FakeLab:
@@ -116,9 +116,9 @@ class _FakeLab:
         self.xpos[:, self.feet, 0] = feet
 
 
-def _reference(x: float) -> Reference:
+def _reference(x: float) -> TickReference:
     quat = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1)
-    return Reference(torch.tensor([[x, 0.0, 0.75]] * 2), quat, torch.zeros(2, 29), torch.zeros(2, len(LINKS), 3))
+    return TickReference(torch.tensor([[x, 0.0, 0.75]] * 2), quat, torch.zeros(2, 29), torch.zeros(2, len(LINKS), 3))
 
 
 def test_measures_are_what_they_say():
@@ -175,20 +175,26 @@ def test_worlds_of_a_batch_differ_as_asked(engine):
     lab.start(Start(root, joints, away, np.full((2, 3), np.nan)))
     lab.force[0, 0], lab.force[1, 0] = 100.0, 100.0
     masses = [float(lab.scene.mj_model.body_subtreemass[lab.scene.link("pelvis")]) + extra for extra in (0.0, 4.0)]
-    held = torch.tensor(g1.DEFAULT_POSE).repeat(2, 1)
-    for _ in range(5):
-        lab.step(held)
+    _run_standing(lab, ticks=5)
     momentum = [mass * float(v) for mass, v in zip(masses, _mean_velocity(lab), strict=True)]
     # 100 N for 0.1 s, in free fall.
     assert momentum == pytest.approx([10.0, 10.0], rel=0.03)
-    lab.force.zero_()
     lab.start(Start(root * [1, 1, 0.8 / 3.0, 1, 1, 1, 1], joints, {}, np.full((2, 3), np.nan)))
-    lab.add_velocity(np.tile([1.5, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1)))
-    for _ in range(8):
-        lab.step(held)
+    assert not lab.force.any(), "a reset clears forces"
+    lab.physics.add_velocity(np.tile([1.5, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1)))
+    _run_standing(lab, ticks=8)
     foot = lab.xpos[:, lab.scene.link("left_ankle_roll_link"), 0]
     assert float(foot[1]) > float(foot[0]) + 0.005  # less friction slides farther
     assert lab.overflows() == 0
+
+
+def _run_standing(lab: Lab, ticks: int) -> None:
+    """Let the drives hold the default pose."""
+    ctrl = lab.physics.ctrl.numpy()
+    ctrl[:, lab.scene.robot.joint_ctrl] = g1.DEFAULT_POSE
+    lab.physics.ctrl.assign(ctrl)
+    for _ in range(ticks):
+        lab.physics.step()
 
 
 def _exact_follower(name: str):
@@ -200,7 +206,7 @@ def _exact_follower(name: str):
     from arena_newton.trackers.motions.frames import actions_to_motion
 
     cell = next(c for c in suite("full") if c.name == name)
-    tables = plan([cell], 1, 0).tables(torch.device("cpu"))
+    tables = make_plan([cell], 1, 0).tables(torch.device("cpu"))
     motion = actions_to_motion(tables.actions.transpose(0, 1))
     scene = load_scene(
         "lab",
@@ -257,7 +263,7 @@ def test_who_steps_over_a_sill_exactly_does_not_touch_it():
 
     cell, tables, scene, q, _ = _exact_follower("sill 0.09")
     m = scene.mj_model
-    x, clearance = sill_place(tables.feet[:, 0].numpy())
+    x, clearance = find_sill(tables.feet[:, 0].numpy())
     assert clearance >= cell.support.height + 0.05
     sill = set(scene.geom_ids("/World/Sill"))
 
@@ -299,8 +305,8 @@ def test_a_tracker_that_cannot_balance_falls_when_pushed():
 
     push = next(cell for cell in suite("full") if cell.name == "push 40 N·s, stand")
     cells = [Cell("short stand", "stand", 1.0, primitives.stand(1.0)), push]
-    played = plan(cells, 2, 0)
-    outcome = run(get("pd"), played, engine="mujoco", threads=1)
+    played = make_plan(cells, 2, 0)
+    outcome = play(get("pd"), played, engine="mujoco", threads=1)
     fell = outcome.measures["fell"]
     assert fell.tolist() == [False, False, True, True]
     assert np.all(outcome.measures["fall_time"][2:] > 3.0)
@@ -314,7 +320,7 @@ def test_official_twist2_walks_the_reference(shared):
     goal = Cell("near goal", "goal", 13.0, goal=Navigation(1.0, 0.3, 0.5), rollouts=1)
     cells = [Cell("short walk", "walk", 5.0, primitives.walk(0.3, seconds=5.0)), goal]
     tracker = get("twist2", shared / "reference/twist2/twist2_1017_20k.onnx")
-    outcome = run(tracker, plan(cells, 2, 0), engine="mujoco", fast_physics=True, threads=1)
+    outcome = play(tracker, make_plan(cells, 2, 0), engine="mujoco", fast_physics=True, threads=1)
     m = outcome.measures
     assert not m["fell"].any()
     assert np.mean(m["speed_x"][:2] / m["ref_x"][:2]) >= 0.9
@@ -323,7 +329,7 @@ def test_official_twist2_walks_the_reference(shared):
 
 
 def _result(label: str, interface: str, official: bool, falls: int, cells: list[Cell] | None = None) -> Result:
-    played = plan(suite("full") if cells is None else cells, 2, 0)
+    played = make_plan(suite("full") if cells is None else cells, 2, 0)
     worlds = len(played.cell)
     names = "leg_rmse drift_10s lowest speed_x ref_x goal_distance goal_turn seat_time end_z end_x support_x touch"
     measures = {name: np.full(worlds, 0.05) for name in [*names.split(), "ball_peak", "ball_end"]}

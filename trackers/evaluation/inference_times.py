@@ -1,20 +1,19 @@
-"""How long a tracker takes for one tick, without physics."""
+"""Inference time of a tracker per tick, without physics."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import torch
+import torch
 
-    from arena_newton.trackers.base import Tracker
+from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
+from arena_newton.robot import DEFAULT_POSE
 
 __all__ = ["GPU_WORLDS", "inference"]
 
 GPU_WORLDS = 4096
-"""Worlds of the GPU's figure."""
+"""Worlds of the measurement on a GPU."""
 WARM_UP, CALLS = 30, 200
 
 
@@ -22,10 +21,8 @@ def inference(make: Callable[[], Tracker]) -> dict[str, float]:
     """Median time of a tick [ms]: `cpu` for one world and, where there is a GPU, `cuda` for `GPU_WORLDS`.
 
     Args:
-        make: Makes a tracker that is not bound yet.
+        make: Returns a tracker that is not bound yet.
     """
-    import torch
-
     out = {"cpu": _median(make(), 1, torch.device("cpu"))}
     if torch.cuda.is_available():
         out["cuda"] = _median(make(), GPU_WORLDS, torch.device("cuda"))
@@ -33,11 +30,6 @@ def inference(make: Callable[[], Tracker]) -> dict[str, float]:
 
 
 def _median(tracker: Tracker, worlds: int, device: torch.device) -> float:
-    import torch
-
-    from arena_newton.interfaces import RobotState, TrackerCommand
-    from arena_newton.robot import DEFAULT_POSE
-
     quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(worlds, 1)
     joints = torch.tensor(DEFAULT_POSE, device=device).repeat(worlds, 1)
     zero = torch.zeros(worlds, 29, device=device)

@@ -1,6 +1,6 @@
 """Measures of a rollout, accumulated on the device: nothing leaves it before the last tick.
 
-Names are those of the motion tracking literature; every value is a number a rollout, taken until its end or its fall.
+Names are those of the motion tracking literature; every value is one number per rollout, taken until its end or fall.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from arena_newton.robot import TICK
+from arena_newton import robot as g1
 from arena_newton.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 
 if TYPE_CHECKING:
     from arena_newton.trackers.evaluation.lab import Lab
 
-__all__ = ["FALL_HEIGHT", "FALL_TILT_DEG", "LINKS", "Meter", "Reference"]
+__all__ = ["FALL_HEIGHT", "FALL_TILT_DEG", "LINKS", "Meter", "TickReference"]
 
 FALL_TILT_DEG = 60.0
 """A pelvis tilted beyond this has fallen [deg]."""
@@ -34,19 +34,19 @@ LINKS: tuple[str, ...] = tuple(
 """Links whose position counts in the link error."""
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 CONTACT_HEIGHT = SOLE_HEIGHT + 0.01
-"""An ankle frame below this is taken for a foot on the floor [m]."""
+"""An ankle frame below this counts as a foot on the floor [m]."""
 SEAT_LOAD = 100.0
 """Force that counts as sitting [N]."""
 SEAT_SMOOTHING = 0.1
 """Time constant of the seat's force [s]: the solver's force of one step jitters."""
-LEGS, ARMS = slice(0, 12), slice(15, 29)
+LEGS, ARMS = (slice(block[0], block[-1] + 1) for block in (g1.LEGS, g1.ARMS))
 
 _POSTURE = ("joint", "legs", "arms", "link", "velocity", "height", "tilt", "slip", "contact", "rate", "torque", "limit")
 _WINDOW = ("speed_x", "speed_y", "speed_yaw", "ref_x", "ref_y", "ref_yaw")
 
 
 @dataclass
-class Reference:
+class TickReference:
     """The reference of one tick, rows are worlds."""
 
     position: torch.Tensor
@@ -101,7 +101,7 @@ class Meter:
         return q[:, at : at + 3], q[:, at + 3 : at + 7]
 
     def anchor(self, targets: torch.Tensor, reference: torch.Tensor) -> None:
-        """Remember where the first tick starts from: root, feet, targets and the reference's root [worlds, 3]."""
+        """Store the state before the first tick: root, feet, targets and the reference's root [worlds, 3]."""
         position, quat = self._root()
         self._last = {
             "position": position.clone(),
@@ -112,12 +112,12 @@ class Meter:
             "targets": targets.clone(),
         }
 
-    def update(self, tick: int, reference: Reference, targets: torch.Tensor) -> torch.Tensor:
+    def update(self, tick: int, reference: TickReference, targets: torch.Tensor) -> torch.Tensor:
         """Take one tick into account; returns the worlds that still run, bool [worlds].
 
         Args:
-            tick: Ticks since the anchor, negative while settling: then only falls are looked for.
-            reference: Where the robot should be now.
+            tick: Ticks since the anchor, negative in the start-up, where only falls are detected.
+            reference: Reference of this tick.
             targets: Joint targets of this tick [rad], [worlds, 29].
         """
         position, quat = self._root()
@@ -139,7 +139,7 @@ class Meter:
         self,
         live: torch.Tensor,
         tick: int,
-        reference: Reference,
+        reference: TickReference,
         targets: torch.Tensor,
         position: torch.Tensor,
         quat: torch.Tensor,
@@ -154,13 +154,13 @@ class Meter:
         level = torch.cat([rotate_xy(-yaw[:, None], offset[..., :2]), offset[..., 2:]], dim=-1)
         link = torch.linalg.vector_norm(level - reference.links, dim=-1).mean(1)
 
-        moved = rotate_xy(-yaw, (position - last["position"])[:, :2]) / TICK
-        ref_moved = rotate_xy(-ref_yaw, (reference.position - last["ref_position"])[:, :2]) / TICK
-        turned, ref_turned = wrap_angle(yaw - last["yaw"]) / TICK, wrap_angle(ref_yaw - last["ref_yaw"]) / TICK
+        moved = rotate_xy(-yaw, (position - last["position"])[:, :2]) / g1.TICK
+        ref_moved = rotate_xy(-ref_yaw, (reference.position - last["ref_position"])[:, :2]) / g1.TICK
+        turned, ref_turned = wrap_angle(yaw - last["yaw"]) / g1.TICK, wrap_angle(ref_yaw - last["ref_yaw"]) / g1.TICK
 
         feet = lab.xpos[:, self._feet]
         down = (torch.maximum(feet[..., 2], last["feet"][..., 2]) < CONTACT_HEIGHT).float()
-        slip = torch.linalg.vector_norm((feet - last["feet"])[..., :2], dim=-1) / TICK
+        slip = torch.linalg.vector_norm((feet - last["feet"])[..., :2], dim=-1) / g1.TICK
         torque = (self._kp * (targets - joints) - self._kd * speed) / self._effort
         ref_up = 1.0 - 2.0 * (reference.quat[:, 1].square() + reference.quat[:, 2].square())
 
@@ -175,7 +175,7 @@ class Meter:
                 (torch.acos(up.clamp(-1, 1)) - torch.acos(ref_up.clamp(-1, 1))).abs(),
                 (slip * down).sum(1),
                 down.sum(1),
-                ((targets - last["targets"]) / TICK).square().mean(1),
+                ((targets - last["targets"]) / g1.TICK).square().mean(1),
                 torque.abs().clamp_max(1.0).mean(1),
                 (torque.abs() > 0.95).float().mean(1),
             ],
@@ -209,11 +209,11 @@ class Meter:
         ball = torch.linalg.vector_norm(lab.qvel[:, lab.ball_v : lab.ball_v + 2], dim=1)
         self._ball_peak = torch.where(live, torch.maximum(self._ball_peak, ball), self._ball_peak)
         self._ball_end = torch.where(live, ball, self._ball_end)
-        share = TICK / (SEAT_SMOOTHING + TICK)
-        self._force = self._force + share * (lab.pair_force - self._force)
+        gain = g1.TICK / (SEAT_SMOOTHING + g1.TICK)
+        self._force = self._force + gain * (lab.pair_force - self._force)
         self._touch = torch.where(live, torch.maximum(self._touch, lab.pair_force), self._touch)
         # A leaky count: every tick below the load takes one back.
-        step = torch.where(self._force >= SEAT_LOAD, TICK, -TICK)
+        step = torch.where(self._force >= SEAT_LOAD, g1.TICK, -g1.TICK)
         self._streak = torch.where(live, (self._streak + step).clamp_min(0.0), self._streak)
         self._loaded = torch.maximum(self._loaded, self._streak)
 
@@ -224,21 +224,21 @@ class Meter:
         [m]; `velocity_error`: RMS of the root's planar velocity error [m/s]; `height_error` [m]; `tilt_error` [rad];
         `drift`: planar distance from the reference at the end [m]; `drift_10s`: the same scaled to 10 s [m];
         `heading_error` at the end [deg]; `foot_slip`: mean planar speed of a foot on the floor [m/s]; `action_rate`:
-        RMS of the targets' rate [rad/s]; `torque`: mean share of the torque limit; `saturation`: share of joint ticks
-        above 95 % of it; `speed_*`, `ref_*`: mean speeds in the heading frame [m/s], [rad/s]; `ball_peak`, `ball_end`
-        [m/s]; `seat_time`: time at 100 N and more, less the gaps [s]; `touch`: largest force on a support [N];
-        `lowest`, `lowest_ref`: lowest pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: the root at the end.
+        RMS of the targets' rate [rad/s]; `torque`: mean fraction of the torque limit; `saturation`: fraction of joint
+        ticks above 95 % of it; `speed_*`, `ref_*`: mean speeds in the heading frame [m/s], [rad/s]; `ball_peak`,
+        `ball_end` [m/s]; `seat_time`: time at 100 N and more, minus the gaps [s]; `touch`: largest force on a support
+        [N]; `lowest`, `lowest_ref`: lowest pelvis [m]; `end_x`, `end_y`, `end_z` [m], `end_yaw` [rad]: root at the end.
         """
         host: Callable[[torch.Tensor], np.ndarray] = lambda t: t.double().cpu().numpy()  # noqa: E731
         count = np.maximum(host(self._count), 1.0)
         mean = {name: column / count for name, column in zip(_POSTURE, host(self._sum).T, strict=True)}
         windowed = host(self._window_sum) / np.maximum(host(self._window_count), 1.0)[:, None]
-        seconds = count * TICK
+        seconds = count * g1.TICK
         offset = np.linalg.norm(host(self._end_offset), axis=1)
         root = host(self._end_root)
         out = {
             "fell": host(self.fallen) > 0.5,
-            "fall_time": np.where(host(self.fall_tick) != -1, host(self.fall_tick) * TICK, np.nan),
+            "fall_time": np.where(host(self.fall_tick) != -1, host(self.fall_tick) * g1.TICK, np.nan),
             "seconds": seconds,
             "joint_rmse": np.sqrt(mean["joint"]),
             "leg_rmse": np.sqrt(mean["legs"]),

@@ -4,42 +4,47 @@ from __future__ import annotations
 
 import time
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import warp as wp
 
 from arena_newton import robot as g1
+from arena_newton import rule_sets
 from arena_newton.errors import ArenaError
-from arena_newton.interfaces import RobotState, TrackerCommand
+from arena_newton.interfaces import Tracker
+from arena_newton.rotations import heading
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
-from arena_newton.trackers.evaluation.meter import Meter, Reference
+from arena_newton.trackers.evaluation.meter import Meter, TickReference
 from arena_newton.trackers.evaluation.suite import Cell, Tables, tabulate
-from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
+from arena_newton.trackers.motions.commands import MotionCommand
+from arena_newton.trackers.motions.generator import ReferenceGenerator
+from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT, neutral_stance
 from arena_newton.trackers.motions.library import FIXTURES
-from arena_newton.trackers.motions.programs import place_platform
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
+from arena_newton.trackers.motions.programs import SILL_SIZE, place_platform
+from arena_newton.tracking import TrackerLoop
 
-if TYPE_CHECKING:
-    from arena_newton.trackers.base import Tracker
+__all__ = ["Outcome", "Plan", "SuiteRollout", "find_sill", "make_plan", "play"]
 
-__all__ = ["Outcome", "Plan", "plan", "run"]
-
-SETTLE_TICKS = 50
-"""Standing before the reference starts [ticks], as in an episode: the tracker takes its stance."""
+BALL_RADIUS = 0.11
+"""[m]"""
 JOINT_NOISE = 0.03
 """Uniform error of the initial joints [rad]."""
-PLACE_NOISE, YAW_NOISE = 0.01, 0.02
-"""Uniform errors of the initial place [m] and heading [rad]."""
+POSITION_NOISE, YAW_NOISE = 0.01, 0.02
+"""Uniform errors of the initial position [m] and heading [rad]."""
 VELOCITY_KICK, TURN_KICK = 0.1, 0.1
-"""Uniform kicks of the root when the reference starts [m/s], [rad/s]: rollouts of one cell part ways."""
-SILL_LENGTH, FOOT_FRONT, FOOT_BACK = 0.10, 0.12, 0.05
-"""Sill and sole along the way, the sole's from the ankle frame [m]."""
+"""Uniform kicks of the root when the reference starts [m/s], [rad/s]: they make rollouts of one cell differ."""
+TOE, HEEL = 0.12, 0.05
+"""Ends of the sole in front of and behind the ankle frame [m]: the foot itself. `motions.programs` adds one or two
+centimetres (`SOLE_FRONT`, `SOLE_BACK`) where it draws clips for training, which must leave room for errors."""
 
 
 @dataclass
 class Plan:
-    """Which cell each world plays and what is drawn for it; the same for every tracker."""
+    """Which cell each world plays and the random numbers it gets; the same for every tracker."""
 
     cells: list[Cell]
     cell: np.ndarray
@@ -49,7 +54,7 @@ class Plan:
     _tables: dict[torch.device, Tables] = field(default_factory=dict, repr=False)
 
     def tables(self, device: torch.device) -> Tables:
-        """References of all cells, rolled out once a device."""
+        """References of all cells, rolled out once per device."""
         if device not in self._tables:
             self._tables[device] = tabulate(self.cells, device)
         return self._tables[device]
@@ -57,7 +62,7 @@ class Plan:
 
 @dataclass
 class Outcome:
-    """What one tracker did."""
+    """Measures of one tracker on a plan."""
 
     measures: dict[str, np.ndarray]
     """`Meter.results` and, of worlds that have one, `support_x` [m], `goal_distance` [m] and `goal_turn` [deg]."""
@@ -74,12 +79,12 @@ class Outcome:
     """Wall-clock time of the rollouts [s]."""
 
 
-def plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
+def make_plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
     """Worlds for cells; a cell's draws depend on the seed and its name alone.
 
     Args:
         cells: The suite.
-        rollouts: Worlds a cell, where the cell does not say.
+        rollouts: Worlds per cell, where the cell does not say.
         seed: Seed of all draws.
     """
     index = np.concatenate([np.full(c.rollouts or rollouts, i) for i, c in enumerate(cells)])
@@ -89,7 +94,7 @@ def plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
         rng = np.random.default_rng([seed, zlib.crc32(c.name.encode())])
         draws = {
             "joints": rng.uniform(-JOINT_NOISE, JOINT_NOISE, (count, 29)),
-            "place": rng.uniform(-PLACE_NOISE, PLACE_NOISE, (count, 2)),
+            "position": rng.uniform(-POSITION_NOISE, POSITION_NOISE, (count, 2)),
             "yaw": rng.uniform(-YAW_NOISE, YAW_NOISE, count),
             "kick": np.concatenate(
                 [
@@ -107,27 +112,27 @@ def plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
 
 
 def _supports(plan: Plan, tables: Tables) -> dict[str, np.ndarray]:
+    """Poses of the supports, as `Start.supports`."""
     out = {name: np.full((len(plan.cell), 4), np.nan) for name in FIXTURES}
     for i, cell in enumerate(plan.cells):
         if cell.support is not None:
+            feet, height = tables.feet[: cell.ticks, i], cell.support.height
             x = cell.support.x
             if x is None and cell.support.name == "Platform":
-                feet = tables.feet[None, : cell.ticks, i]
-                height = feet.new_tensor([cell.support.height])
-                place, room = place_platform(feet[..., :2].mean(2), feet, height)
+                position, room = place_platform(feet[None, ..., :2].mean(2), feet[None], feet.new_tensor([height]))
                 if float(room) < 0.0:
                     raise ArenaError(f"{cell.name}: the reference's feet do not tread on the platform")
-                x = float(place[0, 0])
+                x = float(position[0, 0])
             elif x is None:
-                x, clear = sill_place(tables.feet[: cell.ticks, i].cpu().numpy())
-                if clear < cell.support.height:
-                    raise ArenaError(f"{cell.name}: the reference's feet clear only {clear:.3f} m")
-            out[cell.support.name][plan.cell == i] = (x, 0.0, cell.support.height, 0.0)
+                x, clearance = find_sill(feet.cpu().numpy())
+                if clearance < height:
+                    raise ArenaError(f"{cell.name}: the reference's feet clear only {clearance:.3f} m")
+            out[cell.support.name][plan.cell == i] = (x, 0.0, height, 0.0)
     return out
 
 
-def sill_place(feet: np.ndarray) -> tuple[float, float]:
-    """Where across the way a sill stands that a reference's feet step over with the most clearance.
+def find_sill(feet: np.ndarray) -> tuple[float, float]:
+    """Position of a sill across a walk along x that a reference's feet step over with the most clearance.
 
     Args:
         feet: Ankle frames [m], shape [ticks, 2, 3].
@@ -135,33 +140,34 @@ def sill_place(feet: np.ndarray) -> tuple[float, float]:
     Returns:
         Middle of the sill and the least height of a sole above the floor while it is over the sill [m].
     """
-    best, place = -np.inf, 0.0
+    best, middle = -np.inf, 0.0
     for x in np.arange(0.4, max(0.45, float(feet[..., 0].max()) - 0.6), 0.01):
-        low, high = x - SILL_LENGTH / 2 - FOOT_FRONT, x + SILL_LENGTH / 2 + FOOT_BACK
+        low, high = x - SILL_SIZE[0] / 2 - TOE, x + SILL_SIZE[0] / 2 + HEEL
         over = (feet[..., 0] > low) & (feet[..., 0] < high)
         if over.any():
             clearance = float(feet[over][:, 2].min())
             if clearance > best + 1e-3:
-                best, place = clearance, float(x)
-    return place, best - SOLE_HEIGHT
+                best, middle = clearance, float(x)
+    return middle, best - SOLE_HEIGHT
 
 
-def _start(plan: Plan, tables: Tables, feet_ahead: float) -> Start:
+def _start(plan: Plan, tables: Tables) -> Start:
+    """Initial state of every world."""
     first = tables.actions[0].cpu().numpy()[plan.cell]
     n, w = plan.noise, len(plan.cell)
     root = np.zeros((w, 7))
-    root[:, :2], root[:, 2] = n["place"], first[:, 2]
+    root[:, :2], root[:, 2] = n["position"], first[:, 2]
     root[:, 3], root[:, 6] = np.cos(0.5 * n["yaw"]), np.sin(0.5 * n["yaw"])
     joints = first[:, 9:38][:, list(g1.MUJOCO_TO_CANONICAL)] + n["joints"]
-    ball = np.full((w, 3), np.nan)
+    ball, ankle = np.full((w, 3), np.nan), neutral_stance().ankle
     for i, cell in enumerate(plan.cells):
         if cell.ball is not None:
             rows = plan.cell == i
             near, far = cell.ball.distance
             u = n["unit"][rows]
-            ball[rows, 0] = feet_ahead + near + (far - near) * u[:, 0]
+            ball[rows, 0] = ankle + near + (far - near) * u[:, 0]
             ball[rows, 1] = cell.ball.lateral + cell.ball.spread * (2 * u[:, 1] - 1)
-            ball[rows, 2] = 0.11
+            ball[rows, 2] = BALL_RADIUS
     return Start(root=root, joints=joints, supports=_supports(plan, tables), ball=ball)
 
 
@@ -200,10 +206,6 @@ class _Goals:
     """Closed-loop references of the worlds that have a goal."""
 
     def __init__(self, plan: Plan, device: torch.device):
-        from arena_newton.trackers.motions.commands import MotionCommand
-        from arena_newton.trackers.motions.generator import ReferenceGenerator
-        from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
-
         goals = [plan.cells[i].goal for i in plan.cell]
         rows = [w for w, goal in enumerate(goals) if goal is not None]
         self.rows = torch.tensor(rows, dtype=torch.long, device=device)
@@ -227,8 +229,105 @@ class _Goals:
         actions.index_copy_(0, self.rows, self._generator.action())
 
 
+class SuiteRollout:
+    """A plan under one tracker: `prepare` once, `tick` from `-startup_ticks` to `ticks - 1`, then `outcome`."""
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        plan: Plan,
+        *,
+        engine: str = "auto",
+        device: str | None = None,
+        fast_physics: bool = False,
+        threads: int | None = None,
+        startup_ticks: int | None = None,
+    ):
+        """Build worlds and references; see `play`."""
+        began = time.perf_counter()
+        self.plan, self.rate = plan, tracker.rate(fast=fast_physics)
+        self.startup_ticks = rule_sets.get("paper").startup.ticks if startup_ticks is None else startup_ticks
+        cells, cell = plan.cells, plan.cell
+        kinds = [WorldKind(cells[i].friction, cells[i].payload) for i in cell]
+        watched = np.array([cells[i].support is not None for i in cell])
+        self.lab = Lab(
+            kinds, watched, drive=tracker.drive, rate=self.rate, engine=engine, device=device, threads=threads
+        )
+        self.tables = plan.tables(self.lab.device)
+        self.start = _start(plan, self.tables)
+        end = np.array([c.ticks for c in cells])[cell]
+        self.ticks = int(end.max())
+        self.meter = Meter(self.lab, end, np.array([round(c.window / g1.TICK) for c in cells])[cell])
+        self.loop = TrackerLoop(self.lab.physics, self.lab.scene.robot, tracker)
+        self._every = np.ones(self.lab.worlds, dtype=bool)
+        self._cell = torch.as_tensor(cell, dtype=torch.long, device=self.lab.device)
+        self._forces = _Forces(plan, self.lab.device)
+        self._goals = _Goals(plan, self.lab.device) if any(c.goal is not None for c in cells) else None
+        self._position = wp.to_torch(self.loop.reference.position)
+        self.setup_s = time.perf_counter() - began
+        self._began = time.perf_counter()
+
+    def prepare(self) -> None:
+        """Put every world at its start, with the first action as a command to stand still."""
+        self.lab.start(self.start)
+        self.loop.fresh(self._every, prefill=True)
+        self.loop.anchor(self._every)
+        action = self.loop.action
+        action.copy_(self.tables.actions[0].index_select(0, self._cell))
+        action[:, :2] = 0.0
+
+    def _pose(self) -> torch.Tensor:
+        """Measured x, y and heading of the robots [m, rad], shape [worlds, 3]."""
+        lab, at = self.lab, self.lab.root_q
+        return torch.cat([lab.qpos[:, at : at + 2], heading(lab.qpos[:, at + 3 : at + 7])[:, None]], dim=1)
+
+    def _begin(self) -> None:
+        """Kick the robots and start references and measures where they are now."""
+        self.lab.physics.add_velocity(self.plan.noise["kick"])
+        self.loop.anchor(self._every)
+        self.meter.anchor(self.loop.targets, self._position)
+        if self._goals is not None:
+            self._goals.begin(self._pose())
+
+    def tick(self, tick: int) -> None:
+        """Advance every world by one tick; `tick` counts from the start of the references, the start-up is negative."""
+        lab, loop = self.lab, self.loop
+        if tick == 0:
+            self._begin()
+        if tick >= 0:
+            torch.index_select(self.tables.actions[tick], 0, self._cell, out=loop.action)
+            if self._goals is not None:
+                self._goals.write(self._pose(), loop.action)
+            if self._forces.any:
+                lab.force.copy_(self._forces.at(tick, self._pose()[:, 2]))
+        targets = loop.tick(loop.action, self._every)
+        lab.physics.step()
+        links = self.tables.links[max(tick, 0)].index_select(0, self._cell)
+        reference = TickReference(self._position, loop.command.quat, loop.command.joints, links)
+        live = self.meter.update(tick, reference, targets)
+        if lab.engine == "mujoco":  # spare the CPU ended worlds; on CUDA the answer would wait for the device
+            lab.physics.set_active(live.numpy())
+
+    def outcome(self) -> Outcome:
+        """The measures; the one transfer from the device."""
+        measures = self.meter.results()
+        measures["support_x"] = _support_x(self.start)
+        if self._goals is not None:
+            _add_goals(measures, self.plan)
+        return Outcome(
+            measures=measures,
+            overflows=self.lab.overflows(),
+            ticks=self.ticks + self.startup_ticks,
+            engine=self.lab.engine,
+            device=str(self.lab.device),
+            rate=self.rate,
+            setup_s=self.setup_s,
+            rollout_s=time.perf_counter() - self._began,
+        )
+
+
 @torch.inference_mode()
-def run(
+def play(
     tracker: Tracker,
     plan: Plan,
     *,
@@ -236,122 +335,41 @@ def run(
     device: str | None = None,
     fast_physics: bool = False,
     threads: int | None = None,
-    observer: Any = None,
+    startup_ticks: int | None = None,
+    observer: Callable[[Lab, int], None] | None = None,
 ) -> Outcome:
     """Play a plan.
 
     Args:
         tracker: A tracker, not bound yet.
-        plan: What to play.
+        plan: Cells and draws.
         engine: `auto`, `mujoco` or `warp`.
         device: Warp device.
         fast_physics: Use the tracker's fast physics rate.
         threads: CPU threads of engine `mujoco`.
+        startup_ticks: Standing before the references start [ticks]; as in an episode of the rule set `paper` by
+            default.
         observer: Called as observer(lab, tick) after every tick, for films.
     """
-    import warp as wp
-
-    from arena_newton.kernels import canonical
-    from arena_newton.rotations import heading
-    from arena_newton.trackers.motions.kinematics import neutral_stance
-
-    began = time.perf_counter()
-    cells, worlds = plan.cells, len(plan.cell)
-    kinds = [WorldKind(cells[i].friction, cells[i].payload) for i in plan.cell]
-    watched = np.array([cells[i].support is not None for i in plan.cell])
-    rate = tracker.rate(fast=fast_physics)
-    lab = Lab(kinds, watched, drive=tracker.drive, rate=rate, engine=engine, device=device, threads=threads)
-    tables = plan.tables(lab.device)
-    start = _start(plan, tables, neutral_stance().ankle)
-    lab.start(start)
-    end = np.array([c.ticks for c in cells])[plan.cell]
-    meter = Meter(lab, end, np.array([round(c.window / g1.TICK) for c in cells])[plan.cell])
-    tracker.bind(worlds, lab.device)
-
-    of_world = torch.as_tensor(plan.cell, dtype=torch.long, device=lab.device)
-    to_mujoco = torch.tensor(g1.MUJOCO_TO_CANONICAL, dtype=torch.long, device=lab.device)
-    forces = _Forces(plan, lab.device)
-    goals = _Goals(plan, lab.device) if any(c.goal is not None for c in cells) else None
-    pose_of = canonical.ReferencePose.allocate(
-        worlds, lab.physics.device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK
+    rollout = SuiteRollout(
+        tracker,
+        plan,
+        engine=engine,
+        device=device,
+        fast_physics=fast_physics,
+        threads=threads,
+        startup_ticks=startup_ticks,
     )
-    action = torch.zeros(worlds, 40, device=lab.device)
-    action_wp, every = wp.from_torch(action), wp.full(worlds, 1, dtype=wp.int32, device=lab.physics.device)
-    ref_position, ref_quat, ref_joints, ref_vel, mimic = (
-        wp.to_torch(a) for a in (pose_of.position, pose_of.quat, pose_of.joints, pose_of.joint_vel, pose_of.mimic)
-    )
-
-    def anchor() -> None:
-        canonical.launch_reset_reference(pose_of, lab.physics.qpos, lab.root_q, every)
-
-    def pose() -> torch.Tensor:
-        at = lab.root_q
-        return torch.cat([lab.qpos[:, at : at + 2], heading(lab.qpos[:, at + 3 : at + 7])[:, None]], dim=1)
-
-    def drive(fresh: bool) -> torch.Tensor:
-        canonical.launch_integrate(pose_of, action_wp, every, tracker.max_root_delta_deg)
-        command = TrackerCommand(
-            mimic=mimic,
-            joints=ref_joints.index_select(1, to_mujoco),
-            joint_vel=ref_vel.index_select(1, to_mujoco),
-            quat=ref_quat,
-        )
-        state = RobotState(
-            quat=lab.qpos[:, lab.root_q + 3 : lab.root_q + 7],
-            ang_vel_body=lab.qvel[:, lab.root_v + 3 : lab.root_v + 6],
-            joint_pos=lab.qpos.index_select(1, lab.joint_q),
-            joint_vel=lab.qvel.index_select(1, lab.joint_v),
-        )
-        if fresh:
-            tracker.prefill(command, state)
-        targets = tracker.step(command, state)
-        lab.step(targets)
-        return targets
-
-    anchor()
-    action.copy_(tables.actions[0].index_select(0, of_world))
-    action[:, :2] = 0.0
-    setup, ticks = time.perf_counter() - began, int(end.max())
-    targets = ref_joints
-    for tick in range(-SETTLE_TICKS, ticks):
-        if tick == 0:
-            lab.add_velocity(plan.noise["kick"])
-            anchor()
-            meter.anchor(targets, ref_position)
-            if goals is not None:
-                goals.begin(pose())
-        if tick >= 0:
-            torch.index_select(tables.actions[tick], 0, of_world, out=action)
-            if goals is not None:
-                goals.write(pose(), action)
-            if forces.any:
-                lab.force.copy_(forces.at(tick, pose()[:, 2]))
-        targets = drive(fresh=tick == -SETTLE_TICKS)
-        joints = ref_joints.index_select(1, to_mujoco)
-        links = tables.links[max(tick, 0)].index_select(0, of_world)
-        live = meter.update(tick, Reference(ref_position, ref_quat, joints, links), targets)
-        lab.set_active(live)
+    rollout.prepare()
+    for tick in range(-rollout.startup_ticks, rollout.ticks):
+        rollout.tick(tick)
         if observer is not None:
-            observer(lab, tick)
-    measures = meter.results()
-    measures["support_x"] = _support_x(start)
-    if goals is not None:
-        _add_goals(measures, plan)
-    done = time.perf_counter()
-    return Outcome(
-        measures=measures,
-        overflows=lab.overflows(),
-        ticks=ticks + SETTLE_TICKS,
-        engine=lab.engine,
-        device=str(lab.device),
-        rate=rate,
-        setup_s=setup,
-        rollout_s=done - began - setup,
-    )
+            observer(rollout.lab, tick)
+    return rollout.outcome()
 
 
 def _support_x(start: Start) -> np.ndarray:
-    """Place of each world's support along the way [m], NaN without one, [worlds]."""
+    """Position of each world's support along x [m], NaN without one, shape [worlds]."""
     out: np.ndarray = np.full(len(start.root), np.nan)
     for pose in start.supports.values():
         out = np.where(np.isfinite(pose[:, 0]), pose[:, 0], out)
@@ -359,6 +377,7 @@ def _support_x(start: Start) -> np.ndarray:
 
 
 def _add_goals(measures: dict[str, np.ndarray], plan: Plan) -> None:
+    """Errors at the end of the worlds that have a goal."""
     goals = [plan.cells[i].goal for i in plan.cell]
     wanted = np.array([(g.x, g.y, g.yaw) if g is not None else (np.nan,) * 3 for g in goals])
     offset = np.stack([measures["end_x"], measures["end_y"]], axis=1) - wanted[:, :2]

@@ -1,19 +1,23 @@
-"""What is asked of a tracker: cells, each a reference, the world it happens in, and how many rollouts it gets."""
+"""Cells of the tracker suite: each a reference, the world that it is tracked in, and a number of rollouts."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from arena_newton.canonical import ACTION, ACTION_WIDTH, STAND_ACTION
 from arena_newton.robot import TICK
-
-if TYPE_CHECKING:
-    import torch
-
-    from arena_newton.trackers.motions.primitives import Script
+from arena_newton.rotations import heading, quat_apply, quat_from_yaw
+from arena_newton.trackers.evaluation.meter import FEET, LINKS
+from arena_newton.trackers.motions.formats import read_library
+from arena_newton.trackers.motions.frames import actions_to_motion, motion_actions
+from arena_newton.trackers.motions.generator import ReferenceGenerator
+from arena_newton.trackers.motions.kinematics import forward, link_index
+from arena_newton.trackers.motions.playback import startup_actions
+from arena_newton.trackers.motions.primitives import Program, Script
 
 __all__ = ["Ball", "Cell", "Navigation", "Placed", "Push", "Tables", "clip_cells", "tabulate"]
 
@@ -23,27 +27,26 @@ BLEND = 1.0
 
 @dataclass(frozen=True)
 class Placed:
-    """A support in front of or behind the robot that stands at the origin and faces +x."""
+    """A support in front of or behind the robot, which starts at the origin and faces +x."""
 
     name: str
     """`Seat`, `Sill` or `Platform`."""
     height: float
     """Height of its top [m]."""
     x: float | None = None
-    """Centre [m]; None finds the place of a sill that the reference's feet step over with the most clearance,
-    or of a platform that they tread on."""
+    """Centre [m]; None: where the reference's feet step over a sill with the most clearance, or tread on a platform."""
 
 
 @dataclass(frozen=True)
 class Ball:
-    """Where the ball lies, drawn per rollout."""
+    """Position of the ball, drawn per rollout."""
 
     distance: tuple[float, float]
-    """Least and largest distance ahead of the ankles [m]."""
+    """Least and largest distance in front of the ankles [m]."""
     lateral: float
     """To the left of the robot's middle [m]."""
     spread: float = 0.01
-    """Uniform error of the lateral place [m]."""
+    """Uniform error of the lateral position [m]."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Push:
     seconds: float
     """Duration [s]."""
     backward: bool = False
-    """Against the robot's heading; otherwise from any side, drawn per rollout."""
+    """Against the robot's heading; otherwise in any direction, drawn per rollout."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +80,9 @@ class Cell:
     """One row of the tables."""
 
     name: str
-    """What tables call it."""
+    """Its name in tables."""
     group: str
-    """Primitive or condition that it belongs to."""
+    """Primitive or condition that it tests."""
     seconds: float
     """Length after the start-up [s]."""
     script: Script | None = None
@@ -112,23 +115,17 @@ class Tables:
     actions: torch.Tensor
     """[ticks, cells, 40]."""
     links: torch.Tensor
-    """Reference of `measure.LINKS` relative to the root in its heading frame [m], [ticks, cells, links, 3]."""
+    """Reference of `meter.LINKS` relative to the root in its heading frame [m], [ticks, cells, links, 3]."""
     feet: torch.Tensor
     """Ankle frames of the nominal reference in the world [m], [ticks, cells, 2, 3]."""
 
 
 def clip_cells(paths: list[Path]) -> list[Cell]:
-    """A cell a clip: files in any format that `motions.formats` reads, or motion libraries.
+    """One cell per clip: files in any format that `motions.formats` reads, or motion libraries.
 
     Raises:
-        InputError: A file is absent or unfit.
+        InputError: A file is missing or cannot be used.
     """
-    import torch
-
-    from arena_newton.trackers.motions.formats import read_library
-    from arena_newton.trackers.motions.frames import motion_actions
-    from arena_newton.trackers.motions.playback import startup_actions
-
     if not paths:
         return []
     library, _ = read_library(paths)
@@ -145,16 +142,7 @@ def clip_cells(paths: list[Path]) -> list[Cell]:
 
 
 def tabulate(cells: list[Cell], device: torch.device) -> Tables:
-    """Roll out every cell's reference; goals stand still here, their rows are made while they run."""
-    import torch
-
-    from arena_newton.canonical import ACTION, ACTION_WIDTH
-    from arena_newton.env import STAND_ACTION
-    from arena_newton.rotations import heading, quat_apply, quat_from_yaw
-    from arena_newton.trackers.evaluation.meter import FEET, LINKS
-    from arena_newton.trackers.motions.frames import actions_to_motion
-    from arena_newton.trackers.motions.kinematics import forward, link_index
-
+    """Roll out every cell's reference; cells with a goal stand here and get their actions in closed loop later."""
     ticks = max(cell.ticks for cell in cells)
     actions = torch.empty(ticks, len(cells), ACTION_WIDTH, device=device)
     actions[:] = torch.as_tensor(STAND_ACTION, device=device)
@@ -181,11 +169,6 @@ def tabulate(cells: list[Cell], device: torch.device) -> Tables:
 
 
 def _generate(cells: list[Cell], ticks: int, device: torch.device) -> torch.Tensor:
-    import torch
-
-    from arena_newton.trackers.motions.generator import ReferenceGenerator
-    from arena_newton.trackers.motions.primitives import Program
-
     program = Program([cell.script for cell in cells if cell.script is not None], device)
     generator = ReferenceGenerator(len(cells), device)
     out = []

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from arena_newton.interfaces import Tracker
+from arena_newton.pictures.camera import Camera, WorldLights
+from arena_newton.pictures.video import film_strip
 from arena_newton.robot import TICK
 from arena_newton.trackers.evaluation.cells import suite
-from arena_newton.trackers.evaluation.rollout import plan, run
-
-if TYPE_CHECKING:
-    from arena_newton.trackers.base import Tracker
+from arena_newton.trackers.evaluation.lab import Lab
+from arena_newton.trackers.evaluation.rollout import make_plan, play
 
 __all__ = ["FILMED", "film"]
 
 FILMED = {"walk 0.6": "walk", "ball, standing kick": "kick", "squat 0.45": "squat", "sit 0.42": "sit"}
 """Cell to file name."""
 PICTURES = 10
-"""Pictures a strip."""
+"""Pictures per strip."""
 WIDTH, HEIGHT = 256, 256
 SHOWN = {"walk 0.6": (0.0, 5.0), "ball, standing kick": (0.5, 4.0), "squat 0.45": (0.0, 7.0), "sit 0.42": (0.0, 12.0)}
 """Part of each rollout that is shown [s]."""
@@ -29,29 +29,27 @@ VIEWS = {
     "squat 0.45": (0.1, 2.6),
     "sit 0.42": (-0.1, 2.6),
 }
-"""Middle of the picture along the robot's way and distance of the camera to its right [m]."""
+"""Middle of the picture along the robot's path and distance of the camera to its right [m]."""
 EYE, GAZE = 1.05, 0.72
-"""Height of the camera and of what it looks at [m]."""
+"""Heights of the camera and of its target [m]."""
 FOCAL, APERTURE = 24.0, 20.0
 """Horizontal field of view 45°."""
 
 
-class _Camera:
-    """Takes each strip's pictures at its own times."""
+class _StripCamera:
+    """Takes each strip's pictures at its own times; cell `w` runs in world `w`."""
 
     def __init__(self, names: list[str]):
         self.names = names
-        self.frames: list[list[Any]] = [[] for _ in names]
+        self.frames: list[list[np.ndarray]] = [[] for _ in names]
         self._wanted = []
         for name in names:
             first, last = SHOWN[name]
             step = (last - first) / (PICTURES - 1)
             self._wanted.append({round((first + k * step) / TICK) for k in range(PICTURES)})
-        self._cameras: list[Any] = []
+        self._cameras: list[Camera] = []
 
-    def _place(self, lab: Any) -> None:
-        from arena_newton.pictures.camera import Camera, WorldLights
-
+    def _set_up(self, lab: Lab) -> None:
         lights = WorldLights.allocate(lab.worlds, lab.scene.device, lab.scene.stage)
         for name in self.names:
             x, distance = VIEWS[name]
@@ -73,34 +71,46 @@ class _Camera:
             )
         self._state = lab.scene.model.state()
 
-    def __call__(self, lab: Any, tick: int) -> None:
+    def __call__(self, lab: Lab, tick: int) -> None:
         due = [w for w, ticks in enumerate(self._wanted) if tick in ticks]
         if not due:
             return
         if not self._cameras:
-            self._place(lab)
+            self._set_up(lab)
         lab.physics.write_newton_state(self._state)
         for w in due:
             mask = np.arange(lab.worlds) == w
             self.frames[w].append(self._cameras[w].render(self._state, mask)[w].cpu().numpy().copy())
 
 
-def film(tracker: Tracker, label: str, out: Path, *, seed: int = 0, **options: Any) -> list[Path]:
-    """Play the filmed cells once and write a strip each; returns the files.
+def film(
+    tracker: Tracker,
+    label: str,
+    out: Path,
+    *,
+    seed: int = 0,
+    engine: str = "auto",
+    device: str | None = None,
+    fast_physics: bool = False,
+    threads: int | None = None,
+) -> list[Path]:
+    """Play the filmed cells once and write one strip per cell; returns the files.
 
     Args:
         tracker: A tracker, not bound yet.
-        label: What the file names and the line above a strip call it.
+        label: Its name in file names and in the line above a strip.
         out: Folder.
         seed: Seed of the plan.
-        options: Engine, device and so on of `rollout.run`.
+        engine: As in `rollout.play`, like the rest.
+        device: Warp device.
+        fast_physics: Use the tracker's fast physics rate.
+        threads: CPU threads of engine `mujoco`.
     """
-    from arena_newton.pictures.video import film_strip
-
     cells = [cell for cell in suite("full") if cell.name in FILMED]
     names = [cell.name for cell in cells]
-    camera = _Camera(names)
-    run(tracker, plan(cells, 1, seed), observer=camera, **options)
+    camera = _StripCamera(names)
+    plan = make_plan(cells, 1, seed)
+    play(tracker, plan, engine=engine, device=device, fast_physics=fast_physics, threads=threads, observer=camera)
     safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in label)
     written = []
     for name, frames in zip(names, camera.frames, strict=True):

@@ -239,8 +239,7 @@ def test_a_clip_depends_on_its_seed_family_and_number_alone():
 
 def test_official_tracker_walks_these_references(shared):
     """TWIST2's released weights, in plain MuJoCo, reach 90 % of a commanded 0.3 and 0.6 m/s and stay up."""
-    from arena_newton.eval import oracle
-    from arena_newton.eval.oracle_references import Reference
+    from arena_newton.trackers import oracle
 
     names = {0.3: "walk 0.3", 0.6: "walk 0.6"}
     program = Program([primitives.stand(0.5) + primitives.walk(v, seconds=8.0) for v in names])
@@ -248,10 +247,10 @@ def test_official_tracker_walks_these_references(shared):
     for tick in range(400):
         generator.step(program(tick * TICK))
         actions.append(generator.action())
-    streams = [Reference(n, a) for n, a in zip(names.values(), torch.stack(actions, 1).numpy(), strict=True)]
+    streams = [oracle.ActionStream(n, a) for n, a in zip(names.values(), torch.stack(actions, 1).numpy(), strict=True)]
     root = shared / "reference"
     tracks = oracle.run_oracle(root / "twist2/twist2_1017_20k.onnx", root / "g1/g1_sim2sim_29dof.xml", streams)
     for speed, stream, track in zip(names, streams, tracks, strict=True):
-        assert oracle.measure(stream, track)[0] is None
+        assert oracle.measure_track(stream, track).fell is None
         reached = np.linalg.norm(track.position[-1, :2] - track.position[200, :2]) / (199 * TICK)
         assert reached > 0.9 * speed

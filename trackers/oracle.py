@@ -1,8 +1,9 @@
-"""Does a tracker drive our G1 as it drives its own MJCF in plain MuJoCo? `python -m arena_newton.eval.oracle --help`.
+"""Does a tracker drive our G1 as it drives its own MJCF in plain MuJoCo? `python -m arena_newton.trackers.oracle`.
 
-One stream of canonical actions a reference goes to both sides: (a) the environment, football scene, engine `mujoco`;
-(b) the official MJCF in plain MuJoCo with the same drive gains, physics step and tracker class. The oracle side turns
-40 numbers into the 35 of the mimic command by NumPy code of its own (`MimicCommand`), not by the kernel under test.
+One stream of canonical actions per reference goes to both sides: (a) the lab of this package, engine `mujoco`, through
+`TrackerLoop`; (b) the official MJCF in plain MuJoCo with the same drive gains, physics step and tracker class. The
+oracle side converts 40 numbers into the 35 of the mimic command by NumPy code of its own (`MimicCommand`), not by the
+kernel under test.
 """
 
 from __future__ import annotations
@@ -10,47 +11,64 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
+import torch
+import tyro
 
 from arena_newton import robot as g1
+from arena_newton import rule_sets, trackers
+from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-
-if TYPE_CHECKING:
-    from arena_newton.eval.oracle_references import Reference
+from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
+from arena_newton.trackers.evaluation.meter import FEET
+from arena_newton.trackers.evaluation.suite import Cell, clip_cells, tabulate
+from arena_newton.trackers.motions import primitives
+from arena_newton.tracking import TrackerLoop
 
 __all__ = [
+    "ActionStream",
     "MimicCommand",
     "Options",
     "Row",
     "Track",
+    "action_streams",
     "compare",
     "load_official",
     "main",
-    "measure",
-    "references",
+    "measure_track",
+    "row_table",
     "run_oracle",
     "run_ours",
-    "table",
 ]
 
-PROG = "python -m arena_newton.eval.oracle"
+PROG = "python -m arena_newton.trackers.oracle"
 FALL_TILT = 60.0
 """A pelvis tilted beyond this has fallen [deg]."""
 FALL_HEIGHT = 0.3
 """A pelvis below this has fallen [m]; the squat goes to 0.45 m."""
-OPEN_GROUND = (0.0, -15.0, g1.SPAWN_HEIGHT)
-"""Where the robot starts in the football scene [m]: walks end before they reach ball and goal."""
+
+
+@dataclass(frozen=True)
+class ActionStream:
+    """A named reference."""
+
+    name: str
+    """Its name in tables."""
+    actions: np.ndarray
+    """Canonical actions, float32, shape [ticks, 40]."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One reference on both sides; `ours` and `oracle` of each measure."""
+    """One reference on both sides; each measure for `ours` and for the `oracle`."""
 
     reference: str
     """Name of the reference."""
@@ -90,7 +108,7 @@ class Row:
 
 @dataclass
 class Track:
-    """What one side did with one reference."""
+    """Motion of one side under one reference."""
 
     joints: np.ndarray
     """Joint positions after each tick [rad], MuJoCo order, shape [ticks, 29]."""
@@ -105,8 +123,6 @@ class Track:
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
-    import mujoco
-
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, np.asarray(quat, dtype=float))
     return out.reshape(3, 3)
@@ -121,7 +137,7 @@ def _wrap(angle: float) -> float:
 
 
 class MimicCommand:
-    """Canonical actions to TWIST2's command for one world, written from the schema, float64.
+    """Converts canonical actions to TWIST2's command for one world, written from the schema, float64.
 
     The action's displacement is given in the frame of its own root orientation; its height is absolute. The world
     displacement d is the one whose first two components in that frame are the action's and whose world z is the
@@ -135,7 +151,8 @@ class MimicCommand:
         c, s = np.cos(yaw), np.sin(yaw)
         self.heading = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         self.position, self.rotation = np.array(position, dtype=float), rotation
-        self._yaw, self._height = yaw, None
+        self._yaw = yaw
+        self._height: float | None = None
         self._joints: np.ndarray | None = None
         self.joint_vel = np.zeros(29)
 
@@ -165,18 +182,16 @@ class MimicCommand:
     @property
     def quat(self) -> np.ndarray:
         """Target orientation, wxyz, shape [4]."""
-        import mujoco
-
         out = np.zeros(4)
         mujoco.mju_mat2Quat(out, self.rotation.ravel())
         return out
 
 
-def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: float = 0.005) -> Any:
+def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: float = 0.005) -> mujoco.MjModel:
     """Compile the official MJCF without its meshes and with implicit PD drives.
 
-    Every link has an explicit inertia, so masses stay; what collides without meshes are the four spheres under each
-    foot and the shoulders' cylinders. The file's floor, torque ranges, armature and solver stay as they are.
+    Every link has an explicit inertia, so that masses stay; without meshes the four spheres under each foot and the
+    cylinders of the shoulders collide. The file's floor, torque ranges, armature and solver stay as they are.
 
     Args:
         mjcf: `g1_sim2sim_29dof.xml`.
@@ -184,14 +199,8 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
         dt: Physics step [s].
 
     Raises:
-        InputError: The file is absent, unreadable or no G1 of 29 joints.
+        InputError: The file is missing, unreadable or not a G1 with 29 joints.
     """
-    import xml.etree.ElementTree as ElementTree
-
-    import mujoco
-
-    from arena_newton.eval.oracle_references import FEET
-
     path = Path(mjcf)
     if not path.is_file():
         raise InputError(f"--mjcf {path}: no such file")
@@ -227,79 +236,85 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
     return model
 
 
-def references(model: Any, clips: Sequence[str | Path], clip_seconds: float | None = None) -> list[Reference]:
-    """Standing 10 s, walking 0.3 m/s, a squat to 0.45 m, and clips."""
-    from arena_newton.eval import oracle_references as build
+def action_streams(clips: Sequence[str | Path] = (), clip_seconds: float | None = None) -> list[ActionStream]:
+    """Standing 10 s, walking at 0.3 m/s, a squat to 0.45 m, and clips, of which `clip_seconds` keeps the start."""
+    scripts = {
+        "stand 10 s": primitives.stand(10.0),
+        "walk 0.3 m/s": primitives.walk(0.3, seconds=8.0),
+        "squat to 0.45 m": primitives.squat(0.45),
+    }
+    cells = [Cell(name, "oracle", script.seconds, script) for name, script in scripts.items()]
+    for cell in clip_cells([Path(path) for path in clips]):
+        kept = cell.ticks if clip_seconds is None else round(clip_seconds / g1.TICK)
+        actions = np.asarray(cell.actions)[:kept]
+        cells.append(dataclasses.replace(cell, seconds=len(actions) * g1.TICK, actions=actions))
+    table = tabulate(cells, torch.device("cpu")).actions.numpy()
+    return [ActionStream(cell.name, table[: cell.ticks, i]) for i, cell in enumerate(cells)]
 
-    return [
-        build.stand(10.0),
-        build.walk(model, 0.3),
-        build.squat(model, bottom=0.45),
-        *(build.clip(path, clip_seconds) for path in clips),
-    ]
 
-
-def _tracks(streams: Sequence[Reference], history: Sequence[tuple[np.ndarray, ...]]) -> list[Track]:
-    """Rows of every tick to one track a reference, cut to its length."""
+def _tracks(streams: Sequence[ActionStream], history: Sequence[tuple[np.ndarray, ...]]) -> list[Track]:
+    """Rows of every tick as one track per reference, cut to its length."""
     columns = [np.stack(column) for column in zip(*history, strict=True)]
     return [Track(*(c[: len(s.actions), w] for c in columns)) for w, s in enumerate(streams)]
 
 
-def _padded(streams: Sequence[Reference]) -> np.ndarray:
-    """Actions of all references, the short ones held without displacement; shape [ticks, references, 40]."""
+def _padded(streams: Sequence[ActionStream]) -> np.ndarray:
+    """Actions of all references, short ones held without displacement; shape [ticks, references, 40]."""
     ticks = max(len(s.actions) for s in streams)
     out = np.empty((ticks, len(streams), 40), dtype=np.float32)
     for w, stream in enumerate(streams):
         out[:, w] = stream.actions[-1]
-        out[len(stream.actions) :, w, :2] = 0.0
+        out[len(stream.actions) :, w, ACTION["root_xy_delta"]] = 0.0
         out[: len(stream.actions), w] = stream.actions
     return out
 
 
+def _with_startup(streams: Sequence[ActionStream]) -> tuple[np.ndarray, int]:
+    """Actions after the start-up of an episode, shape [ticks, references, 40], and the start-up's length [ticks]."""
+    startup = rule_sets.get("paper").startup.ticks
+    standing = np.tile(STAND_ACTION, (startup, len(streams), 1))
+    return np.concatenate([standing, _padded(streams)]), startup
+
+
 def run_ours(
-    checkpoint: str | Path, streams: Sequence[Reference], *, tracker: str = "twist2", fast: bool = True
+    checkpoint: str | Path, streams: Sequence[ActionStream], *, tracker: str = "twist2", fast: bool = True
 ) -> list[Track]:
-    """Play references in the environment, each in a world of one batch."""
-    import torch
-
-    from arena_newton import trackers
-    from arena_newton.env import ArenaEnv
-
+    """Play references in the lab, each in a world of one batch."""
     worlds = len(streams)
     driver = trackers.get(tracker, checkpoint)
-    env = ArenaEnv("football", tracker=driver, worlds=worlds, engine="mujoco", device="cpu", fast_physics=fast)
-    env.reset([0] * worlds, spawn=lambda _: (OPEN_GROUND, env.spec.spawn_quat))
-    h, p = env.scene.robot, env.physics
-    waiting = torch.zeros(worlds, 40)
-    for _ in range(env.startup_ticks):
-        env.step(waiting)
-    history = []
-    for actions in _padded(streams):
-        env.step(torch.from_numpy(actions))
-        qpos = p.qpos.numpy().astype(float)
-        root = h.root_qpos
-        history.append(
-            (
-                qpos[:, h.joint_qpos],
-                qpos[:, root : root + 3],
-                qpos[:, root + 3 : root + 7],
-                env.loop.reference.position.numpy().astype(float),
-                env.loop.reference.quat.numpy().astype(float),
-            )
-        )
+    watched, every = np.zeros(worlds, dtype=bool), np.ones(worlds, dtype=bool)
+    lab = Lab([WorldKind()] * worlds, watched, drive=driver.drive, rate=driver.rate(fast=fast), engine="mujoco")
+    root = np.tile([0.0, 0.0, g1.SPAWN_HEIGHT, 1.0, 0.0, 0.0, 0.0], (worlds, 1))
+    lab.start(Start(root, np.tile(g1.DEFAULT_POSE, (worlds, 1)), {}, np.full((worlds, 3), np.nan)))
+    loop = TrackerLoop(lab.physics, lab.scene.robot, driver)
+    loop.fresh(every, prefill=True)
+    loop.anchor(every)
+    actions, startup = _with_startup(streams)
+    history, at = [], lab.root_q
+    for tick, action in enumerate(actions):
+        if tick == startup:
+            loop.anchor(every)
+        loop.tick(torch.from_numpy(action), every)
+        lab.physics.step()
+        if tick >= startup:
+            qpos = lab.physics.qpos.numpy().astype(float)
+            target = (loop.reference.position.numpy().astype(float), loop.reference.quat.numpy().astype(float))
+            joints = qpos[:, lab.scene.robot.joint_qpos]
+            history.append((joints, qpos[:, at : at + 3], qpos[:, at + 3 : at + 7], *target))
+    lab.physics.close()
     return _tracks(streams, history)
 
 
 def run_oracle(
     checkpoint: str | Path,
     mjcf: str | Path,
-    streams: Sequence[Reference],
+    streams: Sequence[ActionStream],
     *,
     tracker: str = "twist2",
     fast: bool = True,
-    model: Any = None,
+    model: mujoco.MjModel | None = None,
 ) -> list[Track]:
-    """Play references on the official MJCF in plain MuJoCo, with the environment's start-up.
+    """Play references on the official MJCF in plain MuJoCo, after the start-up of an episode.
 
     Args:
         checkpoint: Weights of the tracker.
@@ -307,15 +322,8 @@ def run_oracle(
         streams: References.
         tracker: Name of the tracker.
         fast: The tracker's fast physics rate.
-        model: A changed model instead of the file's, to look for what makes a difference.
+        model: A changed model instead of the file's, to find what makes a difference.
     """
-    import mujoco
-    import torch
-
-    from arena_newton import rule_sets, trackers
-    from arena_newton.env import STAND_ACTION
-
-    worlds, startup = len(streams), rule_sets.get("paper").startup.ticks
     driver = trackers.get(tracker, checkpoint)
     rate = driver.rate(fast=fast)
     m = model if model is not None else load_official(mjcf, driver.drive, rate.dt)
@@ -327,7 +335,7 @@ def run_oracle(
     for d in sims:
         d.qpos[:3], d.qpos[3:7] = (0.0, 0.0, g1.SPAWN_HEIGHT), (1.0, 0.0, 0.0, 0.0)
         d.qpos[q_of] = g1.DEFAULT_POSE
-    driver.bind(worlds, torch.device("cpu"))
+    driver.bind(len(streams), torch.device("cpu"))
 
     def anchor() -> list[MimicCommand]:
         return [MimicCommand(d.qpos[:3], d.qpos[3:7]) for d in sims]
@@ -336,8 +344,8 @@ def run_oracle(
         return torch.from_numpy(np.stack(values).astype(np.float32))
 
     commands, history = anchor(), []
-    settle = np.repeat(np.repeat(STAND_ACTION[None, None], worlds, axis=1), startup, axis=0)
-    for tick, actions in enumerate(np.concatenate([settle, _padded(streams)])):
+    stream, startup = _with_startup(streams)
+    for tick, actions in enumerate(stream):
         if tick == startup:
             commands = anchor()
         mimic = rows([c.advance(a) for c, a in zip(commands, actions, strict=True)])
@@ -368,8 +376,18 @@ def run_oracle(
     return _tracks(streams, history)
 
 
-def measure(stream: Reference, track: Track) -> tuple[float | None, float, float, float, float]:
-    """Time of the fall [s], joint errors of all joints and legs [rad], drift [m] and yaw error [deg] at the end."""
+class TrackErrors(NamedTuple):
+    """Errors of one side, as in `Row`."""
+
+    fell: float | None
+    error: float
+    legs: float
+    drift: float
+    yaw: float
+
+
+def measure_track(stream: ActionStream, track: Track) -> TrackErrors:
+    """Errors of a track until its end or its fall."""
     x, y = track.quat[:, 1], track.quat[:, 2]
     tilt = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))
     down = np.flatnonzero((tilt > FALL_TILT) | (track.position[:, 2] < FALL_HEIGHT) | ~np.isfinite(tilt))
@@ -379,7 +397,8 @@ def measure(stream: Reference, track: Track) -> tuple[float | None, float, float
     drift = float(np.linalg.norm(track.position[end - 1, :2] - track.target[end - 1, :2]))
     yaw = _yaw(_matrix(track.quat[end - 1])) - _yaw(_matrix(track.target_quat[end - 1]))
     fell = end * g1.TICK if down.size else None
-    return fell, float(error.mean()), float(error[:, :12].mean()), drift, float(np.degrees(_wrap(yaw)))
+    legs = float(error[:, list(g1.LEGS)].mean())
+    return TrackErrors(fell, float(error.mean()), legs, drift, float(np.degrees(_wrap(yaw))))
 
 
 def compare(
@@ -396,29 +415,44 @@ def compare(
     Args:
         checkpoint: Weights of the tracker.
         mjcf: The official MJCF.
-        clips: Motion clips beside standing, walking and the squat.
+        clips: Motion clips in addition to standing, walking and the squat.
         tracker: Name of the tracker.
         fast: The tracker's fast physics rate instead of its own.
-        clip_seconds: Keep so much of each clip.
+        clip_seconds: Length of the part of each clip that is played, from its start [s]; the whole clip by default.
 
     Returns:
-        One row a reference.
+        One row per reference.
 
     Raises:
-        InputError: A file is absent or unfit.
+        InputError: A file is missing or cannot be used.
     """
-    streams = references(load_official(mjcf), clips, clip_seconds)
+    load_official(mjcf)  # an unfit file is reported before anything is played
+    streams = action_streams(clips, clip_seconds)
     oracle = run_oracle(checkpoint, mjcf, streams, tracker=tracker, fast=fast)
     ours = run_ours(checkpoint, streams, tracker=tracker, fast=fast)
     rows = []
     for stream, a, b in zip(streams, ours, oracle, strict=True):
-        pairs = zip(measure(stream, a), measure(stream, b), strict=True)
-        values: list[Any] = [value for pair in pairs for value in pair]
-        rows.append(Row(stream.name, len(stream.actions) * g1.TICK, *values))
+        x, y = measure_track(stream, a), measure_track(stream, b)
+        rows.append(
+            Row(
+                reference=stream.name,
+                seconds=len(stream.actions) * g1.TICK,
+                fell_ours=x.fell,
+                fell_oracle=y.fell,
+                error_ours=x.error,
+                error_oracle=y.error,
+                legs_ours=x.legs,
+                legs_oracle=y.legs,
+                drift_ours=x.drift,
+                drift_oracle=y.drift,
+                yaw_ours=x.yaw,
+                yaw_oracle=y.yaw,
+            )
+        )
     return rows
 
 
-def table(rows: Sequence[Row]) -> str:
+def row_table(rows: Sequence[Row]) -> str:
     """Markdown table; each cell holds ours / oracle."""
 
     def fell(at: float | None) -> str:
@@ -446,9 +480,9 @@ class Options:
     mjcf: Path
     """The official MJCF, g1_sim2sim_29dof.xml."""
     clip: tuple[Path, ...] = ()
-    """A motion clip (.pkl); repeat for more."""
+    """A motion clip in any format that `trackers motions` reads; repeat for more."""
     clip_seconds: float | None = None
-    """Keep so much of each clip [s]."""
+    """Play only the start of each clip [s]."""
     tracker: str = "twist2"
     """Name of the tracker."""
     fast_physics: bool = False
@@ -459,8 +493,6 @@ class Options:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; exit code 0 done, 2 bad input."""
-    import tyro
-
     options = tyro.cli(Options, args=argv, prog=PROG, config=(tyro.conf.UseAppendAction,))
     try:
         rows = compare(
@@ -477,7 +509,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.json:
         print(json.dumps([dataclasses.asdict(r) | {"ratio": r.ratio} for r in rows], indent=2))
     else:
-        print(table(rows))
+        print(row_table(rows))
     return 0
 
 
