@@ -1,4 +1,4 @@
-"""``python -m arena_newton.eval bench``: this machine against the figures the product is to reach."""
+"""``python -m arena_newton.eval bench``: this machine against the figures that the product must reach."""
 
 from __future__ import annotations
 
@@ -14,10 +14,15 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
 from arena_newton.quiet import quiet_warp
+
+if TYPE_CHECKING:
+    from arena_newton.env import ArenaEnv
+    from arena_newton.interfaces import Physics
+    from arena_newton.trackers.base import Tracker
 
 __all__ = ["BenchOptions", "Figure", "run"]
 
@@ -132,7 +137,7 @@ def _cores(count: int) -> Iterator[int]:
         torch.set_num_threads(threads)
 
 
-def _twist2(options: BenchOptions) -> tuple[Any, str]:
+def _twist2(options: BenchOptions) -> tuple[Tracker, str]:
     """TWIST2 tracker and how to call its weights in a note."""
     from arena_newton import trackers
 
@@ -173,7 +178,7 @@ def _write_random_network(path: Path) -> None:
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)]), path)
 
 
-def _sync(env: Any) -> None:
+def _sync(env: ArenaEnv) -> None:
     if env.device.is_cuda:
         import warp as wp
 
@@ -181,25 +186,11 @@ def _sync(env: Any) -> None:
 
 
 @contextlib.contextmanager
-def _as_before(physics: Any) -> Iterator[None]:
+def _as_before(physics: Physics) -> Iterator[None]:
     """Put the physics back into the state it had, so that the bare steps start where the full ticks do."""
-    if physics.engine == "mujoco":
-        import copy
-
-        import mujoco
-
-        kept = [copy.copy(data) for data in physics._data]
-        yield
-        for data, before in zip(physics._data, kept, strict=True):
-            mujoco.mj_copyData(data, physics._m, before)
-        return
-    import warp as wp
-
-    arrays = (physics._d.qpos, physics._d.qvel, physics._d.qacc_warmstart, physics._d.time)
-    copies = [wp.clone(array) for array in arrays]
+    kept = physics.snapshot()
     yield
-    for array, before in zip(arrays, copies, strict=True):
-        wp.copy(array, before)
+    physics.restore(kept)
 
 
 def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> tuple[float, float, str]:
@@ -240,7 +231,7 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
             alone.append(timed(bare))
         full.append(timed(ticks))
         ended = np.flatnonzero(status)
-        if len(ended):  # as in an evaluation, a world that ended begins anew
+        if len(ended):  # as in an evaluation, a world that ended starts its next episode
             env.reset([int(w) for w in ended], ended)
     return statistics.median(full), statistics.median(alone), note
 
@@ -283,14 +274,15 @@ def _frames(worlds: int, device: str, engine: str, rounds: int) -> tuple[float, 
         mode="visual",
         camera=CameraConfig(width=224, height=224),
     )
+    camera = env.camera
+    assert camera is not None
     env.reset(list(range(worlds)))
-    assert env.camera is not None
-    env.render(env.camera)
+    env.render(camera)
     times, processor = [], []
     for _ in range(rounds):
         _sync(env)
         began, used = time.perf_counter(), time.process_time()
-        env.render(env.camera)
+        env.render(camera)
         _sync(env)
         times.append(time.perf_counter() - began)
         processor.append(time.process_time() - used)
