@@ -121,5 +121,4 @@ def build(folder: Path) -> None:
     crate(stage)
     for variant, bindings in looks.items():
         rooms.bind_in(stage, variant, bindings)
-    stage.Save()
-    rooms.variant_layer(folder / "variants" / "semantic.usda", "semantic")
+    rooms.save(stage, folder)

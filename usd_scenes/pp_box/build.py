@@ -137,5 +137,4 @@ def build(folder: Path) -> None:
         rooms.bind_in(stage, variant, looks["base"])
     with rooms.edit(stage, "semantic"):
         clutter(stage)
-    stage.Save()
-    rooms.variant_layer(folder / "variants" / "semantic.usda", "semantic")
+    rooms.save(stage, folder)

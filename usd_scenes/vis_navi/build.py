@@ -111,7 +111,7 @@ def build(folder: Path) -> None:
         facing=TASK.spawn_quat,
         eye=(0.45796, -1.01443, 2.42268),
         gaze=(0.50211, 0.27898, 0.39756, 0.71555),
-        variants=warehouse.VARIANTS,
+        variants=("base", "semantic"),
     )
     rough = warehouse.surface(stage)
     warehouse.room_looks(stage)
@@ -127,11 +127,10 @@ def build(folder: Path) -> None:
     (cx, cy), half = OUTLINE_CENTRE, OUTLINE / 2
     author.box(stage, f"{frame}/Body", (0.15, 0.05, 0.3), (-0.05, cy + half - 0.02, 0.305), visual=False, surface=rough)
     author.marker(stage, f"{frame}/Zone", (OUTLINE, OUTLINE, ZONE_HEIGHT), (cx, cy, ZONE_HEIGHT / 2))
-    for variant in warehouse.semantics(stage):
-        if variant == "base":
-            _folding_sign(stage, frame)
-            _outline(stage, frame)
-        else:
-            _ring_sign(stage, frame)
-            author.attribute(stage.GetPrimAtPath(f"{frame}/Zone"), "arena:round", True, Sdf.ValueTypeNames.Bool)
-    warehouse.save(stage, folder)
+    with rooms.edit(stage, "base"):
+        _folding_sign(stage, frame)
+        _outline(stage, frame)
+    with rooms.edit(stage, "semantic"):
+        _ring_sign(stage, frame)
+        author.attribute(stage.GetPrimAtPath(f"{frame}/Zone"), "arena:round", True, Sdf.ValueTypeNames.Bool)
+    rooms.save(stage, folder)
