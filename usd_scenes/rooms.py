@@ -77,7 +77,7 @@ def save(stage: Usd.Stage, folder: Path) -> None:
     """Write the scene and, next to it, `variants/<name>.usda` per further variant: the same scene with it selected.
 
     Raises:
-        InputError: A variant says nothing, so that nobody authored its look.
+        InputError: A variant is empty: its look was not authored.
     """
     layer = stage.GetRootLayer()
     variants = layer.GetPrimAtPath("/World").variantSets[SEMANTICS].variants

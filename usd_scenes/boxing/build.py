@@ -1,6 +1,6 @@
-"""Author Boxing: two bags on posts and the small green target beside one of them.
+"""Author Boxing: two bags on posts and the small green target at one of them.
 
-Bag size, heights and places, post offset and hook height: spec of the original (measured on its clips). Bags are
+Bag size, heights and positions, post offset and hook height: spec of the original (measured on its clips). Bags are
 static, as the rule needs no contact and no force.
 """
 

@@ -1,4 +1,4 @@
-"""Author SitSofa: a living room with carpet, sofa, coffee table and two light cartons in the way.
+"""Author SitSofa: a living room with carpet, sofa, coffee table and two light cartons on the path.
 
 Sofa, table and carton sizes: spec of the original (measured on its clips). The seat is stiff (solref 0.02 s,
 friction 1): experts sit on it as well as on a soft one, and it is cheaper to simulate.

@@ -1,8 +1,8 @@
 """Author VisNavi: walk between dropped beams and blocks into the yellow outline by the wet-floor sign.
 
 Sizes of beams, blocks, outline and the poses before the first draw: spec of the original (measured on its clips).
-Masses are our choice, the original's are not published: light crates that a robot can shove, not lift. So is where the
-origins lie, a beam's at its centre and a block's at the middle of its underside: then the heights from which the
+Masses are our choice, the original's are not published: light crates that a robot can shove, not lift. So are the
+origins, a beam's at its centre and a block's at the middle of its underside: then the heights from which the
 original drops them form a ladder on which hardly any two touch (centred blocks overlap in 46 of 60 layouts).
 """
 
