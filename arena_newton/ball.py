@@ -1,4 +1,4 @@
-"""The ball's contacts: one bounces with a given restitution, a slightly larger sphere lies and rolls."""
+"""The ball's contacts: one sphere bounces with a given restitution, a slightly larger one rests and rolls."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ much with the depth at which a step finds the ball, and a sunk ball at rest rise
 BALL_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
 """Constraint impedance of the ball: constant and near 1, so that the contact does what its solref says."""
 BALL_SKIN = f"{BALL}/Skin"
-"""Label of the sphere around a ball on which it lies and rolls, see `add_skin`."""
+"""Label of the sphere around a ball on which it rests and rolls, see `add_skin`."""
 SKIN_HEIGHT = 0.001
 """How much larger that sphere is [m]: its contact carries a ball at rest before the inner one is touched."""
 SKIN_SOLREF = (-0.01, -0.01)
@@ -32,7 +32,7 @@ SKIN_SOLIMP = (0.9, 0.001, 0.002, 0.5, 2.0)
 def ball_solref(restitution: float, dt: float) -> tuple[float, float]:
     """MuJoCo direct-form solref (−stiffness, −damping) of a contact with the given coefficient of restitution.
 
-    The contact turns the velocity round within the physics step that finds it, as the original's engine does: a damper
+    The contact reverses the velocity within the physics step that finds it, as the original's engine does: a damper
     of (1 + e)/dt takes the approach u away and adds e·u. It then does not pull the ball back, since a contact only
     pushes; the closed form of a spring with damping, which pulls too, bounces 0.25 where 0.1 is asked. The weak spring
     lifts the ball out; it adds at most BALL_SPRING·u. MuJoCo divides the stiffness by the impedance's square and the
@@ -48,7 +48,7 @@ def ball_solref(restitution: float, dt: float) -> tuple[float, float]:
 
 
 def add_skin(builder: newton.ModelBuilder) -> None:
-    """Give a round ball two contacts: its own, now without friction, bounces; a sphere 1 mm larger lies and rolls.
+    """Give a round ball two contacts: its own, now without friction, bounces; a sphere 1 mm larger rests and rolls.
 
     One contact cannot do both. MuJoCo's pyramidal cone couples the damping that a bounce needs to the speed of sliding:
     a ball kicked to 6 m/s along the grass would hop 15 cm, and a glancing bounce would be several times as high as it

@@ -1,4 +1,4 @@
-"""How much of a file that somebody else made is read: one table of limits, each with its reason.
+"""How much of a foreign file is read: one table of limits, each with its reason.
 
 A limit is some ten times what a real file needs, and small enough that reading up to it stays below 1 GiB of memory.
 Whoever needs more changes the number here.
@@ -44,15 +44,15 @@ LAYERS = 256
 """Layers and images of a scene. The project's own consist of 10; each is opened twice."""
 PRIMS = 50_000
 """Prims of a scene, counted through every reference before USD composes them: 30 small files that name each other twice
-make 2^30. The project's own scenes count 1,000; USD needs some 10 kB a prim, and Newton more."""
+make 2^30. The project's own scenes count 1,000; USD needs some 10 kB per prim, and Newton more."""
 NESTING = 100
-"""Deepest prim: USD and the importer call themselves once a level."""
+"""Deepest prim: USD and the importer recurse once per level."""
 ARC_DEPTH = 100
 """Longest chain of references."""
 TEXT_BYTES = 64 * MIB
 """Size of a `.usda` layer."""
 TEXT_LINES = 500_000
-"""Lines of a `.usda` layer: a line can be a prim or an attribute, and USD keeps 400 bytes of one."""
+"""Lines of a `.usda` layer: a line can be a prim or an attribute, and USD keeps 400 bytes of each."""
 TEXT_NUMBERS = 4_000_000
 """Commas of a `.usda` layer: while USD parses a list it keeps 110 bytes of each element. Larger meshes fit `.usdc`."""
 CRATE_BYTES = 128 * MIB
@@ -62,7 +62,7 @@ CRATE_MEMORY = 512 * MIB
 CRATE_SECONDS = 20.0
 """Time that a binary layer may take to be read [s]; 100 MiB take one."""
 MESH_POINTS = 500_000
-"""Points, and corners of faces, of one mesh: hull, normals and ray tree take 600 bytes a point."""
+"""Points, and corners of faces, of one mesh: hull, normals and ray tree take 600 bytes per point."""
 SCENE_POINTS = 1_000_000
 """Points of all meshes of a scene."""
 VARIANTS = 32
@@ -76,7 +76,7 @@ SCENE_PIXELS = 4 * IMAGE_PIXELS
 ARCHIVE_MEMBERS = 1000
 """Members of a `.usdz` or `.npz` archive."""
 FARTHEST = 1000.0
-"""Farthest that a prim may lie from the origin, and largest extent [m]: single precision resolves 0.1 mm there."""
+"""Farthest of a prim from the origin, and largest extent [m]: single precision resolves 0.1 mm there."""
 PENETRATION = 0.01
 """Depth [m] from which two things that start inside each other are named."""
 
@@ -90,7 +90,7 @@ HEADER_BYTES = 10_000
 PICKLE_BYTES = 256 * MIB
 """Size of a pickle, and what its arrays may hold: instructions of a few bytes repeat or invent arrays of any size."""
 TABLE_BYTES = 64 * MIB
-"""Size of a table (`.csv`): 3 hours at 30 frames a second."""
+"""Size of a table (`.csv`): 3 hours at 30 frames per second."""
 
 # Networks
 NETWORK_BYTES = 512 * MIB

@@ -188,7 +188,7 @@ class StartupRule:
     ticks: int
     """Length [50 Hz ticks] under a standing command; 0: the policy is asked at the spawn pose."""
     prefill: bool
-    """True: the tracker's history holds the first frame, as if the robot had stood there before. False: it starts as
+    """True: the tracker's history holds the first frame, as if the robot had been standing there. False: it starts as
     the original resets it (TWIST2: zeros; SONIC: the first joints, zeros otherwise)."""
 
     @property
@@ -237,7 +237,7 @@ class RuleSet:
 
     @property
     def ball_restitution(self) -> float:
-        """Coefficient of restitution of a ball in a scene that says none itself: the first task's that has a ball."""
+        """Coefficient of restitution of a ball in a scene of no task (the lab): that of the first task with a ball."""
         return next(value for task in self.tasks if (value := task.success.bounce()) is not None)
 
     def bounce(self, task: str) -> float:

@@ -1,6 +1,6 @@
 """A USD stage becomes one Newton model with N worlds and the one MuJoCo model that both engines step.
 
-Handles (bodies, joints, geoms, markers, frames) are found by prim path; nothing here knows a task.
+Handles (bodies, joints, geoms, markers, frames) are found by prim path; of a task only the path of its layer is known.
 """
 
 from __future__ import annotations
@@ -252,13 +252,13 @@ class Scene:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a scene is the project's own: what others made is looked at before it is built."""
+    """Whether a scene is the project's own: other scenes are checked before they are built."""
     return path.resolve().is_relative_to(SCENES.resolve())
 
 
 @contextlib.contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Put what the importer says about somebody's scene into one line that names it."""
+    """Turn an error of the importer about a foreign scene into one line that names the file."""
     try:
         yield
     except Exception as error:  # Newton and MuJoCo raise nearly anything

@@ -14,8 +14,8 @@ __all__ = ["episode_seed", "light_rng", "object_rng", "object_seed"]
 _U64 = (1 << 64) - 1
 _EPISODE_STEP = 0x9E3779B185EBCA87
 """Step of the object seed between the episodes of one process; every evaluation episode is the first of its process."""
-_ENV_STEP = 0x85EBCA77
-"""Step of the object generator between the worlds of the original simulator."""
+_FIRST_WORLD = 0x85EBCA77
+"""What the original's first world adds to the key of an object's generator."""
 _LIGHT_KEY = 0x1A2B3C4D
 """Separates the light's generator from all others."""
 
@@ -37,17 +37,17 @@ def object_seed(episode_seed: int) -> int:
     return (int(episode_seed) ^ _EPISODE_STEP) & _U64
 
 
-def object_rng(object_seed: int, record_name: str, env_index: int = 0) -> np.random.Generator:
+def object_rng(object_seed: int, record_name: str) -> np.random.Generator:
     """Generator of one object.
+
+    The original evaluates one world per process, so an episode here is drawn as in the original's first world,
+    whichever world of the batch runs it.
 
     Args:
         object_seed: Master seed of the episode's objects.
         record_name: The object's name in the original's records, e.g. `football`.
-        env_index: World index in the original's simulator. The original evaluates one world a process, so an
-            episode here always uses 0, whichever world of the batch runs it.
     """
-    key = int(object_seed) ^ zlib.crc32(record_name.encode()) ^ ((env_index + 1) * _ENV_STEP)
-    return np.random.default_rng(key & _U64)
+    return np.random.default_rng((int(object_seed) ^ zlib.crc32(record_name.encode()) ^ _FIRST_WORLD) & _U64)
 
 
 def light_rng(episode_seed: int) -> random.Random:

@@ -1,7 +1,8 @@
 """Oriented boxes carried by bodies, and slacks: signed distances [m] of a point to a box's faces, negative outside.
 
-Boxes come from the stage's markers, in the frame of the body that carries them. The functions here and the verdicts
-built from slacks are shared by all success predicates.
+Boxes come from the stage's markers, in the frame of the body that carries them. All success conditions use the
+functions here. Searches such as "the nearest of some boxes" are functions and not loops of a kernel: in the backward
+pass Warp does not run a kernel's loops again, but it does call functions again.
 """
 
 from collections.abc import Iterable

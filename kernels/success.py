@@ -1,9 +1,9 @@
 """Success predicates of the seven tasks in both rule sets, each with a signed continuous margin.
 
-A margin is the smallest slack [m] of the conditions of one instant: at least 0 exactly when all hold. Conditions that
-are no lengths enter by a length that the docstring of their launch names. Margins are differentiable almost everywhere.
+A margin is the smallest slack [m] of the conditions of one instant: at least 0 exactly when all hold. Conditions other
+than lengths enter by a length that the docstring of their launch names. Margins are differentiable almost everywhere.
 Success is the margin's sign, or, where a rule asks for several ticks in a row, a counter of ticks with margin >= 0.
-A minimum may drop a NaN: `reset.launch_nonfinite` tells broken worlds, whose verdict means nothing.
+A minimum may drop a NaN: `reset.launch_nonfinite` flags broken worlds, whose verdict is meaningless.
 """
 
 from arena_newton.kernels.boxes import Boxes

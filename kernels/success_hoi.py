@@ -47,7 +47,7 @@ def football_kernel(
     margin: wp.array[float],
     event: wp.array[int],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     p = load_vec3(xpos, w, ball)
     q = box_rotation(xquat, goal_body, goal_quat, w, 0)
@@ -122,7 +122,7 @@ def double_desk_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     p = load_vec3(xipos, w, hammer)
     q = box_rotation(xquat, box_body, box_quat, w, 0)
@@ -225,7 +225,7 @@ def best_deck(
     world: int,
     height_tolerance: float,
 ) -> int:
-    """The deck with the largest slack. A function of its own: backward, a kernel does not run its loops anew."""
+    """The deck with the largest slack."""
     best = int(0)
     best_slack = float(-FAR)
     for d in range(deck_body.shape[0]):
@@ -260,7 +260,7 @@ def pp_box_paper_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     p = box_centre(xpos, xquat, box_body, box_pos, w, 0)
     bottom = p[2] - world_half(box_rotation(xquat, box_body, box_quat, w, 0), box_half[0])[2]
@@ -349,7 +349,7 @@ def pp_box_released_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     p = box_centre(xpos, xquat, box_body, box_pos, w, 0)
     half = box_half[0]
@@ -381,7 +381,7 @@ def launch_pp_box_released(
         box: One box, the one to move; half its xy extents shrink the span, half its z is taken off its centre's height.
         decks: The shelf's decks.
         deck: Which of them is the target.
-        plane_below: How far the target plane lies below that deck's upper face [m].
+        plane_below: How far the target plane is below that deck's upper face [m].
         height_tolerance: Largest distance to the plane [m], 0.06.
         success: Output, int32, shape [worlds].
         margin: Output [m], shape [worlds].

@@ -44,7 +44,7 @@ def open_door_paper_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     p = wp.vec3(qpos[w, root], qpos[w, root + 1], qpos[w, root + 2])
     q = box_rotation(xquat, door_body, door_quat, w, 0)
@@ -117,7 +117,7 @@ def open_door_released_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     m = -min_angle
     if latched[w] == 0:
@@ -176,7 +176,7 @@ def sit_sofa_paper_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     m = wp.min(max_root_z - qpos[w, root + 2], (seat_force[w] - min_force) / stiffness)
     count = count_up(m, counter[w])
@@ -259,7 +259,7 @@ def most_pressing(
     min_force: float,
     stiffness: float,
 ) -> int:
-    """The body with the largest pressing slack. A function: backward, a kernel does not run its loops anew."""
+    """The body with the largest pressing slack."""
     best = bodies[0]
     best_slack = float(-FAR)
     for k in range(bodies.shape[0]):
@@ -318,7 +318,7 @@ def sit_sofa_released_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     c = box_centre(xpos, xquat, seat_body, seat_pos, w, 0)
     h = world_half(box_rotation(xquat, seat_body, seat_quat, w, 0), seat_half[0])
@@ -395,7 +395,7 @@ def nearest_fist(
     palm_offset: wp.array[wp.vec3],
     world: int,
 ) -> int:
-    """The palm nearest to a point. A function of its own: backward, a kernel does not run its loops anew."""
+    """The palm nearest to a point."""
     best = int(0)
     best_distance = float(FAR)
     for k in range(palm_body.shape[0]):
@@ -421,7 +421,7 @@ def boxing_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     centre = box_centre(xpos, xquat, target_body, target_pos, w, 0)
     h = target_half[0]
@@ -495,7 +495,7 @@ def worst_foot(
     round_zone: int,
     world: int,
 ) -> int:
-    """The foot with the smallest slack. A function of its own: backward, a kernel does not run its loops anew."""
+    """The foot with the smallest slack."""
     worst = int(0)
     worst_slack = float(FAR)
     for k in range(feet.shape[0]):
@@ -523,7 +523,7 @@ def vis_navi_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     q = box_rotation(xquat, zone_body, zone_quat, w, 0)
     c = box_centre(xpos, xquat, zone_body, zone_pos, w, 0)

@@ -22,11 +22,11 @@ from arena_newton.quiet import quiet_warp
 if TYPE_CHECKING:
     from arena_newton.scene import Scene
 
-__all__ = ["Compiled", "Told", "compiled", "compiled_changes", "lost_contacts", "own_compiled", "release"]
+__all__ = ["Compiled", "Reported", "compiled", "compiled_changes", "lost_contacts", "own_compiled", "release"]
 
 _ROBOT = "/World/Robot"
 _GROUND = "Ground"
-"""Name of the collider that every scene's robot stands on."""
+"""Name of the collider under every scene's robot."""
 _CLOSE = 1e-4
 """Relative difference of numbers that are the same."""
 _MOST_OF_A_THING = 4
@@ -59,7 +59,7 @@ _BODY = {
     "centre of mass": ("body_ipos", ("physics:centerOfMass",)),
     "gravity compensation": ("body_gravcomp", ("gravcomp",)),
 }
-"""Field of the model, and words of a sentence that tells of it already."""
+"""Field of the model, and words by which a sentence already mentions it."""
 _SIZE = (
     "radius",
     "size",
@@ -116,8 +116,8 @@ Facts = dict[str, dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class Told:
-    """What is said already, so that the cause of a change and its effect are not told twice."""
+class Reported:
+    """What is already reported, so that the cause of a change and its effect are not reported twice."""
 
     sentences: tuple[str, ...] = ()
 
@@ -146,13 +146,13 @@ class Compiled:
     joints: Facts
     geoms: Facts
     meets: frozenset[tuple[str, str]]
-    """Pairs of geoms, by prim path in order, that MuJoCo looks for contacts of."""
+    """Pairs of geoms, by prim path in order, that MuJoCo tests for contacts."""
     colliders: frozenset[str]
     """Prims of the stage that are made to collide, whether or not they do."""
 
 
 def compiled(path: str | Path, variant: str | None = None) -> Compiled:
-    """Build a scene on the CPU and read off what counts.
+    """Build a scene on the CPU and collect its facts.
 
     Args:
         path: A layer that passes `validate`, or a task.
@@ -164,7 +164,7 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
     from arena_newton.scene import load_scene
 
     quiet_warp()
-    # What the importer remarks is said again when the scene is built to be run.
+    # The importer repeats its remarks when the scene is built to be run.
     with (
         warnings.catch_warnings(),
         contextlib.redirect_stdout(io.StringIO()),
@@ -202,15 +202,15 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
 
 
 def release() -> None:
-    """Let go of the stages that were built: the importer leaves cycles that hold them.
+    """Release the stages that were built: the importer leaves reference cycles that hold them.
 
-    USD would otherwise go on with the layers as they were when the files change.
+    USD would otherwise keep using the old layers after the files change.
     """
     gc.collect()
 
 
 def own_compiled(task: str, variant: str | None) -> Compiled:
-    """The same of a task's own scene, which a process reads once."""
+    """The facts of a task's own scene, read once per process."""
     return _kept(tasks.get(task).layer, variant)
 
 
@@ -271,19 +271,19 @@ def _meets(scene: Scene) -> frozenset[tuple[str, str]]:
     return frozenset(found)
 
 
-def compiled_changes(theirs: Compiled, ours: Compiled, told: Told, needed: Iterable[str] = ()) -> Iterator[str]:
-    """What is different in the compiled model and is not told already.
+def compiled_changes(theirs: Compiled, ours: Compiled, reported: Reported, needed: Iterable[str] = ()) -> Iterator[str]:
+    """What is different in the compiled model and is not reported already.
 
     Args:
         theirs: A variant.
         ours: Its task's own scene, in the same variant of `semantics`.
-        told: Sentences about the variant's layer.
+        reported: Sentences about the variant's layer.
         needed: Prims that the task needs, which are called rule objects.
 
     Yields:
         Sentences such as `rule object: /World/Ball/Collider: friction is (0, 0, 0), not (1, 0.005, 0.0001)`.
     """
-    if not _same(theirs.gravity, ours.gravity) and not told.gravity():
+    if not _same(theirs.gravity, ours.gravity) and not reported.gravity():
         yield f"gravity: is {_shown(theirs.gravity)} m/s², not {_shown(ours.gravity)} m/s²"
     yield from _contact_changes(theirs, ours)
     for name, old in ours.options.items():
@@ -299,13 +299,13 @@ def compiled_changes(theirs: Compiled, ours: Compiled, told: Told, needed: Itera
         grouped: dict[tuple[str, str, str], list[tuple[str, str]]] = {}
         for path, old in our.items():
             if path not in their:
-                if not told.gone(path) and not told.about(path, ("collisionEnabled", "Enabled is")):
+                if not reported.gone(path) and not reported.about(path, ("collisionEnabled", "Enabled is")):
                     text = f"no longer one of the {noun} of the model"
                     grouped.setdefault((_kind(path, roots), _top(path), text), []).append((path, "part in the model"))
                 continue
             new = their[path]
             for name in dict.fromkeys((*old, *new)):
-                if _same(new.get(name), old.get(name)) or told.about(path, words.get(name, (name,))):
+                if _same(new.get(name), old.get(name)) or reported.about(path, words.get(name, (name,))):
                     continue
                 text = f"{name} is {_shown(new.get(name))}, not {_shown(old.get(name))}"
                 grouped.setdefault((_kind(path, roots), _top(path), text), []).append((path, name))
@@ -321,12 +321,12 @@ def _grouped(changes: dict[tuple[str, str, str], list[tuple[str, str]]], noun: s
         things.setdefault((kind, top), {}).setdefault(paths, []).append(text)
         for path, name in found:
             names.setdefault((kind, top), {}).setdefault(name, set()).add(path)
-    for (kind, top), told in things.items():
-        if len(told) > _MOST_OF_A_THING:
+    for (kind, top), reported in things.items():
+        if len(reported) > _MOST_OF_A_THING:
             shown = (f"{name} of {len(paths)}" for name, paths in names[kind, top].items())
             yield f"{kind}: {top}: {noun} differ: {', '.join(shown)}"
             continue
-        for paths, texts in told.items():
+        for paths, texts in reported.items():
             what = paths[0] if len(paths) == 1 else f"{top} ({len(paths)} {noun})"
             yield f"{kind}: {what}: {', '.join(texts)}"
 

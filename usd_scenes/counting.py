@@ -12,17 +12,17 @@ __all__ = ["Arc", "Contents", "count_prims"]
 
 @dataclass(eq=False)
 class Arc:
-    """One place where a layer names another, or a prim of its own."""
+    """One reference of a layer to another, or a prim of its own."""
 
     prim: str
-    """Where it stands: a prim or property, empty for the whole layer."""
+    """Where it is written: a prim or property, empty for the whole layer."""
     asset: str
     """The asset path as written; empty for the layer itself."""
     target: str = ""
     """The prim that is named; empty for the default prim."""
     of_class: bool = False
     """An inherit or a specialize, which also reaches the class of that name in every layer above."""
-    place: Any = None
+    location: Any = None
     """What the asset path leads to."""
 
 
@@ -51,8 +51,8 @@ def count_prims(graph: Mapping[Any, Contents], start: Any) -> tuple[str, str] | 
     and every variant counts.
 
     Args:
-        graph: Contents of every layer by its place.
-        start: Place of the layer that is opened.
+        graph: Contents of every layer by its location.
+        start: Location of the layer that is opened.
     """
     try:
         _Counting(graph).total(start, "", 0)
@@ -70,22 +70,22 @@ class _Counting:
         self._arcs: dict[Any, dict[str, list[Arc]]] = {}
         self._totals: dict[tuple[Any, str], int] = {}
 
-    def total(self, place: Any, prim: str, depth: int) -> int:
+    def total(self, location: Any, prim: str, depth: int) -> int:
         """Prims at and below a prim of a layer and its sublayers, with all that they refer to."""
-        key = (place, prim)
+        key = (location, prim)
         if key in self._totals:
             return self._totals[key]
         # USD names a cycle and cuts it; here it ends with nothing.
         self._totals[key] = 0
         count = 0
-        for layer in self._stack(place):
+        for layer in self._stack(location):
             below, arcs = self._tables(layer)
             for path, times in below.get(prim, {}).items():
                 count += times
                 for arc in arcs.get(path, ()):
                     if depth >= limits.ARC_DEPTH:
                         raise _TooMany(path, f"references lead over more than {limits.ARC_DEPTH} prims")
-                    count += self._target(arc, place, depth + 1)
+                    count += self._target(arc, location, depth + 1)
                     if count > limits.PRIMS:
                         break
                 if count > limits.PRIMS:
@@ -94,26 +94,26 @@ class _Counting:
         self._totals[key] = count
         return count
 
-    def _target(self, arc: Arc, place: Any, depth: int) -> int:
+    def _target(self, arc: Arc, location: Any, depth: int) -> int:
         if arc.of_class:
             # A class also takes what layers above say about the prim of that name.
             return sum(self.total(layer, arc.target, depth) for layer in self._graph)
         if not arc.asset:
-            return self.total(place, arc.target or self._default(place), depth)
-        if arc.place not in self._graph:
+            return self.total(location, arc.target or self._default(location), depth)
+        if arc.location not in self._graph:
             return 0
-        return self.total(arc.place, arc.target or self._default(arc.place), depth)
+        return self.total(arc.location, arc.target or self._default(arc.location), depth)
 
-    def _default(self, place: Any) -> str:
+    def _default(self, location: Any) -> str:
         """Path of the default prim; a layer without one is counted as a whole."""
-        name = next((self._graph[layer].default_prim for layer in self._stack(place)), "")
+        name = next((self._graph[layer].default_prim for layer in self._stack(location)), "")
         return f"/{name.lstrip('/')}" if name else ""
 
-    def _stack(self, place: Any) -> list[Any]:
+    def _stack(self, location: Any) -> list[Any]:
         """A layer and its sublayers, each as often as USD would take it."""
-        if place not in self._stacks:
+        if location not in self._stacks:
             stack: list[Any] = []
-            waiting: list[tuple[Any, tuple[Any, ...]]] = [(place, ())]
+            waiting: list[tuple[Any, tuple[Any, ...]]] = [(location, ())]
             while waiting:
                 layer, above = waiting.pop()
                 if layer in above or layer not in self._graph:
@@ -121,9 +121,9 @@ class _Counting:
                 stack.append(layer)
                 if len(stack) > limits.LAYERS:
                     raise _TooMany("", f"its sublayers lead to more than {limits.LAYERS} layers")
-                waiting += [(arc.place, (*above, layer)) for arc in reversed(self._graph[layer].sublayers)]
-            self._stacks[place] = stack
-        return self._stacks[place]
+                waiting += [(arc.location, (*above, layer)) for arc in reversed(self._graph[layer].sublayers)]
+            self._stacks[location] = stack
+        return self._stacks[location]
 
     def _tables(self, layer: Any) -> tuple[dict[str, dict[str, int]], dict[str, list[Arc]]]:
         """Prims at and below each prim (the empty path for all) with how often they stand, and the arcs of each."""

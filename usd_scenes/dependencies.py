@@ -1,7 +1,7 @@
 """Follow everything that a USD layer names, file by file, before anything is composed.
 
-USD opens what a layer names while it composes, a named pipe included, and composes on when that fails. The search looks
-at every path first: only regular files of the right kind are opened, none larger than `limits` says, and the prims that
+USD opens what a layer names while it composes, a named pipe included, and composes on when that fails. So every path is
+checked first: only regular files of the right kind are opened, none larger than `limits` says, and the prims that
 references would make are counted.
 """
 
@@ -28,7 +28,7 @@ __all__ = [
     "IMAGES",
     "LAYERS",
     "PACKAGE",
-    "Place",
+    "Location",
     "Problem",
     "Dependencies",
     "check_files",
@@ -46,7 +46,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
 PACKAGE = "arena_newton/usd_scenes/"
 """What an asset path begins with that names a scene of this package, wherever the naming file lies."""
 _ROOT = Path(arena_newton.__file__).resolve().parent.parent
-"""Folder in which `PACKAGE` is looked up: the checkout, or an installation's `site-packages`."""
+"""Folder in which `PACKAGE` is searched: the checkout, or an installation's `site-packages`."""
 _CRATE = b"PXR-USDC"
 _FORMATS = ("PNG", "JPEG", "BMP", "TGA")
 _SHADER = ("inputs:", "outputs:")
@@ -80,7 +80,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Place:
+class Location:
     """A layer or image: a file, or an entry of a .usdz package."""
 
     file: Path
@@ -109,8 +109,8 @@ class Dependencies:
 def layers(path: str | Path) -> list[Path]:
     """Every local file that a scene consists of: its layers and the images they name, the layer at `path` first.
 
-    These are the files that `validate` followed, and a stage without problems is composed from no others, so whoever
-    hashes a scene hashes exactly these. Paths are absolute; a .usdz package is one file.
+    These are the files that `validate` followed, and a stage without problems is composed from no others, so the
+    hash of a scene must cover exactly these. Paths are absolute; a .usdz package is one file.
 
     Raises:
         InputError: A file that the scene needs is missing, no regular file or unreadable, or a number is not finite.
@@ -121,7 +121,7 @@ def layers(path: str | Path) -> list[Path]:
 
 
 def check_files(path: str | Path) -> None:
-    """Raise if any file that the layer at `path` needs is missing or unreadable; prims are not looked at.
+    """Raise if any file that the layer at `path` needs is missing or unreadable; prims are not checked.
 
     Raises:
         InputError: One line that names the file and its first fault.
@@ -137,28 +137,28 @@ def _raise_fatal(found: Dependencies) -> None:
 def collect(path: Path) -> Dependencies:
     """Follow sublayers, references, payloads and asset values through the files, without composing anything."""
     found = Dependencies()
-    start = Place(Path(os.path.abspath(path)))
+    start = Location(Path(os.path.abspath(path)))
     message = _file_fault(start.file) or _suffix_fault(str(path), LAYERS)
     if message:
         found.problems.append(Problem(str(path), "", message))
         found.fatal = True
         return found
     queue, seen = [start], {start}
-    graph: dict[Place, Contents] = {}
+    graph: dict[Location, Contents] = {}
     while queue:
-        place = named_as = queue.pop(0)
-        shown = str(path) if place == start else str(place)
-        if place.file not in found.files:
-            found.files.append(place.file)
+        location = named_as = queue.pop(0)
+        shown = str(path) if location == start else str(location)
+        if location.file not in found.files:
+            found.files.append(location.file)
         try:
             if len(seen) > limits.LAYERS:
                 raise _Unreadable(f"the scene consists of more than {limits.LAYERS} files")
-            if place.file.suffix.lower() == ".usdz" and not place.entry:
-                place = Place(place.file, _entries(place.file)[0])
-            if str(place).rstrip("]").lower().endswith(IMAGES):
-                found.pixels += _read_image(place, limits.SCENE_PIXELS - found.pixels)
+            if location.file.suffix.lower() == ".usdz" and not location.entry:
+                location = Location(location.file, _entries(location.file)[0])
+            if str(location).rstrip("]").lower().endswith(IMAGES):
+                found.pixels += _read_image(location, limits.SCENE_PIXELS - found.pixels)
                 continue
-            contents = _read_layer(place, shown, found, built_on=shown != str(path))
+            contents = _read_layer(location, shown, found, built_on=shown != str(path))
         except _Unreadable as error:
             found.problems.append(Problem(shown, "", str(error)))
             found.fatal = True
@@ -169,12 +169,12 @@ def collect(path: Path) -> Dependencies:
         for named in (*contents.arcs, *contents.sublayers, *contents.images):
             if not named.asset:
                 continue
-            target = _locate(named.asset, place, IMAGES if named in contents.images else LAYERS)
+            target = _locate(named.asset, location, IMAGES if named in contents.images else LAYERS)
             if isinstance(target, str):
                 found.problems.append(Problem(shown, named.prim, target))
                 found.fatal = True
                 continue
-            named.place = target
+            named.location = target
             if target not in seen:
                 seen.add(target)
                 queue.append(target)
@@ -191,37 +191,37 @@ def search_context() -> Ar.DefaultResolverContext:
     return Ar.DefaultResolverContext([str(_ROOT)])
 
 
-def _read_layer(place: Place, shown: str, found: Dependencies, *, built_on: bool) -> Contents:
+def _read_layer(location: Location, shown: str, found: Dependencies, *, built_on: bool) -> Contents:
     """What a layer names; faults of its units and numbers go to `found`."""
-    _check_layer(place)
+    _check_layer(location)
     try:
-        layer = Sdf.Layer.FindOrOpen(str(place))
+        layer = Sdf.Layer.FindOrOpen(str(location))
         if layer is None:
             raise _Unreadable("not a readable USD layer")
         if built_on:
             found.problems += _units(layer, shown)
         contents, faults = _contents(layer)
     except (Tf.ErrorException, UnicodeDecodeError, RuntimeError, MemoryError) as error:
-        raise _Unreadable(f"not a readable USD layer: {_plain(reason(error), place)}") from None
+        raise _Unreadable(f"not a readable USD layer: {_plain(reason(error), location)}") from None
     if faults:
         found.problems += [Problem(shown, where, message) for where, message in faults]
         found.fatal = True
     return contents
 
 
-def _plain(text: str, place: Place) -> str:
-    return text.replace(f"<{place}>", place.file.name).replace(str(place), place.file.name)
+def _plain(text: str, location: Location) -> str:
+    return text.replace(f"<{location}>", location.file.name).replace(str(location), location.file.name)
 
 
-def _check_layer(place: Place) -> None:
+def _check_layer(location: Location) -> None:
     """Refuse what USD would take too much memory or time to read."""
-    data = _read(place, max(limits.TEXT_BYTES, limits.CRATE_BYTES))
+    data = _read(location, max(limits.TEXT_BYTES, limits.CRATE_BYTES))
     if data.startswith(_CRATE):
         if len(data) > limits.CRATE_BYTES:
             raise _Unreadable(_too_large(len(data), limits.CRATE_BYTES))
-        fault = _crate_fault(place)
+        fault = _crate_fault(location)
         if fault:
-            raise _Unreadable(f"not a readable USD layer: {_plain(reason(ValueError(fault)), place)}")
+            raise _Unreadable(f"not a readable USD layer: {_plain(reason(ValueError(fault)), location)}")
         return
     if len(data) > limits.TEXT_BYTES:
         raise _Unreadable(_too_large(len(data), limits.TEXT_BYTES))
@@ -243,47 +243,47 @@ _CRATE_FAULTS: dict[tuple[str, int, int, int], str | None] = {}
 """What was found in binary layers, by name, file, size and time: a scene is walked more than once."""
 
 
-def _known_as(place: Place) -> tuple[str, int, int, int]:
-    about = os.stat(place.file)
-    return str(place), about.st_ino, about.st_size, about.st_mtime_ns
+def _known_as(location: Location) -> tuple[str, int, int, int]:
+    about = os.stat(location.file)
+    return str(location), about.st_ino, about.st_size, about.st_mtime_ns
 
 
-def _crate_fault(place: Place) -> str | None:
-    key = _known_as(place)
+def _crate_fault(location: Location) -> str | None:
+    key = _known_as(location)
     if key not in _CRATE_FAULTS:
-        _probe([place])
+        _probe([location])
     return _CRATE_FAULTS[key]
 
 
-def _probe(places: list[Place]) -> None:
-    names = [str(place) for place in places]
+def _probe(locations: list[Location]) -> None:
+    names = [str(location) for location in locations]
     faults = probe.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
-    _CRATE_FAULTS.update({_known_as(place): fault for place, fault in zip(places, faults, strict=True)})
+    _CRATE_FAULTS.update({_known_as(location): fault for location, fault in zip(locations, faults, strict=True)})
 
 
 def probe_layers(paths: Sequence[Path]) -> None:
     """Open many binary layers in one process of their own at once; a search through each then asks no more."""
-    _probe([Place(Path(os.path.abspath(path))) for path in paths])
+    _probe([Location(Path(os.path.abspath(path))) for path in paths])
 
 
-def _read(place: Place, most: int) -> bytes | bytearray:
+def _read(location: Location, most: int) -> bytes | bytearray:
     """The bytes of a file or of a package's entry."""
-    if place.entry:
-        package = _open_package(place.file)
-        size = package.GetFileInfo(place.entry).size
+    if location.entry:
+        package = _open_package(location.file)
+        size = package.GetFileInfo(location.entry).size
     else:
-        size = os.stat(place.file).st_size
+        size = os.stat(location.file).st_size
     if size > most:
         raise _Unreadable(_too_large(size, most))
     try:
-        return package.GetFile(place.entry) if place.entry else place.file.read_bytes()
+        return package.GetFile(location.entry) if location.entry else location.file.read_bytes()
     except OSError as error:
         raise _Unreadable(f"cannot be read ({error.strerror})") from None
 
 
-def _read_image(place: Place, pixels: int) -> int:
+def _read_image(location: Location, pixels: int) -> int:
     """Read an image of at most so many pixels, and count them."""
-    data = _read(place, limits.IMAGE_BYTES)
+    data = _read(location, limits.IMAGE_BYTES)
     try:
         with warnings.catch_warnings():
             # Pillow warns of large images; here they are refused by name.
@@ -327,8 +327,8 @@ def _entries(package: Path) -> list[str]:
     return list(_open_package(package).GetFileNames())
 
 
-def _locate(asset: str, at: Place, kinds: tuple[str, ...]) -> Place | str:
-    """The place that an asset path means, or what is wrong with it."""
+def _locate(asset: str, at: Location, kinds: tuple[str, ...]) -> Location | str:
+    """The location that an asset path means, or what is wrong with it."""
     if asset.startswith("`"):
         return f"asset path expression @{asset}@: expected a plain relative path"
     if asset.startswith(("/", "\\")) or _DRIVE.match(asset):
@@ -339,17 +339,17 @@ def _locate(asset: str, at: Place, kinds: tuple[str, ...]) -> Place | str:
     outer, entry = packaged.groups() if packaged else (asset, "")
     unfit = _suffix_fault(f"asset @{asset}@", kinds, ending=entry or outer)
     if at.entry:
-        # USD looks beside the naming entry first, then at the top of the package.
+        # USD searches next to the naming entry first, then at the top of the package.
         names = _entries(at.file)
         choices = (posixpath.normpath(posixpath.join(posixpath.dirname(at.entry), asset)), posixpath.normpath(asset))
         inside = next((name for name in choices if name in names), None)
         if inside is None or inside.lower().endswith(".usdz"):
             return f"asset @{asset}@ does not exist: expected it in {at.file}"
-        return unfit or Place(at.file, inside)
+        return unfit or Location(at.file, inside)
     target = Path(os.path.abspath(at.file.parent / outer))
     message = _file_fault(target)
     if message == "no such file" and outer.startswith(PACKAGE) and ".." not in outer.split("/"):
-        # As USD does it with `search_context`: beside the naming file first, then among the package's own scenes.
+        # As USD does it with `search_context`: next to the naming file first, then among the package's own scenes.
         target = Path(os.path.abspath(_ROOT / outer))
         message = _file_fault(target)
     if message:
@@ -363,7 +363,7 @@ def _locate(asset: str, at: Place, kinds: tuple[str, ...]) -> Place | str:
                 return f"asset @{asset}@ does not exist: expected {entry} in {target}"
         except _Unreadable as error:
             return f"asset @{asset}@: {error}"
-    return Place(target, entry)
+    return Location(target, entry)
 
 
 def _file_fault(path: Path) -> str | None:
@@ -441,7 +441,7 @@ def _contents(layer: Sdf.Layer) -> tuple[Contents, list[tuple[str, str]]]:
 
 
 def _names_file(spec: Sdf.AttributeSpec) -> bool:
-    """Whether text stands where a shader looks for a texture; the importer would open it, URLs too, unchecked."""
+    """Whether a string is used where a shader expects a texture; the importer would open it, URLs too, unchecked."""
     if str(spec.typeName).removesuffix("[]") not in ("string", "token") or not spec.name.startswith(_SHADER):
         return False
     value = spec.default
@@ -484,7 +484,7 @@ def _units(layer: Sdf.Layer, shown: str) -> Iterator[Problem]:
 
 
 def reason(error: Exception) -> str:
-    """What USD complains about, on one printable line, without the place in USD's own source."""
+    """What USD complains about, on one printable line, without the line of USD's own source."""
     try:
         text = str(error)
     except UnicodeDecodeError as bytes_error:

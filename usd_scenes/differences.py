@@ -11,23 +11,23 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.usd_scenes.compiled import Told, compiled, compiled_changes, own_compiled, release
+from arena_newton.usd_scenes.compiled import Reported, compiled, compiled_changes, own_compiled, release
 from arena_newton.usd_scenes.shapes import open_stage
 
 __all__ = ["differences"]
 
 _ROBOT = "/World/Robot"
 _MOST = 40
-"""Sentences that are told; a scene with more is another scene."""
+"""Most sentences that are reported; a scene with more changes is a different scene."""
 _PHYSICAL = ("physics:", "mjc:", "newton:", "arena:", "drive:", "limit:", "physx")
 """Attributes of these namespaces move, weigh or judge."""
 _SHAPE = ("size", "radius", "height", "width", "length", "axis", "points", "faceVertexIndices")
 _LENS = ("focalLength", "horizontalAperture", "verticalAperture", "projection", "clippingRange")
 _SKIPPED = ("arena:resolution",)
 _TARGETS = ("physics:", "collection:colliders:")
-"""Relationships of these namespaces count as well; those of a joint's bodies are told by their short names."""
+"""Relationships of these namespaces count as well; those of a joint's bodies are reported under their short names."""
 _FIRST = ("scene:", "gravity:", "collisions:")
-"""Sentences that stand first, since they concern everything."""
+"""Beginnings of the sentences that come first, since they concern everything."""
 _CLOSE = 1e-6
 """Relative difference of numbers that are the same."""
 
@@ -46,8 +46,8 @@ def differences(path: str | Path, task: str) -> list[str]:
     """What a layer changes of a task's gravity, collisions, robot, rules, joints, surfaces, masses and colliders.
 
     The layers are compared attribute by attribute, and so are the MuJoCo models that they are compiled to: what changes
-    by other ways (a scaled parent, a collision group, another surface bound) shows there. Looks, lights and the world
-    camera are free; nothing is said about them.
+    in other ways (a scaled parent, a collision group, another surface bound) shows there. Looks, lights and the world
+    camera may change freely and are not reported.
 
     Args:
         path: A layer that passes `validate`.
@@ -64,10 +64,10 @@ def differences(path: str | Path, task: str) -> list[str]:
     theirs, ours = open_stage(path), open_stage(built_in, checked=False)
     if Path(path).resolve() == built_in.resolve():
         return []
-    told: dict[str, None] = {}
+    reported: dict[str, None] = {}
     own = _selection(theirs)
     if own and own != _selection(ours):
-        told[f"scene: selects the variant {own} by itself"] = None
+        reported[f"scene: selects the variant {own} by itself"] = None
         _select(ours, own)
     needed = [item.path for item in tasks.get(task).requires]
     for variant in ("base", "semantic"):
@@ -81,18 +81,18 @@ def differences(path: str | Path, task: str) -> list[str]:
         note = "" if variant == "base" else f" (variant {variant})"
         models = compiled(path, selected[0]), own_compiled(task, selected[1])
         sentences = _authored(_parts(theirs), _parts(ours), models[0].gravity == models[1].gravity)
-        for sentence in (*sentences, *compiled_changes(*models, Told(tuple(sentences)), needed)):
-            if sentence not in told:
-                told[sentence + note] = None
+        for sentence in (*sentences, *compiled_changes(*models, Reported(tuple(sentences)), needed)):
+            if sentence not in reported:
+                reported[sentence + note] = None
     release()
-    sentences = sorted(told, key=lambda text: not text.startswith(_FIRST))
+    sentences = sorted(reported, key=lambda text: not text.startswith(_FIRST))
     if len(sentences) > _MOST:
         return [*sentences[: _MOST - 1], f"and {len(sentences) - _MOST + 1} more changes"]
     return sentences
 
 
 def _authored(theirs: dict[str, _Part], ours: dict[str, _Part], same_gravity: bool) -> list[str]:
-    """What the layers say differently; what a PhysicsScene says has no effect where another one counts."""
+    """Differences between the layers; a PhysicsScene has no effect where another one is used."""
     sentences = []
     stays = "; gravity stays" if same_gravity else ""
     for sentence in _compared(theirs, ours):
@@ -200,9 +200,9 @@ def _compared(theirs: dict[str, _Part], ours: dict[str, _Part]) -> Iterator[str]
             _change(name, theirs[path].values.get(name), part.values.get(name))
             for name in (*part.values, *(name for name in theirs[path].values if name not in part.values))
         ]
-        told = [text for text in changed if text]
-        if told:
-            yield f"{part.kind}: {path}: {', '.join(told)}{_unscaled(theirs[path].values, part.values)}"
+        reported = [text for text in changed if text]
+        if reported:
+            yield f"{part.kind}: {path}: {', '.join(reported)}{_unscaled(theirs[path].values, part.values)}"
     for path, part in theirs.items():
         if path not in ours:
             what = "a new collision group" if part.kind == "collisions" else "new"

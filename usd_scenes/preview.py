@@ -101,7 +101,7 @@ def _variant(target: str, mode: str) -> str:
 
 
 def _selected(target: str) -> str | None:
-    """The variant that a scene selects by itself, None if it has none."""
+    """The variant that a scene selects by itself; None without one."""
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
     return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None

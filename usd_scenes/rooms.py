@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
+from arena_newton.errors import InputError
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
 
-__all__ = ["SEMANTICS", "bench", "bind_in", "contact", "edit", "floor", "task_stage", "variant_layer", "workshop"]
+__all__ = ["SEMANTICS", "bench", "bind_in", "contact", "edit", "floor", "save", "task_stage", "workshop"]
 
 SEMANTICS = "semantics"
 """Name of the variant set on `/World` that holds the changed looks."""
@@ -47,8 +48,17 @@ def task_stage(path: Path, *, spawn: Vec, facing: Vec, eye: Vec, gaze: Vec, vari
 
 @contextmanager
 def edit(stage: Usd.Stage, variant: str) -> Iterator[None]:
-    """Author into one variant of `semantics`; the selection afterwards is the one before."""
+    """Author into one variant of `semantics`; the selection afterwards is the one before.
+
+    Whatever differs between variants is authored inside each of them: opinions outside a variant set are stronger.
+
+    Raises:
+        InputError: The stage has no such variant.
+    """
     choice = stage.GetDefaultPrim().GetVariantSets().GetVariantSet(SEMANTICS)
+    if variant not in choice.GetVariantNames():
+        known = ", ".join(choice.GetVariantNames())
+        raise InputError(f"{stage.GetRootLayer().identifier}: no variant {variant!r}, choose from {known}")
     selected = choice.GetVariantSelection()
     choice.SetVariantSelection(variant)
     with choice.GetVariantEditContext():
@@ -63,15 +73,33 @@ def bind_in(stage: Usd.Stage, variant: str, looks: dict[str, Usd.Prim]) -> None:
             author.bind(stage.OverridePrim(path), look)
 
 
+def save(stage: Usd.Stage, folder: Path) -> None:
+    """Write the scene and, next to it, `variants/<name>.usda` per further variant: the same scene with it selected.
+
+    Raises:
+        InputError: A variant is empty: its look was not authored.
+    """
+    layer = stage.GetRootLayer()
+    variants = layer.GetPrimAtPath("/World").variantSets[SEMANTICS].variants
+    for name, variant in variants.items():
+        if not (variant.primSpec.nameChildren or variant.primSpec.properties):
+            raise InputError(f"{layer.identifier}: variant {name} is empty; its look is authored with `rooms.edit`")
+    selected = stage.GetDefaultPrim().GetVariantSet(SEMANTICS).GetVariantSelection()
+    layer.Save()
+    for name in variants.keys():
+        if name != selected:
+            variant_layer(folder / "variants" / f"{name}.usda", name)
+
+
 def variant_layer(path: Path, variant: str) -> None:
-    """Write a layer that is the scene next door with another variant selected: the pattern for a user's own room."""
+    """Write a layer that is the scene of the folder above with another variant selected, as a user's own room does."""
     path.parent.mkdir(parents=True, exist_ok=True)
     layer = Sdf.Layer.FindOrOpen(str(path)) if path.exists() else Sdf.Layer.CreateNew(str(path))
     layer.Clear()
     layer.subLayerPaths.append("../scene.usda")
     layer.defaultPrim = "World"
     root = layer.pseudoRoot
-    # Stage metadata does not come through a sublayer, so that it is said again here.
+    # Stage metadata does not come through a sublayer and must be repeated.
     root.SetInfo("metersPerUnit", 1.0)
     root.SetInfo("kilogramsPerUnit", 1.0)
     root.SetInfo("upAxis", "Z")

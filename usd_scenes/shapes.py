@@ -35,11 +35,11 @@ _GRAVITY = 100.0
 
 
 def open_stage(path: str | Path, *, checked: bool = True) -> Usd.Stage:
-    """Open a stage that somebody else made, or the project's own.
+    """Open a stage of the project or a foreign one.
 
     Args:
         path: A USD layer.
-        checked: Walk through its files first; without it the file must be the project's own.
+        checked: Check its files first; only the project's own may do without.
 
     Raises:
         InputError: The stage cannot or must not be composed.
@@ -165,7 +165,7 @@ def _primvar_fault(mesh: Usd.Typed, points: int, corners: int, faces: int) -> st
 
 
 def shape_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
-    """Sizes, poses, lights, gravity and inertias that are none, as (prim path, message)."""
+    """Sizes, poses, lights, gravity and inertias that are impossible, as (prim path, message)."""
     poses = UsdGeom.XformCache()
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         faults: list[str | None] = []
@@ -218,7 +218,7 @@ def _pose_fault(prim: Usd.Prim, poses: object) -> str | None:
 
 
 def _flat_fault(prim: Usd.Prim) -> str | None:
-    """The hull of points that lie in a plane or on a line has no inside that could carry a contact."""
+    """The hull of points in a plane or on a line has no inside that could carry a contact."""
     points = np.asarray(UsdGeom.Mesh(prim).GetPointsAttr().Get() or (), dtype=np.float64)
     if len(points) < 4:
         return f"is a collision mesh of {len(points)} points, which is flat: expected a solid, as a thin Cube"
@@ -254,7 +254,7 @@ def _gravity_fault(prim: Usd.Prim) -> str | None:
 
 
 def _inertia_fault(prim: Usd.Prim) -> str | None:
-    """Inertia that no body of this mass can have; missing values are told elsewhere."""
+    """Inertia that no body of this mass can have; missing values are reported by `validate`."""
     api = UsdPhysics.MassAPI(prim)
     mass, inertia = api.GetMassAttr().Get(), api.GetDiagonalInertiaAttr().Get()
     if mass and mass > 0 and not _MASSES[0] <= mass <= _MASSES[1]:

@@ -1,4 +1,4 @@
-"""The first lines of a variant: a layer over a task's scene that may lie anywhere."""
+"""The first lines of a variant: a layer over a task's scene that may be stored anywhere."""
 
 import os
 from pathlib import Path
@@ -17,13 +17,13 @@ _TEXT = """#usda 1.0
     metersPerUnit = 1
     kilogramsPerUnit = 1
     upAxis = "Z"
-    # Looked up in the installed package, so this file may lie anywhere.
+    # Found in the installed package, so this file may be stored anywhere.
     subLayers = [@{scene}@]
 )
 
 over "World"
 {{
-    # Every attribute stands on a line of its own. What the task needs, and what rules read:
+    # Write every attribute on a line of its own. What the task needs, and what rules read:
 {prims}
     over "Light"
     {{

@@ -1,4 +1,4 @@
-"""Many simple solids in one textured mesh: the scenes stay rich to look at with few shapes to trace."""
+"""Many simple solids in one textured mesh: rich scenes with few shapes to trace."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What starts inside something else: one episode a mode is reset, and its first contacts are looked at."""
+"""What starts inside something else: the contacts at the reset of one episode per mode."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _inside(scene: Scene, draws: Any, spec: Any) -> dict[tuple[str, str], float]
         if contact.dist >= -limits.PENETRATION:
             continue
         names = [_name(scene, bodies, int(geom)) for geom in contact.geom]
-        # A robot's link before what it stands in, an object before what is fixed.
+        # A robot's link is named first, then an object, then what is fixed.
         first, second = sorted(names, key=lambda name: (name[1], name[0]))
         pair = (first[0], second[0])
         found[pair] = max(found.get(pair, 0.0), -float(contact.dist))

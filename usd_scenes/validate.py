@@ -53,7 +53,7 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
 
     Args:
         path: A USD layer.
-        task: Task name; by default the task whose folder the layer, or a layer it builds on, lies in.
+        task: Task name; by default the task whose folder the layer, or a layer it builds on, is stored in.
 
     Raises:
         InputError: `task` is no task.
@@ -83,7 +83,7 @@ def check(path: str | Path, task: str | None = None) -> None:
 
 
 def task_of(path: str | Path) -> str | None:
-    """The task whose folder the layer, or a layer it builds on, lies in; `None` if that is none or several."""
+    """The task whose folder the layer, or a layer it builds on, is stored in; `None` if there is not exactly one."""
     return _deduce(collect(Path(path)).files)
 
 
@@ -119,13 +119,13 @@ _COLLISION_WORDS = ("filter", "group", "colli", "contype", "conaffinity", "enabl
 def _contacts(stage: Usd.Stage, file: Path, found: Dependencies, task: str) -> Iterator[Problem]:
     """Needed things that no longer meet each other; built, since groups and filters have no simpler answer.
 
-    Only a layer that says something of collisions itself is built.
+    Only a layer that itself mentions collisions is built.
     """
     if not _speaks_of_collisions(stage, found):
         return
     choice = stage.GetPrimAtPath("/World").GetVariantSet("semantics")
     own = choice.GetVariantSelection() or None
-    told: set[tuple[str, str]] = set()
+    reported: set[tuple[str, str]] = set()
     for variant in dict.fromkeys((own, *sorted(choice.GetVariantNames()))):
         needed = [
             item.path
@@ -138,9 +138,9 @@ def _contacts(stage: Usd.Stage, file: Path, found: Dependencies, task: str) -> I
             yield Problem(str(file), "", str(error).removeprefix(f"{file}: "))
             break
         for prim, message in lost_contacts(*models, needed):
-            if (prim, message) not in told:
+            if (prim, message) not in reported:
                 yield Problem(str(file), prim, message + ("" if variant == own else f" (variant {variant})"))
-            told.add((prim, message))
+            reported.add((prim, message))
     release()
 
 
@@ -174,7 +174,7 @@ def _prims(stage: Usd.Stage, file: Path, task: str | None) -> Iterator[Problem]:
             if len(names) > 1:
                 choice.SetVariantSelection(name)
             for prim, message in _faults(stage, task, name):
-                # A fault of every variant is told once; a variant's own fault names the variant.
+                # A fault of every variant is reported once; a variant's own fault names the variant.
                 if (prim, message) not in seen:
                     yield Problem(str(file), prim, message + ("" if name == names[0] else f" (variant {name})"))
                 seen.add((prim, message))
@@ -217,7 +217,7 @@ def _composition(stage: Usd.Stage, file: Path) -> Iterator[Problem]:
 
 
 def _strangers(stage: Usd.Stage, file: Path, found: Dependencies) -> Iterator[Problem]:
-    """Layers that the stage uses and the search did not look at; there should be none."""
+    """Layers that the stage uses and the search did not check; there should be no such layer."""
     for layer in stage.GetUsedLayers():
         path = layer.realPath.split("[", 1)[0]
         if not layer.anonymous and not (path and Path(path) in found.files):
@@ -384,7 +384,7 @@ def _masses(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
             (api.GetPrincipalAxesAttr(), (axes.real, *axes.imaginary)),
         ):
             if not attribute.HasAuthoredValue():
-                yield path, f"{attribute.GetName()} is missing: expected an authored value beside the inertia"
+                yield path, f"{attribute.GetName()} is missing: expected an authored value next to the inertia"
             elif not all(map(math.isfinite, numbers)):
                 yield path, f"{attribute.GetName()} is not finite"
         if api.GetPrincipalAxesAttr().HasAuthoredValue() and abs(axes.GetLength() - 1) > 0.01:

@@ -1,37 +1,31 @@
-"""The grey warehouse room shared by several scenes, and the mesh shapes its furniture is made of.
+"""The grey warehouse room of several scenes, and the mesh shapes its furniture is made of.
 
 Lengths [m]. Room size: walls of the original near x = +0.55 and y = −6.5 (measured on its clips), the far walls
 near x = −7.2 and behind the camera.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.tasks.base import ROOM
-from arena_newton.usd_scenes import author, rooms
+from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
 
 __all__ = [
     "FLOOR_X",
     "FLOOR_Y",
-    "VARIANTS",
     "boxes",
     "room",
     "room_looks",
     "rounded_box",
-    "save",
-    "semantics",
     "surface",
 ]
 
 FLOOR_X, FLOOR_Y = zip(*ROOM, strict=True)
 """Extent of the room along x and y [m]."""
-VARIANTS = ("base", "semantic")
-"""Variants of these scenes; the first is selected."""
 _HEIGHT = 3.3
 _SKIRTING = 0.09
 
@@ -163,23 +157,3 @@ def room(stage: Usd.Stage, rough: Usd.Prim, *, tile: float = 2.0) -> None:
         ("StopNorth", (cx, y1, 0), (r, r, 0, 0)),
     ):
         _plane(stage, f"/World/Room/{name}", position, quat, rough)
-
-
-def semantics(stage: Usd.Stage) -> Iterator[str]:
-    """Author the variants of /World: yields each name while edits go into that variant, then selects the first.
-
-    Whatever differs between variants is written inside each of them: opinions outside a variant set are stronger.
-    """
-    choice = stage.GetDefaultPrim().GetVariantSets().GetVariantSet(rooms.SEMANTICS)
-    first = choice.GetVariantSelection()
-    for name in choice.GetVariantNames():
-        choice.SetVariantSelection(name)
-        with choice.GetVariantEditContext():
-            yield name
-    choice.SetVariantSelection(first)
-
-
-def save(stage: Usd.Stage, folder: Path) -> None:
-    """Write the scene and, beside it, `variants/semantic.usda`, the same scene with that variant selected."""
-    stage.GetRootLayer().Save()
-    rooms.variant_layer(folder / "variants" / "semantic.usda", "semantic")

@@ -1,6 +1,6 @@
 """What a task is: one record of everything that the project knows about it.
 
-Drawing is pure: an episode's draws depend on its seed, its mode and the rule set, and on nothing else.
+Drawing is pure: an episode's draws depend on its seed, its mode and the rule set only.
 """
 
 from __future__ import annotations
@@ -143,18 +143,18 @@ class ObjectSpec:
     execution_void: bool = False
     """The original's execution range has no effect there (its placement scales it away)."""
     paper_execution: PoseRange | None = None
-    """Execution range of `paper` where the common way to widen one does not do; None: the common way."""
+    """Execution range of `paper` where the common rule for widening does not work; None: the common rule."""
     lift: float = 0.0
     """Height of our prim's origin above the original's [m]."""
-    stands: float | None = None
+    rest_height: float | None = None
     """Height [m] of the origin above the lowest point of the object's geoms in our own scene; where a variant's geoms
     reach lower, the object starts that much higher. None: the height is the sample's alone."""
 
     def raised(self, scene: Scene) -> float:
         """What a scene's own geoms add to the height of a sample [m]; 0 in our own scene."""
-        if self.stands is None:
+        if self.rest_height is None:
             return 0.0
-        added = -scene.lowest(self.prim) - self.stands
+        added = -scene.lowest(self.prim) - self.rest_height
         return added if abs(added) > SAME_HEIGHT else 0.0
 
     def rule(self, rules_name: str) -> ObjectRule:
@@ -233,7 +233,7 @@ def multiply(a: Quat, b: Quat) -> Quat:
     )
 
 
-def place(spec: ObjectSpec, rule: ObjectRule, sample: Sample) -> Pose:
+def world_pose(spec: ObjectSpec, rule: ObjectRule, sample: Sample) -> Pose:
     """World pose of an object's prim for a sample."""
     p = [sample["x"], sample["y"], sample["z"]]
     if rule.placement != "absolute":
@@ -282,7 +282,7 @@ class Overlap:
     episodes: int
     """How many of the 60 episodes of each of these modes."""
     depth: float
-    """The deepest of them [m]: the shortest way that parts the two."""
+    """The deepest of them [m]: the shortest shift that separates the two."""
     why: str
     """Which of the original's ranges meet."""
 
@@ -383,7 +383,7 @@ class TaskSpec:
         _check_mode(mode)
         own = rules.task(self.name)
         sampled = self.sample(seed, mode, own)
-        placed = {o.prim: place(o, own.object(o.record), sampled[o.record]) for o in self.objects}
+        placed = {o.prim: world_pose(o, own.object(o.record), sampled[o.record]) for o in self.objects}
         light = None
         if mode == "visual":
             light = draw_light(seed, rules.visual_light)

@@ -30,7 +30,7 @@ TOE = (0.12, 0.0, -0.02)
 KICK = 0.06
 """Distance of a toe to the ball's bounding box [m] that counts as contact: half a foot's width, and some motion."""
 ROLLING = 0.5
-"""Speed toward the goal [m/s] that tells a kicked ball from one that a passing foot brushed."""
+"""Speed toward the goal [m/s] that distinguishes a kicked ball from one that a passing foot brushed."""
 
 PREDICATES = (
     Predicate("approach", f"root within {num(REACH)} m of the ball, seen from above"),
@@ -132,7 +132,7 @@ TASK = TaskSpec(
             prim=BALL,
             base=PoseRange(x=(-1.2, 1.2), y=(-1.2, 1.2), z=(0.11, 0.11)),
             execution=PoseRange(x=(-1.45, 1.45), y=(-1.45, 1.45), z=(0.11, 0.11)),
-            stands=0.11,
+            rest_height=0.11,
         ),
     ),
     steps=ByRules(paper=1300, released=2000),

@@ -27,7 +27,7 @@ __all__ = ["PALMS", "Condition", "Judge", "above", "bounding_box", "links", "nea
 
 PALMS = ("left_hand_palm_link", "right_hand_palm_link")
 _ABOVE = 50.0
-"""Half extent of the box that stands for all above a height [m]: larger than any scene."""
+"""Half extent of the box that represents everything above a height [m]: larger than any scene."""
 
 
 @dataclass(frozen=True)

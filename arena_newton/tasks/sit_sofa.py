@@ -41,8 +41,8 @@ PRESSING_LINKS = ("pelvis", *_HIPS)
 TOUCHING_LINKS = (*PRESSING_LINKS, "pelvis", "waist_yaw_link", "waist_roll_link", "torso_link")
 """Links that the original's code accepts on the seat.
 
-It lists `pelvis_contour` too, which the public G1 models carry as a body of its own in the pelvis's place; here that
-body is part of the pelvis, which therefore stands twice. It also lists `imu`: sensor frames, no bodies here."""
+It lists `pelvis_contour` too, which the public G1 models carry as a separate body in addition to the pelvis; here that
+body is part of the pelvis, which is therefore listed twice. It also lists `imu`: sensor frames, no bodies here."""
 
 
 @dataclass(frozen=True)

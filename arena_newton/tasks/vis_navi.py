@@ -115,8 +115,8 @@ def sample_layout(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, S
 def _obstacle(record: str, prim: str, x: tuple[float, float], z: float) -> ObjectSpec:
     """An obstacle dropped from height z [m] (of a beam's centre, of a block's underside); it may land on another.
 
-    Beams lie at once. Blocks roll on and off them: in 56 of 60 layouts something still moves (0.02 m/s, 0.05 rad/s) a
-    second after the drop, in half of them for 1.7 s, in one of ten for 6 s and more.
+    Beams come to rest at once. Blocks roll on and off them: in 56 of 60 layouts something still moves (0.02 m/s,
+    0.05 rad/s) one second after the drop, in half of them for 1.7 s, in one of ten for 6 s and more.
     """
     yaw = (-0.785398, 0.785398)
     return ObjectSpec(

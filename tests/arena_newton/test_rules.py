@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -52,14 +53,26 @@ def test_unknown_names_are_refused():
         rules.ByRules(1, 2).of("typo")
 
 
-@pytest.mark.parametrize(
-    ("name", "steps"),
-    [("paper", (1300, 2000, 2000, 1800, 1050, 1500, 1800)), ("released", (2000, 2000, 1450, 1800, 2000, 900, 1800))],
-)
-def test_step_budgets(name, steps):
-    """Budgets of the paper and of the launch scripts, in the order of the tasks (rule table, first row)."""
-    rule_set = rule_sets.get(name)
-    assert tuple(tasks.get(task).max_steps(rule_set) for task in tasks.names()) == steps
+ORIGINAL = {  # budgets of the paper and of the launch scripts; the robot's position [m] and yaw [deg] at the start
+    "football": (1300, 2000, (0.0, -2.0, 0.8), 90.0),
+    "double_desk": (2000, 2000, (-3.7, -2.2, 0.8), 0.0),
+    "pp_box": (2000, 1450, (-1.6, -5.0, 0.8), 0.0),
+    "open_door": (1800, 1800, (-1.6, 0.2, 0.8), 90.0),
+    "sit_sofa": (1050, 2000, (-1.6, 2.0, 0.8), -90.0),
+    "boxing": (1500, 900, (-1.6, -2.0, 0.8), -90.0),
+    "vis_navi": (1800, 1800, (-1.9, -5.2, 0.8), 90.0),
+}
+
+
+@pytest.mark.parametrize("task", ORIGINAL)
+def test_budget_and_spawn_are_the_originals(task):
+    """Step budgets of both rule sets and the spawn pose of the paper's tasks."""
+    paper, released, position, yaw = ORIGINAL[task]
+    spec = tasks.get(task)
+    assert [spec.max_steps(rule_sets.get(name)) for name in rule_sets.names()] == [paper, released]
+    w, x, y, z = spec.spawn_quat
+    assert spec.spawn_position == position and x == y == 0.0
+    assert math.degrees(2 * math.atan2(z, w)) == pytest.approx(yaw, abs=1e-3)
 
 
 def test_fall_rules():

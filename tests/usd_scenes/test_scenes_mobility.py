@@ -7,15 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from arena_newton import tasks
 from arena_newton.scene import SCENES, load_scene
 
-TASKS = ("open_door", "sit_sofa", "boxing", "vis_navi")
-SPAWN = {  # original benchmark: robot spawn per task
-    "open_door": ((-1.6, 0.2, 0.8), 90.0),
-    "sit_sofa": ((-1.6, 2.0, 0.8), -90.0),
-    "boxing": ((-1.6, -2.0, 0.8), -90.0),
-    "vis_navi": ((-1.9, -5.2, 0.8), 90.0),
-}
+TASKS = tuple(name for name in tasks.names() if tasks.get(name).suite == "HSI")
 OBSTACLES = tuple(f"/World/{kind}_{letter}" for kind in ("Beam", "Block") for letter in "abc")
 _LOADED: dict[tuple, object] = {}
 
@@ -37,22 +32,12 @@ def fresh(scene, dt=0.005):
     return m, data
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_robot_spawns_where_the_task_says(task):
-    """The robot's root is at the original's spawn pose."""
-    scene = scene_of(task)
-    q = scene.mj_model.qpos0[scene.robot.root_qpos :][:7]
-    position, yaw = SPAWN[task]
-    assert np.allclose(q[:3], position, atol=1e-6)
-    assert np.degrees(2 * np.arctan2(q[6], q[3])) == pytest.approx(yaw, abs=1e-3)
-
-
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", tasks.names())
 def test_scene_is_light_enough(task):
-    """A scene with its robot holds fewer than 150 shapes and fewer than 30 solids of its own."""
+    """A scene with its robot holds fewer than 150 shapes and fewer than 60 solids of its own."""
     scene = scene_of(task)
     assert scene.model.shape_count < 150
-    assert sum(not label.startswith("/World/Robot") for label in scene.geom_labels) < 30
+    assert sum(not label.startswith("/World/Robot") for label in scene.geom_labels) < (30 if task in TASKS else 60)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -70,7 +55,7 @@ def test_world_camera_sees_the_robot_and_the_goal(task):
     camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/WorldCamera"))
     to_camera = UsdGeom.XformCache().GetLocalToWorldTransform(camera.GetPrim()).GetInverse()
     half = 0.5 * camera.GetHorizontalApertureAttr().Get() / camera.GetFocalLengthAttr().Get()
-    for point in (SPAWN[task][0], goal):
+    for point in (tasks.get(task).spawn_position, goal):
         x, y, z = to_camera.Transform(Gf.Vec3d(*point))
         assert z < 0 and abs(x / z) < half and abs(y / z) < half * 9 / 16
 

@@ -28,8 +28,8 @@ def hammer_inertia() -> tuple[np.ndarray, np.ndarray]:
     """Centre of mass [m] and diagonal inertia about it [kg·m²], handle along y, uniform capsule and box."""
     cylinder = HANDLE_LENGTH - 2 * HANDLE_RADIUS
     r, m = HANDLE_RADIUS, HANDLE_MASS
-    share = cylinder / (cylinder + 4 / 3 * r)
-    tube, caps = m * share, m * (1 - share)
+    fraction = cylinder / (cylinder + 4 / 3 * r)
+    tube, caps = m * fraction, m * (1 - fraction)
     along = tube * r**2 / 2 + caps * 0.4 * r**2
     across = tube * (cylinder**2 / 12 + r**2 / 4) + caps * (0.4 * r**2 + cylinder**2 / 4 + 3 / 8 * cylinder * r)
     handle = np.array([across, along, across])
@@ -121,5 +121,4 @@ def build(folder: Path) -> None:
     crate(stage)
     for variant, bindings in looks.items():
         rooms.bind_in(stage, variant, bindings)
-    stage.Save()
-    rooms.variant_layer(folder / "variants" / "semantic.usda", "semantic")
+    rooms.save(stage, folder)

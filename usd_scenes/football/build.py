@@ -133,8 +133,6 @@ def build(folder: Path) -> None:
         rooms.bind_in(stage, variant, {"/World/Goal/FrameLook": striped, "/World/Goal/Net": orange})
     rubber = author.material(stage, "/World/Looks/basketball", texture="../textures/basketball.png")
     with rooms.edit(stage, "semantic_released"):
-        # The original drops a 1 kg basketball beside the robot's way to the ball.
+        # The original drops a 1 kg basketball next to the robot's path to the ball.
         ball(stage, "/World/Distractor", (-0.037, 0.496, 0.929), 0.12, 1.0, rubber)
-    stage.Save()
-    for variant in variants[1:]:
-        rooms.variant_layer(folder / "variants" / f"{variant}.usda", variant)
+    rooms.save(stage, folder)

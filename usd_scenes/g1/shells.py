@@ -2,7 +2,7 @@
 
 Dimensions are our own, read off the public proportions of the robot (1.32 m tall) and of its joint offsets. Light
 shells, black motors, hands and feet, and a dark head, as the robot looks from outside; its chest edge, forearms, hands
-and feet are what its head camera sees. Nothing stands in front of the head camera or around it.
+and feet are what its head camera sees. The space in front of and around the head camera is empty.
 """
 
 from collections.abc import Sequence

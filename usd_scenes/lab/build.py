@@ -1,6 +1,6 @@
 """Author of the lab: the open floor on which trackers are trained and measured. No task of the benchmark uses it.
 
-Seat, sill and platform are fixtures that wait under the floor; whoever needs one poses its `Frame`, whose origin is
+Seat, sill and platform are fixtures parked under the floor; to use one, pose its `Frame`, whose origin is
 the centre of the box's top face, so that a support's height is the z of its pose. Each box is taller than any support
 it plays: what is too much sinks into the floor, with which fixtures do not collide.
 """
@@ -27,9 +27,9 @@ PARKED: dict[str, tuple[float, float, float]] = {
     "Sill": (0.0, 0.0, -5.0),
     "Platform": (0.0, 0.0, -6.0),
 }
-"""Where the fixtures wait [m]: no part of a robot on the floor comes near, wherever it walks."""
+"""Where the fixtures are parked [m]: out of reach of a robot on the floor."""
 BALL_PARKED = (0.0, 40.0, BALL_RADIUS)
-"""Where the ball of variant `ball` rests until somebody places it [m]."""
+"""Where the ball of variant `ball` rests until it is used [m]."""
 
 
 def _support(stage: Usd.Stage, name: str, size: Sequence[float], surface: Usd.Prim, look: Usd.Prim) -> None:
@@ -44,7 +44,7 @@ def build(folder: Path) -> None:
         folder / "scene.usda",
         spawn=(0.0, 0.0, SPAWN_HEIGHT),
         facing=(1.0, 0.0, 0.0, 0.0),
-        # From the robot's right, looking across its way at the height of its waist.
+        # From the robot's right, looking across its path at the height of its waist.
         eye=(1.0, -3.4, 1.3),
         gaze=(0.7644, 0.64208, 0.03764, 0.04481),
         variants=("base", "ball"),

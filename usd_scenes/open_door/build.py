@@ -102,22 +102,24 @@ def _leaf(stage, path: str, origin, rough) -> None:
     author.box(stage, f"{path}/Solid", half, centre, visual=False, surface=rough)
 
 
-def _leaf_looks(stage, path: str, base: bool) -> None:
-    """What the leaf looks like: tan with two framed panels, or blue steel with a window and hazard stripes."""
+def _tan_leaf(stage, path: str) -> None:
+    """The leaf of the base look: tan with two framed panels."""
     half = 0.5 * np.asarray(LEAF_SIZE)
     cx, cz = half[0], LEAF_CLEARANCE + half[2]
-    if base:
-        board = author.material(stage, "/World/Looks/Leaf", (0.36, 0.28, 0.21))
-        dark = author.material(stage, "/World/Looks/LeafPanel", (0.25, 0.19, 0.14))
-        warehouse.boxes(stage, f"{path}/Board", [(half, (cx, 0, cz))], look=board)
-        lines = []
-        for low, high in ((0.25, 0.85), (1.10, 1.95)):
-            lines += [((0.30, half[1] + 0.002, 0.008), (cx, 0, z)) for z in (low, high)]
-            lines += [
-                ((0.008, half[1] + 0.002, (high - low) / 2), (cx + k * 0.30, 0, (low + high) / 2)) for k in (-1, 1)
-            ]
-        warehouse.boxes(stage, f"{path}/Mouldings", lines, look=dark)
-        return
+    board = author.material(stage, "/World/Looks/Leaf", (0.36, 0.28, 0.21))
+    dark = author.material(stage, "/World/Looks/LeafPanel", (0.25, 0.19, 0.14))
+    warehouse.boxes(stage, f"{path}/Board", [(half, (cx, 0, cz))], look=board)
+    lines = []
+    for low, high in ((0.25, 0.85), (1.10, 1.95)):
+        lines += [((0.30, half[1] + 0.002, 0.008), (cx, 0, z)) for z in (low, high)]
+        lines += [((0.008, half[1] + 0.002, (high - low) / 2), (cx + k * 0.30, 0, (low + high) / 2)) for k in (-1, 1)]
+    warehouse.boxes(stage, f"{path}/Mouldings", lines, look=dark)
+
+
+def _blue_leaf(stage, path: str) -> None:
+    """The leaf of the semantic look: blue steel with a window and hazard stripes."""
+    half = 0.5 * np.asarray(LEAF_SIZE)
+    cx, cz = half[0], LEAF_CLEARANCE + half[2]
     paint = author.material(stage, "/World/Looks/Leaf", (0.05, 0.16, 0.38))
     glass = author.material(stage, "/World/Looks/LeafGlass", (0.62, 0.74, 0.78), roughness=0.2)
     hazard = author.material(stage, "/World/Looks/LeafHazard", (0.8, 0.7, 0.1), texture="../textures/hazard.png")
@@ -190,7 +192,7 @@ def build(folder: Path) -> None:
         facing=TASK.spawn_quat,
         eye=(0.26556, 1.33827, 3.77471),
         gaze=(0.6811, 0.21343, 0.20944, 0.66834),
-        variants=warehouse.VARIANTS,
+        variants=("base", "semantic"),
     )
     rough = warehouse.surface(stage)
     warehouse.room_looks(stage)
@@ -200,6 +202,8 @@ def build(folder: Path) -> None:
     _partition(stage, "/World/Door/Frame", rough)
     author.marker(stage, "/World/Door/Frame/Doorway", DOORWAY, (0, 0, DOORWAY[2] / 2))
     _chain(stage, rough)
-    for variant in warehouse.semantics(stage):
-        _leaf_looks(stage, "/World/Door/Leaf", variant == "base")
-    warehouse.save(stage, folder)
+    with rooms.edit(stage, "base"):
+        _tan_leaf(stage, "/World/Door/Leaf")
+    with rooms.edit(stage, "semantic"):
+        _blue_leaf(stage, "/World/Door/Leaf")
+    rooms.save(stage, folder)

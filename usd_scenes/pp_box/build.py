@@ -59,7 +59,7 @@ def carton_box(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
 
 def shelf(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
     """Four decks and a top between blue uprights, long side along x; first, third and fourth deck stocked."""
-    # The middle of the range of its placement; every episode poses it anew.
+    # The middle of the range of its placement; every episode poses it again.
     author.fixture(stage, "/World/Shelf", (-2.2, -2.9, 0))
     frame = "/World/Shelf/Frame"
     blue = author.material(stage, "/World/Looks/upright", (0.01, 0.05, 0.19))
@@ -104,7 +104,7 @@ def shelf(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
 
 
 def clutter(stage: Usd.Stage) -> None:
-    """More things on the table, along its far edge where the box never stands: tins, a tool case, a carton."""
+    """More things on the table, along its far edge where the box never is: tins, a tool case, a carton."""
     author.xform(stage, "/World/Clutter", (0, 0, rooms.BENCH_TOP))
     red = author.material(stage, "/World/Looks/tin", (0.55, 0.04, 0.03))
     green = author.material(stage, "/World/Looks/case", (0.03, 0.25, 0.10))
@@ -137,5 +137,4 @@ def build(folder: Path) -> None:
         rooms.bind_in(stage, variant, looks["base"])
     with rooms.edit(stage, "semantic"):
         clutter(stage)
-    stage.Save()
-    rooms.variant_layer(folder / "variants" / "semantic.usda", "semantic")
+    rooms.save(stage, folder)

@@ -1,4 +1,4 @@
-"""Author SitSofa: a living room with carpet, sofa, coffee table and two light cartons in the way.
+"""Author SitSofa: a living room with carpet, sofa, coffee table and two light cartons on the path.
 
 Sofa, table and carton sizes: spec of the original (measured on its clips). The seat is stiff (solref 0.02 s,
 friction 1): experts sit on it as well as on a soft one, and it is cheaper to simulate.
@@ -100,6 +100,11 @@ def _carton(stage, name: str, position, looks, rough) -> None:
     warehouse.boxes(stage, f"{path}/Tape", tape, look=looks[1])
 
 
+def _look(stage, name: str, color, texture: str | None = None) -> None:
+    path = None if texture is None else f"../textures/{texture}.png"
+    author.material(stage, f"/World/Looks/{name}", color, texture=path)
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(
@@ -108,25 +113,19 @@ def build(folder: Path) -> None:
         facing=TASK.spawn_quat,
         eye=(-5.00612, 1.22158, 2.27319),
         gaze=(-0.43051, -0.25339, 0.43941, 0.74657),
-        variants=warehouse.VARIANTS,
+        variants=("base", "semantic"),
     )
     rough = warehouse.surface(stage)
-    for variant in warehouse.semantics(stage):
-        base = variant == "base"
-        warehouse.room_looks(
-            stage,
-            floor="concrete" if base else "tiles",
-            wall=None if base else "brick",
-            skirting=(0.9, 0.9, 0.88) if base else (0.25, 0.16, 0.10),
-        )
-        looks = {
-            "Carpet": ((0.30, 0.30, 0.31), None) if base else ((0.5, 0.3, 0.3), "carpet"),
-            "Sofa": ((0.80, 0.79, 0.77), "fabric") if base else ((0.10, 0.19, 0.33), None),
-            "Table": ((0.88, 0.88, 0.88), None) if base else ((0.22, 0.12, 0.06), None),
-        }
-        for name, (color, texture) in looks.items():
-            path = None if texture is None else f"../textures/{texture}.png"
-            author.material(stage, f"/World/Looks/{name}", color, texture=path)
+    with rooms.edit(stage, "base"):
+        warehouse.room_looks(stage)
+        _look(stage, "Carpet", (0.30, 0.30, 0.31))
+        _look(stage, "Sofa", (0.80, 0.79, 0.77), "fabric")
+        _look(stage, "Table", (0.88, 0.88, 0.88))
+    with rooms.edit(stage, "semantic"):
+        warehouse.room_looks(stage, floor="tiles", wall="brick", skirting=(0.25, 0.16, 0.10))
+        _look(stage, "Carpet", (0.5, 0.3, 0.3), "carpet")
+        _look(stage, "Sofa", (0.10, 0.19, 0.33))
+        _look(stage, "Table", (0.22, 0.12, 0.06))
     warehouse.room(stage, rough)
     author.quad(
         stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(3.2, 2.5),
@@ -138,4 +137,4 @@ def build(folder: Path) -> None:
     tape = author.material(stage, "/World/Looks/Tape", (0.50, 0.36, 0.20))
     for name, position in CARTONS.items():
         _carton(stage, name, position, (board, tape), rough)
-    warehouse.save(stage, folder)
+    rooms.save(stage, folder)

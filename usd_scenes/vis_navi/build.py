@@ -1,8 +1,8 @@
 """Author VisNavi: walk between dropped beams and blocks into the yellow outline by the wet-floor sign.
 
 Sizes of beams, blocks, outline and the poses before the first draw: spec of the original (measured on its clips).
-Masses are our choice, the original's are not published: light crates that a robot can shove, not lift. So is where the
-origins lie, a beam's at its centre and a block's at the middle of its underside: then the heights from which the
+Masses are our choice, the original's are not published: light crates that a robot can shove, not lift. So are the
+origins, a beam's at its centre and a block's at the middle of its underside: then the heights from which the
 original drops them form a ladder on which hardly any two touch (centred blocks overlap in 46 of 60 layouts).
 """
 
@@ -111,7 +111,7 @@ def build(folder: Path) -> None:
         facing=TASK.spawn_quat,
         eye=(0.45796, -1.01443, 2.42268),
         gaze=(0.50211, 0.27898, 0.39756, 0.71555),
-        variants=warehouse.VARIANTS,
+        variants=("base", "semantic"),
     )
     rough = warehouse.surface(stage)
     warehouse.room_looks(stage)
@@ -127,11 +127,10 @@ def build(folder: Path) -> None:
     (cx, cy), half = OUTLINE_CENTRE, OUTLINE / 2
     author.box(stage, f"{frame}/Body", (0.15, 0.05, 0.3), (-0.05, cy + half - 0.02, 0.305), visual=False, surface=rough)
     author.marker(stage, f"{frame}/Zone", (OUTLINE, OUTLINE, ZONE_HEIGHT), (cx, cy, ZONE_HEIGHT / 2))
-    for variant in warehouse.semantics(stage):
-        if variant == "base":
-            _folding_sign(stage, frame)
-            _outline(stage, frame)
-        else:
-            _ring_sign(stage, frame)
-            author.attribute(stage.GetPrimAtPath(f"{frame}/Zone"), "arena:round", True, Sdf.ValueTypeNames.Bool)
-    warehouse.save(stage, folder)
+    with rooms.edit(stage, "base"):
+        _folding_sign(stage, frame)
+        _outline(stage, frame)
+    with rooms.edit(stage, "semantic"):
+        _ring_sign(stage, frame)
+        author.attribute(stage.GetPrimAtPath(f"{frame}/Zone"), "arena:round", True, Sdf.ValueTypeNames.Bool)
+    rooms.save(stage, folder)
