@@ -139,16 +139,16 @@ def _inspect(args: argparse.Namespace) -> None:
     from arena_newton.trackers.motions.formats import read_library
 
     library, reports = read_library(args.files, _options(args))
-    measures = measure.measure(library)
+    measures = measure.measure_clips(library)
     if args.json:
         import json
 
-        print(json.dumps(measure.summary(measures), indent=2, allow_nan=False))
+        print(json.dumps(measure.measures_summary(measures), indent=2, allow_nan=False))
         return
     for report in reports:
         if report.trimmed or report.notes:
             print(report.line())
-    print(measure.table(measures, None if args.all else ROWS))
+    print(measure.measures_table(measures, None if args.all else ROWS))
 
 
 def _render(args: argparse.Namespace) -> None:
