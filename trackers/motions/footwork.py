@@ -61,7 +61,7 @@ LEAST_CLEARANCE = 0.05
 HIGH_STEP, RISE_PER_HEIGHT, MOST_RISE = 0.08, 1.6, 0.16
 """A step higher than this [m] rises before it goes on: by this fraction of the swing per metre, up to a limit."""
 LANDING_FIXED, LANDING_BLEND = 0.9, 0.4
-"""From this fraction of a swing on, the landing no longer follows the plan; over the fraction before, ever less."""
+"""From this fraction of a swing on, the landing is fixed; in the fraction before, it follows the plan less and less."""
 GAIT_RATE, GAIT_ACCELERATION = 3.0, 15.0
 """Limits of the change between standing and walking [1/s, 1/s²]."""
 MISPLACED = (0.02, 0.07)
