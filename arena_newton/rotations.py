@@ -46,7 +46,7 @@ def wrap_by_remainder(angle: Tensor) -> Tensor:
 
 
 def rotate_xy(yaw: Tensor, vector: Tensor) -> Tensor:
-    """Planar vectors of a heading frame in the world, for `-yaw` the inverse; yaw [rad], shape [...], vector [..., 2]."""
+    """Planar vectors of a heading frame in the world, for `-yaw` the inverse; shapes [...] [rad] and [..., 2]."""
     c, s = torch.cos(yaw), torch.sin(yaw)
     x, y = vector.unbind(-1)
     return torch.stack([c * x - s * y, s * x + c * y], dim=-1)

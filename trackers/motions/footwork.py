@@ -32,8 +32,8 @@ __all__ = [
 PEAK_OF_SMOOTH = 1.875
 """Peak speed of a minimum-jerk course (`smooth`) over its mean: 15/8."""
 BRAKING = 1.8
-"""A value slows down as v² = `BRAKING` · acceleration · distance. At 2 it would stop exactly at its target in
-continuous time; what is less makes up for ticks."""
+"""A value slows down as v² = `BRAKING` · acceleration · distance: 2 in continuous time. With ticks, 2 overshoots a
+target 1.5 m away by up to 5 mm, 1.9 by 1 mm, 1.8 not at all."""
 DOUBLE_SUPPORT = 0.2
 """Fraction of a step with both feet on the ground."""
 SWAY, SWAY_WIDTH = 0.05, 0.22
