@@ -46,7 +46,7 @@ def wrap_by_remainder(angle: Tensor) -> Tensor:
 
 
 def rotate_xy(yaw: Tensor, vector: Tensor) -> Tensor:
-    """Planar vectors rotated by `yaw` [rad]; shapes [...] and [..., 2]. Heading frame to world; -yaw the way back."""
+    """Planar vectors of a heading frame in the world, for `-yaw` the inverse; shapes [...] [rad] and [..., 2]."""
     c, s = torch.cos(yaw), torch.sin(yaw)
     x, y = vector.unbind(-1)
     return torch.stack([c * x - s * y, s * x + c * y], dim=-1)
@@ -117,7 +117,7 @@ def roll_pitch(quat: Tensor) -> Tensor:
 
 
 def rotation_vector(quat: Tensor) -> Tensor:
-    """Axis times angle [rad] of unit quaternions along the shorter way, shape [..., 3]."""
+    """Axis times angle [rad] of unit quaternions along the shorter arc, shape [..., 3]."""
     quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
     sine = torch.linalg.vector_norm(quat[..., 1:], dim=-1, keepdim=True)
     angle = 2.0 * torch.atan2(sine, quat[..., :1])

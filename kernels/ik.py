@@ -101,7 +101,7 @@ RESTART_ROUNDS = wp.constant(16)
 STEP = wp.constant(0.4)
 """Largest change of a joint in one Gauss-Newton step [rad]."""
 ARM_SPEED = wp.constant(0.12)
-"""Largest change of an arm joint by IK in a tick [rad]: 6 rad/s."""
+"""Largest change of an arm joint by IK per tick [rad]: 6 rad/s."""
 SEAT_SOFTNESS = wp.constant(0.02)
 """Width of the change from balance to the seat [m]."""
 REACH_MIN = wp.constant(0.16)

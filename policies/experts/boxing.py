@@ -20,6 +20,7 @@ from arena_newton.tasks.boxing import PALMS, TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.kinematics import HAND_POINT
 from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
+from arena_newton.usd_scenes.g1.links import PALM_OFFSET
 
 __all__ = ["BoxingExpert"]
 
@@ -31,8 +32,6 @@ STAND = 0.45
 """Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
 READY = 0.70
 """The same where the robot turns to the bag before the last step [m]: its hands must not meet the bag."""
-PALM_FRAME = 0.0415
-"""The palm frame that the rule reads, so far before the wrist yaw frame [m]."""
 OFF = 0.06
 """Distance of the palm from the target, away from the bag [m]: the hand is there before it touches."""
 BELOW = 0.12
@@ -203,7 +202,7 @@ class BoxingExpert(Expert):
 
         root = torch.cat([pose[:, :2], self.sight.height[:, None]], dim=1)
         point = self._local(wanted - root, pose) + self._correction
-        point[:, 0] += HAND_POINT - PALM_FRAME
+        point[:, 0] += HAND_POINT - PALM_OFFSET[0]
         is_right = torch.stack([~self.right, self.right], dim=1)
         command.hand_point = torch.where(is_right[..., None], point[:, None], command.hand_point)
         command.reach = (is_right & striking[:, None]).to(command.reach.dtype)

@@ -56,10 +56,12 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--licence", default=None, help="licence of the clips, as MIT (libraries keep theirs)")
     convert.add_argument("--source", default=None, help="where the clips are from, as a link (libraries keep theirs)")
     convert.add_argument("--family", default="clips", help="kind of motion of the clips (libraries keep theirs)")
-    convert.add_argument("--ground", action="store_true", help="shift each clip so that its soles stand on the floor")
+    convert.add_argument("--ground", action="store_true", help="shift each clip so that its soles are on the floor")
     convert.add_argument("--mirror", action="store_true", help="add every clip with left and right exchanged")
 
-    inspect = commands.add_parser("inspect", parents=[reading], help="print speed, heights, limits, jumps, slip a clip")
+    inspect = commands.add_parser(
+        "inspect", parents=[reading], help="print speed, heights, limits, jumps, slip per clip"
+    )
     inspect.add_argument("--all", action="store_true", help=f"list every clip, not the first {ROWS}")
     inspect.add_argument("--json", action="store_true", help="print the numbers as JSON")
 
@@ -68,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument(
         "--clip", action="append", default=None, metavar="CLIP", help="name or number; repeat for more (default: 0)"
     )
-    render.add_argument("--pictures", type=int, default=10, help="pictures a strip")
+    render.add_argument("--pictures", type=int, default=10, help="pictures per strip")
     render.add_argument("--width", type=int, default=180, help="width of a picture [px]")
     render.add_argument("--start", type=float, default=0.0, help="time of the first picture [s]")
     render.add_argument(
@@ -139,16 +141,16 @@ def _inspect(args: argparse.Namespace) -> None:
     from arena_newton.trackers.motions.formats import read_library
 
     library, reports = read_library(args.files, _options(args))
-    measures = measure.measure(library)
+    measures = measure.measure_clips(library)
     if args.json:
         import json
 
-        print(json.dumps(measure.summary(measures), indent=2, allow_nan=False))
+        print(json.dumps(measure.measures_summary(measures), indent=2, allow_nan=False))
         return
     for report in reports:
         if report.trimmed or report.notes:
             print(report.line())
-    print(measure.table(measures, None if args.all else ROWS))
+    print(measure.measures_table(measures, None if args.all else ROWS))
 
 
 def _render(args: argparse.Namespace) -> None:

@@ -225,7 +225,7 @@ LIMITED_WIDTH = sum(channel.width for channel in _LIMITED.values())
 
 @functools.cache
 def neutral_row() -> tuple[float, ...]:
-    """A packed command that says: stand."""
+    """The packed command to stand."""
     row: list[float] = []
     for channel in CHANNELS.values():
         neutral = channel.neutral(neutral_stance()) if callable(channel.neutral) else channel.neutral

@@ -1,17 +1,19 @@
-"""Film strips and videos of clips: a row of pictures a clip, the time under each."""
+"""Film strips and videos of clips: a row of pictures per clip, the time under each."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from arena_newton.errors import InputError
-from arena_newton.pictures.video import GAP, LABEL_HEIGHT
+from arena_newton.files import replace_atomically
+from arena_newton.pictures.video import GAP, LABEL_HEIGHT, VideoWriter
 from arena_newton.robot import TICK
 from arena_newton.trackers.motions.library import MotionLibrary
+from arena_newton.trackers.motions.render import ClipRenderer
 
 __all__ = ["film", "movie", "picked_frames"]
 
@@ -46,13 +48,13 @@ def film(
     start: float = 0.0,
     end: float | None = None,
 ) -> Path:
-    """Write a PNG with one strip of pictures a clip.
+    """Write a PNG with one strip of pictures per clip.
 
     Args:
         library: The clips.
         clips: Which of them.
         out: The PNG.
-        pictures: Pictures a clip.
+        pictures: Pictures per clip.
         width: Width of a picture [px]; its height is a third more.
         start: Time of the first picture [s].
         end: Time of the last [s]; the clip's end by default.
@@ -63,10 +65,6 @@ def film(
     Raises:
         InputError: No clips, no time, or the file cannot be written.
     """
-    from PIL import Image, ImageDraw
-
-    from arena_newton.trackers.motions.render import ClipRenderer
-
     if not clips:
         raise InputError("render: name at least one clip")
     picked = [picked_frames(library, clip, pictures, start, end) for clip in clips]
@@ -84,11 +82,9 @@ def film(
             sheet.paste(Image.fromarray(picture), (x, y + LABEL_HEIGHT))
             text.text((x + 3, y + LABEL_HEIGHT + high - 14), f"{frames[column] * TICK:.2f} s", fill="black")
     out = Path(out)
-    part = out.with_name(out.name + ".part")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        sheet.save(part, format="PNG")
-        os.replace(part, out)
+        with replace_atomically(out) as file:
+            sheet.save(file, format="PNG")
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
     return out
@@ -103,14 +99,11 @@ def movie(
     start: float = 0.0,
     end: float | None = None,
 ) -> Path:
-    """Write an MP4 of clips one after the other, at 25 frames a second; arguments as of `film`.
+    """Write an MP4 of clips one after the other, at 25 frames per second; arguments as of `film`.
 
     Raises:
         InputError: No clips, no time, or the file cannot be written.
     """
-    from arena_newton.pictures.video import VideoWriter
-    from arena_newton.trackers.motions.render import ClipRenderer
-
     if not clips:
         raise InputError("render: name at least one clip")
     picked = []

@@ -32,8 +32,8 @@ __all__ = [
 PEAK_OF_SMOOTH = 1.875
 """Peak speed of a minimum-jerk course (`smooth`) over its mean: 15/8."""
 BRAKING = 1.8
-"""A value slows down as v² = `BRAKING` · acceleration · distance. At 2 it would stop exactly at its target in
-continuous time; what is less makes up for ticks."""
+"""A value slows down as v² = `BRAKING` · acceleration · distance: 2 in continuous time. With ticks, 2 overshoots a
+target 1.5 m away by up to 5 mm, 1.9 by 1 mm, 1.8 not at all."""
 DOUBLE_SUPPORT = 0.2
 """Fraction of a step with both feet on the ground."""
 SWAY, SWAY_WIDTH = 0.05, 0.22
@@ -61,7 +61,7 @@ LEAST_CLEARANCE = 0.05
 HIGH_STEP, RISE_PER_HEIGHT, MOST_RISE = 0.08, 1.6, 0.16
 """A step higher than this [m] rises before it goes on: by this fraction of the swing per metre, up to a limit."""
 LANDING_FIXED, LANDING_BLEND = 0.9, 0.4
-"""From this fraction of a swing on, the landing no longer follows the plan; over the fraction before, ever less."""
+"""From this fraction of a swing on, the landing is fixed; in the fraction before, it follows the plan less and less."""
 GAIT_RATE, GAIT_ACCELERATION = 3.0, 15.0
 """Limits of the change between standing and walking [1/s, 1/s²]."""
 MISPLACED = (0.02, 0.07)

@@ -3,7 +3,7 @@
 | file | what is in it |
 |---|---|
 | `.pkl` | TWIST2, GMR (29 joints), GMT (23), ASAP/PHC (23, several clips in a joblib file): `load` |
-| `.csv` | Unitree's LAFAN1 set, Kimodo: root x, y, z, quaternion, 29 or 23 joints (MuJoCo order); a line a frame |
+| `.csv` | Unitree's LAFAN1 set, Kimodo: root x, y, z, quaternion, 29 or 23 joints (MuJoCo order); a line per frame |
 | `.npz` | BeyondMimic: fps, joint_pos, body_pos_w, body_quat_w (wxyz; body 0 is the pelvis) |
 | `.npz` | a motion library, or canonical actions (array action) |
 """
@@ -55,7 +55,7 @@ class ReadOptions:
     fps: float | None = None
     """Frame rate of tables [1/s]; 30 by default."""
     quat_order: QuatOrder = "auto"
-    """Order of a table's quaternions; by default the one in which the robot stands upright."""
+    """Order of a table's quaternions; by default the one in which the robot is upright."""
     joint_order: JointOrder = "auto"
     """Order of the joints of BeyondMimic's NPZ: `isaac` (its own), `mujoco` (mjlab's); by default the one whose
     kinematics give the file's body positions."""
@@ -212,7 +212,7 @@ def _table(path: Path, options: ReadOptions) -> Reading:
     widths = (7 + len(MUJOCO_JOINTS), 7 + len(JOINTS_23))
     rows: list[np.ndarray] = []
     for number, line in enumerate(io.StringIO(text), 1):
-        # A line of column names may stand above the numbers.
+        # The first line may hold column names.
         if not line.strip() or (number == 1 and not _is_number(line.partition(",")[0])):
             continue
         # Counted before it is split: a single line can be as long as the file.
@@ -236,7 +236,7 @@ def _table(path: Path, options: ReadOptions) -> Reading:
     clip = checked_clip(
         fps, table[:, :3], table[:, 3:7], table[:, 7:], str(path), xyzw=order == "xyzw", trim=options.trim
     )
-    notes = [f"{fps:g} frames a second", f"quaternions {order}", *_padding({width - 7})]
+    notes = [f"{fps:g} frames per second", f"quaternions {order}", *_padding({width - 7})]
     return _reading(path, "table", {path.stem: clip}, notes)
 
 
@@ -249,7 +249,7 @@ def _is_number(text: str) -> bool:
 
 
 def _quat_order(quat: np.ndarray, path: Path) -> str:
-    """Unitree's tables say xyzw, others wxyz; a robot that stands upright tells which."""
+    """Unitree's tables say xyzw, others wxyz; the order in which the robot is upright is taken."""
     square = quat**2 / np.maximum((quat**2).sum(axis=1, keepdims=True), 1e-12)
     # Uprightness R22 = 1 - 2 (x² + y²).
     wxyz, xyzw = (float((1 - 2 * square[:, list(at)].sum(axis=1)).mean()) for at in ((1, 2), (0, 1)))
@@ -309,7 +309,7 @@ def _beyond_mimic(path: Path, arrays: dict[str, np.ndarray], options: ReadOption
     if order == "auto":
         plain = checked_clip(rate, pos[:, 0], quat[:, 0], joints, where, trim=False)
         far = {name: _link_distance(plain, mujoco, pos) for name, mujoco in candidates.items()}
-        # Where both fit (joints alike on both sides), the format's own order stands.
+        # Where both fit (joints alike on both sides), the format's own order is taken.
         order = "mujoco" if far["mujoco"] < far["isaac"] - JOINT_ORDER_MARGIN else "isaac"
     clip = checked_clip(rate, pos[:, 0], quat[:, 0], candidates[order], where, trim=options.trim)
     note = "joints in Isaac Lab's order" if order == "isaac" else "joints in MuJoCo's order"

@@ -1,7 +1,7 @@
 """Frames of a motion, canonical 40D actions and 35D mimic commands: each made from the other, batched, in torch.
 
-A frame is a root position [m], a root orientation (wxyz), 29 joints in MuJoCo order [rad] and two hands, 50 times a
-second; frame k is where the robot should be after tick k. The formulas are those of `kernels.canonical`, which executes
+A frame is a root position [m], a root orientation (wxyz), 29 joints in MuJoCo order [rad] and two hands, at
+50 Hz; frame k is where the robot should be after tick k. The formulas are those of `kernels.canonical`, which executes
 the actions: what it integrates from the actions of a motion is the motion again.
 """
 
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 _LEVEL_FLOOR = 1e-6
-"""Below this |R22| height no longer tells the displacement along the root's z axis (`kernels.canonical`)."""
+"""Below this |R22| height does not determine the displacement along the root's z axis (`kernels.canonical`)."""
 
 
 class MotionClip(NamedTuple):

@@ -1,6 +1,6 @@
 """A library of motions: many clips at 50 Hz in one NPZ file without pickles, each with its licence and its source.
 
-Frames of all clips stand one after the other. `MotionLibrary` is the file; `DeviceLibrary` is what training and
+Frames of all clips follow one another. `MotionLibrary` is the file; `DeviceLibrary` is what training and
 evaluation read: torch tensors with velocities and mimic commands for every frame.
 """
 
@@ -56,7 +56,7 @@ def _mirrored_joint(name: str) -> str:
 MIRROR_JOINTS: tuple[int, ...] = tuple(MUJOCO_JOINTS.index(_mirrored_joint(name)) for name in MUJOCO_JOINTS)
 """Joint (MuJoCo order) that each joint becomes in the mirror: `mirrored[i] = signs[i] * joints[MIRROR_JOINTS[i]]`."""
 MIRROR_SIGNS: tuple[float, ...] = tuple(1.0 if _HINGE_AXIS[name] == "Y" else -1.0 for name in MUJOCO_JOINTS)
-"""The mirror keeps rotations about the sideways axis and turns those about the other two round."""
+"""The mirror keeps rotations about the sideways axis and reverses those about the other two."""
 
 # Array → (type, shape after the first axis, what the first axis counts).
 _ARRAYS: dict[str, tuple[Any, tuple[int, ...], str]] = {
@@ -104,7 +104,7 @@ class MotionLibrary:
     source: np.ndarray
     """Where each clip is from, str, shape [clips]."""
     support_kind: np.ndarray
-    """Index into `SUPPORTS` of what the clip stands or sits on beside the floor, int64, shape [clips]."""
+    """Index into `SUPPORTS` of what the clip stands or sits on in addition to the floor, int64, shape [clips]."""
     support_box: np.ndarray
     """That support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
     top above the floor [m]; float32, shape [clips, 7]."""
@@ -334,7 +334,7 @@ class MotionLibrary:
         return MotionLibrary(**arrays)
 
     def save(self, path: str | Path) -> None:
-        """Write an NPZ file, which appears under its name only when it is complete.
+        """Write an NPZ file, which has its name only when it is complete.
 
         Raises:
             InputError: The file cannot be written.
@@ -351,7 +351,7 @@ class MotionLibrary:
         """Read a library file.
 
         Raises:
-            InputError: The file is absent, damaged, or no motion library.
+            InputError: The file is absent, damaged, or not a motion library.
         """
         file = read_arrays(path, ("format", "fps", *_ARRAYS))
         if "format" not in file or str(file["format"]) != FORMAT:
@@ -362,7 +362,7 @@ class MotionLibrary:
         fps = numbers(file.get("fps", np.array(FPS)), f"{path}: array fps", np.float64)
         if fps.size != 1 or fps.item() != FPS:
             given = f"{fps.item():g}" if fps.size == 1 else "several numbers of"
-            raise InputError(f"{path}: has {given} frames a second, expected {FPS}; convert it again")
+            raise InputError(f"{path}: has {given} frames per second, expected {FPS}; convert it again")
         try:
             return cls(**{name: file[name] for name in _ARRAYS})
         except InputError as error:
@@ -419,17 +419,17 @@ class DeviceLibrary:
 
         pos, quat, joints = up(library.root_pos), up(library.root_quat), up(library.joint_pos)
         clip = np.repeat(np.arange(library.clips), library.clip_length)
-        before = up(np.maximum(np.arange(library.frames) - 1, library.clip_start[clip]))
+        previous = up(np.maximum(np.arange(library.frames) - 1, library.clip_start[clip]))
         # In double precision: a difference over a tick multiplies rounding by 50.
         pos64, quat64 = pos.double(), torch.nn.functional.normalize(quat.double(), dim=-1)
-        turned = quat_multiply(quat_conjugate(quat64[before]), quat64)
-        mimic = frame_mimic(pos64[before], quat64[before], pos64, quat64, joints.double())
+        turned = quat_multiply(quat_conjugate(quat64[previous]), quat64)
+        mimic = frame_mimic(pos64[previous], quat64[previous], pos64, quat64, joints.double())
         return cls(
             root_pos=pos,
             root_quat=quat,
             joint_pos=joints,
-            joint_vel=(joints - joints[before]) / TICK,
-            lin_vel=((pos64 - pos64[before]) / TICK).float(),
+            joint_vel=(joints - joints[previous]) / TICK,
+            lin_vel=((pos64 - pos64[previous]) / TICK).float(),
             ang_vel=(rotation_vector(turned) / TICK).float(),
             mimic=mimic.float(),
             hands=up(library.hands),
@@ -454,7 +454,7 @@ class DeviceLibrary:
         return self.root_pos.device
 
     def index(self, clip: Tensor, step: Tensor) -> Tensor:
-        """Frame of a clip at a step; the first and the last frame stand for what is outside. Shapes [...]."""
+        """Frame of a clip at a step; outside a clip, its first or last frame. Shapes [...]."""
         last = self.clip_length[clip] - 1
         return self.clip_start[clip] + torch.minimum(step.clamp_min(0), last)
 

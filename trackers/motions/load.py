@@ -1,7 +1,7 @@
 """Readers of motion clips in pickles (TWIST2/GMR, GMT, ASAP) and of action files (NPZ).
 
 Pickles run code when they are read. Only NumPy arrays, numbers, strings and plain containers are admitted here; a file
-that names anything else is refused before it is called. Arrays may also stand between the pickle's frames, as joblib
+that names anything else is refused before it is called. Arrays may also follow between the pickle's frames, as joblib
 writes them.
 """
 
@@ -37,13 +37,13 @@ __all__ = [
 
 JOINTS = 29
 JOINTS_23: tuple[int, ...] = (*range(19), *range(22, 26))
-"""The joints of 23-DoF clips (GMT, ASAP): legs, waist, shoulders and elbows; their wrists stand at zero."""
+"""The joints of 23-DoF clips (GMT, ASAP): legs, waist, shoulders and elbows; their wrists are set to zero."""
 FIELDS = {"root_pos": "root_trans_offset", "root_rot": "root_rot", "dof_pos": "dof"}
 """TWIST2's name of a field → ASAP's."""
 FAR = 1000.0
 """Farthest that a root may be from the origin [m]; beyond it a file is in other units or damaged."""
 START_FRAMES = 15
-"""A motion capture jump is looked for in this many first frames."""
+"""A motion capture jump is searched for in this many first frames."""
 START_HEIGHT = 1.3
 """Root height [m] that no clip starts with; captures that begin with a jump show 1.8 m."""
 START_SPEED = 2.5
@@ -57,7 +57,7 @@ class Clip:
     """A whole-body motion."""
 
     fps: float
-    """Frames a second."""
+    """Frames per second."""
     root_pos: np.ndarray
     """Root position [m], world, shape [frames, 3]."""
     root_quat: np.ndarray
@@ -76,7 +76,7 @@ class Clip:
 
 
 class _RefusedError(Exception):
-    """The pickle names something that is no plain data."""
+    """The pickle names something that is not plain data."""
 
 
 def _latin1(text: str, encoding: str = "latin1") -> bytes:
@@ -150,7 +150,7 @@ class _JoblibArray:
         return array.reshape(shape[::-1]).T if self.order == "F" else array.reshape(shape)
 
 
-# The C unpickler cannot be told to read an array between two frames; the one in Python can.
+# The C unpickler cannot read an array between two frames; the one in Python can.
 class _PlainUnpickler(pickle._Unpickler):
     """Admits NumPy arrays and plain containers only."""
 
@@ -178,7 +178,7 @@ class _PlainUnpickler(pickle._Unpickler):
             raise _RefusedError(f"arrays of more than {limits.PICKLE_BYTES // limits.MIB} MiB")
 
     def load_bytearray8(self) -> None:
-        # Python's own makes the array before it looks whether the file is as long.
+        # Python's own makes the array before it checks the length of the file.
         size = int.from_bytes(self.read(8), "little")  # type: ignore[attr-defined]
         data = self.read(size)  # type: ignore[attr-defined]
         if len(data) != size:
@@ -263,7 +263,7 @@ def load_clip(path: str | Path, *, flag: str = "--policy replay:", trim: bool = 
 
     Args:
         path: The `.pkl` file.
-        flag: What errors name before the path.
+        flag: What errors name in front of the path.
         trim: Cut a motion capture jump off the start.
 
     Raises:
@@ -279,7 +279,7 @@ def motions_of(content: Any, where: str) -> dict[str, Mapping[str, Any]]:
     """The clips of an unpickled file by name: ASAP nests them under names, the others hold one (named "").
 
     Raises:
-        InputError: The content is no clip.
+        InputError: The content is not a clip.
     """
     if not isinstance(content, dict):
         raise InputError(f"{where}: holds {type(content).__name__}, expected a clip with named fields")
@@ -332,17 +332,17 @@ def checked_clip(
     """A clip of finite arrays.
 
     Args:
-        fps: Frames a second.
+        fps: Frames per second.
         root_pos: Root position [m].
         root_rot: Root orientation.
         dof_pos: Joint positions [rad], MuJoCo order, 29 or the 23 without wrists.
         where: What errors name.
-        xyzw: The quaternions' scalar stands last.
+        xyzw: The quaternions' scalar comes last.
         trim: Cut a motion capture jump off the start.
 
     Raises:
-        InputError: A frame rate outside 1 to 1000, a wrong shape, a quaternion that is none, or numbers so large that
-            they are in other units.
+        InputError: A frame rate outside 1 to 1000, a wrong shape, a quaternion that is not of length 1, or numbers
+            that are too large for their units.
     """
     if not 1.0 <= fps <= 1000.0:
         raise InputError(f"{where}: field fps must be one number from 1 to 1000")
@@ -400,38 +400,38 @@ def _start(root_pos: np.ndarray, joint_pos: np.ndarray, fps: float) -> int:
 
 
 def resample(clip: Clip, fps: float) -> Clip:
-    """The same motion at another frame rate: orientation by slerp, hands by the frame before, all else linearly.
+    """The same motion at another frame rate: orientation by slerp, hands from the previous frame, all else linearly.
 
-    Frames that already stand at that rate come back as they are.
+    A clip of that rate is returned unchanged.
     """
     if abs(clip.fps - fps) < 1e-6 * fps:
         return clip
     count = int(np.floor(clip.duration * fps + 1e-6)) + 1
     at = np.minimum(np.arange(count) * (clip.fps / fps), len(clip.root_pos) - 1)
     low = np.minimum(at.astype(int), len(clip.root_pos) - 2)
-    share = (at - low)[:, None]
+    weight = (at - low)[:, None]
 
     def between(values: np.ndarray) -> np.ndarray:
-        return (1 - share) * values[low] + share * values[low + 1]
+        return (1 - weight) * values[low] + weight * values[low + 1]
 
     return Clip(
         fps,
         between(clip.root_pos),
-        _slerp(clip.root_quat[low], clip.root_quat[low + 1], share),
+        _slerp(clip.root_quat[low], clip.root_quat[low + 1], weight),
         between(clip.joint_pos),
         clip.trimmed,
         None if clip.hands is None else clip.hands[low],
     )
 
 
-def _slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Spherical interpolation of unit quaternions [n, 4] along the shorter arc; `share` [n, 1]."""
+def _slerp(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Spherical interpolation of unit quaternions [n, 4] along the shorter arc; `weight` [n, 1]."""
     dot = (a * b).sum(axis=-1, keepdims=True)
     b, dot = np.where(dot < 0, -b, b), np.abs(dot)
     angle = np.arccos(np.clip(dot, 0.0, 1.0))
     near = angle < 1e-6
     sine = np.where(near, 1.0, np.sin(angle))
-    quat = np.where(near, a + share * (b - a), (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / sine)
+    quat = np.where(near, a + weight * (b - a), (np.sin((1 - weight) * angle) * a + np.sin(weight * angle) * b) / sine)
     return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
 
 

@@ -14,20 +14,20 @@ from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = ["ClipMeasures", "grounded", "joint_limits", "measure", "summary", "table"]
+__all__ = ["ClipMeasures", "grounded", "joint_limits", "measure_clips", "measures_summary", "measures_table"]
 
 JUMP_SPEED = 4.0
 """Root speed [m/s] that no motion of the robot reaches within a tick."""
 JUMP_JOINT_SPEED = 35.0
 """Joint speed [rad/s] that the fastest of its motors does not reach."""
 LIMIT_SLACK = 1e-3
-"""A joint this far outside its range is within it [rad]: rounding of clips clipped to the range."""
+"""A joint this far outside its range counts as within it [rad]: rounding of clips that were clipped to the range."""
 CONTACT_HEIGHT = 0.015
-"""A sole stands while its middle is less than this above the clip's floor [m]..."""
+"""A sole carries the robot while its middle is less than this above the clip's floor [m]..."""
 CONTACT_SPEED = 0.1
 """...and moves up or down slower than this [m/s]."""
 FLOOR_QUANTILE = 0.02
-"""Share of frames whose lower sole may be below a clip's floor: single frames do not decide."""
+"""Fraction of frames whose lower sole may be below a clip's floor: single frames do not decide."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class ClipMeasures:
     lowest: float
     """Least root height [m]."""
     beyond_limits: float
-    """Farthest that a joint stands outside its range [rad]."""
+    """Largest angle of a joint outside its range [rad]."""
     beyond_limits_joint: str
-    """That joint; empty if none does."""
+    """That joint; empty without one."""
     jumps: int
     """Ticks in which root or joints move faster than the robot can."""
     slip: float
-    """Mean horizontal speed of the soles that stand [m/s]."""
+    """Mean horizontal speed of the soles on the ground [m/s]."""
     floor: float
-    """Height at which its soles stand [m]; 0 is right."""
+    """Height of its soles on the ground [m]; 0 is right."""
     support: str
-    """What it stands or sits on beside the floor."""
+    """What it stands or sits on in addition to the floor."""
     licence: str
     """Its licence."""
     source: str
@@ -86,11 +86,11 @@ def _soles(library: MotionLibrary) -> np.ndarray:
 
 
 def _floor(soles: np.ndarray) -> float:
-    """Height at which a clip's soles stand [m]."""
+    """Height of a clip's soles on the ground [m]."""
     return float(np.quantile(soles[..., 2].min(axis=1), FLOOR_QUANTILE))
 
 
-def measure(library: MotionLibrary) -> list[ClipMeasures]:
+def measure_clips(library: MotionLibrary) -> list[ClipMeasures]:
     """Measure every clip."""
     low, high = joint_limits()
     soles = _soles(library)
@@ -134,9 +134,9 @@ def _slip(soles: np.ndarray, floor: float) -> float:
 
 
 def grounded(library: MotionLibrary) -> tuple[MotionLibrary, np.ndarray]:
-    """The library with every clip on a floor of its own shifted up or down until its soles stand at height 0.
+    """The library with every clip on a floor of its own shifted up or down until its soles are at height 0.
 
-    Clips with a support keep their height: theirs is known.
+    Clips with a support keep their height, which is known.
 
     Returns:
         The library and the shift of each clip [m], shape [clips].
@@ -150,7 +150,7 @@ def grounded(library: MotionLibrary) -> tuple[MotionLibrary, np.ndarray]:
     return replace(library, root_pos=root), shift
 
 
-def summary(measures: list[ClipMeasures]) -> dict[str, Any]:
+def measures_summary(measures: list[ClipMeasures]) -> dict[str, Any]:
     """Totals: clips and seconds of all, by family and by licence; the clips as dictionaries."""
 
     def by(key: str) -> dict[str, dict[str, float]]:
@@ -204,7 +204,7 @@ def _cells(m: ClipMeasures) -> tuple[str, ...]:
     )
 
 
-def table(measures: list[ClipMeasures], rows: int | None = None) -> str:
+def measures_table(measures: list[ClipMeasures], rows: int | None = None) -> str:
     """A table of the first `rows` clips (all by default), with totals by family below."""
     lines = [tuple(name for name, _ in _COLUMNS), *map(_cells, measures[:rows])]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
@@ -214,7 +214,7 @@ def table(measures: list[ClipMeasures], rows: int | None = None) -> str:
         text.append("  ".join(cells).rstrip())
     if rows is not None and len(measures) > rows:
         text.append(f"... and {len(measures) - rows} more (--all shows them)")
-    total = summary(measures)
+    total = measures_summary(measures)
     text.append("")
     for name, group in total["families"].items():
         text.append(f"{name}: {group['clips']} clips, {group['seconds']:.1f} s")

@@ -15,6 +15,11 @@ from arena_newton.rotations import rotate_xy, wrap_angle
 
 __all__ = ["Command", "NavigationLimits", "Navigator", "steer"]
 
+TURN_FIRST, TURN_BLEND = 1.3, 0.7
+"""Far from the goal, a heading error of `TURN_FIRST` stops the walk; this much less leaves it at full speed [rad]."""
+ROUTE_WINDOW = 1.5
+"""Stretch of a route ahead of the last position in which the robot is searched for [m]."""
+
 
 @dataclass(frozen=True)
 class NavigationLimits:
@@ -51,7 +56,7 @@ class NavigationLimits:
     smoothing: float = 0.6
     """Time constant of the position that decides about arrival [s]: the pelvis sways by 5 cm with every step."""
     learning: float = 0.5
-    """Share of the error of a stop that was not good enough which the next approach aims against: a tracker ends its
+    """Fraction of the error of a stop that was not good enough which the next approach aims against: a tracker ends its
     last steps some centimetres from where it decides to stop, always to the same side."""
     most_learned: tuple[float, float] = (0.05, 0.07)
     """Largest such correction [m, rad]."""
@@ -66,7 +71,7 @@ class Command:
     arrived: Tensor
     """At the goal and holding, bool, [worlds]."""
     distance: Tensor
-    """Way left [m], [worlds]."""
+    """Path left [m], [worlds]."""
     heading_error: Tensor
     """Goal heading minus present heading [rad], [worlds]."""
     stray: Tensor
@@ -74,13 +79,13 @@ class Command:
 
 
 def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: NavigationLimits) -> Tensor:
-    """Velocity command towards a point, slowing down for what is left of the way.
+    """Velocity command towards a point, slowing down for what is left of the path.
 
     Args:
         pose: x, y [m], yaw [rad], shape [worlds, 3].
         aim: Point to walk to now [m], shape [worlds, 2].
         goal_yaw: Heading at the goal [rad], shape [worlds].
-        left: Way left to the goal [m], shape [worlds].
+        left: Path left to the goal [m], shape [worlds].
         limits: Speeds and gains.
 
     Returns:
@@ -90,9 +95,9 @@ def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: Nav
     offset = aim - pose[:, :2]
     distance = torch.linalg.vector_norm(offset, dim=1)
     direction = offset / distance.clamp_min(1e-6)[:, None]
-    share = ((left - limits.near) / (limits.far - limits.near)).clamp(0.0, 1.0)
+    far = ((left - limits.near) / (limits.far - limits.near)).clamp(0.0, 1.0)
     bearing = torch.atan2(offset[:, 1], offset[:, 0])
-    wanted = goal_yaw + share * wrap_angle(bearing - goal_yaw)
+    wanted = goal_yaw + far * wrap_angle(bearing - goal_yaw)
     error = wrap_angle(wanted - yaw)
     turn = (limits.heading_gain * error).clamp(-limits.turn, limits.turn)
 
@@ -103,19 +108,19 @@ def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: Nav
     cap = 1.0 / torch.sqrt((x / ahead) ** 2 + (y / limits.sideways) ** 2).clamp_min(1e-6)
     speed = torch.minimum((limits.position_gain * left).clamp_min(limits.crawl), cap)
     # Far from the goal the robot first turns to where it goes; near it moves while turning.
-    facing = ((1.3 - error.abs()) / 0.7).clamp(0.0, 1.0)
-    speed = speed * (1.0 - share + share * facing)
+    facing = ((TURN_FIRST - error.abs()) / TURN_BLEND).clamp(0.0, 1.0)
+    speed = speed * (1.0 - far + far * facing)
     return torch.cat([local * speed[:, None], turn[:, None]], dim=1)
 
 
 class Navigator:
-    """The controller with its memory, one row a world: a goal or a route, arrival with hysteresis."""
+    """The controller with its memory, one row per world: a goal or a route, arrival with hysteresis."""
 
     def __init__(self, worlds: int, device: torch.device | str = "cpu", limits: NavigationLimits | None = None):
         """Start with no goal; call `reset` and `command`."""
         self.limits = limits or NavigationLimits()
         self.holding = torch.zeros(worlds, dtype=torch.bool, device=device)
-        """Worlds that have arrived and stand."""
+        """Worlds that have arrived and hold their position."""
         self._smooth = torch.zeros(worlds, 2, device=device)
         self._fresh = torch.ones(worlds, dtype=torch.bool, device=device)
         self._travelled = torch.zeros(worlds, device=device)
@@ -150,7 +155,7 @@ class Navigator:
             pose: Measured x, y [m], yaw [rad], shape [worlds, 3].
             goal: Wanted x, y [m], yaw [rad], shape [worlds, 3].
             dt: Time since the last call [s].
-            route: Points to pass on the way, from the start to the goal [m], shape [worlds, points, 2]; shorter routes
+            route: Points to pass, from the start to the goal [m], shape [worlds, points, 2]; shorter routes
                 repeat their last point.
             mask: Worlds whose memory advances, bool, shape [worlds]; all by default.
 
@@ -200,33 +205,33 @@ def follow(
     Args:
         route: Points from start to goal [m], shape [worlds, points, 2].
         here: Measured position [m], shape [worlds, 2].
-        travelled: Way along the route at the last call [m], shape [worlds]; it never shrinks.
+        travelled: Path along the route at the last call [m], shape [worlds]; it never shrinks.
         limits: Look-ahead.
 
     Returns:
-        Way along the route [m], point to walk to [m], way left [m] and distance from the route [m], shapes [worlds],
+        Path along the route [m], point to walk to [m], path left [m] and distance from the route [m], shapes [worlds],
         [worlds, 2], [worlds], [worlds].
     """
     start, step = route[:, :-1], route[:, 1:] - route[:, :-1]
     length = torch.linalg.vector_norm(step, dim=2)
-    before = torch.cumsum(length, dim=1) - length
+    passed = torch.cumsum(length, dim=1) - length
     along = ((here[:, None] - start) * step).sum(2) / length.square().clamp_min(1e-9)
     along = along.clamp(0.0, 1.0)
     gap = torch.linalg.vector_norm(start + along[..., None] * step - here[:, None], dim=2)
-    place = before + along * length
+    position = passed + along * length
     # Only the stretch just ahead: a route may pass close to itself.
-    reachable = (place >= travelled[:, None] - 1e-4) & (place <= travelled[:, None] + 1.5)
+    reachable = (position >= travelled[:, None] - 1e-4) & (position <= travelled[:, None] + ROUTE_WINDOW)
     stray, nearest = torch.where(reachable, gap, torch.inf).min(dim=1)
-    found = torch.gather(place, 1, nearest[:, None])[:, 0]
+    found = torch.gather(position, 1, nearest[:, None])[:, 0]
     progress = torch.where(torch.isinf(stray), travelled, torch.maximum(found, travelled))
 
     total = length.sum(dim=1)
     target = torch.minimum(progress + limits.lookahead, total)
-    leg = (target[:, None] > before + length).sum(dim=1, keepdim=True).clamp_max(length.shape[1] - 1)
-    share = (target[:, None] - torch.gather(before, 1, leg)) / torch.gather(length, 1, leg).clamp_min(1e-9)
-    share = share.clamp(0.0, 1.0)
+    leg = (target[:, None] > passed + length).sum(dim=1, keepdim=True).clamp_max(length.shape[1] - 1)
+    fraction = (target[:, None] - torch.gather(passed, 1, leg)) / torch.gather(length, 1, leg).clamp_min(1e-9)
+    fraction = fraction.clamp(0.0, 1.0)
     pick = leg[..., None].expand(-1, -1, 2)
-    aim = (torch.gather(start, 1, pick) + share[..., None] * torch.gather(step, 1, pick))[:, 0]
+    aim = (torch.gather(start, 1, pick) + fraction[..., None] * torch.gather(step, 1, pick))[:, 0]
     left = total - progress
     # On the last stretch the distance itself counts, which sees sideways errors too.
     direct = torch.linalg.vector_norm(route[:, -1] - here, dim=1)

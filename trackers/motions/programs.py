@@ -1,23 +1,23 @@
-"""Random motion programs: clips for training that cover the primitives, their parameters and the ways between them."""
+"""Random motion programs: clips for training that cover primitives, their parameters and the transitions between."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TICK
+from arena_newton.rotations import heading, rotate_xy
 from arena_newton.trackers.motions import primitives as p
+from arena_newton.trackers.motions.generator import ReferenceGenerator
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 from arena_newton.trackers.motions.library import SUPPORTS
 from arena_newton.trackers.motions.primitives import Program, Script
-
-if TYPE_CHECKING:
-    import torch
 
 __all__ = ["FAMILIES", "place_platform", "random_clips"]
 
@@ -34,41 +34,22 @@ PLATFORM_SIZE = (1.0, 1.4)
 PLATFORM_HEIGHTS = (0.05, 0.12)
 """Lowest and highest platform [m]."""
 SOLE_BACK, SOLE_FRONT = 0.06, 0.14
-"""Ends of the foot behind and before the ankle [m], with a centimetre to spare."""
+"""Ends of the foot behind and ahead of the ankle [m], with a centimetre of margin."""
+ARM_RANGES = ((-1.9, 0.6), (0.05, 0.9), (-0.7, 0.7), (-0.7, 1.5), (-0.6, 0.6), (-0.5, 0.5), (-0.5, 0.5))
+"""Random posture of a left arm [rad]."""
 LARGEST_ERROR = 0.02
 """A clip with more IK error anywhere is replaced [m]."""
 FASTEST_JOINT = 25.0
 """A clip with a faster joint anywhere is replaced [rad/s]."""
+SIT_SECONDS, RISE_SECONDS = 3.2, 5.0
+"""Time of sitting down, and for standing up and a second after it [s]."""
 ROUNDS = 6
-"""Times that refused clips are drawn anew."""
-
-FAMILIES: dict[str, int] = {
-    "stand": 128,
-    "squat": 224,
-    "shift": 128,
-    "step": 96,
-    "walk": 832,
-    "turn": 192,
-    "reach": 160,
-    "crouch_reach": 96,
-    "kick": 224,
-    "walk_kick": 96,
-    "punch": 64,
-    "carry": 96,
-    "push": 96,
-    "sit_air": 64,
-    "sit": 224,
-    "walk_sit": 96,
-    "sill": 128,
-    "mixed": 160,
-    "platform": 96,
-}
-"""Clips of each family in the default library."""
+"""Attempts at a clip before the library is refused."""
 
 
 @dataclass
 class _Plan:
-    """One clip before it is played."""
+    """One clip, drawn and not yet played."""
 
     script: Script
     support: str = "none"
@@ -81,7 +62,7 @@ class _Plan:
 
 
 class _Draw:
-    """Random parameters."""
+    """Random parameters of one clip."""
 
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
@@ -89,26 +70,15 @@ class _Draw:
     def __call__(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
 
-    def chance(self, share: float) -> bool:
-        return bool(self.rng.random() < share)
+    def chance(self, probability: float) -> bool:
+        return bool(self.rng.random() < probability)
 
     def side(self) -> str:
         return "left" if self.chance(0.5) else "right"
 
     def arms(self) -> tuple[float, ...]:
         """A random posture of both arms [rad]."""
-        limbs = [
-            (
-                self(-1.9, 0.6),
-                self(0.05, 0.9),
-                self(-0.7, 0.7),
-                self(-0.7, 1.5),
-                self(-0.6, 0.6),
-                self(-0.5, 0.5),
-                self(-0.5, 0.5),
-            )
-            for _ in range(2)
-        ]
+        limbs = [tuple(self(low, high) for low, high in ARM_RANGES) for _ in range(2)]
         return (*limbs[0], *p.mirrored_arms(limbs[1])[7:])
 
     def hand(self, side: str) -> tuple[float, float, float]:
@@ -136,9 +106,9 @@ class _Draw:
             return 0.0, self(-0.3, 0.3), 0.0
         return self(-0.3, 0.6), self(-0.25, 0.25), self(-0.8, 0.8)
 
-    def upper(self, script: Script, share: float = 0.5) -> Script:
+    def upper(self, script: Script, probability: float = 0.5) -> Script:
         """Random arms, waist and tilt on some scripts, another posture for every segment."""
-        if not self.chance(share):
+        if not self.chance(probability):
             return script
         out = []
         for s in script.segments:
@@ -151,7 +121,32 @@ class _Draw:
         return Script(tuple(out))
 
 
+@dataclass(frozen=True)
+class _Family:
+    """A kind of motion."""
+
+    clips: int
+    """Clips in the default library."""
+    make: Callable[[_Draw, float], _Plan]
+    """Draws a clip of a length [s]."""
+
+
+_FAMILIES: dict[str, _Family] = {}
+
+
+def _family(clips: int) -> Callable[[Callable[[_Draw, float], _Plan]], Callable[[_Draw, float], _Plan]]:
+    """Adds a function `_name` as the family `name`; its docstring says what is drawn."""
+
+    def add(make: Callable[[_Draw, float], _Plan]) -> Callable[[_Draw, float], _Plan]:
+        _FAMILIES[make.__name__.removeprefix("_")] = _Family(clips, make)
+        return make
+
+    return add
+
+
+@_family(128)
 def _stand(d: _Draw, seconds: float) -> _Plan:
+    """Heights, tilts, arms."""
     parts = p.stand(d(0.5, 1.5))
     while parts.seconds < seconds:
         channels: dict[str, Any] = {}
@@ -163,7 +158,9 @@ def _stand(d: _Draw, seconds: float) -> _Plan:
     return _Plan(d.upper(parts, 0.75))
 
 
+@_family(224)
 def _squat(d: _Draw, seconds: float) -> _Plan:
+    """Down to 0.42-0.72 m, repeated."""
     parts = p.stand(d(0.3, 1.0))
     while parts.seconds < seconds:
         height = d(0.42, 0.72)
@@ -171,21 +168,30 @@ def _squat(d: _Draw, seconds: float) -> _Plan:
     return _Plan(d.upper(parts))
 
 
+@_family(128)
 def _shift(d: _Draw, seconds: float) -> _Plan:
+    """Weight shifts."""
     parts = p.stand(d(0.3, 1.0))
     while parts.seconds < seconds:
         parts = parts + p.shift(d(-0.04, 0.05), d(-0.09, 0.09), d(0.5, 2.0))
     return _Plan(d.upper(parts.over(height=d(0.66, 0.779), stance_width=d(0.19, 0.28))))
 
 
+@_family(96)
 def _step(d: _Draw, seconds: float) -> _Plan:
+    """Steps in place."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
         parts = parts + p.step(d(1.5, 4.0), pause=d(0.5, 1.5)).over(**d.gait())
     return _Plan(d.upper(parts))
 
 
+@_family(832)
 def _walk(d: _Draw, seconds: float) -> _Plan:
+    """Pieces of 2-4.5 s: forward 0.1-0.8, back to -0.4, sideways 0.3 m/s, arcs to 0.8 rad/s, stops between a third.
+
+    A tenth walks crouched at 0.60-0.70 m.
+    """
     gait, parts = d.gait(), p.stand(d(0.1, 0.6))
     if d.chance(0.1):
         gait["height"], gait["pitch"] = d(0.60, 0.70), d(0.0, 0.15)
@@ -196,14 +202,18 @@ def _walk(d: _Draw, seconds: float) -> _Plan:
     return _Plan(d.upper(parts.over(**gait)))
 
 
+@_family(192)
 def _turn(d: _Draw, seconds: float) -> _Plan:
+    """Turns on the spot."""
     gait, parts = d.gait(), p.stand(d(0.1, 0.6))
     while parts.seconds < seconds:
         parts = parts + p.walk(0.0, 0.0, d(0.2, 1.0) * d.rng.choice([-1, 1]), d(1.5, 4.0), pause=d(0.3, 1.5))
     return _Plan(d.upper(parts.over(**gait)))
 
 
+@_family(160)
 def _reach(d: _Draw, seconds: float) -> _Plan:
+    """Either palm to random points."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
         side = d.side()
@@ -216,7 +226,9 @@ def _reach(d: _Draw, seconds: float) -> _Plan:
     return _Plan(parts)
 
 
+@_family(96)
 def _crouch_reach(d: _Draw, seconds: float) -> _Plan:
+    """The same in a squat."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
         side = d.side()
@@ -226,14 +238,18 @@ def _crouch_reach(d: _Draw, seconds: float) -> _Plan:
     return _Plan(parts)
 
 
+@_family(224)
 def _kick(d: _Draw, seconds: float) -> _Plan:
+    """Either foot at 1.5-3.5 m/s."""
     parts = p.stand(d(0.3, 1.0))
     while parts.seconds < seconds:
         parts = parts + p.kick(d.side(), d(1.5, 3.5), pause=d(0.2, 1.2))
     return _Plan(d.upper(parts, 0.3))
 
 
+@_family(96)
 def _walk_kick(d: _Draw, seconds: float) -> _Plan:
+    """A kick out of a walk."""
     gait, parts = d.gait(), p.stand(d(0.1, 0.5))
     while parts.seconds < seconds:
         parts = parts + p.walk(d(0.15, 0.6), 0.0, d(-0.3, 0.3), d(1.2, 3.0), pause=0.0)
@@ -241,7 +257,9 @@ def _walk_kick(d: _Draw, seconds: float) -> _Plan:
     return _Plan(d.upper(parts.over(**gait), 0.3))
 
 
+@_family(64)
 def _punch(d: _Draw, seconds: float) -> _Plan:
+    """Some crouched, some after steps."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
         height = d(0.55, 0.77) if d.chance(0.5) else None
@@ -251,7 +269,9 @@ def _punch(d: _Draw, seconds: float) -> _Plan:
     return _Plan(parts)
 
 
+@_family(96)
 def _carry(d: _Draw, seconds: float) -> _Plan:
+    """A walk with palms at a box of 16-40 cm."""
     parts = p.stand(d(0.2, 0.6))
     while parts.seconds < seconds:
         forward, left, turn = d.velocity()
@@ -259,7 +279,9 @@ def _carry(d: _Draw, seconds: float) -> _Plan:
     return _Plan(parts)
 
 
+@_family(96)
 def _push(d: _Draw, seconds: float) -> _Plan:
+    """A walk with the feet 3-10 cm behind the pelvis."""
     parts = p.stand(d(0.2, 0.6))
     while parts.seconds < seconds:
         hands = [(d(0.25, 0.42), s * d(0.05, 0.25), d(0.0, 0.35)) for s in (1, -1)]
@@ -267,8 +289,9 @@ def _push(d: _Draw, seconds: float) -> _Plan:
     return _Plan(parts)
 
 
+@_family(64)
 def _sit_air(d: _Draw, seconds: float) -> _Plan:
-    """The way down to a seat and back without one: the weight stays over the feet."""
+    """Down to 0.5-0.6 m and up without a seat: the weight stays over the feet."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
         low = {"height": d(0.5, 0.6), "pitch": d(0.2, 0.45), "arms": p.FORWARD_ARMS}
@@ -279,48 +302,44 @@ def _sit_air(d: _Draw, seconds: float) -> _Plan:
 
 
 def _seated(d: _Draw, lead: Script, seconds: float) -> _Plan:
+    """Down to a seat of 0.36-0.48 m with the front edge 3-8 cm behind the standing pelvis, and up again.
+
+    The seat is loaded: the pelvis ends 24-36 cm back and 9-14 cm above it.
+    """
     seat, edge = d(0.36, 0.48), d(0.03, 0.08)
     depth, press = d(0.24, 0.36), d(0.09, 0.14)
-    left = seconds - lead.seconds - 3.2 - 5.0
-    script = lead + p.sit(seat, hold=max(left, 1.0), depth=depth, press=press)
+    hold = seconds - lead.seconds - SIT_SECONDS - RISE_SECONDS
+    script = lead + p.sit(seat, hold=max(hold, 1.0), depth=depth, press=press)
     script = script + p.rise(seat, depth=depth, press=press) + p.stand(1.0)
     return _Plan(script, "seat", lead.seconds, seat, edge)
 
 
+@_family(224)
 def _sit(d: _Draw, seconds: float) -> _Plan:
+    """From standing onto a seat; see `_seated`."""
     return _seated(d, p.stand(d(0.3, 1.5)), seconds)
 
 
+@_family(96)
 def _walk_sit(d: _Draw, seconds: float) -> _Plan:
+    """The same after turning and walking backwards to the seat."""
     back = p.walk(-d(0.15, 0.3), 0.0, 0.0, d(1.0, 1.8), pause=1.2)
     if d.chance(0.5):
         back = p.walk(0.0, 0.0, d(0.5, 0.9) * d.rng.choice([-1, 1]), d(0.8, 1.6), pause=0.6) + back
     return _seated(d, p.stand(0.2) + back, seconds)
 
 
+@_family(128)
 def _sill(d: _Draw, seconds: float) -> _Plan:
-    """A walk with high steps; where a sill fits under it is found afterwards."""
+    """A walk with steps of 15-20 cm, the feet next to each other; `_place_sill` finds where a sill fits under it."""
     lead = p.stand(d(0.1, 0.5)) + p.walk(d(0.2, 0.5), 0.0, 0.0, d(0.5, 1.5), pause=0.0)
     over = p.step_over(d(0.37, 0.44), d(4.0, 6.0), swing_height=d(0.15, 0.20), step_time=d(0.48, 0.6))
     return _Plan(d.upper(lead + over + p.stand(1.0), 0.3), "sill", height=d(*SILL_HEIGHTS))
 
 
-def _platform(d: _Draw, seconds: float) -> _Plan:
-    """A walk onto a platform, half of them over it and down again; where it stands is found afterwards."""
-    height, down = d(*PLATFORM_HEIGHTS), d.chance(0.5)
-    over = p.step_up(
-        height,
-        d(0.38, 0.42),
-        3 if down else 2,
-        ahead=d(1.0, 2.0),
-        down=down,
-        swing_height=d(0.14, 0.18),
-        step_time=d(0.5, 0.6),
-    )
-    return _Plan(d.upper(p.stand(d(0.1, 0.5)) + over, 0.3), "platform", height=height)
-
-
+@_family(160)
 def _mixed(d: _Draw, seconds: float) -> _Plan:
+    """Walk, reach, crouch, kick, punch, squat in any order."""
     parts = p.stand(d(0.1, 0.6))
     while parts.seconds < seconds:
         kind = int(d.rng.integers(6))
@@ -341,35 +360,28 @@ def _mixed(d: _Draw, seconds: float) -> _Plan:
     return _Plan(parts)
 
 
-_MAKERS: dict[str, Callable[[_Draw, float], _Plan]] = {
-    "stand": _stand,
-    "squat": _squat,
-    "shift": _shift,
-    "step": _step,
-    "walk": _walk,
-    "turn": _turn,
-    "reach": _reach,
-    "crouch_reach": _crouch_reach,
-    "kick": _kick,
-    "walk_kick": _walk_kick,
-    "punch": _punch,
-    "carry": _carry,
-    "push": _push,
-    "sit_air": _sit_air,
-    "sit": _sit,
-    "walk_sit": _walk_sit,
-    "sill": _sill,
-    "mixed": _mixed,
-    "platform": _platform,
-}
+@_family(96)
+def _platform(d: _Draw, seconds: float) -> _Plan:
+    """A walk onto a platform, half of them over it and down again; `place_platform` finds where it fits."""
+    height, down = d(*PLATFORM_HEIGHTS), d.chance(0.5)
+    over = p.step_up(
+        height,
+        d(0.38, 0.42),
+        3 if down else 2,
+        ahead=d(1.0, 2.0),
+        down=down,
+        swing_height=d(0.14, 0.18),
+        step_time=d(0.5, 0.6),
+    )
+    return _Plan(d.upper(p.stand(d(0.1, 0.5)) + over, 0.3), "platform", height=height)
+
+
+FAMILIES: dict[str, int] = {name: family.clips for name, family in _FAMILIES.items()}
+"""Clips of each family in the default library."""
 
 
 def _play(plans: list[_Plan], ticks: int, device: Any) -> dict[str, torch.Tensor]:
     """Frames of all plans, and which of them are sound."""
-    import torch
-
-    from arena_newton.trackers.motions.generator import ReferenceGenerator
-
     program = Program([plan.script for plan in plans], device)
     generator = ReferenceGenerator(len(plans), device)
     names = ("root_pos", "root_quat", "joint_pos", "hands")
@@ -388,27 +400,21 @@ def _play(plans: list[_Plan], ticks: int, device: Any) -> dict[str, torch.Tensor
     return out
 
 
-def _seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Boxes behind the standing pelvis, and which stay clear of feet and of the walk before."""
-    import torch
-
-    from arena_newton.trackers.motions.frames import heading
-
+def _place_seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Boxes behind the standing pelvis, and which stay clear of the feet and of the walk to them."""
     root = out["root_pos"]
     at = torch.tensor([min(round(plan.start / TICK), root.shape[1] - 1) for plan in plans], device=root.device)
     rows = torch.arange(len(plans), device=root.device)
-    place, yaw = root[rows, at], heading(out["root_quat"][rows, at])
+    position, yaw = root[rows, at], heading(out["root_quat"][rows, at])
     edge = torch.tensor([plan.edge for plan in plans], device=root.device)
     height = torch.tensor([plan.height for plan in plans], device=root.device)
     ahead = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
-    centre = place[:, :2] - ahead * (edge + 0.5 * SEAT_SIZE[0])[:, None]
+    centre = position[:, :2] - ahead * (edge + 0.5 * SEAT_SIZE[0])[:, None]
     size = torch.tensor(SEAT_SIZE, device=root.device).expand(len(plans), 2)
     box = torch.cat([centre, height[:, None], yaw[:, None], size, height[:, None]], dim=1)
 
     def local(xy: torch.Tensor) -> torch.Tensor:
-        d = xy - centre[:, None]
-        c, s = torch.cos(yaw)[:, None], torch.sin(yaw)[:, None]
-        return torch.stack([c * d[..., 0] + s * d[..., 1], -s * d[..., 0] + c * d[..., 1]], dim=-1).abs()
+        return rotate_xy(-yaw[:, None], xy - centre[:, None]).abs()
 
     half = 0.5 * torch.tensor(SEAT_SIZE, device=root.device)
     feet = local(out["feet"][..., :2].flatten(1, 2))
@@ -426,22 +432,20 @@ def _along(root_xy: torch.Tensor, feet: torch.Tensor) -> tuple[torch.Tensor, tor
         feet: Ankles [m], shape [clips, ticks, 2, 2 or more].
 
     Returns:
-        Start [m] and direction, shape [clips, 2], length [m], shape [clips], and the way of each foot along it [m],
-        shape [clips, ticks, 2].
+        Start [m] and direction, shape [clips, 2], length [m], shape [clips], and the position of each foot along it
+        [m], shape [clips, ticks, 2].
     """
-    start, way = root_xy[:, 0], root_xy[:, -1] - root_xy[:, 0]
-    length = way.square().sum(1).sqrt().clamp(min=1e-3)
-    ahead = way / length[:, None]
+    start, path = root_xy[:, 0], root_xy[:, -1] - root_xy[:, 0]
+    length = path.square().sum(1).sqrt().clamp(min=1e-3)
+    ahead = path / length[:, None]
     return start, ahead, length, ((feet[..., :2] - start[:, None, None]) * ahead[:, None, None]).sum(-1)
 
 
 def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where along the walk a sill is cleared best, and whether it is cleared by enough; lowers it where need be.
+    """Where along the walk a sill is cleared best, and whether by enough; a sill that is too high is lowered.
 
-    Each place along the line from start to end is tried; feet and their soles cross it in the air.
+    Positions along the line from start to end are tried; feet and their soles cross the sill in the air.
     """
-    import torch
-
     root, feet = out["root_pos"], out["feet"]
     start, ahead, length, along = _along(root[..., :2], feet)
     along = along.flatten(1)
@@ -449,8 +453,8 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
     best = torch.full_like(length, -1.0)
     where = torch.zeros_like(length)
     half = 0.5 * SILL_SIZE[0]
-    for share in np.linspace(0.25, 0.85, 49):
-        spot = length * float(share)
+    for fraction in np.linspace(0.25, 0.85, 49):
+        spot = length * float(fraction)
         over = (along - SOLE_BACK < (spot + half)[:, None]) & (along + SOLE_FRONT > (spot - half)[:, None])
         clear = torch.where(over, height, 1.0).amin(1)
         where = torch.where(clear > best, spot, where)
@@ -467,7 +471,7 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
 def place_platform(
     root_xy: torch.Tensor, feet: torch.Tensor, height: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where along a straight walk a platform stands under the feet that tread at its height.
+    """Where along a straight walk a platform fits under the feet that tread at its height.
 
     Args:
         root_xy: Pelvis [m], shape [clips, ticks, 2].
@@ -476,10 +480,8 @@ def place_platform(
 
     Returns:
         Centre x, y and yaw [m, rad], shape [clips, 3], and the least distance of a foot's tread from an end of the
-        platform [m], shape [clips]: below 0 where there is no place.
+        platform [m], shape [clips]: below 0 where none fits.
     """
-    import torch
-
     start, ahead, length, along = _along(root_xy, feet)
     above = feet[..., 2] - SOLE_HEIGHT - height[:, None, None]
     still = torch.zeros_like(above, dtype=torch.bool)
@@ -500,22 +502,24 @@ def place_platform(
     return torch.cat([centre, torch.atan2(ahead[:, 1], ahead[:, 0])[:, None]], dim=1), best
 
 
-def _platform_box(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Platforms under the feet, and which of them every foot treads on whole or passes over."""
-    import torch
-
+def _place_platform_box(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Platforms under the feet, and on which of them no foot treads on an edge."""
     root = out["root_pos"]
     height = torch.tensor([plan.height for plan in plans], device=root.device)
-    place, room = place_platform(root[..., :2], out["feet"], height)
+    pose, room = place_platform(root[..., :2], out["feet"], height)
     size = torch.tensor(PLATFORM_SIZE, device=root.device).expand(len(plans), 2)
-    box = torch.cat([place[:, :2], height[:, None], place[:, 2:], size, height[:, None]], dim=1)
+    box = torch.cat([pose[:, :2], height[:, None], pose[:, 2:], size, height[:, None]], dim=1)
     return box, room >= 0.0
+
+
+_PLACE = {"seat": _place_seat, "sill": _place_sill, "platform": _place_platform_box}
+"""Support → its box for each clip, and whether it fits."""
 
 
 def _drawn(family: str, number: int, seconds: float, seed: int, attempt: int) -> _Plan:
     """A clip's plan from a generator of its own, so that it depends on no other clip and no other family."""
     rng = np.random.default_rng([seed, zlib.crc32(family.encode()), number, attempt])
-    return _MAKERS[family](_Draw(rng), seconds)
+    return _FAMILIES[family].make(_Draw(rng), seconds)
 
 
 def random_clips(
@@ -524,29 +528,19 @@ def random_clips(
     """Random clips of the named families, all of the same length.
 
     A family is a way to draw scripts of primitives (`primitives`), joined until the clip is full; gait shape (step
-    0.38-0.52 s, width 0.19-0.27 m, swing 6-10 cm, pelvis 0.70-0.78 m) is drawn once a clip, and on about half the clips
-    every segment has random arms, waist and hands.
+    0.38-0.52 s, width 0.19-0.27 m, swing 6-10 cm, pelvis 0.70-0.78 m) is drawn once per clip, and on about half the
+    clips every segment has random arms, waist and hands.
 
-    - `stand`: heights, tilts, arms. `shift`: weight shifts. `squat`: 0.42-0.72 m, repeated. `step`: in place.
-    - `walk`: pieces of 2-4.5 s: forward 0.1-0.8, back to -0.4, sideways 0.3 m/s, arcs to 0.8 rad/s, stops between a
-      third of them; a tenth walks crouched at 0.60-0.70 m. `turn`: on the spot.
-    - `reach`, `crouch_reach`: either palm to random points. `kick`: 1.5-3.5 m/s, either foot. `walk_kick`: a kick out
-      of a walk. `punch`: some crouched, some after steps.
-    - `carry`: palms at a box of 16-40 cm. `push`: feet 3-10 cm behind the pelvis.
-    - `sit_air`: down to 0.5-0.6 m and up in balance, no seat. `sit`, `walk_sit`: seats of 0.36-0.48 m with the front
-      edge 3-8 cm behind the standing pelvis, really loaded (the pelvis ends 24-36 cm back and at seat + 0.09-0.14 m);
-      after standing, or after turning and walking backwards to it.
-    - `sill`: steps of 15-20 cm, the feet beside each other; a sill of 5-10 cm lies where every sole clears it by 5 cm.
-    - `platform`: up onto a platform of 5-12 cm that every tread stands on whole; half of them go over it and down.
-    - `mixed`: walk, reach, crouch, kick, punch, squat in any order.
+    The docstring of each maker (`_stand` to `_platform`) says what it draws.
 
-    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support that feet run into is drawn anew.
+    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support in the way of a foot is drawn
+    again.
 
     Args:
         families: Clips of each family; `FAMILIES` without it.
         seconds: Length of every clip [s].
-        seed: The same seed gives the same clips of a family, whatever families and however many clips stand beside
-            them; at least 0.
+        seed: The same seed gives the same clips of a family, whatever other families and however many clips are
+            made; at least 0.
         device: Torch device; a GPU makes 2400 clips in seconds.
 
     Returns:
@@ -556,14 +550,12 @@ def random_clips(
         [rad], length along the heading, width, height of the top [m] (zeros without one).
 
     Raises:
-        InputError: An unknown family, or one whose clips are refused again and again.
+        InputError: An unknown family, or one whose clips are refused `ROUNDS` times.
     """
-    import torch
-
     counts = dict(FAMILIES if families is None else families)
     for name in counts:
-        if name not in _MAKERS:
-            raise InputError(f"random clips: no family {name!r}, expected one of {', '.join(_MAKERS)}")
+        if name not in FAMILIES:
+            raise InputError(f"random clips: no family {name!r}, expected one of {', '.join(FAMILIES)}")
     names = list(counts)
     family = np.repeat(np.arange(len(names)), [counts[n] for n in names])
     ticks = round(seconds / TICK)
@@ -577,13 +569,12 @@ def random_clips(
         out = _play(plans, ticks, device)
         sound = out.pop("sound")
         kind = torch.tensor([SUPPORTS.index(plan.support) for plan in plans], device=sound.device)
-        seat, clear = _seat(plans, out)
-        sill, cleared = _place_sill(plans, out)
-        platform, trodden = _platform_box(plans, out)
-        box = torch.zeros_like(seat)
-        for k, (found, fits) in enumerate(((seat, clear), (sill, cleared), (platform, trodden)), start=1):
-            sound &= torch.where(kind == k, fits, True)
-            box = torch.where((kind == k)[:, None], found, box)
+        box = torch.zeros(len(plans), 7, device=sound.device)
+        for support, place in _PLACE.items():
+            found, fits = place(plans, out)
+            chosen = kind == SUPPORTS.index(support)
+            sound &= torch.where(chosen, fits, True)
+            box = torch.where(chosen[:, None], found, box)
         out = {**out, "support_kind": kind, "support_box": box}
         good = sound.cpu().numpy()
         to = torch.tensor(missing[good], device=sound.device)
@@ -594,6 +585,9 @@ def random_clips(
         missing = missing[~good]
     if len(missing):
         bad = sorted({names[family[i]] for i in missing})
-        raise InputError(f"random clips: {len(missing)} clips of {', '.join(bad)} were refused {ROUNDS} times")
+        why = "IK error, joint speed or support"
+        raise InputError(
+            f"could not generate {len(missing)} clips of {', '.join(bad)}: {ROUNDS} attempts failed ({why})"
+        )
     del result["feet"]
     return {**result, "family": torch.tensor(family, device=device), "family_names": names}

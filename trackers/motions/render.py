@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
 from arena_newton import robot as g1
 from arena_newton.errors import InputError
-from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
-
-if TYPE_CHECKING:
-    from arena_newton.pictures.camera import Camera
+from arena_newton.pictures.camera import Camera, WorldLights
+from arena_newton.rotations import heading_np, quat_from_yaw_np
+from arena_newton.scene import load_scene
+from arena_newton.tasks import LightDraw
+from arena_newton.trackers.motions.library import FIXTURES, SUPPORTS, MotionLibrary
 
 __all__ = ["ClipRenderer"]
 
@@ -23,10 +24,10 @@ TARGET_HEIGHT = 0.68
 EYE = (1.1, -2.6, 0.35)
 """Eye from there [m]: from the robot's right, a little ahead."""
 LIGHT_DIRECTION = (-0.35, 0.45, -1.0)
-"""From the light to the scene; its shadows tell feet on the floor from feet above it."""
+"""From the light to the scene; its shadows show whether a foot is on the floor."""
 LIGHT_INTENSITY = 4000.0
-FIXTURES = {"seat": "/World/Seat", "sill": "/World/Sill", "platform": "/World/Platform"}
-"""Support → the lab's fixture that plays it."""
+_FIXTURE = {kind: f"/World/{name}" for kind, name in zip(SUPPORTS[1:], FIXTURES, strict=True)}
+"""Support → the lab's prim of it."""
 
 
 class ClipRenderer:
@@ -43,17 +44,11 @@ class ClipRenderer:
         Raises:
             InputError: A size below 16 px.
         """
-        import mujoco
-
-        from arena_newton.pictures.camera import WorldLights
-        from arena_newton.scene import load_scene
-        from arena_newton.tasks import LightDraw
-
         if min(width, height) < 16:
             raise InputError(f"render: pictures of {width}x{height} px, expected at least 16 each way")
         self.library, self.width, self.height = library, width, height
         self.scene = load_scene("lab", worlds=1, device="cpu", native=True)
-        self._mj, self._data = mujoco, mujoco.MjData(self.scene.mj_model)
+        self._data = mujoco.MjData(self.scene.mj_model)
         self._parked = self._data.mocap_pos.copy()
         self._state = self.scene.model.state()
         self._lights = WorldLights.allocate(1, self.scene.device, self.scene.stage)
@@ -62,7 +57,7 @@ class ClipRenderer:
     def pictures(self, clip: int, frames: np.ndarray) -> Iterator[np.ndarray]:
         """Pictures of a clip, one at a time.
 
-        The clip is turned to start towards +x, and its path laid over the middle of the floor.
+        The clip is turned to start towards +x, and its path centred on the floor.
 
         Args:
             clip: Index of the clip.
@@ -73,7 +68,7 @@ class ClipRenderer:
         """
         rows = self.library.rows(clip)
         pos, quat = (getattr(self.library, name)[rows].astype(np.float64) for name in ("root_pos", "root_quat"))
-        turn = _yaw_quat(-_yaw(quat[0]))
+        turn = quat_from_yaw_np(-heading_np(quat[0]))
         matrix = self._rotation(turn)
         pos = pos @ matrix.T
         middle = (pos[:, :2].min(axis=0) + pos[:, :2].max(axis=0)) / 2
@@ -82,24 +77,24 @@ class ClipRenderer:
         joints, hands = self.library.joint_pos[rows], self.library.hands[rows]
         for frame in frames:
             root = np.zeros(4)
-            self._mj.mju_mulQuat(root, turn, quat[frame])
+            mujoco.mju_mulQuat(root, turn, quat[frame])
             self._pose(pos[frame], root, joints[frame], hands[frame])
             yield self._camera(pos[frame]).render(self._state)[0].cpu().numpy().copy()
 
     def _rotation(self, quat: np.ndarray) -> np.ndarray:
         matrix = np.zeros(9)
-        self._mj.mju_quat2Mat(matrix, quat)
+        mujoco.mju_quat2Mat(matrix, quat)
         return matrix.reshape(3, 3)
 
     def _place_support(self, clip: int, turn: np.ndarray, matrix: np.ndarray, middle: np.ndarray) -> None:
         self._data.mocap_pos[:] = self._parked
         kind = SUPPORTS[self.library.support_kind[clip]]
-        if kind not in FIXTURES:
+        if kind not in _FIXTURE:
             return
         box = self.library.support_box[clip].astype(np.float64)
-        mocap = self.scene.mocap_id(FIXTURES[kind])
+        mocap = self.scene.mocap_id(_FIXTURE[kind])
         self._data.mocap_pos[mocap] = matrix @ box[:3] - [*middle, 0.0]
-        self._mj.mju_mulQuat(self._data.mocap_quat[mocap], turn, _yaw_quat(box[3]))
+        mujoco.mju_mulQuat(self._data.mocap_quat[mocap], turn, quat_from_yaw_np(box[3]))
 
     def _pose(self, pos: np.ndarray, quat: np.ndarray, joints: np.ndarray, hands: np.ndarray) -> None:
         robot, data = self.scene.robot, self._data
@@ -110,7 +105,7 @@ class ClipRenderer:
         for side in range(2):
             fingers = robot.hand_qpos[7 * side : 7 * side + 7]
             data.qpos[fingers] = closed[side] if hands[side] >= 0.5 else g1.HAND_OPEN
-        self._mj.mj_kinematics(self.scene.mj_model, data)
+        mujoco.mj_kinematics(self.scene.mj_model, data)
         poses = self._state.body_q.numpy()
         bodies = self.scene.body_to_newton[0]
         moving = bodies >= 0
@@ -119,14 +114,12 @@ class ClipRenderer:
         self._state.body_q.assign(poses)
 
     def _camera(self, pos: np.ndarray) -> Camera:
-        from arena_newton.pictures.camera import Camera
-
         eye = np.array([pos[0], pos[1], TARGET_HEIGHT]) + EYE
         back = np.array(EYE) / np.linalg.norm(EYE)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
         quat = np.zeros(4)
-        self._mj.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).ravel())
+        mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).ravel())
         return Camera(
             self.scene.model,
             np.array([-1]),
@@ -139,12 +132,3 @@ class ClipRenderer:
             lights=self._lights,
             samples=2,
         )
-
-
-def _yaw(quat: Any) -> float:
-    w, x, y, z = quat
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-
-
-def _yaw_quat(yaw: float) -> np.ndarray:
-    return np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])

@@ -12,7 +12,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from arena_newton.usd_scenes import author
-from arena_newton.usd_scenes.g1.links import LINKS, Link
+from arena_newton.usd_scenes.g1.links import LINKS, PALM_OFFSET, Link
 from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Bar, Loft, Rod, grid, merge
 
 __all__ = ["PATH", "build", "fuse", "zero_poses"]
@@ -25,9 +25,6 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 HEAD_CAMERA = ((0.0576235, 0.01753, 0.42987), 0.8307767239493009)
 """`d435_link` on `torso_link`: offset [m], pitch down [rad]; Unitree's public G1 model."""
-
-PALM_OFFSET = 0.0415, 0.003
-"""Palm frame on the wrist_yaw link: x, and y mirrored between the hands [m]; position of the palm mesh in the MJCF."""
 
 ROS_FRONT = (0.5, -0.5, 0.5, -0.5)
 """Head camera on `d435_link`, looking along +z with y down (the original benchmark's camera configuration)."""

@@ -9,9 +9,11 @@ the jointless `pelvis_contour_link` (1 g). Rows stand depth first, parents befor
 
 from dataclasses import dataclass
 
-__all__ = ["Hinge", "LINKS", "Link"]
+__all__ = ["Hinge", "LINKS", "Link", "PALM_OFFSET"]
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
+PALM_OFFSET = 0.0415, 0.003
+"""Palm frame on the wrist_yaw link: x, and y mirrored between the hands [m]; that of the palm mesh in the MJCF."""
 
 
 @dataclass(frozen=True)

@@ -198,7 +198,7 @@ def test_measures():
     library.joint_pos[library.rows(1), 3] = 3.0
     library.root_pos[library.rows(2).start + 20 : library.rows(2).stop, 0] += 0.3
     library.root_pos[library.rows(3), 1] = np.arange(40) * 0.02 * 0.1
-    plain, floating, jumping, sliding = measure.measure(library)
+    plain, floating, jumping, sliding = measure.measure_clips(library)
     assert plain.beyond_limits == 0.0 and plain.jumps == 0 and plain.slip == pytest.approx(0.0, abs=1e-4)
     assert plain.floor == pytest.approx(0.0, abs=1e-4)
     assert floating.beyond_limits == pytest.approx(3.0 - 2.8798, abs=1e-4)
@@ -206,7 +206,7 @@ def test_measures():
     assert jumping.jumps == 1 and sliding.slip == pytest.approx(0.1, abs=1e-3) and sliding.speed > 0.09
     level, shift = measure.grounded(MotionLibrary.concatenate([standing(0.0), standing(0.05)]))
     np.testing.assert_allclose(shift, [0.0, -0.05], atol=1e-4)
-    assert measure.measure(level)[1].floor == pytest.approx(0.0, abs=1e-4)
+    assert measure.measure_clips(level)[1].floor == pytest.approx(0.0, abs=1e-4)
 
 
 def test_supports_keep_their_height():
@@ -223,7 +223,7 @@ def test_real_files(shared):
     files = sorted((shared / "reference" / "motions").iterdir())
     library, reports = read_library(files, licence="MIT", source="test")
     assert library.clips == len(files) and {r.kind for r in reports} >= {"ASAP pickle", "table", "TWIST2/GMR pickle"}
-    assert all(m.jumps == 0 and m.beyond_limits == 0.0 and m.lowest > 0.4 for m in measure.measure(library))
+    assert all(m.jumps == 0 and m.beyond_limits == 0.0 and m.lowest > 0.4 for m in measure.measure_clips(library))
     path = shared / "reference" / "motions" / "gmt_walk_stand.pkl"
     raw, clip = load_plain_pickle(path), read_file(path).clips[0]
     still = torch.zeros(len(clip.joint_pos), 3, dtype=torch.float64)

@@ -225,7 +225,7 @@ def test_bad_files(library, tmp_path):
     cases = {
         "array hands is missing": {k: v for k, v in good.items() if k != "hands"},
         "not a motion library": {k: v for k, v in good.items() if k != "format"},
-        "30 frames a second": good | {"fps": np.array(30)},
+        "30 frames per second": good | {"fps": np.array(30)},
         "joint_pos holds NaN": good | {"joint_pos": nan},
         r"joint_pos has shape \[191, 28\]": good | {"joint_pos": nan[:, :28]},
         "do not cover": good | {"clip_length": library.clip_length + 1},
