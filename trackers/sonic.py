@@ -213,7 +213,6 @@ class _DeployedSonic(PartialNetwork):
 class SonicFrontEnd(FrontEnd):
     """Encoder input (1762), then proprioception (930)."""
 
-    interface = "sonic"
     obs_width = OBSERVATION
     default_pose = SONIC_DEFAULT_POSE
     graphable = True

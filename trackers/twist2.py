@@ -85,7 +85,6 @@ class Twist2Net(TrackerNetwork):
 class Twist2FrontEnd(FrontEnd):
     """TWIST2's observation around the 35-number mimic command."""
 
-    interface = "twist2"
     obs_width = OBSERVATION
     default_pose = DEFAULT_POSE
     graphable = True

@@ -65,8 +65,8 @@ def cell_rows(result: Result) -> list[dict[str, Any]]:
 def group_rows(result: Result) -> list[dict[str, Any]]:
     """Falls and means of every group and of the whole suite."""
     groups = dict.fromkeys(cell.group for cell in result.plan.cells)
-    rows = [_entry(result, "", group, result.group(group)) for group in groups]
-    return [*rows, _entry(result, "", "all", np.ones(len(result.plan.cell), dtype=bool))]
+    rows = [_entry(result, "", group, result.rows(group)) for group in groups]
+    return [*rows, _entry(result, "", "all", result.rows())]
 
 
 def document(results: Sequence[Result], options: dict[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from arena_newton.trackers.train.options import FAMILY_WEIGHTS, TrainOptions, ru
 
 if TYPE_CHECKING:
     from arena_newton.robot import DriveGains, PhysicsRate
-    from arena_newton.trackers.front_end import ActionForm, FrontEnd
+    from arena_newton.trackers.front_end import FrontEnd
     from arena_newton.trackers.motions.library import MotionLibrary
     from arena_newton.trackers.train.runner import TrackerRunner
 
@@ -40,21 +40,10 @@ def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveG
     Raises:
         InputError: Another interface or form.
     """
-    from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
-    from arena_newton.trackers import sonic, twist2
-    from arena_newton.trackers.front_end import residual_form
+    from arena_newton.trackers.interface import get
 
-    kinds: dict[str, tuple[type[FrontEnd], DriveGains, ActionForm]] = {
-        "twist2": (twist2.Twist2FrontEnd, TWIST2_DRIVE, twist2.OFFICIAL_FORM),
-        "sonic": (sonic.SonicFrontEnd, SONIC_DRIVE, sonic.SONIC_FORM),
-    }
-    if tracker not in kinds:
-        raise InputError(f"--tracker {tracker}: no interface that is trained here; there are {', '.join(kinds)}")
-    if action_form not in ("auto", "residual", "default"):
-        raise InputError(f"--action-form {action_form}: expected auto, residual or default")
-    kind, drive, default = kinds[tracker]
-    form = dataclasses.replace(default, clip=10.0) if action_form == "default" else residual_form(drive)
-    return kind(form), drive, PhysicsRate(dt=0.005, substeps=4)
+    kind = get(tracker)
+    return kind.front_end(kind.action_form(action_form)), kind.drive, kind.rate
 
 
 def make_library(options: TrainOptions, device: str, seed: int) -> MotionLibrary:
