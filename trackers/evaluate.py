@@ -2,6 +2,9 @@
 
 One suite of references for any number of trackers, every rollout of a tracker in one batch of worlds; tables to
 Markdown, JSON and CSV. Figures that have a bar are printed with their verdict.
+
+The command line is argparse's: `--checkpoint` and `--label` belong to the `--tracker` before them, and tyro does not
+keep the order of flags.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.quiet import quiet_warp
@@ -24,7 +27,7 @@ __all__ = ["Entry", "main"]
 
 PROG = "python -m arena_newton.trackers.evaluate"
 ROLLOUTS = {"full": 64, "quick": 8}
-"""Rollouts a cell, unless --rollouts says otherwise."""
+"""Rollouts per cell, unless --rollouts says otherwise."""
 
 
 class Entry:
@@ -45,7 +48,7 @@ class Entry:
 
     @property
     def official(self) -> bool:
-        """Whether the weights are others': ours are safetensors."""
+        """Whether the weights are not ours, which are safetensors."""
         return self.checkpoint is not None and not self.checkpoint.endswith(".safetensors")
 
     def make(self) -> Tracker:
@@ -62,19 +65,23 @@ class Entry:
 
 
 class _AddTracker(argparse.Action):
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
         namespace.trackers = [*(namespace.trackers or []), Entry(values)]
 
 
 class _OfLastTracker(argparse.Action):
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
         if not namespace.trackers:
             raise InputError(f"{option} {values}: name its --tracker first")
         setattr(namespace.trackers[-1], "checkpoint" if option == "--checkpoint" else "given_label", values)
 
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> Any:
+    def error(self, message: str) -> NoReturn:
         raise InputError(message)
 
 
@@ -91,9 +98,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--checkpoint", action=_OfLastTracker, metavar="PATH", help="weights of the --tracker before it")
     add("--label", action=_OfLastTracker, metavar="TEXT", help="what tables call the --tracker before it")
     add("--suite", choices=tuple(ROLLOUTS), default="full", help="full: every cell; quick: a few")
-    add("--only", nargs="+", default=[], metavar="CELL", help="only cells or groups whose names hold one of these")
+    add("--only", nargs="+", default=[], metavar="CELL", help="only cells or groups whose names contain one of these")
     add("--clips", nargs="+", default=[], type=Path, metavar="FILE", help="motion clips or libraries to add")
-    add("--rollouts", type=int, default=None, metavar="N", help="rollouts a cell (64 full, 8 quick)")
+    add("--rollouts", type=int, default=None, metavar="N", help="rollouts per cell (64 full, 8 quick)")
     add("--goals", type=int, default=None, metavar="N", help="goals in closed loop (20 full, 4 quick)")
     add("--seed", type=int, default=0, help="seed of goals and start perturbations")
     add("--engine", choices=("auto", "mujoco", "warp"), default="auto", help="physics engine")
@@ -122,7 +129,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
         kept = {word: [c for c in cells if word in c.name or word == c.group] for word in args.only}
         for word, matches in kept.items():
             if not matches:
-                raise InputError(f"--only {word}: no such cell; --list prints them")
+                raise InputError(f"--only {word}: no cell or group matches (see --list)")
         cells = [c for c in cells if any(c in matches for matches in kept.values())]
     return cells
 
@@ -149,9 +156,9 @@ def _evaluate(args: argparse.Namespace) -> int:
         raise InputError("name at least one --tracker")
     labels = [entry.label for entry in args.trackers]
     if len(set(labels)) < len(labels):
-        raise InputError(f"two trackers are called {max(labels, key=labels.count)!r}: tell them apart with --label")
+        raise InputError(f"two trackers are called {max(labels, key=labels.count)!r}: give each a --label")
     for entry in args.trackers:
-        entry.make()  # complains about files before anything is built
+        entry.make()  # refuses unfit files before anything is built
 
     from arena_newton.physics import resolve_engine
     from arena_newton.trackers.evaluation import chart, tracker_report
@@ -165,7 +172,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         try:
             args.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"--out {args.out}: cannot be made ({error.strerror})") from None
+            raise InputError(f"--out {args.out}: cannot be created ({error.strerror})") from None
     played = make_plan(_cells(args), rollouts, args.seed)
     options = {"engine": args.engine, "device": args.device, "fast_physics": args.fast_physics, "threads": args.threads}
     results = []

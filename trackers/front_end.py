@@ -72,8 +72,6 @@ def plain(*signs: float) -> tuple[Sequence[int], Sequence[float]]:
 class FrontEnd(abc.ABC):
     """Base of all front ends; a subclass sets the widths and writes `prefill`, `write` and `advance`."""
 
-    interface: str = ""
-    """Name of the interface in weights files, such as `twist2`."""
     obs_width: int = 0
     """Width of the observation."""
     action_width: int = JOINTS

@@ -1,6 +1,6 @@
 """Interfaces that are trained here: one record per tracker, from which training, weights files and bars are derived.
 
-A module such as `twist2` ends with its record, `INTERFACE`, and stands in `MODULES`. Nothing here imports torch, so
+A module such as `twist2` ends with its record, `INTERFACE`, and is listed in `MODULES`. Nothing here imports torch, so
 that command lines can list the names.
 """
 

@@ -92,9 +92,9 @@ SONIC_FORM = ActionForm("default", (*_LEG_SCALE, *_LEG_SCALE, _YAW, _SMALL, _SMA
 _R00, _R01 = ((10, -2), (15, -2)), ((6, 2), (3, -2))
 _R10, _R11 = ((6, 2), (3, 2)), ((5, -2), (15, -2))
 _R20, _R21 = ((7, 2), (2, -2)), ((11, 2), (1, 2))
-_ROT6D = (_R00, _R01, _R10, _R11, _R20, _R21)
-"""Two columns of the rotation matrix, row by row, less the identity's: from a_i a_j (index 4 i + j)."""
-_RELATIVE_AND_DOWN = (
+ROT6D = (_R00, _R01, _R10, _R11, _R20, _R21)
+"""Two columns of the rotation matrix, row by row, minus the identity's: from a_i a_j (index 4 i + j)."""
+RELATIVE_AND_DOWN = (
     ((4, 1), (13, 1), (22, 1), (31, 1)),
     ((5, 1), (12, -1), (23, -1), (30, 1)),
     ((6, 1), (15, 1), (20, -1), (29, -1)),
@@ -103,8 +103,8 @@ _RELATIVE_AND_DOWN = (
     ((19, -2), (1, -2), (0, 0), (0, 0)),
     ((9, 2), (18, 2), (0, 0), (0, 0)),
 )
-"""conj(a) b, then minus the last row of a's rotation matrix, less the identity's: where down is, seen from the body.
-From a_i (a, b)_j (index 8 i + j)."""
+"""conj(a) b; then the negative last row of a's rotation matrix without the identity's, the direction down seen from the
+body. From a_i (a, b)_j (index 8 i + j)."""
 
 
 _MIRROR = (
@@ -213,7 +213,6 @@ class _DeployedSonic(PartialNetwork):
 class SonicFrontEnd(FrontEnd):
     """Encoder input (1762), then proprioception (930)."""
 
-    interface = "sonic"
     obs_width = OBSERVATION
     default_pose = SONIC_DEFAULT_POSE
     graphable = True
@@ -228,8 +227,8 @@ class SonicFrontEnd(FrontEnd):
         four = [JOINTS * part + joint for part in range(4) for joint in CANONICAL_TO_MUJOCO]
         self._four_to_canonical = torch.tensor(four, device=self.device)
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
-        self._relative_and_down = Quadratic(_RELATIVE_AND_DOWN, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), self.device)
-        self._rot6d = Quadratic(_ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
+        self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), self.device)
+        self._rot6d = Quadratic(ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
 
         def frames(name: str) -> torch.Tensor:
             return self.obs[:, AT[name]].view(worlds, FRAMES, -1)
@@ -251,7 +250,7 @@ class SonicFrontEnd(FrontEnd):
         self._source = torch.tensor(source, device=self.device)
         self._shifted = torch.zeros(worlds, PROPRIOCEPTION, device=self.device)
         self._first_tick = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
-        # Saves two operations a tick on the CPU; elsewhere a graph may be recorded now and replayed after a reset.
+        # Saves two operations per tick on the CPU; elsewhere a graph may be recorded now and replayed after a reset.
         self._may_be_first = True
 
     @torch.no_grad()

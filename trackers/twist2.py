@@ -42,10 +42,11 @@ JOINT_VEL_SCALE = 0.05
 OFFICIAL_FORM = ActionForm("default", (0.5,) * JOINTS, clip=10.0)
 """Action form of the official checkpoints."""
 OBSERVATION_CLIP = 100.0
-_TILT_TERMS = (((1, 2), (11, 2)), ((5, -2), (10, -2)), ((2, 2), (7, -2)))
+TILT_TERMS = (((1, 2), (11, 2)), ((5, -2), (10, -2)), ((2, 2), (7, -2)))
 """2(wx + yz), -2(x² + y²), 2(wy - zx) from the products of a quaternion with itself (`Quadratic`)."""
 _VECTOR = 64
-"""Rows are padded to a multiple of this for `atan2` and `asin`: two AVX-512 vectors and room."""
+"""Rows are padded to a multiple of this for `atan2` and `asin`. Measured with AVX-512: a multiple of 32 rows goes
+through torch's vector code whole; of 15 or 48 rows two have other last bits in `atan2`."""
 
 
 class Twist2Net(TrackerNetwork):
@@ -85,7 +86,6 @@ class Twist2Net(TrackerNetwork):
 class Twist2FrontEnd(FrontEnd):
     """TWIST2's observation around the 35-number mimic command."""
 
-    interface = "twist2"
     obs_width = OBSERVATION
     default_pose = DEFAULT_POSE
     graphable = True
@@ -107,7 +107,7 @@ class Twist2FrontEnd(FrontEnd):
         self._newest = self._past[:, -FRAME:]
         self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
-        self._tilt_terms = Quadratic(_TILT_TERMS, (0.0, 1.0, 0.0), self.device)
+        self._tilt_terms = Quadratic(TILT_TERMS, (0.0, 1.0, 0.0), self.device)
         terms, angles = torch.zeros(3, padded, device=self.device), torch.zeros(2, padded, device=self.device)
         self._roll_sine, self._roll_cosine, self._pitch_sine = terms
         self._roll, self._pitch = angles

@@ -15,13 +15,13 @@ __all__ = ["GOALS", "QUICK", "goals", "suite"]
 GOALS = 20
 """Goals of a suite."""
 GOAL_SECONDS = 26.0
-"""Time for a goal, the way back from an overshoot included [s]."""
+"""Time for a goal, the return from an overshoot included [s]."""
 GOAL_RANGE = 3.0
-"""Goals lie within this on either axis [m]."""
+"""Goals are within this on either axis [m]."""
 RIGHT_FOOT = -0.11
-"""To the left of the robot's middle [m]: what lies before the right foot."""
+"""To the left of the robot's middle [m]: in front of the right foot."""
 SEAT_DEPTH, SEAT_GAP = 0.5, 0.05
-"""Depth of the seat, and its front edge behind the standing pelvis [m] (measured: 5 cm is sat on, 18 cm is missed)."""
+"""Depth of the seat, and its front edge behind the standing pelvis [m] (measured: at 18 cm the robot misses it)."""
 QUICK = (
     "stand",
     "walk 0.3",
@@ -32,11 +32,9 @@ QUICK = (
     "sit 0.42",
     "push 40 N·s, walk 0.3",
 )
-"""Cells of the quick suite, beside a few goals."""
-
-
+"""Cells of the quick suite, besides a few goals."""
 CARRY_WALK = 1.5
-"""When a carrying robot sets off [s]."""
+"""Time at which a carrying robot starts to walk [s]."""
 LEFT_HIGH, FRONT, LOW = (0.35, 0.20, 0.45), (0.42, 0.12, 0.20), (0.38, 0.15, -0.05)
 """Points for the left hand [m], pelvis' heading frame."""
 
@@ -70,7 +68,7 @@ def _standing() -> list[Cell]:
 
 
 def _walking() -> list[Cell]:
-    way = {
+    velocities = {
         "walk 0.3": (0.3, 0.0, 0.0),
         "walk 0.6": (0.6, 0.0, 0.0),
         "walk 0.8": (0.8, 0.0, 0.0),
@@ -81,7 +79,7 @@ def _walking() -> list[Cell]:
         "turn -0.8": (0.0, 0.0, -0.8),
         "arc 0.4, 0.4": (0.4, 0.0, 0.4),
     }
-    cells = [_cell(name, name.split()[0], _go(10.0, *velocity)) for name, velocity in way.items()]
+    cells = [_cell(name, name.split()[0], _go(10.0, *velocity)) for name, velocity in velocities.items()]
     stops = p.walk(0.5, seconds=2.5, pause=2.5) + p.walk(0.5, seconds=2.5, pause=2.5)
     return [*cells, _cell("walk 0.5, stop and go", "walk", stops, window=0.0)]
 
@@ -136,7 +134,7 @@ def _contact() -> list[Cell]:
     for newtons in (0.0, 5.0, 10.0):
         steady = Push(newtons, (2.5, 2.5), 30.0, backward=True)
         lean = p.push(0.35, 9.0, foot_offset=0.08)
-        # Judged after the force has been on for two seconds, before the walk ends.
+        # Measured after the force has acted for two seconds, and before the walk ends.
         cells.append(Cell(f"chest {newtons:g} N, walk 0.35", "chest", 10.2, lean, push=steady, window=4.5))
     for impulse, speed in ((20, 0.3), (20, 0.6), (40, 0.0), (40, 0.3), (40, 0.6)):
         blow = Push(impulse / 0.1, (3.0, 4.0), 0.1)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
 from arena_newton.trackers.evaluation.figures import Figure, Result, figures
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["chart", "missing"]
 
@@ -16,7 +20,7 @@ _COLOURS = {"pass": "#8fcfa5", "MISS": "#f0a090", "": "#d0d0d0"}
 _WIDEST = 2.0
 """Where a bar is cut off, as a multiple of the limit."""
 _NARROWEST = 0.012
-"""Length of a bar of nothing: its colour stays to be seen."""
+"""Least length of a bar: its colour stays visible."""
 
 
 def missing() -> str:
@@ -27,7 +31,7 @@ def missing() -> str:
 
 
 def chart(results: Sequence[Result], out: Path) -> Path:
-    """Draw every figure of every tracker as a fraction of its limit: up to the line at 1 it is met.
+    """Draw every figure of every tracker as a fraction of its limit: up to the line at 1 the bar is met.
 
     A bar's length is the figure's number over its limit, or the limit over the number where more is better; its colour
     is the verdict, which may ask for more than the number (no fall). Figures without a limit show their value alone.
@@ -68,9 +72,9 @@ def chart(results: Sequence[Result], out: Path) -> Path:
     return out
 
 
-def _row(axis: object, row: int, figure: Figure | None) -> None:
+def _row(axis: Axes, row: int, figure: Figure | None) -> None:
     value = "–" if figure is None else figure.value
     ratio = None if figure is None else figure.ratio
     if figure is not None and ratio is not None:
-        axis.barh(row, min(max(ratio, _NARROWEST), _WIDEST), height=0.72, color=_COLOURS[figure.verdict])  # type: ignore[attr-defined]
-    axis.text(0.02, row, value, va="center", fontsize=6.5)  # type: ignore[attr-defined]
+        axis.barh(row, min(max(ratio, _NARROWEST), _WIDEST), height=0.72, color=_COLOURS[figure.verdict])
+    axis.text(0.02, row, value, va="center", fontsize=6.5)

@@ -9,17 +9,24 @@ from typing import Any
 import numpy as np
 
 from arena_newton.intervals import wilson
+from arena_newton.trackers import interface
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.rollout import Outcome, Plan
 
-__all__ = ["Figure", "Result", "figures"]
+__all__ = ["BARS", "Bar", "Figure", "Result", "figures"]
 
-GOAL_PLACE, GOAL_TURN = 0.08, 5.0
+BASELINE = "twist2"
+"""Interface whose official checkpoints set the bar of the fall rate for everyone."""
+GOAL_DISTANCE, GOAL_TURN = 0.08, 5.0
 """A goal counts as reached within this [m], [deg]."""
+BALL_SPEED = 1.5
+"""A ball counts as hit from this speed on [m/s]."""
+TOUCH = 5.0
+"""Force above which a sill counts as touched [N]."""
 SEAT_TIME = 2.0
 """Time at 100 N and more that counts as sitting [s]."""
 BEHIND = 0.2
-"""A pelvis this far behind the middle of a sill is over it [m]."""
+"""A pelvis this far past the middle of a sill is over it [m]."""
 RISEN = 0.65
 """A pelvis above this stands again [m]."""
 
@@ -31,7 +38,7 @@ class Result:
     label: str
     """What tables call it."""
     interface: str
-    """Name of the tracker's class: decides which bars hold."""
+    """Name of the tracker's class: which bars apply follows from it."""
     official: bool
     """Weights of others, to compare with."""
     tracker: dict[str, Any]
@@ -42,13 +49,8 @@ class Result:
     """`cpu` of one world and, where there is a GPU, `cuda` of 4096 [ms]."""
 
     def rows(self, *names: str) -> np.ndarray:
-        """Worlds of the cells with these names, bool [worlds]."""
-        wanted = [i for i, cell in enumerate(self.plan.cells) if cell.name in names]
-        return np.isin(self.plan.cell, wanted)
-
-    def group(self, name: str) -> np.ndarray:
-        """Worlds of a group's cells, bool [worlds]."""
-        wanted = [i for i, cell in enumerate(self.plan.cells) if cell.group == name]
+        """Worlds of the cells or groups with these names, bool [worlds]; all without a name."""
+        wanted = [i for i, cell in enumerate(self.plan.cells) if not names or {cell.name, cell.group} & set(names)]
         return np.isin(self.plan.cell, wanted)
 
     @property
@@ -56,9 +58,10 @@ class Result:
         """Whether the plan holds every cell of the full suite: the bar of the fall rate is one for all of it."""
         return {cell.name for cell in suite("full")} <= {cell.name for cell in self.plan.cells}
 
-    def of(self, measure: str, rows: np.ndarray) -> np.ndarray:
-        """Values of a measure in some worlds."""
-        return self.outcome.measures[measure][rows]
+    @property
+    def fall_rate(self) -> float:
+        """Fraction of all rollouts that fell."""
+        return float(self.outcome.measures["fell"].mean())
 
 
 @dataclass(frozen=True)
@@ -92,10 +95,163 @@ class Figure:
         return "" if self.met is None else "pass" if self.met else "MISS"
 
 
-def _falls(result: Result, rows: np.ndarray) -> tuple[int, int, str]:
-    fell, count = int(result.of("fell", rows).sum()), int(rows.sum())
-    low, high = wilson(fell, count)
-    return fell, count, f"{fell}/{count} = {100 * fell / max(count, 1):.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+class Sample:
+    """The rollouts of a figure's cells."""
+
+    def __init__(self, result: Result, rows: np.ndarray):
+        """Take some worlds of a result, bool [worlds]."""
+        self.measures = {name: values[rows] for name, values in result.outcome.measures.items()}
+        self.fell: np.ndarray = self.measures["fell"].astype(bool)
+
+    def mean(self, measure: str) -> float:
+        """Mean over the rollouts."""
+        return float(self.measures[measure].mean())
+
+    def common(self) -> dict[str, Any]:
+        """What every text may name: falls, rollouts, and the fall rate with its 95 % interval [%]."""
+        fell, count = int(self.fell.sum()), len(self.fell)
+        low, high = wilson(fell, count)
+        rate = f"{fell}/{count} = {100 * fell / max(count, 1):.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+        return {"fell": fell, "count": count, "falls": rate}
+
+
+Numbers = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """How a figure is read off the suite, and its bar."""
+
+    name: str
+    """The figure's row."""
+    cells: tuple[str, ...]
+    """Cells or groups whose rollouts count; all without one."""
+    reduce: Callable[[Sample], Numbers]
+    """Numbers for the text; the first one is judged."""
+    value: str
+    """Text of the value, made of these numbers and of `Sample.common`."""
+    bar: str
+    """Text of the bar, made of `limit`, or of `percent`, a hundred times that."""
+    limit: float | None = None
+    """Bar of the judged number."""
+    at_least: bool = False
+    """Whether the number must reach the limit; otherwise it must not pass it."""
+    no_fall: bool = False
+    """Whether nobody may fall besides."""
+    key: str = ""
+    """Where each interface has a limit of its own, or none: its key in `Interface.bars`."""
+    whole: bool | None = None
+    """Shown only if every cell of the full suite was played (True), or only if not (False)."""
+
+    def figure(self, result: Result) -> Figure | None:
+        """The row of a tracker; None where its cells were not played."""
+        rows = result.rows(*self.cells)
+        if not rows.any() or (self.whole is not None and self.whole != result.whole):
+            return None
+        sample = Sample(result, rows)
+        numbers = self.reduce(sample)
+        number, limit = next(iter(numbers.values())), self.limit
+        if self.key:
+            limit = (
+                interface.get(result.interface).bars.get(self.key) if result.interface in interface.names() else None
+            )
+        met, bar = None, ""
+        if limit is not None:
+            met = (number >= limit if self.at_least else number <= limit) and not (self.no_fall and sample.fell.any())
+            bar = self.bar.format(limit=limit, percent=100 * limit)
+        value = self.value.format(**sample.common(), **numbers)
+        return Figure(self.name, value, bar, met, number, limit, self.at_least)
+
+
+def _fall_rate(sample: Sample) -> Numbers:
+    return {"fall_rate": int(sample.fell.sum()) / max(len(sample.fell), 1)}
+
+
+def _speed(sample: Sample) -> Numbers:
+    asked = sample.mean("ref_x")
+    # Where nobody was still up when the mean speed began to count, nothing was reached.
+    fraction = sample.mean("speed_x") / asked if asked else 0.0
+    return {"fraction": fraction, "percent": 100 * fraction}
+
+
+def _goals(sample: Sample) -> Numbers:
+    distance, turn = sample.measures["goal_distance"], sample.measures["goal_turn"]
+    reached = (distance <= GOAL_DISTANCE) & (turn <= GOAL_TURN) & ~sample.fell
+    return {
+        "fraction": float(reached.mean()),
+        "reached": int(reached.sum()),
+        "distance": distance.max(),
+        "turn": turn.max(),
+    }
+
+
+def _sit(sample: Sample) -> Numbers:
+    loaded = sample.measures["seat_time"] >= SEAT_TIME
+    risen = ~sample.fell & (sample.measures["end_z"] >= RISEN)
+    return {"fraction": float((loaded & risen).mean()), "seated": int(loaded.sum()), "risen": int(risen.sum())}
+
+
+def _sill(sample: Sample) -> Numbers:
+    over = (sample.measures["end_x"] > sample.measures["support_x"] + BEHIND) & ~sample.fell
+    touched = int((sample.measures["touch"] > TOUCH).sum())
+    return {"fraction": float(over.mean()), "over": int(over.sum()), "touched": touched}
+
+
+def _ball(sample: Sample) -> Numbers:
+    peak, roll = sample.measures["ball_peak"], sample.measures["ball_end"]
+    hit = float((peak >= BALL_SPEED).mean())
+    return {"median": float(np.median(peak)), "rolls": float(np.median(roll)), "hit": hit, "percent": 100 * hit}
+
+
+def _standing_ball(sample: Sample) -> Numbers:
+    numbers = _ball(sample)
+    return {"hit": numbers.pop("hit")} | numbers
+
+
+_BALL = "median {median:.1f} m/s (rolls {rolls:.1f}), {percent:.0f} % ≥ 1.5 m/s, falls {fell}/{count}"
+
+
+def _mean(measure: str) -> Callable[[Sample], Numbers]:
+    return lambda sample: {"mean": sample.mean(measure)}
+
+
+# fmt: off
+def _walk(speed: str, leg_rmse: float) -> tuple[Bar, ...]:
+    cells, name = (f"walk {speed}",), f"walk {speed} m/s"
+    return (
+        Bar(f"speed reached, {name}", cells, _speed, "{percent:.0f} %", "≥ {percent:.0f} %", 0.9, at_least=True),
+        Bar(f"leg joint RMSE, {name}", cells, _mean("leg_rmse"), "{mean:.3f} rad", "≤ {limit:g} rad", leg_rmse),
+        Bar(f"drift per 10 s, {name}, open loop", cells, _mean("drift_10s"), "{mean:.2f} m", "≤ {limit:.2f} m",
+            key=f"drift, walk {speed}"),
+    )
+
+
+BARS: tuple[Bar, ...] = (
+    Bar("fall rate, whole suite", (), _fall_rate, "{falls}", "≤ {percent:g} %", key="fall_rate", whole=True),
+    Bar("fall rate, these cells only", (), _fall_rate, "{falls}", "", whole=False),
+    *_walk("0.3", 0.045),
+    *_walk("0.6", 0.06),
+    Bar("goals reached in closed loop", ("goal",), _goals,
+        "{reached}/{count} (worst {distance:.3f} m, {turn:.1f}°, falls {fell})",
+        "all within 0.08 m and 5°, no fall", 1.0, at_least=True, no_fall=True),
+    Bar("squat to 0.45 m and back", ("squat 0.45",), _mean("lowest"),
+        "falls {fell}/{count}, lowest {mean:.2f} m", "no fall, ≤ {limit:.2f} m", 0.50, no_fall=True),
+    Bar("sit on 0.42 m (100 N for 2 s) and rise", ("sit 0.42",), _sit,
+        "falls {fell}/{count}, seated {seated}, risen {risen}",
+        "no fall, all seated and risen", 1.0, at_least=True, no_fall=True),
+    Bar("step over a 9 cm sill", ("sill 0.09",), _sill, "falls {fell}/{count}, over {over}, touched {touched}",
+        "no fall, all over", 1.0, at_least=True, no_fall=True),
+    Bar("ball speed: walk through 0.6", ("ball, walk through 0.6",), _ball, _BALL,
+        "median ≥ {limit:g} m/s, no fall", BALL_SPEED, at_least=True, no_fall=True),
+    Bar("ball speed: standing kick", ("ball, standing kick",), _standing_ball, _BALL,
+        "≥ 1.5 m/s in {percent:g} %, no fall", 0.8, at_least=True, no_fall=True),
+    Bar("10 N against the chest, walk 0.35 m/s", ("chest 10 N, walk 0.35",), _mean("speed_x"),
+        "{mean:.2f} m/s, falls {fell}/{count}", "≥ {limit:g} m/s, no fall", 0.2, at_least=True, no_fall=True),
+    Bar("push of 40 N·s in 0.1 s while walking, falls", ("push 40 N·s, walk 0.3", "push 40 N·s, walk 0.6"), _fall_rate,
+        "{falls}", "≤ {percent:g} %", 0.15),
+)
+# fmt: on
+"""Figures in the order of the table."""
 
 
 def figures(result: Result, others: Sequence[Result] = ()) -> list[Figure]:
@@ -105,165 +261,24 @@ def figures(result: Result, others: Sequence[Result] = ()) -> list[Figure]:
         result: The tracker to judge.
         others: All results of the same plan, for comparisons.
     """
-    rows = [
-        _fall_rate(result),
-        _against_official(result, others),
-        *_walks(result),
-        _goals(result),
-        _squat(result),
-        _sit(result),
-        _sill(result),
-        _ball(result, "ball, walk through 0.6", share=None),
-        _ball(result, "ball, standing kick", share=0.8),
-        _chest(result),
-        _push(result),
-        *_inference(result),
-    ]
-    return [row for row in rows if row is not None]
-
-
-def _fall_rate(result: Result) -> Figure:
-    fell, count, text = _falls(result, np.ones(len(result.plan.cell), dtype=bool))
-    if not result.whole:
-        return Figure("fall rate, these cells only", text, "", None, fell / max(count, 1))
-    limit = {"twist2": 0.01, "sonic": 0.03}.get(result.interface)
-    bar = "" if limit is None else f"≤ {100 * limit:g} %"
-    met = None if limit is None else fell <= limit * count
-    return Figure("fall rate, whole suite", text, bar, met, fell / max(count, 1), limit)
+    rows = [bar.figure(result) for bar in BARS]
+    rows.insert(1, _against_official(result, others))
+    return [row for row in rows if row is not None] + _inference(result)
 
 
 def _against_official(result: Result, others: Sequence[Result]) -> Figure | None:
-    rates = {
-        o.label: float(o.outcome.measures["fell"].mean()) for o in others if o.official and o.interface == "twist2"
-    }
+    rates = {other.label: other.fall_rate for other in others if other.official and other.interface == BASELINE}
     if result.official or not rates or not result.whole:
         return None
-    own, (name, best) = float(result.outcome.measures["fell"].mean()), min(rates.items(), key=lambda item: item[1])
+    own, (name, best) = result.fall_rate, min(rates.items(), key=lambda item: item[1])
     bar = f"≤ {100 * best:.1f} % ({name})"
     return Figure("fall rate, against official TWIST2", f"{100 * own:.1f} %", bar, own <= best, own, best)
 
 
-def _walks(result: Result) -> list[Figure]:
-    out = []
-    for speed, error, drift in ((0.3, 0.045, 0.20), (0.6, 0.06, 0.30)):
-        rows = result.rows(f"walk {speed:g}")
-        if not rows.any():
-            continue
-        asked = float(np.mean(result.of("ref_x", rows)))
-        # Nobody was still up when the mean speed began to count: nothing was reached.
-        share = float(np.mean(result.of("speed_x", rows))) / asked if asked else 0.0
-        name = f"speed reached, walk {speed:g} m/s"
-        out.append(Figure(name, f"{100 * share:.0f} %", "≥ 90 %", share >= 0.9, share, 0.9, at_least=True))
-        rmse = float(result.of("leg_rmse", rows).mean())
-        name = f"leg joint RMSE, walk {speed:g} m/s"
-        out.append(Figure(name, f"{rmse:.3f} rad", f"≤ {error:g} rad", rmse <= error, rmse, error))
-        mean = float(result.of("drift_10s", rows).mean())
-        judged = result.interface == "twist2"
-        bar = f"≤ {drift:.2f} m" if judged else ""
-        name = f"drift per 10 s, walk {speed:g} m/s, open loop"
-        met, limit = (mean <= drift, drift) if judged else (None, None)
-        out.append(Figure(name, f"{mean:.2f} m", bar, met, mean, limit))
-    return out
-
-
-def _goals(result: Result) -> Figure | None:
-    rows = result.group("goal")
-    if not rows.any():
-        return None
-    place, turn = result.of("goal_distance", rows), result.of("goal_turn", rows)
-    fell = result.of("fell", rows)
-    reached = (place <= GOAL_PLACE) & (turn <= GOAL_TURN) & ~fell
-    text = (
-        f"{int(reached.sum())}/{len(reached)} (worst {place.max():.3f} m, {turn.max():.1f}°, falls {int(fell.sum())})"
-    )
-    bar = "all within 0.08 m and 5°, no fall"
-    share = float(reached.mean())
-    return Figure("goals reached in closed loop", text, bar, bool(reached.all()), share, 1.0, at_least=True)
-
-
-def _squat(result: Result) -> Figure | None:
-    rows = result.rows("squat 0.45")
-    if not rows.any():
-        return None
-    fell, count, _ = _falls(result, rows)
-    lowest = float(result.of("lowest", rows).mean())
-    done = bool(fell == 0 and lowest <= 0.50)
-    text = f"falls {fell}/{count}, lowest {lowest:.2f} m"
-    return Figure("squat to 0.45 m and back", text, "no fall, ≤ 0.50 m", done, lowest, 0.50)
-
-
-def _sit(result: Result) -> Figure | None:
-    rows = result.rows("sit 0.42")
-    if not rows.any():
-        return None
-    fell, count, _ = _falls(result, rows)
-    loaded = result.of("seat_time", rows) >= SEAT_TIME
-    risen = ~result.of("fell", rows) & (result.of("end_z", rows) >= RISEN)
-    text = f"falls {fell}/{count}, seated {int(loaded.sum())}, risen {int(risen.sum())}"
-    met = bool(fell == 0 and loaded.all() and risen.all())
-    share = float((loaded & risen).mean())
-    bar = "no fall, all seated and risen"
-    return Figure("sit on 0.42 m (100 N for 2 s) and rise", text, bar, met, share, 1.0, at_least=True)
-
-
-def _sill(result: Result) -> Figure | None:
-    rows = result.rows("sill 0.09")
-    if not rows.any():
-        return None
-    fell, count, _ = _falls(result, rows)
-    over = (result.of("end_x", rows) > result.of("support_x", rows) + BEHIND) & ~result.of("fell", rows)
-    text = f"falls {fell}/{count}, over {int(over.sum())}, touched {int((result.of('touch', rows) > 5).sum())}"
-    met, share = bool(fell == 0 and over.all()), float(over.mean())
-    return Figure("step over a 9 cm sill", text, "no fall, all over", met, share, 1.0, at_least=True)
-
-
-def _ball(result: Result, cell: str, share: float | None) -> Figure | None:
-    rows = result.rows(cell)
-    if not rows.any():
-        return None
-    fell, count, _ = _falls(result, rows)
-    peak, roll = result.of("ball_peak", rows), result.of("ball_end", rows)
-    hit = float((peak >= 1.5).mean())
-    text = (
-        f"median {np.median(peak):.1f} m/s (rolls {np.median(roll):.1f}), "
-        f"{100 * hit:.0f} % ≥ 1.5 m/s, falls {fell}/{count}"
-    )
-    bar = "median ≥ 1.5 m/s, no fall" if share is None else f"≥ 1.5 m/s in {100 * share:g} %, no fall"
-    enough = bool(np.median(peak) >= 1.5) if share is None else hit >= share
-    number, limit = (float(np.median(peak)), 1.5) if share is None else (hit, share)
-    name = f"ball speed: {cell.removeprefix('ball, ')}"
-    return Figure(name, text, bar, enough and fell == 0, number, limit, at_least=True)
-
-
-def _chest(result: Result) -> Figure | None:
-    rows = result.rows("chest 10 N, walk 0.35")
-    if not rows.any():
-        return None
-    fell, count, _ = _falls(result, rows)
-    speed = float(result.of("speed_x", rows).mean())
-    text = f"{speed:.2f} m/s, falls {fell}/{count}"
-    met = speed >= 0.2 and fell == 0
-    return Figure("10 N against the chest, walk 0.35 m/s", text, "≥ 0.2 m/s, no fall", met, speed, 0.2, at_least=True)
-
-
-def _push(result: Result) -> Figure | None:
-    rows = result.rows("push 40 N·s, walk 0.3", "push 40 N·s, walk 0.6")
-    if not rows.any():
-        return None
-    fell, count, text = _falls(result, rows)
-    met = fell <= 0.15 * count
-    return Figure("push of 40 N·s in 0.1 s while walking, falls", text, "≤ 15 %", met, fell / max(count, 1), 0.15)
-
-
 def _inference(result: Result) -> list[Figure]:
-    bars: list[tuple[str, str, float]] = [
-        ("cpu", "inference, 1 world on the CPU", 0.3),
-        ("cuda", "inference, 4096 worlds on the GPU", 1.0),
+    bars = (("cpu", "inference, 1 world on the CPU", 0.3), ("cuda", "inference, 4096 worlds on the GPU", 1.0))
+    return [
+        Figure(name, f"{time:.3f} ms", f"≤ {limit:g} ms", time <= limit, time, limit)
+        for key, name, limit in bars
+        if (time := result.inference.get(key)) is not None
     ]
-    times: Callable[[str], float | None] = result.inference.get
-    out = []
-    for key, name, limit in bars:
-        value = times(key)
-        if value is not None:
-            out.append(Figure(name, f"{value:.3f} ms", f"≤ {limit:g} ms", value <= limit, value, limit))
-    return out

@@ -65,8 +65,8 @@ def cell_rows(result: Result) -> list[dict[str, Any]]:
 def group_rows(result: Result) -> list[dict[str, Any]]:
     """Falls and means of every group and of the whole suite."""
     groups = dict.fromkeys(cell.group for cell in result.plan.cells)
-    rows = [_entry(result, "", group, result.group(group)) for group in groups]
-    return [*rows, _entry(result, "", "all", np.ones(len(result.plan.cell), dtype=bool))]
+    rows = [_entry(result, "", group, result.rows(group)) for group in groups]
+    return [*rows, _entry(result, "", "all", result.rows())]
 
 
 def document(results: Sequence[Result], options: dict[str, Any]) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def document(results: Sequence[Result], options: dict[str, Any]) -> dict[str, An
 
 
 def figure_table(results: Sequence[Result]) -> str:
-    """Figures of all trackers side by side, Markdown."""
+    """Figures of all trackers, one column each, Markdown."""
     columns = [{f.name: f for f in figures(r, results)} for r in results]
     names = list(dict.fromkeys(name for column in columns for name in column))
     head = ["figure", "bar", *(r.label for r in results)]
@@ -113,8 +113,8 @@ def _shown(figure: Figure | None) -> str:
     return f"{figure.value} **{figure.verdict}**" if figure.verdict else figure.value
 
 
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def _line(texts: Sequence[str]) -> str:
+    return "| " + " | ".join(texts) + " |"
 
 
 def _table(entries: Sequence[dict[str, Any]], key: str) -> str:
@@ -161,7 +161,7 @@ def markdown(results: Sequence[Result], options: dict[str, Any]) -> str:
 
 
 def write(results: Sequence[Result], options: dict[str, Any], out: Path) -> list[Path]:
-    """Write `evaluation.md`, `evaluation.json` and `evaluation.csv` (a row a tracker and cell) into `out`."""
+    """Write `evaluation.md`, `evaluation.json` and `evaluation.csv` (one row per tracker and cell) into `out`."""
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / f"evaluation.{kind}" for kind in ("md", "json", "csv")]
     paths[0].write_text(markdown(results, options), encoding="utf-8")

@@ -54,6 +54,12 @@ _BINARY: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
 _SAME = frozenset({"Identity", "Dropout", "Cast", "Clip"})
 
 
+Step = tuple[torch.nn.Module, tuple[str, ...], str]
+"""A module, the names of its inputs and of its output."""
+Node = tuple[str, list[str], list[str], dict[str, Any]]
+"""Operator, inputs, outputs, attributes."""
+
+
 class _Unfit(Exception):
     """The graph holds something that this reader does not know."""
 
@@ -84,22 +90,22 @@ class _Convolution(torch.nn.Module):
 
 
 class _Call(torch.nn.Module):
-    """A function with its constant arguments in place."""
+    """A function with some arguments that are constant."""
 
     def __init__(self, function: Callable[..., torch.Tensor], constants: dict[int, torch.Tensor] | None = None):
         super().__init__()
         self.function = function
         constants = constants or {}
-        self.places = tuple(sorted(constants))
-        for place in self.places:
-            self.register_buffer(f"constant_{place}", constants[place])
+        self.positions = tuple(sorted(constants))
+        for position in self.positions:
+            self.register_buffer(f"constant_{position}", constants[position])
 
     def forward(self, *dynamic: torch.Tensor) -> torch.Tensor:
-        if not self.places:
+        if not self.positions:
             return self.function(*dynamic)
         arguments = list(dynamic)
-        for place in self.places:
-            arguments.insert(place, getattr(self, f"constant_{place}"))
+        for position in self.positions:
+            arguments.insert(position, getattr(self, f"constant_{position}"))
         return self.function(*arguments)
 
 
@@ -150,8 +156,10 @@ class _Graph:
         self.evaluate(_probe(_PROBE_ROWS, self.in_width), self.probe, self.dynamic)
         self.steps = self._live(self._compile())
 
-    def evaluate(self, x: torch.Tensor, values: dict[str, torch.Tensor], dynamic: set[str] | None = None):
-        """The output node by node; `values` receives every intermediate, `dynamic` the names that depend on `x`."""
+    def evaluate(
+        self, x: torch.Tensor, values: dict[str, torch.Tensor], dynamic: set[str] | None = None
+    ) -> torch.Tensor:
+        """The output, node by node; `values` receives every intermediate, `dynamic` the names that depend on `x`."""
         dynamic = set() if dynamic is None else dynamic
         values.update(self.constants)
         values[self.input] = x
@@ -167,8 +175,8 @@ class _Graph:
                 dynamic.add(outputs[0])
         return values[self.output]
 
-    def _compile(self) -> list[tuple[torch.nn.Module, tuple[str, ...], str]]:
-        steps: list[tuple[torch.nn.Module, tuple[str, ...], str]] = []
+    def _compile(self) -> list[Step]:
+        steps: list[Step] = []
         same: dict[str, str] = {}
         for op, inputs, outputs, attributes in self.nodes:
             output = outputs[0]
@@ -192,7 +200,7 @@ class _Graph:
         bounds += [float(attributes[k]) for k in ("min", "max") if k in attributes]
         return all(math.isinf(b) for b in bounds)
 
-    def _module(self, op, inputs, output, attributes) -> tuple[torch.nn.Module, tuple[str, ...], str]:
+    def _module(self, op: str, inputs: list[str], output: str, attributes: dict[str, Any]) -> Step:
         fused = (self._silu(op, inputs) or self._layer_norm(op, inputs)) if self._fuse else None
         if fused is not None:
             return (*fused, output)
@@ -263,7 +271,13 @@ class _Graph:
         epsilon = float(self.probe[variance[1]])
         return _Call(lambda v, w, b: functional.layer_norm(v, w.shape, w, b, epsilon), {1: weight, 2: bias}), (x,)
 
-    def _convolution(self, inputs, static, attributes, shape) -> torch.nn.Module:
+    def _convolution(
+        self,
+        inputs: list[str],
+        static: dict[int, torch.Tensor],
+        attributes: dict[str, Any],
+        shape: tuple[int, ...],
+    ) -> torch.nn.Module:
         in_shape = tuple(self.probe[inputs[0]].shape)[1:]
         size = math.prod(in_shape)
         if size * max(size, math.prod(shape[1:])) > _CONV_MATRIX_LIMIT:
@@ -273,7 +287,7 @@ class _Graph:
         bias = static[2].repeat_interleave(math.prod(shape[2:])) if 2 in static else None
         return _Convolution(matrix, bias, shape[1:])
 
-    def _live(self, steps):
+    def _live(self, steps: list[Step]) -> list[Step]:
         needed, live = {self.output}, []
         for step in reversed(steps):
             if step[2] in needed:
@@ -286,14 +300,14 @@ def _probe(rows: int, width: int) -> torch.Tensor:
     return torch.randn(rows, width, generator=torch.Generator().manual_seed(rows))
 
 
-def _attributes(node: Any) -> dict[str, Any]:
+def _attributes(node: onnx.NodeProto) -> dict[str, Any]:
     values = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
     if "value" in values:
         values["value"] = torch.from_numpy(onnx.numpy_helper.to_array(values["value"]).copy())
     return values
 
 
-def _axes(node: tuple, values: dict[str, torch.Tensor]) -> list[int]:
+def _axes(node: Node, values: dict[str, torch.Tensor]) -> list[int]:
     _, inputs, _, attributes = node
     if "axes" in attributes:
         return list(attributes["axes"])
@@ -327,7 +341,7 @@ def _size(op: str, x: list[Any], attributes: dict[str, Any]) -> int:
     if op == "Gather":
         return x[0].numel() // max(x[0].shape[attributes.get("axis", 0)], 1) * x[1].numel()
     if op == "Conv":
-        # Padded input, and every output: as many places as the padded input at most, for each filter.
+        # Padded input, and every output: as many positions as the padded input at most, per filter.
         padded = x[0].numel() // max(x[0].shape[-1], 1) * (x[0].shape[-1] + sum(map(abs, attributes.get("pads", [0]))))
         return padded + padded // max(x[0].shape[1], 1) * x[1].shape[0]
     return sum(value.numel() for value in given)

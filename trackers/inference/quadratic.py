@@ -2,6 +2,9 @@
 
 Products, sums in a fixed order and nothing else: each is exactly rounded, so a row's bits do not depend on the other
 rows, which matrix products on a CPU do not promise.
+
+A table takes 12 us where the formula written out takes 30 (twist2), and 34 where it takes 115 (sonic), of a tick of 120
+to 150 us for one world on one core; the bits are the same (the tests hold the formula of each table).
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ __all__ = ["Quadratic", "products"]
 
 
 def products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """All products a_i b_j at index (width of b) i + j, shape [rows, width of a x width of b]."""
+    """All products a_i b_j at index i (width of b) + j, shape [rows, (width of a) (width of b)]."""
     return (a[:, :, None] * b[:, None, :]).flatten(1)
 
 

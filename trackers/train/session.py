@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError, naming
-from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, DriveGains, PhysicsRate
-from arena_newton.trackers import interface, sonic, twist2
-from arena_newton.trackers.front_end import ActionForm, FrontEnd, residual_form
+from arena_newton.robot import DriveGains, PhysicsRate
+from arena_newton.trackers import interface
+from arena_newton.trackers.front_end import FrontEnd
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.motions import programs
 from arena_newton.trackers.motions.formats import read_library
@@ -47,17 +47,8 @@ def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveG
     Raises:
         InputError: Another interface or form.
     """
-    kinds: dict[str, tuple[type[FrontEnd], DriveGains, ActionForm]] = {
-        "twist2": (twist2.Twist2FrontEnd, TWIST2_DRIVE, twist2.OFFICIAL_FORM),
-        "sonic": (sonic.SonicFrontEnd, SONIC_DRIVE, sonic.SONIC_FORM),
-    }
-    if tracker not in kinds:
-        raise InputError(f"--tracker {tracker}: not an interface that can be trained; there are {', '.join(kinds)}")
-    if action_form not in ("auto", "residual", "default"):
-        raise InputError(f"--action-form {action_form}: expected auto, residual or default")
-    kind, drive, default = kinds[tracker]
-    form = dataclasses.replace(default, clip=10.0) if action_form == "default" else residual_form(drive)
-    return kind(form), drive, PhysicsRate(dt=0.005, substeps=4)
+    kind = interface.get(tracker)
+    return kind.front_end(kind.action_form(action_form)), kind.drive, kind.rate
 
 
 def make_library(options: TrainOptions, device: str, seed: int) -> MotionLibrary:

@@ -31,7 +31,6 @@ SMOOTHING = 0.04
 class FalconFrontEnd(FrontEnd):
     """Five frames of 115 numbers, oldest first; within a frame the terms are in the order of their names."""
 
-    interface = "falcon"
     obs_width = FRAMES * FRAME
     default_pose = (*LEG, *LEG, *(0.0,) * 17)
 

@@ -1,0 +1,118 @@
+"""A trainable tracker is a module with its `INTERFACE`, a line in `interface.MODULES` and a weights file."""
+
+import dataclasses
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from arena_newton.errors import InputError
+from arena_newton.robot import PhysicsRate
+from arena_newton.trackers import interface, sonic, twist2
+from arena_newton.trackers.evaluation.cells import suite
+from arena_newton.trackers.evaluation.figures import Result, figures
+from arena_newton.trackers.evaluation.rollout import Outcome, plan
+from arena_newton.trackers.front_end import NetworkTracker
+from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, mlp
+from arena_newton.trackers.train.session import front_end
+
+RATE = PhysicsRate(dt=0.005, substeps=4)
+
+
+class SmallNet(TrackerNetwork):
+    """One hidden layer behind TWIST2's observation."""
+
+    obs_width = twist2.OBSERVATION
+
+    def __init__(self, hidden: int = 8):
+        super().__init__()
+        self.hidden = hidden
+        self.norm, self.actor = InputNorm(self.obs_width), mlp((self.obs_width, hidden, 29))
+
+    def config(self):
+        return {"hidden": self.hidden}
+
+    def deployed(self):
+        return nn.Sequential(self.norm, self.actor)
+
+    def update_norm(self, obs):
+        self.norm.update(obs)
+
+    def forward(self, obs):
+        return self.actor(self.norm(obs))
+
+
+class SmallFrontEnd(twist2.Twist2FrontEnd):
+    """TWIST2's front end under another name."""
+
+
+class SmallTracker(NetworkTracker):
+    """The tracker of the third interface."""
+
+    name = "small"
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The third interface, in a module of its own and in the list."""
+    module = types.ModuleType("small_tracker")
+    module.INTERFACE = dataclasses.replace(
+        twist2.INTERFACE, name="small", front_end=SmallFrontEnd, network=SmallNet, bars={"fall_rate": 0.5}
+    )
+    monkeypatch.setitem(sys.modules, "small_tracker", module)
+    monkeypatch.setitem(interface.MODULES, "small", "small_tracker")
+    return module.INTERFACE
+
+
+def test_training_finds_it(small):
+    """Training's front end, drive and physics rate are those of the record."""
+    front, drive, rate = front_end("small")
+    assert isinstance(front, SmallFrontEnd) and (drive, rate) == (small.drive, RATE)
+    assert "small" in interface.names() and front.obs_width == small.obs_width
+
+
+def test_weights_round_trip(small, tmp_path):
+    """Its weights are saved, loaded and run without another line."""
+    network = small.make_network({"hidden": 6})
+    network.update_norm(torch.randn(9, network.obs_width))
+    form = small.action_form("residual")
+    path = tmp_path / "small.safetensors"
+    weights_file.save(path, weights_file.Weights("small", network, form, small.drive, RATE))
+    loaded = weights_file.load(path, "small")
+    x = torch.randn(3, network.obs_width)
+    assert loaded.network.config() == {"hidden": 6} and torch.equal(loaded.network(x), network(x))
+    tracker = SmallTracker.from_weights(path)
+    assert tracker.drive == small.drive and tracker.front_end.action_form == form
+
+
+def test_figures_apply_its_bars(small):
+    """Its bar of the fall rate applies to it; bars that it does not name do not."""
+    played = plan(suite("full"), 1, 0)
+    worlds = len(played.cell)
+    names = "leg_rmse drift_10s lowest speed_x ref_x goal_distance goal_turn seat_time end_z end_x support_x touch"
+    measures = {name: np.full(worlds, 0.05) for name in [*names.split(), "ball_peak", "ball_end"]}
+    measures["fell"] = np.arange(worlds) < 0.4 * worlds
+    outcome = Outcome(measures, 0, 1, "mujoco", "cpu", RATE, 0.0, 0.0)
+    shown = {f.name: f for f in figures(Result("s", "small", False, {}, played, outcome))}
+    assert shown["fall rate, whole suite"].verdict == "pass" and shown["fall rate, whole suite"].bar == "≤ 50 %"
+    assert shown["drift per 10 s, walk 0.3 m/s, open loop"].verdict == ""
+
+
+def test_layouts():
+    """Parts of an observation follow each other, and their widths add up to what the official networks take."""
+    assert sum(twist2.LAYOUT.values()) == twist2.Twist2FrontEnd.obs_width == 1432
+    assert (sonic.ENCODER_INPUT, sonic.PROPRIOCEPTION, sonic.SonicFrontEnd.obs_width) == (1762, 930, 2692)
+    assert sonic.AT["anchors"] == slice(601, 661) and sonic.AT["gravity"] == slice(2662, 2692)
+
+
+def test_unknown():
+    """An interface that does not exist is named together with the known ones, and unfit widths are refused."""
+    with pytest.raises(InputError, match="'falcon': unknown; trained here are sonic, twist2"):
+        interface.get("falcon")
+    for config in ({"hidden": [10**9]}, {"hidden": ["a"]}, {"depth": 3}):
+        with pytest.raises(InputError, match="network of interface 'twist2'"):
+            interface.get("twist2").make_network(config)
