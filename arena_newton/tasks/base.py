@@ -321,6 +321,8 @@ class TaskSpec:
     success: ByRules[SuccessRule]
     """The predicate's numbers and its sentence, one per rule set."""
     make_judge: Callable[[Scene, RuleSet], Judge]
+    expert: str | None = None
+    """Class of its scripted expert as `module:attribute`; None: it has none."""
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
     overlaps: tuple[Overlap, ...] = ()

@@ -100,5 +100,6 @@ TASK = TaskSpec(
     steps=ByRules(paper=1500, released=900),
     success=ByRules(paper=BoxingRule(min_radius=0.0), released=BoxingRule(min_radius=0.10)),
     make_judge=BoxingJudge,
+    expert="arena_newton.policies.experts.boxing:BoxingExpert",
     sample=sample_target,
 )

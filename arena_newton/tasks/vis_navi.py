@@ -148,5 +148,6 @@ TASK = TaskSpec(
         Overlap(*_HIGH_BLOCKS, ("paper", "released"), ("base", "semantic", "visual"), 2, 0.21, _SIDE_BY_SIDE),
         Overlap(*_HIGH_BLOCKS, ("paper", "released"), ("execution",), 2, 0.182, _SIDE_BY_SIDE),
     ),
+    expert="arena_newton.policies.experts.vis_navi:VisNaviExpert",
     sample=sample_layout,
 )

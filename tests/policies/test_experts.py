@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, seeding, tasks, trackers
 from arena_newton.canonical import validate_action
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Observation
-from arena_newton.policies.experts import EXPERTS
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.robot import DEFAULT_POSE
 
@@ -28,8 +27,8 @@ def rotation(quat):
 
 def along(points, steps=200):
     """Many points on a polyline [K, 2]."""
-    share = torch.linspace(0, 1, steps)[:, None, None]
-    return (points[:-1] + share * (points[1:] - points[:-1])).reshape(-1, 2)
+    fraction = torch.linspace(0, 1, steps)[:, None, None]
+    return (points[:-1] + fraction * (points[1:] - points[:-1])).reshape(-1, 2)
 
 
 def test_footprint_of_an_upright_box_is_exact():
@@ -132,7 +131,7 @@ def pose(env, roots, joints):
         env.physics._publish(world, data)
 
 
-@pytest.mark.parametrize("task", sorted(EXPERTS))
+@pytest.mark.parametrize("task", [name for name in tasks.names() if tasks.get(name).expert])
 def test_reference_solves_the_task(task):
     """A robot that follows the expert's reference exactly solves the task in half of its step budget."""
     assert play(task, EPISODES[task], 750).all()
