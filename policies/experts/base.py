@@ -166,8 +166,9 @@ class ExpertPolicy(Policy):
         Raises:
             InputError: There is no expert for the task.
         """
+        expert = expert_class(env.spec.name)
         self.sight = Sight(env)
-        self.expert = expert_class(env.spec.name)(self.sight)
+        self.expert = expert(self.sight)
         self.generator = ReferenceGenerator(env.worlds, env.torch_device)
         self._begins = np.ones(env.worlds, dtype=bool)
 

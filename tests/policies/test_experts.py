@@ -98,7 +98,7 @@ def test_unknown_task_is_named():
 
 
 def play(task, indices, ticks):
-    """Which worlds succeed when robots obey their references exactly."""
+    """Which worlds succeed when robots obey their references exactly, and each one's phases in their order."""
     env = ArenaEnv(task, tracker=trackers.get("pd"), worlds=len(indices), engine="mujoco", device="cpu", threads=1)
     seeds = [seeding.episode_seed(env.spec.gym_id, i // 20, i % 20) for i in indices]
     env.reset(seeds)
@@ -110,15 +110,20 @@ def play(task, indices, ticks):
     policy.attach(env)
     policy.reset(seeds, [task] * env.worlds)
     done = np.zeros(env.worlds, bool)
+    phases = [[] for _ in indices]
     for _ in range(ticks // policy.chunk_size):
-        validate_action(policy.act(env.observe(~done)).actions, task)
+        chunk = policy.act(env.observe(~done))
+        validate_action(chunk.actions, task)
+        for world in np.flatnonzero(~done):
+            if chunk.phases[world] not in phases[world][-1:]:
+                phases[world].append(chunk.phases[world])
         frames = policy.generator.frames
         pose(env, np.concatenate([frames.root_pos, frames.root_quat], axis=1), frames.joint_pos.numpy())
         env.judge.evaluate(env.physics)
         done |= env.judge.success.numpy() > 0
         if done.all():
             break
-    return done
+    return done, phases
 
 
 def pose(env, roots, joints):
@@ -133,8 +138,15 @@ def pose(env, roots, joints):
 
 @pytest.mark.parametrize("task", [name for name in tasks.names() if tasks.get(name).expert])
 def test_reference_solves_the_task(task):
-    """A robot that follows the expert's reference exactly solves the task in half of its step budget."""
-    assert play(task, EPISODES[task], 750).all()
+    """A robot that follows the expert's reference solves the task in half of its budget, phase by phase."""
+    done, phases = play(task, EPISODES[task], 750)
+    assert done.all()
+    for named in phases:
+        if task == "boxing":
+            assert named[:3] == ["approach", "step up", "strike"]
+        else:
+            walk = named[: named.index("goal") + 1]
+            assert walk == [f"waypoint {i}" for i in range(1, len(walk))] + ["goal"] and len(walk) > 1
 
 
 def test_boxing_through_twist2(shared):
