@@ -315,6 +315,7 @@ def _pictures(options: BenchOptions) -> Iterator[Figure]:
     from arena_newton.env import ArenaEnv
     from arena_newton.eval import plan
     from arena_newton.pictures.recorder import EpisodeRecorder
+    from arena_newton.rollout import Rollout
 
     env = ArenaEnv("vis_navi", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu")
     episodes = plan.expand(["vis_navi"], tracker="twist2", policy="expert", seeds=[0], repeats=2)
@@ -325,12 +326,12 @@ def _pictures(options: BenchOptions) -> Iterator[Figure]:
         def play(kind: str) -> None:
             with EpisodeRecorder(folder, video=kind == "video", strip=kind == "strip") as recorder:
                 began = time.perf_counter()
-                env.run_episodes(policy, episodes, recorder=None if kind == "none" else recorder)
+                Rollout(env, policy, episodes, recorder=() if kind == "none" else recorder).run()
                 times[kind].append(time.perf_counter() - began)
 
         # Kernels of tick and camera first.
         with EpisodeRecorder(folder, video=False) as recorder:
-            env.run_episodes(policy, episodes, recorder=recorder, max_steps=20)
+            Rollout(env, policy, episodes, recorder=recorder, max_steps=20).run()
         for _ in range(3):
             play("none")
             play("strip")
@@ -346,6 +347,7 @@ def _episodes(options: BenchOptions) -> Iterator[Figure]:
     from arena_newton import policies
     from arena_newton.env import ArenaEnv
     from arena_newton.eval import plan
+    from arena_newton.rollout import Rollout
 
     name = "60 episodes x 1300 ticks football, stand, TWIST2, no camera, 2 cores"
     if options.checkpoint is None:
@@ -357,7 +359,7 @@ def _episodes(options: BenchOptions) -> Iterator[Figure]:
         env = ArenaEnv("football", worlds=options.worlds, tracker=tracker, engine="mujoco")
         built = time.perf_counter()
         episodes = plan.expand(["football"], tracker="twist2", policy="stand", max_steps=1300)
-        results = env.run_episodes(policies.get("stand"), episodes)
+        results = Rollout(env, policies.get("stand"), episodes).run()
         wall = time.perf_counter() - built
     ticks = sum(result.steps for result in results)
     detail = f"{ticks:,} ticks on {cores} cores, built in {built - began:.1f} s; {note}"

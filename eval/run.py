@@ -25,7 +25,6 @@ from arena_newton.eval.config import RunConfig, RunOptions
 from arena_newton.eval.journal import Journal, StorageError, write_atomic
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, duration, kernels_to_compile, simulated
-from arena_newton.eval.recordings import RecordingPolicy
 from arena_newton.eval.records import counted, plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
@@ -451,6 +450,9 @@ class _Run:
 
     def _play_in_one(self, task: str, mode: str, episodes: list[Episode], left: dict[int, Episode]) -> None:
         """Run episodes in one environment; those that end are taken out of ``left``."""
+        from arena_newton.eval.recordings import ActionRecorder
+        from arena_newton.rollout import Rollout
+
         c = self.config
         self._built = False
         env = recorder = None
@@ -472,26 +474,25 @@ class _Run:
             )
             self._register(f"{task} {mode}", env)
             recorder = _recorder(c, self.folder)
-            actor = RecordingPolicy(self.policy, self.folder / "actions") if c.actions else self.policy
+            recorders: list[Any] = [] if recorder is None else [recorder]
+            recorders += [ActionRecorder(self.folder / "actions")] if c.actions else []
 
             def on_finish(result: Any) -> None:
-                if isinstance(actor, RecordingPolicy):
-                    assert env is not None
-                    actor.write(result, env.spec.gym_id)
                 media = recorder.media(result.episode) if recorder is not None else {}
                 self.journal.append(_record(c, result, media, self.hashes))
                 left.pop(result.episode.index, None)
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK_S))
 
             self._built = True
-            env.run_episodes(
-                actor,
+            Rollout(
+                env,
+                self.policy,
                 episodes,
+                recorder=recorders,
+                max_steps=episodes[0].max_steps,
                 on_finish=on_finish,
                 on_tick=self.progress.tick,
-                recorder=recorder,
-                max_steps=episodes[0].max_steps,
-            )
+            ).run()
         finally:
             if recorder is not None:
                 recorder.close()

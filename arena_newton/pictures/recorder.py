@@ -18,14 +18,14 @@ import torch
 import warp as wp
 
 from arena_newton.errors import InputError
+from arena_newton.interfaces import Recorder
 from arena_newton.pictures import follow as following
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.video import VideoWriter, caption, evenly, film_strip
 from arena_newton.robot import TICK
 
 if TYPE_CHECKING:
-    from arena_newton.env import ArenaEnv
-    from arena_newton.interfaces import EpisodeResult, Observation, World
+    from arena_newton.interfaces import EpisodeResult, World
 
 __all__ = ["EpisodeRecorder", "video_sizes"]
 
@@ -109,8 +109,8 @@ class _Stream:
             self.ticks, self.poses, self.stride = self.ticks[::2], self.poses[::2], 2 * self.stride
 
 
-class EpisodeRecorder:
-    """Records the worlds of an `ArenaEnv`, as an `interfaces.Recorder`; close it after use."""
+class EpisodeRecorder(Recorder):
+    """Records the worlds of an `ArenaEnv` while a `rollout.Rollout` plays; close it after use."""
 
     def __init__(
         self,
@@ -147,7 +147,7 @@ class EpisodeRecorder:
             raise InputError(f"recorder: a frame every {every} ticks, expected at least 1")
         self.folder = Path(folder)
         self.video, self.strip, self.episodes, self.follow, self.every = video, strip, episodes, follow, every
-        self._env: ArenaEnv | None = None
+        self._env: World | None = None
         self._cameras: dict[str, Camera] = {}
         self._strip_cameras: dict[str, Camera] = {}
         self._streams: dict[int, _Stream] = {}
@@ -171,7 +171,7 @@ class EpisodeRecorder:
     def _filmed(self, episode: EpisodeKey) -> bool:
         return self.video and (self.episodes is None or episode.rank < self.episodes)
 
-    def _bind(self, env: ArenaEnv) -> None:
+    def _bind(self, env: World) -> None:
         """Cameras and work space of an environment."""
         if self._env is env:
             return
@@ -191,7 +191,7 @@ class EpisodeRecorder:
         if self.strip:
             self._strip_cameras = {n: self._camera(env, n, size, lights, 1) for n, size in STRIP_SIZES.items()}
 
-    def _camera(self, env: ArenaEnv, name: str, size: tuple[int, int], lights: WorldLights, views: int) -> Camera:
+    def _camera(self, env: World, name: str, size: tuple[int, int], lights: WorldLights, views: int) -> Camera:
         width, height = size
         if name == "world" and self.follow:
             return Camera(
@@ -208,7 +208,7 @@ class EpisodeRecorder:
             )
         return Camera.from_scene(env.scene, prim=name, width=width, height=height, lights=lights, views=views)
 
-    def start(self, env: ArenaEnv, world: int, episode: EpisodeKey) -> None:
+    def start(self, env: World, world: int, episode: EpisodeKey) -> None:
         """Open the streams of a world's new episode.
 
         Raises:
@@ -232,10 +232,7 @@ class EpisodeRecorder:
         if env.tick[world] >= 0:  # without a start-up the first frame is the spawn's
             self._take(env, [world])
 
-    def before_physics(self, env: World, observation: Observation, action: torch.Tensor) -> None:
-        """Nothing: pictures show the state after a tick."""
-
-    def tick(self, env: ArenaEnv) -> None:
+    def tick(self, env: World) -> None:
         """Take a frame of every recorded world that is past its start-up and whose frame is due.
 
         Raises:
@@ -251,7 +248,7 @@ class EpisodeRecorder:
         """Whether a strip keeps the poses of this tick."""
         return self.strip and tick % (self.every * self._streams[world].stride) == 0
 
-    def _take(self, env: ArenaEnv, worlds: Sequence[int], *, final: bool = False) -> None:
+    def _take(self, env: World, worlds: Sequence[int], *, final: bool = False) -> None:
         """A frame of some worlds, whose poses are in `_now`; poses that are not finite cannot be drawn."""
         finite = [w for w in worlds if self._now_poses[self._streams[w].rows].isfinite().all()]
         for world in finite:
@@ -286,7 +283,7 @@ class EpisodeRecorder:
             return follower.draw(camera, state, worlds, pelvises, ticks)
         return camera.render_worlds(state, worlds).cpu().numpy().copy()
 
-    def finish(self, env: ArenaEnv, world: int, result: EpisodeResult) -> None:
+    def finish(self, env: World, world: int, result: EpisodeResult) -> None:
         """Close the streams of a world's episode; the outcome goes onto its pictures.
 
         Raises:

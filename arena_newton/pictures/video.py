@@ -75,9 +75,7 @@ class VideoWriter:
         self._part.parent.mkdir(parents=True, exist_ok=True)
         create(self._part).close()  # a link of that name would be followed
         self._container: av.container.OutputContainer | None
-        self._container = av.open(
-            str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"}
-        )
+        self._container = av.open(str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(float(fps)).limit_denominator(1000)
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.height, self._stream.width = self._size
