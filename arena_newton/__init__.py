@@ -10,19 +10,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from arena_newton import policies, rule_sets, rules, tasks, trackers
-    from arena_newton.canonical import STAND_ACTION
+    from arena_newton import canonical, differentiable, policies, rule_sets, rules, tasks, trackers
     from arena_newton.env import ArenaEnv
     from arena_newton.pictures.camera import Camera, CameraConfig
+    from arena_newton.pictures.recorder import EpisodeRecorder
     from arena_newton.rollout import Rollout
 
 __all__ = [
-    "STAND_ACTION",
     "ArenaEnv",
     "Camera",
     "CameraConfig",
+    "EpisodeRecorder",
     "Rollout",
     "__version__",
+    "canonical",
+    "differentiable",
     "policies",
     "rule_sets",
     "rules",
@@ -33,13 +35,13 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
-    "STAND_ACTION": "arena_newton.canonical",
     "ArenaEnv": "arena_newton.env",
     "Camera": "arena_newton.pictures.camera",
     "CameraConfig": "arena_newton.pictures.camera",
+    "EpisodeRecorder": "arena_newton.pictures.recorder",
     "Rollout": "arena_newton.rollout",
 }
-"""Public class or value → its module; the other public names are modules of this package."""
+"""Public class → its module; the other public names are modules of this package."""
 
 _CHECKOUT = Path(__file__).resolve().parent.parent
 # The checkout root holds a folder `kernels/`, which would shadow the package of that name that transformers imports.
