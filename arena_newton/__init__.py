@@ -1,14 +1,62 @@
 """HumanoidArena on Newton/Warp.
 
-A policy decides a 40D whole-body action, a tracker executes it, a world moves, a rule judges.
+A policy decides a 40D whole-body action, a tracker executes it, a world moves, a rule judges. The names of `__all__`
+are imported when they are first used, so that `import arena_newton` itself loads no library.
 """
 
+import importlib
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from arena_newton import canonical, differentiable, policies, rule_sets, rules, tasks, trackers
+    from arena_newton.env import ArenaEnv
+    from arena_newton.pictures.camera import Camera, CameraConfig
+    from arena_newton.pictures.recorder import EpisodeRecorder
+    from arena_newton.rollout import Rollout
+
+__all__ = [
+    "ArenaEnv",
+    "Camera",
+    "CameraConfig",
+    "EpisodeRecorder",
+    "Rollout",
+    "__version__",
+    "canonical",
+    "differentiable",
+    "policies",
+    "rule_sets",
+    "rules",
+    "tasks",
+    "trackers",
+]
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "ArenaEnv": "arena_newton.env",
+    "Camera": "arena_newton.pictures.camera",
+    "CameraConfig": "arena_newton.pictures.camera",
+    "EpisodeRecorder": "arena_newton.pictures.recorder",
+    "Rollout": "arena_newton.rollout",
+}
+"""Public class → its module; the other public names are modules of this package."""
 
 _CHECKOUT = Path(__file__).resolve().parent.parent
 # The checkout root holds a folder `kernels/`, which would shadow the package of that name that transformers imports.
 if (_CHECKOUT / "pyproject.toml").is_file() and (_CHECKOUT / "kernels").is_dir():
     sys.path[:] = [p for p in sys.path if Path(p or ".").resolve() != _CHECKOUT]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name at its first use."""
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    if name in __all__:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

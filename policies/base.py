@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.metadata
-import inspect
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
+from arena_newton.registry import Registry
 
 if TYPE_CHECKING:
+    from arena_newton.interfaces import World
     from arena_newton.pictures.camera import CameraConfig
 
 __all__ = [
@@ -29,16 +29,10 @@ __all__ = [
     "world_mask",
 ]
 
-ENTRY_POINT_GROUP = "arena_newton.policies"
-"""Other packages offer policies under this entry point group: a callable of the text after the colon (or None)."""
-
-_BUILT_IN = {
-    "expert": "arena_newton.policies.experts:from_spec",
-    "remote": "arena_newton.policies.remote:from_spec",
-    "replay": "arena_newton.policies.replay:from_spec",
-    "stand": "arena_newton.policies.stand:from_spec",
-}
-_registered: dict[str, Callable[..., Policy]] = {}
+Json = dict[str, Any]
+"""A JSON object."""
+Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
+"""Worlds, bool, shape [worlds]; None: all."""
 
 
 class PolicyError(ArenaError):
@@ -52,7 +46,7 @@ class PolicyError(ArenaError):
 
 
 class PolicyUnavailable(ArenaError):
-    """The policy cannot go on at all (its server is gone); the run stops and its unfinished episodes stay unplayed."""
+    """The policy cannot continue (its server is gone); the run stops and its unfinished episodes stay open."""
 
 
 class Policy:
@@ -65,66 +59,80 @@ class Policy:
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
     chunk_size: int = 1
-    """Actions a chunk, where the policy knows it beforehand."""
+    """Actions per chunk, where the policy knows it in advance."""
     depends_on_worlds: bool = False
-    """Whether an episode may depend on how many worlds ask at once; the number then belongs to what a run is known by.
-    Final after `check`."""
+    """Whether an episode may depend on how many worlds ask at once; the number is then part of a run's identity. Final
+    after `check`."""
 
     def check(self) -> None:
-        """Look, before the first episode, whether the policy can work at all.
+        """Validate the policy before the first episode.
 
         Raises:
-            InputError: It cannot, for a reason that the user can mend.
+            InputError: It cannot work, for a reason that the user can repair.
         """
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
-        """Look, before the first episode, whether the policy can do a task.
+        """Check before the first episode that the policy can do a task.
 
         Args:
             task: The task.
-            mode: The mode of the coming episodes, if it is known yet.
+            mode: Mode of the next episodes, if it is known yet.
             seeds: Their episode seeds, if they are known yet.
 
         Raises:
             InputError: It cannot.
         """
 
-    def attach(self, env: Any) -> None:
-        """Get to know the environment before its first episode; only privileged policies (experts) look into it.
+    def attach(self, env: World) -> None:
+        """Take the environment of the next episodes; only privileged policies (experts) read its state.
 
         Args:
-            env: The `ArenaEnv` that the coming calls are about.
+            env: The environment.
 
         Raises:
             InputError: The policy cannot work in this environment.
         """
 
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Begin new episodes in the worlds of `mask`.
 
         Args:
-            seeds: Episode seeds, one a world (those outside the mask are ignored).
-            tasks: Gym ids, one a world.
-            mask: Worlds that begin, bool, shape [worlds]; None: all.
+            seeds: Episode seeds, one per world (those outside the mask are ignored).
+            tasks: Gym ids, one per world.
+            mask: Worlds that begin.
         """
 
     def act(self, observation: Observation) -> Chunk:
         """Actions for the worlds that ask."""
         raise TypeError(f"policy {self.name!r} defines no act()")
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Json:
         """What a result must record to name this policy exactly."""
         return {"name": self.name}
 
     def close(self) -> None:
-        """Let go of connections and memory."""
+        """Release connections and buffers."""
 
 
-def world_mask(mask: Any, worlds: int) -> np.ndarray:
-    """A mask given as None, NumPy array, torch tensor or list, as bool array of shape [worlds]."""
+POLICIES: Registry[Policy] = Registry(
+    "policy",
+    "arena_newton.policies",
+    lambda: Policy,
+    {
+        "expert": "arena_newton.policies.experts:from_spec",
+        "remote": "arena_newton.policies.remote:from_spec",
+        "replay": "arena_newton.policies.replay:from_spec",
+        "stand": "arena_newton.policies.stand:from_spec",
+    },
+)
+"""Makers of policies; each takes the text after the colon, or None."""
+
+
+def world_mask(mask: Mask, worlds: int) -> np.ndarray:
+    """A mask as bool array of shape [worlds]."""
     if mask is None:
         return np.ones(worlds, dtype=bool)
-    if hasattr(mask, "detach"):
+    if isinstance(mask, torch.Tensor):
         mask = mask.detach().cpu()
     return np.asarray(mask).astype(bool).reshape(worlds)
 
@@ -133,23 +141,22 @@ def register(name: str, factory: Callable[..., Policy]) -> None:
     """Offer a policy under `name` in this process.
 
     Args:
-        name: What stands before the colon of a spec.
+        name: What is written before the colon of a spec.
         factory: Takes the text after the colon, or None; and the options of `get` as keywords, if it knows any.
+
+    Raises:
+        InputError: A built-in policy has that name.
     """
-    _registered[name] = factory
-
-
-def _entry_points() -> list[importlib.metadata.EntryPoint]:
-    return list(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP))
+    POLICIES.register(name, factory)
 
 
 def names() -> tuple[str, ...]:
     """Names of all policies that `get` knows, sorted."""
-    return tuple(sorted({*_BUILT_IN, *_registered, *(point.name for point in _entry_points())}))
+    return POLICIES.names()
 
 
 def check_spec(spec: str) -> None:
-    """Look at a spec without making the policy; what a results folder may not hold is refused and not printed.
+    """Check a spec without making the policy; secrets, which results would publish, are refused and not printed.
 
     Args:
         spec: As for `get`.
@@ -163,12 +170,7 @@ def check_spec(spec: str) -> None:
             f"--policy {name}: the address holds a user name or a password (an @), which results would publish; "
             "give a token in the environment variable ARENA_POLICY_TOKEN instead"
         )
-    points = [point for point in _entry_points() if point.name == name]
-    if name not in _BUILT_IN and name not in _registered and not points:
-        raise InputError(f"--policy {name}: unknown policy; known are {', '.join(names())}")
-    offers = [*(["this package"] if name in _BUILT_IN else []), *(_package(point) for point in points)]
-    if len(offers) > 1 and name not in _registered:
-        raise InputError(f"--policy {name}: offered by {' and by '.join(offers)}; uninstall or rename all but one")
+    POLICIES.check(name)
 
 
 def get(spec: str, **options: Any) -> Policy:
@@ -183,33 +185,4 @@ def get(spec: str, **options: Any) -> Policy:
     """
     check_spec(spec)
     name, colon, rest = spec.partition(":")
-    argument = rest if colon else None
-    if name in _registered:
-        return _made(name, _registered[name], argument, options)
-    if name in _BUILT_IN:
-        module, _, attribute = _BUILT_IN[name].partition(":")
-        return getattr(importlib.import_module(module), attribute)(argument, **options)
-    point = next(point for point in _entry_points() if point.name == name)
-    try:
-        factory = point.load()
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"--policy {name}: its package does not load ({type(error).__name__}: {reason})") from error
-    return _made(name, factory, argument, options)
-
-
-def _made(name: str, factory: Callable[..., Policy], argument: str | None, options: dict[str, Any]) -> Policy:
-    try:
-        inspect.signature(factory).bind(argument, **options)
-    except TypeError as error:
-        raise InputError(f"--policy {name}: its factory does not take what it is given ({error})") from None
-    except ValueError:  # some of those written in C have no signature
-        pass
-    policy = factory(argument, **options)
-    if not isinstance(policy, Policy):
-        raise InputError(f"--policy {name}: its factory makes a {type(policy).__name__}, not a Policy")
-    return policy
-
-
-def _package(point: importlib.metadata.EntryPoint) -> str:
-    return f"package {point.dist.name}" if point.dist else "another package"
+    return POLICIES.make(name, rest if colon else None, **options)

@@ -1,11 +1,11 @@
 """The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policies.md).
 
 `POST /reset` begins an episode, `POST /infer` sends image and state and returns a chunk of actions. A server of that
-protocol knows one robot only, so every world that asks is one request. A world whose request fails ends as `error`; the
-others go on. A server that is gone, or that answers nothing usable to anybody, stops the run.
+protocol knows one robot only, so there is one request per world. A world whose request fails ends as `error`; the
+others go on. A server that is gone, or that gives no usable answer to any world, stops the run.
 
 Every request carries the episode's seed and the step, so that a server which draws its noise from these two gives an
-episode the same actions whatever runs beside it. A server says so with `"seeded": true` in its replies to `/reset`.
+episode the same actions whatever other episodes run. A server says so with `"seeded": true` in its replies to `/reset`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import torch
 
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.pictures.camera import CameraConfig
-from arena_newton.policies.base import Chunk, Observation, Policy, PolicyUnavailable, world_mask
+from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 
 __all__ = ["MAX_FAILURES", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
 
@@ -42,14 +43,14 @@ TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 MAX_REPLY = 4 * 2**20
 """Longest reply that is read [bytes]."""
 MAX_CHUNK = 4096
-"""Longest chunk that is taken [actions]."""
+"""Longest chunk that is accepted [actions]."""
 MAX_CONNECTIONS = 32
 MAX_FAILURES = 10
 """Requests in a row, over all worlds, without a usable answer to any, after which the run stops."""
 _RETRY_STATUS = (502, 503, 504)
 _TRANSIENT = (ConnectionError, http.client.RemoteDisconnected, http.client.BadStatusLine, socket.gaierror)
 _ESCAPES = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|.)?", re.DOTALL)
-"""What a terminal takes for a command (ECMA-48: CSI and OSC sequences, and ESC with one more)."""
+"""What a terminal interprets as a command (ECMA-48: CSI and OSC sequences, and ESC with one more)."""
 
 
 class _RemoteError(ArenaError):
@@ -152,7 +153,7 @@ class _Connection:
         return reply.status, bytes(data)
 
     def _dropped(self) -> bool:
-        """Whether the server has closed the kept connection, or sent what nobody asked for."""
+        """Whether the server has closed the kept connection, or sent data without a request."""
         if self._http is None or self._http.sock is None:
             return True
         poll = select.poll()
@@ -167,7 +168,7 @@ class _Connection:
             self._http.sock.settimeout(left)
 
     def abort(self) -> None:
-        """Break off the exchange that another thread waits for, or close a connection that nobody uses."""
+        """Break off the exchange that another thread waits for, or close an idle connection."""
         self._aborted = True
         if not self._busy:
             self.close()
@@ -186,7 +187,7 @@ class _Connection:
 
 
 class RemotePolicy(Policy):
-    """Asks a policy server, one request a world."""
+    """Asks a policy server, one request per world."""
 
     name = "remote"
     needs_image = True
@@ -206,16 +207,16 @@ class RemotePolicy(Policy):
         """Take the server's address; nothing is sent yet.
 
         Args:
-            url: `http://host:port` or `https://host:port`, with or without a path before `/reset` and `/infer`.
+            url: `http://host:port` or `https://host:port`, with or without a path in front of `/reset` and `/infer`.
             timeout: Deadline of one request with all its attempts [s].
             retries: Repeated attempts after a connection error or status 502, 503, 504.
             backoff: Pause before the first repeated attempt [s]; it doubles each time.
-            sequential: Ask for one world after the other, in their order, for servers whose noise depends on the order.
+            sequential: Ask for one world after another, in their order, for servers whose noise depends on the order.
             verify_ssl: Check the certificate of an https server.
 
         Raises:
-            InputError: The address is none, holds a user name or password, or the token has characters that no HTTP
-                header carries.
+            InputError: Not a valid address, or one with a user name or password, or the token has characters that no
+                HTTP header can carry.
         """
         host, port, secure = _address(url)
         if not (math.isfinite(timeout) and 0.0 < timeout <= 86400.0):
@@ -236,7 +237,7 @@ class RemotePolicy(Policy):
         self._seeded = False
         self._served = ""
         self._failures = 0
-        # Rows of worlds that run an episode: its seed, actions received so far, those not handed over yet.
+        # World → seed of its episode, number of actions received, actions not handed over yet.
         self._seeds: dict[int, int] = {}
         self._steps: dict[int, int] = {}
         self._queues: dict[int, np.ndarray] = {}
@@ -244,14 +245,14 @@ class RemotePolicy(Policy):
 
     @property
     def depends_on_worlds(self) -> bool:  # type: ignore[override]
-        """Whether an episode may depend on what runs beside it: the server did not declare that it honours seeds."""
+        """Whether an episode may depend on the others that run: the server did not declare that it honours seeds."""
         return not self._seeded
 
     def check(self) -> None:
-        """Reach the server, begin an episode there, and learn whether it honours seeds.
+        """Reach the server, begin an episode there, and read whether it honours seeds.
 
         Raises:
-            InputError: Nobody listens at the address, or what does is no policy server.
+            InputError: No server listens at the address, or it is not a policy server.
         """
         reason = ""
         for attempt in range(self.retries + 1):
@@ -276,7 +277,7 @@ class RemotePolicy(Policy):
         served = replies[0].get("policy")
         self._served = self._one_line(served) if isinstance(served, str) else ""
 
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Send the seed of each beginning episode; a world whose reset fails gets that error at its next `act`.
 
         Raises:
@@ -299,7 +300,7 @@ class RemotePolicy(Policy):
         actions as the shortest has left, and the rest at their next `act`.
 
         Raises:
-            PolicyUnavailable: The server is gone, or `MAX_FAILURES` requests in a row brought nothing.
+            PolicyUnavailable: The server is gone, or `MAX_FAILURES` requests in a row had no usable answer.
         """
         state = _host(observation.state)
         asking = [int(w) for w in np.flatnonzero(world_mask(observation.mask, len(state)))]
@@ -321,7 +322,7 @@ class RemotePolicy(Policy):
             self._queues[world] = self._queues[world][length:]
         return Chunk(actions, errors)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Json:
         """Address, order of the requests, and what the server says of itself; complete after `check`."""
         return {
             "name": self.name,
@@ -342,7 +343,7 @@ class RemotePolicy(Policy):
         self._connections.clear()
 
     def _body(self, observation: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
-        seen: dict[str, Any] = {"state": [float(v) for v in state[world, :STATE_WIDTH]]}
+        seen: Json = {"state": [float(v) for v in state[world, :STATE_WIDTH]]}
         if image is not None:
             picture = np.ascontiguousarray(image[world], dtype=np.uint8)
             data = base64.b64encode(picture.tobytes()).decode("ascii")
@@ -352,7 +353,7 @@ class RemotePolicy(Policy):
             "robot_type": ROBOT_TYPE,
             "return_chunk": True,
             "task": observation.gym_id,
-            # What the original's client does not send, and its server does not read.
+            # Not sent by the original's client, and not read by its server.
             "instruction": observation.instruction,
             "world": world,
             "step": self._steps.get(world, 0),
@@ -361,7 +362,7 @@ class RemotePolicy(Policy):
             body["seed"] = self._seeds[world]
         return json.dumps(body).encode()
 
-    def _actions(self, reply: dict[str, Any]) -> np.ndarray:
+    def _actions(self, reply: Json) -> np.ndarray:
         where = f"{self.url}/infer"
         rows = reply.get("action_chunk")
         if rows is None and "action" in reply:
@@ -374,7 +375,7 @@ class RemotePolicy(Policy):
             if len(row) != ACTION_WIDTH:
                 raise _RemoteError(f"{where}: an action of {len(row)} numbers, expected {ACTION_WIDTH}")
             if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in row):
-                raise _RemoteError(f"{where}: an action holds something that is no number")
+                raise _RemoteError(f"{where}: an action holds something that is not a number")
         try:
             return validate_action(rows, where)
         except InputError as error:
@@ -383,9 +384,9 @@ class RemotePolicy(Policy):
             raise _RemoteError(f"{where}: an action holds a number that is too large") from error
 
     def _ask[T](
-        self, route: str, bodies: dict[int, bytes], read: Callable[[dict[str, Any]], T], *, sequential: bool
+        self, route: str, bodies: dict[int, bytes], read: Callable[[Json], T], *, sequential: bool
     ) -> tuple[dict[int, T], dict[int, str]]:
-        """Send one request a world; what was read of the replies, and errors, by world.
+        """Send one request per world; the replies as `read` gives them, and errors, by world.
 
         Raises:
             PolicyUnavailable: The server is gone.
@@ -416,7 +417,7 @@ class RemotePolicy(Policy):
             )
 
     def _alive(self) -> bool:
-        """Whether the server answers at all, asked over a fresh connection."""
+        """Whether the server answers at all, asked over a new connection."""
         connection = _Connection(self.url, self._context, self._headers)
         answer = self._threads().submit(connection.alive, self.timeout)
         try:
@@ -431,7 +432,7 @@ class RemotePolicy(Policy):
         return self._pool
 
     def _gather[T](
-        self, route: str, bodies: dict[int, bytes], read: Callable[[dict[str, Any]], T]
+        self, route: str, bodies: dict[int, bytes], read: Callable[[Json], T]
     ) -> tuple[dict[int, T], dict[int, _RemoteError]]:
         """Send requests at the same time; none outlives its deadline."""
         replies: dict[int, T] = {}
@@ -471,29 +472,29 @@ class RemotePolicy(Policy):
         connection: _Connection,
         route: str,
         body: bytes,
-        read: Callable[[dict[str, Any]], T],
+        read: Callable[[Json], T],
         started: dict[int, float],
     ) -> T:
         with self._lock:
             started[world] = time.monotonic()
         status, data = connection.post(route, body, timeout=self.timeout, retries=self.retries, backoff=self.backoff)
-        with self._reading:  # one reply at a time is taken apart: as Python objects it is many times as large
+        with self._reading:  # one reply at a time: as Python objects it is many times as large
             return read(self._decode(route, status, data))
 
-    def _decode(self, route: str, status: int, data: bytes) -> dict[str, Any]:
+    def _decode(self, route: str, status: int, data: bytes) -> Json:
         where, silent = f"{self.url}{route}", status in _RETRY_STATUS
         try:
             content = json.loads(data)
         except (ValueError, RecursionError) as error:
             if status != 200:
                 raise _RemoteError(f"{where}: status {status}", silent=silent) from error
-            raise _RemoteError(f"{where}: the reply is no JSON") from error
+            raise _RemoteError(f"{where}: the reply is not JSON") from error
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
             said = f", {self._one_line(message)}" if isinstance(message, str) and message else ""
             raise _RemoteError(f"{where}: status {status}{said}", silent=silent)
         if not isinstance(content, dict):
-            raise _RemoteError(f"{where}: the reply is no JSON object")
+            raise _RemoteError(f"{where}: the reply is not a JSON object")
         return content
 
     def _one_line(self, said: str) -> str:
@@ -522,18 +523,18 @@ def _address(url: str) -> tuple[str, int, bool]:
 
 
 def _token() -> str:
-    """The token of the environment, or an empty text; one that no header carries is refused and not printed."""
+    """The token of the environment, or an empty text; one that no HTTP header can carry is refused and not printed."""
     token = os.environ.get(TOKEN_VARIABLE, "")
     if not re.fullmatch(r"[!-~]*", token):
         raise InputError(f"{TOKEN_VARIABLE}: holds a space, a line end or another character that no token has")
     return token
 
 
-def _host(values: Any) -> np.ndarray:
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+def _host(values: torch.Tensor | np.ndarray) -> np.ndarray:
+    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
 
 
-def _one_line(text: Any) -> str:
+def _one_line(text: object) -> str:
     """Printable characters of a text that came from elsewhere, at most 200, on one line."""
     plain = _ESCAPES.sub("", str(text)[:4000])
     return " ".join("".join(c if c.isprintable() else " " for c in plain).split())[:200]
@@ -552,7 +553,7 @@ def from_spec(argument: str | None, **options: Any) -> RemotePolicy:
         options: Keywords of `RemotePolicy`.
 
     Raises:
-        InputError: No address was given, or it is none.
+        InputError: No address was given, or it is not valid.
     """
     if not argument:
         raise InputError("--policy remote: needs an address, as in remote:http://localhost:8443")

@@ -5,16 +5,20 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from arena_newton import tasks as task_registry
 from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.foreign import read_arrays
-from arena_newton.policies.base import Chunk, Observation, Policy, world_mask
+from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
 from arena_newton.trackers.motions import load_actions, load_clip
 from arena_newton.trackers.motions.playback import clip_actions, startup_actions
+
+if TYPE_CHECKING:
+    from arena_newton.env import ArenaEnv
 
 __all__ = ["ReplayEpisodes", "ReplayPolicy", "from_spec"]
 
@@ -66,7 +70,7 @@ class ReplayPolicy(Policy):
         self._hash = hashlib.sha256(self.path.read_bytes()).hexdigest()[:12]
         self._steps = np.zeros(0, dtype=np.int64)
 
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Rewind the worlds in `mask`."""
         self._grow(len(seeds))
         self._steps[world_mask(mask, len(seeds))] = 0
@@ -80,7 +84,7 @@ class ReplayPolicy(Policy):
         self._steps[asking] += self.chunk_size
         return Chunk(_played(self.actions, ticks))
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Json:
         """File name and hash, and the times of the start."""
         stand, blend = self._startup
         return {
@@ -101,7 +105,7 @@ class ReplayPolicy(Policy):
 class ReplayEpisodes(Policy):
     """Plays each episode's own recording from a folder that `run --actions` wrote, open loop.
 
-    What one tracker made of a policy's actions, another one gets word for word: the difference is the tracker's.
+    To separate tracker from policy effects, replay the recorded actions through another tracker.
     """
 
     chunk_size = 20
@@ -144,9 +148,7 @@ class ReplayEpisodes(Policy):
         Raises:
             InputError: There is none.
         """
-        from arena_newton import tasks
-
-        gym_id = tasks.get(task).gym_id
+        gym_id = task_registry.get(task).gym_id
         here = {(recorded, seed) for name, recorded, seed in self._episodes if name == gym_id}
         where = f"--policy replay:{self.path}"
         if not here:
@@ -157,11 +159,11 @@ class ReplayEpisodes(Policy):
         if seeds and not any((mode, seed) in here for seed in seeds):
             raise InputError(f"{where}: recordings of task {task}, but of other --seeds")
 
-    def attach(self, env: Any) -> None:
-        """Learn the mode whose recordings are played."""
+    def attach(self, env: ArenaEnv) -> None:  # type: ignore[override]  # worlds have a mode
+        """Take the mode whose recordings are played."""
         self._mode = env.mode
 
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Take the recordings of the worlds in `mask`."""
         if len(self._steps) != len(seeds):
             self._steps = np.zeros(len(seeds), dtype=np.int64)
@@ -187,7 +189,7 @@ class ReplayEpisodes(Policy):
             self._steps[world] += self.chunk_size
         return Chunk(actions, errors)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Json:
         """Folder and number of episodes."""
         return {"name": self.name, "folder": self.path.name, "episodes": len(self._episodes)}
 

@@ -110,7 +110,7 @@ class _Stream:
 
 
 class EpisodeRecorder(Recorder):
-    """Records the worlds of an `ArenaEnv`; give it to `rollout.Rollout` and close it after use."""
+    """Records the worlds of an `ArenaEnv` while a `rollout.Rollout` plays; close it after use."""
 
     def __init__(
         self,

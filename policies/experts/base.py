@@ -1,43 +1,46 @@
-"""What the scripted experts share: a privileged view of the world, and the reference generator that speaks for them.
+"""What the scripted experts share: a privileged view of the world, and the generator that makes their actions.
 
-An expert decides commands for the generator (velocity, height, hand points) from the true state of the world, and hands
-over the canonical actions that the generator makes of them. It never learns which tracker executes those.
+An expert decides commands for the reference generator (velocity, height, hand points) from the true state of the world;
+the generator turns them into canonical actions. The expert does not know which tracker executes those.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+import importlib
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import warp as wp
 from torch import Tensor
 
+from arena_newton import tasks as task_registry
 from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
-from arena_newton.policies.base import Policy, world_mask
+from arena_newton.policies.base import Json, Mask, Policy, world_mask
 from arena_newton.robot import TICK
 from arena_newton.rotations import heading
+from arena_newton.trackers.motions.generator import ReferenceGenerator
 
 if TYPE_CHECKING:
+    from arena_newton.interfaces import World
     from arena_newton.trackers.motions.commands import MotionCommand
 
 __all__ = ["Expert", "ExpertPolicy", "Sight"]
 
 REALIGN = TICK / 10.0
-"""Share of the heading error between reference and robot that a tick of a walk takes out of the reference. Slow: a
-tracker that does not see its heading takes the correction for a yaw rate; one that sees it must not be left far behind.
-"""
+"""Fraction of the heading error between reference and robot that is corrected in the reference per tick of a walk.
+Slow, because a tracker that does not observe its heading interprets the correction as a yaw rate; not slower, because
+one that observes it must not be left far behind."""
 
 
 class Sight:
     """Privileged view of an environment: true poses as torch tensors on its device, rows are worlds."""
 
-    def __init__(self, env: Any):
-        """Bind an `ArenaEnv`."""
-        import warp as wp
-
+    def __init__(self, env: World):
+        """Bind an environment."""
         self.scene = env.scene
         self.worlds: int = env.worlds
         self.device = env.torch_device
@@ -69,13 +72,13 @@ class Sight:
         return pos + v + quat[:, :1] * twice + torch.linalg.cross(axis, twice)
 
     def frame(self, name: str) -> Callable[[], Tensor]:
-        """Position [m] of a frame prim of the robot or scene, to be read again each time; shape [worlds, 3]."""
+        """Reader of the current position [m] of a frame prim of the robot or scene, shape [worlds, 3]."""
         frame = self.scene.frame(name)
         offset = torch.tensor(frame.pos, dtype=torch.float32, device=self.device)
         return lambda: self.point(frame.body_id, offset)
 
     def box(self, prim: str) -> tuple[int, Tensor, Tensor]:
-        """Body of a prim's first box collider, the collider's place in it [m] and its half sizes [m]."""
+        """Body of a prim's first box collider, the collider's position in its frame [m] and its half sizes [m]."""
         model = self.scene.mj_model
         geom = self.scene.geom_ids(prim)[0]
         return (
@@ -86,7 +89,7 @@ class Sight:
 
 
 class Expert:
-    """One task's way of deciding; a subclass writes `begin` and `command`."""
+    """How one task is solved; a subclass writes `begin` and `command`."""
 
     task: str = ""
     """Name of the task that it solves."""
@@ -95,7 +98,7 @@ class Expert:
         """Look up what the task needs in the scene.
 
         Raises:
-            InputError: The scene misses a prim; the message names it.
+            InputError: A prim is missing in the scene; the message names it.
         """
         self.sight = sight
 
@@ -111,23 +114,43 @@ class Expert:
         """
         raise TypeError(f"expert of {self.task!r} defines no command()")
 
+    def phases(self) -> list[str] | None:
+        """Phase that each world is in under the last command; None: the expert knows no phases."""
+        return None
+
+
+def solved_tasks() -> list[str]:
+    """Tasks that name an expert, sorted."""
+    return sorted(name for name in task_registry.names() if task_registry.get(name).expert)
+
+
+def expert_class(task: str) -> type[Expert]:
+    """The expert that a task names.
+
+    Raises:
+        InputError: It names none.
+    """
+    path = task_registry.get(task).expert
+    if path is None:
+        raise InputError(f"--policy expert: no expert for task {task}; there are {', '.join(solved_tasks())}")
+    module, _, attribute = path.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
 
 class ExpertPolicy(Policy):
     """`--policy expert`: the expert of the task that the environment runs."""
 
     name = "expert"
 
-    def __init__(self, experts: Mapping[str, Callable[[Sight], Expert]], chunk_size: int = 5):
-        """Take the table of experts.
+    def __init__(self, chunk_size: int = 5):
+        """Set the length of a chunk.
 
         Args:
-            experts: Task name to maker of its expert.
-            chunk_size: Ticks between two looks at the world.
+            chunk_size: Ticks between two readings of the world's state.
         """
-        self.experts = experts
         self.chunk_size = chunk_size
         self.expert: Expert | None = None
-        """The expert at work; None before `attach`."""
+        """The expert of the environment's task; None before `attach`."""
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
         """Refuse a task without an expert.
@@ -135,28 +158,24 @@ class ExpertPolicy(Policy):
         Raises:
             InputError: There is no expert for the task.
         """
-        if task not in self.experts:
-            raise InputError(f"--policy expert: no expert for task {task}; there are {', '.join(sorted(self.experts))}")
+        expert_class(task)
 
-    def attach(self, env: Any) -> None:
-        """Get the privileged view of an environment and pick the expert of its task.
+    def attach(self, env: World) -> None:
+        """Take the privileged view of an environment and pick the expert of its task.
 
         Raises:
             InputError: There is no expert for the task.
         """
-        task = env.spec.name
-        self.check_task(task)
-        from arena_newton.trackers.motions.generator import ReferenceGenerator
-
+        expert = expert_class(env.spec.name)
         self.sight = Sight(env)
-        self.expert = self.experts[task](self.sight)
+        self.expert = expert(self.sight)
         self.generator = ReferenceGenerator(env.worlds, env.torch_device)
-        self._fresh = np.ones(env.worlds, dtype=bool)
+        self._begins = np.ones(env.worlds, dtype=bool)
 
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Any = None) -> None:
-        """New episodes in the worlds of `mask`; the expert looks at them when they ask first."""
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
+        """New episodes in the worlds of `mask`; the expert reads their state when they ask first."""
         if self.expert is not None:
-            self._fresh |= world_mask(mask, len(seeds))
+            self._begins |= world_mask(mask, len(seeds))
 
     @torch.inference_mode()
     def act(self, observation: Observation) -> Chunk:
@@ -170,21 +189,25 @@ class ExpertPolicy(Policy):
         worlds, device = len(observation.state), self.sight.device
         asking = world_mask(observation.mask, worlds)
         mask = torch.from_numpy(asking).to(device)
-        fresh = asking & self._fresh
-        if fresh.any():
-            begins, pose = torch.from_numpy(fresh).to(device), self.sight.pose
+        beginning = asking & self._begins
+        if beginning.any():
+            begins, pose = torch.from_numpy(beginning).to(device), self.sight.pose
             self.generator.reset(begins, root_xy=pose[:, :2], yaw=pose[:, 2])
             self.expert.begin(begins)
-            self._fresh &= ~fresh
+            self._begins &= ~beginning
         command = self.expert.command(mask, self.chunk_size * TICK)
         actions = torch.empty(worlds, self.chunk_size, ACTION_WIDTH, device=device)
-        yaw, share = self.sight.pose[:, 2], REALIGN * (mask & (command.velocity != 0).any(dim=1))
+        yaw, fraction = self.sight.pose[:, 2], REALIGN * (mask & (command.velocity != 0).any(dim=1))
         for tick in range(self.chunk_size):
-            self.generator.realign(yaw, share)
+            self.generator.realign(yaw, fraction)
             self.generator.step(command, mask)
             actions[:, tick] = self.generator.action()
-        return Chunk(actions)
+        return Chunk(actions, phases=self.expert.phases())
 
-    def describe(self) -> dict[str, Any]:
-        """Name, the tasks it knows and the length of its chunks."""
-        return {"name": self.name, "tasks": sorted(self.experts), "chunk_size": self.chunk_size}
+    def describe(self) -> Json:
+        """Name, the tasks that have an expert and the length of the chunks."""
+        return {
+            "name": self.name,
+            "tasks": solved_tasks(),
+            "chunk_size": self.chunk_size,
+        }

@@ -1,8 +1,8 @@
 """Boxing's expert: walk to the side of the right bag, crouch to the target's height, lead the nearer fist to it.
 
-The palm must come within 13 cm of a target that sits in the bag's skin, and the palm frame lies behind the fingers: a
-hand that comes straight at the bag stops too far out. So the robot stands where the target lies on the bag's flank, in
-front of a shoulder, and the hand passes beside the bag.
+The palm must come within 13 cm of a target in the bag's surface, and the palm frame is behind the fingers: a hand that
+comes straight at the bag stops too far away. So the robot stands such that the target is on the bag's flank, in front
+of a shoulder, and the hand passes next to the bag.
 """
 
 from __future__ import annotations
@@ -26,42 +26,44 @@ __all__ = ["BoxingExpert"]
 
 BAGS = ("/World/Bag_1", "/World/Bag_2")
 FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
-"""Bearing of the target from the bag's axis, against that of the robot [rad]: positive lies on the robot's right."""
+"""Bearing of the target from the bag's axis minus that of the robot [rad]: positive is on the robot's right."""
 BEST_FLANK = math.radians(60)
 STAND = 0.45
 """Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
 READY = 0.70
-"""The same where the robot turns to the bag before the last step [m]: its hands must not meet the bag."""
+"""The same when the robot turns to the bag, before the last step [m]: its hands must not touch the bag."""
 OFF = 0.06
-"""Distance of the palm from the target, away from the bag [m]: the hand is there before it touches."""
+"""Distance of the palm from the target, away from the bag [m]: the hand arrives before it touches."""
 BELOW = 0.12
-"""Pelvis under the target [m]: then the shoulder is 17 cm above it."""
+"""Height of the target above the pelvis [m]: the shoulder is then 17 cm above the target."""
 LOW, HIGH = 0.52, 0.74
 """Range of pelvis heights [m]."""
 PATIENCE = 3.5
-"""Time given to one strike before the robot moves by what its palm is off [s]."""
+"""Time given to one strike before the robot moves by the error of its palm [s]."""
 SHIFTS = 2
-"""Moves of that kind before it goes to another side of the target."""
+"""Number of such moves before it goes to another side of the target."""
 CLOSER = 0.12
-"""Longest of them [m]."""
+"""Longest such move [m]."""
 LEAN = 0.25
 """Waist pitch of a strike [rad]."""
 READY_WITHIN = (0.10, 0.15)
-"""Errors at the ready place that do not matter [m, rad]."""
+"""Errors at the ready pose that do not matter [m, rad]."""
 STAND_WITHIN = (0.05, 0.10)
-"""Errors in front of the bag that the arm makes up for [m, rad]."""
+"""Errors in front of the bag that the arm compensates [m, rad]."""
 STEP_TIME = 6.0
-"""Time given to the last steps before the robot strikes from where it is [s]."""
+"""Time given to the last steps before the robot strikes from its present position [s]."""
 GAIN = 0.6
-"""Share of the palm's error that the command takes up in a second: trackers leave the hand 5-20 cm behind."""
+"""Integral gain on the palm's error [1/s]: trackers leave the hand 5-20 cm behind."""
 MOST = 0.15
 """Largest correction [m]."""
 
 WALK, STEP, STRIKE = 0, 1, 2
+PHASES = ("approach", "step up", "strike")
+"""Their names, in this order."""
 
 
 class BoxingExpert(Expert):
-    """Three phases a world: to the ready place, up to the bag, strike; after a miss back to the first."""
+    """Three phases per world: to the ready pose, up to the bag, strike; after a miss back to the first."""
 
     task = "boxing"
 
@@ -71,11 +73,11 @@ class BoxingExpert(Expert):
         worlds, device = sight.worlds, sight.device
         bags, boxes = [], []
         for bag in BAGS:
-            _, place, half = sight.box(f"{bag}/Collider")
+            _, centre, half = sight.box(f"{bag}/Collider")
             _, post, post_half = sight.box(f"{bag}/Post")
-            bags.append(place[:2])
+            bags.append(centre[:2])
             zero = torch.zeros(1, device=device)
-            boxes.append(torch.cat([place[:2], zero, half[:1], half[:1]]))
+            boxes.append(torch.cat([centre[:2], zero, half[:1], half[:1]]))
             boxes.append(torch.cat([post[:2], zero, post_half[:2]]))
         self._bags = torch.stack(bags)
         self._boxes = torch.stack(boxes).expand(worlds, -1, 5)
@@ -84,6 +86,7 @@ class BoxingExpert(Expert):
         self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.45))
         self.phase = torch.zeros(worlds, dtype=torch.long, device=device)
         """`WALK`, `STEP` or `STRIKE`, shape [worlds]."""
+        self._acting = self.phase
         self.right = torch.zeros(worlds, dtype=torch.bool, device=device)
         """The right hand strikes, shape [worlds]."""
         self.ready = torch.zeros(worlds, 3, device=device)
@@ -107,17 +110,17 @@ class BoxingExpert(Expert):
         return bag, torch.atan2(target[:, 1] - bag[:, 1], target[:, 0] - bag[:, 0])
 
     def _approach(self, mask: Tensor) -> None:
-        """Plan the way to the best stance; after a miss to the next best one."""
+        """Plan the path to the best stance; after a miss to the next best one."""
         pose = self.sight.pose
         bag, bearing = self._bag()
         flank = torch.tensor(FLANKS, device=pose.device)
-        side = bearing[:, None] - flank  # [W, C]: where the robot stands around the bag
+        side = bearing[:, None] - flank  # [W, C]: bearing of the robot from the bag
         out = torch.stack([torch.cos(side), torch.sin(side)], dim=2)
         ready, stand = bag[:, None] + READY * out, bag[:, None] + STAND * out
         room = signed_distance(torch.cat([ready, stand], dim=1), self._boxes[:, 1::2])
         tight = (0.40 - room.view(len(pose), 2, -1).amin(dim=1)).clamp_min(0.0)
-        way = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
-        price = way + 20.0 * tight + 0.5 * (flank.abs() - BEST_FLANK).abs()
+        far = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
+        price = far + 20.0 * tight + 0.5 * (flank.abs() - BEST_FLANK).abs()
         order = price.argsort(dim=1)
         pick = torch.gather(order, 1, (self._tries // (SHIFTS + 1) % len(FLANKS))[:, None])
 
@@ -125,14 +128,14 @@ class BoxingExpert(Expert):
             xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
             return torch.cat([xy, wrap_angle(torch.gather(side, 1, pick) + math.pi)], dim=1)
 
-        place = chosen(ready)
-        ways = plan(pose[:, :2], place[:, :2], Floor(self._boxes, *ROOM))
+        goal = chosen(ready)
+        paths = plan(pose[:, :2], goal[:, :2], Floor(self._boxes, *ROOM))
         row = mask[:, None]
-        self.ready = torch.where(row, place, self.ready)
+        self.ready = torch.where(row, goal, self.ready)
         self.stand = torch.where(row, chosen(stand), self.stand)
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
-        old = self._route if len(self._route) else ways.points
-        self._route = torch.where(mask[:, None, None], ways.points, old)
+        old = self._route if len(self._route) else paths.points
+        self._route = torch.where(mask[:, None, None], paths.points, old)
         self._begin_phase(mask, WALK)
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
@@ -144,6 +147,7 @@ class BoxingExpert(Expert):
             again = stuck & (self._tries % (SHIFTS + 1) == 0)
             self._shift(stuck & ~again)
             self._approach(again)
+        self._acting = self.phase
         walking, striking = self.phase == WALK, self.phase == STRIKE
         goal = torch.where(walking[:, None], self.ready, self.stand)
         route = torch.where(walking[:, None, None], self._route, pose[:, None, :2])
@@ -155,15 +159,19 @@ class BoxingExpert(Expert):
         command.hands = torch.ones_like(command.hands)
         self._strike(command, striking, mask, dt)
 
-        place = torch.where(walking, READY_WITHIN[0], STAND_WITHIN[0])
+        near = torch.where(walking, READY_WITHIN[0], STAND_WITHIN[0])
         turn = torch.where(walking, READY_WITHIN[1], STAND_WITHIN[1])
-        there = (answer.distance < place) & (answer.heading_error.abs() < turn)
+        there = (answer.distance < near) & (answer.heading_error.abs() < turn)
         late = (self.phase == STEP) & (self._clock > STEP_TIME)
         onward = mask & ~striking & (there | answer.arrived | late)
         self.phase = self.phase + onward
         self._clock = self._clock.masked_fill(onward, 0.0)
         self.navigator.retarget(onward)
         return command
+
+    def phases(self) -> list[str]:
+        """`approach`, `step up` or `strike`."""
+        return [PHASES[phase] for phase in self._acting.tolist()]
 
     def _shift(self, mask: Tensor) -> None:
         """Move the stance by what the palm missed: a crouch and a stretched arm push the robot back by centimetres."""
@@ -181,7 +189,7 @@ class BoxingExpert(Expert):
         self.navigator.retarget(mask)
 
     def _wanted(self) -> Tensor:
-        """Where the palm shall be [m]: beside the target, [worlds, 3]."""
+        """Wanted position of the palm [m]: next to the target, [worlds, 3]."""
         target = self._target()
         _, bearing = self._bag()
         away = torch.stack([torch.cos(bearing), torch.sin(bearing), torch.zeros_like(bearing)], dim=1)

@@ -1,7 +1,7 @@
-"""Shortest ways around boxes on the floor: a visibility graph, batched over worlds in torch.
+"""Shortest paths around boxes on the floor: a visibility graph, batched over worlds in torch.
 
-Every box is grown by the clearance that the robot's middle must keep; the ways lead over the grown corners. Narrow and
-wide clearances are tried together, and a detour is taken for a wider one while it is short.
+Every box is grown by the clearance that the robot's centre must keep; paths lead over the grown corners. Narrow and
+wide clearances are tried together, and a short detour is taken for a wider one.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from torch import Tensor
 
 from arena_newton.rotations import rotate_xy
 
-__all__ = ["Floor", "Ways", "footprint", "plan"]
+__all__ = ["BLOCKED", "Floor", "Paths", "footprint", "plan", "signed_distance"]
 
 CLEARANCES = (0.50, 0.43, 0.36, 0.30)
-"""Distances kept from obstacles by the robot's middle [m]: half its width is 0.25 with swinging arms, and a gait
-wanders by 5 cm."""
+"""Distances between obstacles and the robot's centre [m]: half its width is 0.25 with swinging arms, and a gait
+deviates by 5 cm."""
 DETOUR = 8.0
-"""Way that a wider clearance is worth [m per m]."""
+"""Additional path length that a wider clearance is worth [m per m]."""
 BLOCKED = 1e6
-"""Length of a way that does not exist [m]."""
+"""Length of a path that does not exist [m]."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Where the robot may walk."""
+    """Area in which the robot may walk."""
 
     boxes: Tensor
     """Obstacles as rectangles: x, y [m], yaw [rad], half length, half width [m], shape [worlds, boxes, 5]."""
@@ -37,15 +37,15 @@ class Floor:
 
 
 @dataclass(frozen=True)
-class Ways:
-    """Planned ways, one a world."""
+class Paths:
+    """Planned paths, one per world."""
 
     points: Tensor
     """From the start to the goal [m], shape [worlds, points, 2]; the last point is repeated."""
     length: Tensor
-    """[m], `BLOCKED` or more where there is none (the way is then straight), shape [worlds]."""
+    """[m], `BLOCKED` or more where there is none (the path is then straight), shape [worlds]."""
     clearance: Tensor
-    """Distance that it keeps from obstacles [m], 0 where there is none, shape [worlds]."""
+    """Distance that it keeps from obstacles [m], 0 where there is no path, shape [worlds]."""
 
 
 def footprint(pos: Tensor, quat: Tensor, half: Tensor) -> Tensor:
@@ -99,7 +99,7 @@ def _blocked(points: Tensor, boxes: Tensor, grow: Tensor) -> Tensor:
 
 
 def _freed(point: Tensor, boxes: Tensor, grow: Tensor) -> Tensor:
-    """A point moved out of grown boxes, each in turn by the shortest way; [W, 2]."""
+    """A point moved out of grown boxes, each in turn in the shortest direction; [W, 2]."""
     for b in range(boxes.shape[1]):
         box = boxes[:, b : b + 1]
         local = _local(point[:, None], box)[:, 0, 0]
@@ -114,10 +114,10 @@ def _freed(point: Tensor, boxes: Tensor, grow: Tensor) -> Tensor:
     return point
 
 
-def plan(start: Tensor, goal: Tensor, floor: Floor, clearances: tuple[float, ...] = CLEARANCES) -> Ways:
-    """Ways from start to goal.
+def plan(start: Tensor, goal: Tensor, floor: Floor, clearances: tuple[float, ...] = CLEARANCES) -> Paths:
+    """Paths from start to goal.
 
-    A start or goal that lies too near a box is first moved off it; the way ends at the goal itself all the same.
+    A start or goal too near a box is first moved away from it; the path still ends at the goal itself.
 
     Args:
         start: [m], shape [worlds, 2].
@@ -143,7 +143,7 @@ def plan(start: Tensor, goal: Tensor, floor: Floor, clearances: tuple[float, ...
     cost = torch.linalg.vector_norm(nodes[:, :, None] - nodes[:, None], dim=-1)
     cost = cost.masked_fill(_blocked(nodes, boxes, grow) | outside[:, :, None] | outside[:, None], BLOCKED)
 
-    # Bellman-Ford from the goal: a shortest way among convex boxes has few corners.
+    # Bellman-Ford from the goal: a shortest path among convex boxes has few corners.
     most = boxes.shape[1] * 2 + 1
     rest = cost[:, :, 1].clone()
     rest[:, 1] = 0.0
@@ -165,6 +165,6 @@ def plan(start: Tensor, goal: Tensor, floor: Floor, clearances: tuple[float, ...
 
     length = torch.linalg.vector_norm(path[:, 1:] - path[:, :-1], dim=2).sum(dim=1)
     length = torch.where(found, length, BLOCKED)
-    price = (length - DETOUR * grow).view(tries, worlds)
-    best = price.argmin(dim=0) * worlds + torch.arange(worlds, device=start.device)
-    return Ways(path[best], length[best], torch.where(found, grow, 0.0)[best])
+    cost_of_try = (length - DETOUR * grow).view(tries, worlds)
+    best = cost_of_try.argmin(dim=0) * worlds + torch.arange(worlds, device=start.device)
+    return Paths(path[best], length[best], torch.where(found, grow, 0.0)[best])

@@ -1,6 +1,6 @@
-"""VisNavi's expert: plan around the obstacles where they lie, walk, stand in the marked area.
+"""VisNavi's expert: plan around the obstacles at their current positions, walk, stand in the marked area.
 
-Some still roll when the episode begins; one that moves on asks for a new plan, as one does that the robot pushes.
+Some obstacles still roll when the episode begins; one that moves, or that the robot pushes, requires a new plan.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ __all__ = ["VisNaviExpert"]
 
 OBSTACLES = ("Beam_a", "Beam_b", "Beam_c", "Block_a", "Block_b", "Block_c")
 FEET = 0.2
-"""Half of what both feet and the wander of a stop need of the area [m]."""
+"""Margin inside the area for both feet and the deviation of a stop [m]."""
 APART = 0.42
-"""Distance that a place to stand should keep from obstacles and sign [m]."""
+"""Distance that the goal should keep from obstacles and sign [m]."""
 MOVED = 0.06
-"""An obstacle that moved farther than this since the plan was made asks for a new one [m]."""
+"""An obstacle that moved farther than this since the plan was made requires a new one [m]."""
 STRAY = 0.35
-"""So does a robot that is farther off its way than this [m]."""
+"""So does a robot that is farther from its path than this [m]."""
+CORNER = 0.05
+"""Points of a path closer to each other than this count as one [m]."""
 
 
 class VisNaviExpert(Expert):
-    """Walks to the best place in the marked area on the shortest way with room to both sides."""
+    """Walks to the best position in the marked area on the shortest path with room to both sides."""
 
     task = "vis_navi"
 
@@ -44,21 +46,22 @@ class VisNaviExpert(Expert):
         worlds, device = sight.worlds, sight.device
         self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.5))
         self.goal = torch.zeros(worlds, 3, device=device)
-        """Where the robot wants to stand: x, y [m], yaw [rad], shape [worlds, 3]."""
+        """Pose to stand at: x, y [m], yaw [rad], shape [worlds, 3]."""
         self._route = torch.zeros(0, device=device)
         self._stray = torch.zeros(worlds, device=device)
+        self._leg = torch.zeros(worlds, dtype=torch.long, device=device)
         self._seen = torch.zeros(worlds, len(OBSTACLES), 5, device=device)
 
     def boxes(self) -> Tensor:
-        """Obstacles as they lie now, rectangles on the floor, shape [worlds, obstacles, 5]."""
+        """Present obstacles as rectangles on the floor, shape [worlds, obstacles, 5]."""
         return torch.stack([self._footprint(*box) for box in self._obstacles], dim=1)
 
-    def _footprint(self, body: int, place: Tensor, half: Tensor) -> Tensor:
+    def _footprint(self, body: int, offset: Tensor, half: Tensor) -> Tensor:
         _, quat = self.sight.body(body)
-        return footprint(self.sight.point(body, place), quat, half.expand(len(quat), 3))
+        return footprint(self.sight.point(body, offset), quat, half.expand(len(quat), 3))
 
     def begin(self, mask: Tensor) -> None:
-        """Plan from where the robot stands."""
+        """Plan from the robot's position."""
         self.navigator.reset(mask)
         self._plan(mask, self.boxes())
 
@@ -67,19 +70,20 @@ class VisNaviExpert(Expert):
         zone, quat = self._centre(), self.sight.body(self._zone.body_id)[1]
         every = torch.cat([boxes, self._footprint(*self._sign)[:, None]], dim=1)
         spot = self._spot(zone[:, :2], heading(quat), every)
-        # The sign stands in the area itself: it only counts for the choice of the spot.
-        ways = plan(pose[:, :2], spot, Floor(boxes, *ROOM))
-        last = spot - torch.where((ways.length < BLOCKED)[:, None], _before_last(ways.points), pose[:, :2])
+        # The sign is in the area itself: it only counts for the choice of the goal.
+        paths = plan(pose[:, :2], spot, Floor(boxes, *ROOM))
+        last = spot - torch.where((paths.length < BLOCKED)[:, None], _before_last(paths.points), pose[:, :2])
         goal = torch.cat([spot, torch.atan2(last[:, 1], last[:, 0])[:, None]], dim=1)
-        old = self._route if len(self._route) else ways.points
-        self._route = torch.where(mask[:, None, None], ways.points, old)
+        old = self._route if len(self._route) else paths.points
+        self._route = torch.where(mask[:, None, None], paths.points, old)
         self.goal = torch.where(mask[:, None], goal, self.goal)
         self._seen = torch.where(mask[:, None, None], boxes, self._seen)
         self._stray = self._stray.masked_fill(mask, 0.0)
+        self._leg = self._leg.masked_fill(mask, 0)
         self.navigator.retarget(mask)
 
     def _spot(self, centre: Tensor, yaw: Tensor, boxes: Tensor) -> Tensor:
-        """The place in the area that is best to stand on: clear of obstacles, near the middle; [worlds, 2]."""
+        """The best position in the area: clear of obstacles, near the middle; [worlds, 2]."""
         half = torch.tensor(self._zone.half[:2], device=centre.device) - FEET
         steps = torch.linspace(-1.0, 1.0, 9, device=centre.device)
         grid = torch.cartesian_prod(steps, steps) * half
@@ -90,7 +94,7 @@ class VisNaviExpert(Expert):
         return spots[torch.arange(len(spots), device=spots.device), best]
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
-        """Follow the way; plan again where an obstacle was pushed or the robot strayed."""
+        """Follow the path; plan again where an obstacle was pushed or the robot strayed."""
         boxes, pose = self.boxes(), self.sight.pose
         stale = (boxes - self._seen)[..., :2].abs().amax(dim=(1, 2)) > MOVED
         again = mask & (stale | (self._stray > STRAY))
@@ -98,14 +102,38 @@ class VisNaviExpert(Expert):
             self._plan(again, boxes)
         answer = self.navigator.command(pose, self.goal, dt, route=self._route, mask=mask)
         self._stray = torch.where(mask, answer.stray, self._stray)
+        self._leg = torch.where(mask, torch.maximum(self._leg, self._nearest_leg(pose[:, :2])), self._leg)
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         command.velocity = answer.velocity
         return command
 
+    def _legs(self) -> Tensor:
+        """Which pieces of the path have a length, bool, [worlds, points − 1]."""
+        return torch.linalg.vector_norm(self._route[:, 1:] - self._route[:, :-1], dim=2) > CORNER
+
+    def _nearest_leg(self, here: Tensor) -> Tensor:
+        """Number of the path's leg nearest to a position, those without a length not counted; [worlds]."""
+        start, step = self._route[:, :-1], self._route[:, 1:] - self._route[:, :-1]
+        along = ((here[:, None] - start) * step).sum(2) / step.square().sum(2).clamp_min(1e-9)
+        gap = torch.linalg.vector_norm(start + along.clamp(0.0, 1.0)[..., None] * step - here[:, None], dim=2)
+        legs = self._legs()
+        nearest = gap.masked_fill(~legs, torch.inf).argmin(dim=1, keepdim=True)
+        return (torch.gather(legs.cumsum(dim=1), 1, nearest)[:, 0] - 1).clamp_min(0)
+
+    def phases(self) -> list[str]:
+        """`waypoint 1`, `waypoint 2` … while it walks to a corner of its path, `goal` on the last leg, then `hold`."""
+        last = self._legs().sum(dim=1) - 1
+        return [
+            "hold" if holding else "goal" if leg >= end else f"waypoint {leg + 1}"
+            for leg, end, holding in zip(
+                self._leg.tolist(), last.tolist(), self.navigator.holding.tolist(), strict=True
+            )
+        ]
+
 
 def _before_last(points: Tensor) -> Tensor:
-    """The point from which each way reaches its last one; [W, K, 2] to [W, 2]."""
-    away = torch.linalg.vector_norm(points - points[:, -1:], dim=2) > 0.05
+    """The point from which each path reaches its last one; [W, K, 2] to [W, 2]."""
+    away = torch.linalg.vector_norm(points - points[:, -1:], dim=2) > CORNER
     index = torch.arange(points.shape[1], device=points.device).expand_as(away)
     pick = torch.where(away, index, 0).amax(dim=1)
     return points[torch.arange(len(points), device=points.device), pick]

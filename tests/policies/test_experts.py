@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, seeding, tasks, trackers
 from arena_newton.canonical import validate_action
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Observation
-from arena_newton.policies.experts import EXPERTS
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.robot import DEFAULT_POSE
 from arena_newton.rollout import Rollout
@@ -29,8 +28,8 @@ def rotation(quat):
 
 def along(points, steps=200):
     """Many points on a polyline [K, 2]."""
-    share = torch.linspace(0, 1, steps)[:, None, None]
-    return (points[:-1] + share * (points[1:] - points[:-1])).reshape(-1, 2)
+    fraction = torch.linspace(0, 1, steps)[:, None, None]
+    return (points[:-1] + fraction * (points[1:] - points[:-1])).reshape(-1, 2)
 
 
 def test_footprint_of_an_upright_box_is_exact():
@@ -100,7 +99,7 @@ def test_unknown_task_is_named():
 
 
 def play(task, indices, ticks):
-    """Which worlds succeed when robots obey their references exactly."""
+    """Which worlds succeed when robots obey their references exactly, and each one's phases in their order."""
     env = ArenaEnv(task, tracker=trackers.get("pd"), worlds=len(indices), engine="mujoco", device="cpu", threads=1)
     seeds = [seeding.episode_seed(env.spec.gym_id, i // 20, i % 20) for i in indices]
     env.reset(seeds)
@@ -112,15 +111,20 @@ def play(task, indices, ticks):
     policy.attach(env)
     policy.reset(seeds, [task] * env.worlds)
     done = np.zeros(env.worlds, bool)
+    phases = [[] for _ in indices]
     for _ in range(ticks // policy.chunk_size):
-        validate_action(policy.act(env.observe(~done)).actions, task)
+        chunk = policy.act(env.observe(~done))
+        validate_action(chunk.actions, task)
+        for world in np.flatnonzero(~done):
+            if chunk.phases[world] not in phases[world][-1:]:
+                phases[world].append(chunk.phases[world])
         frames = policy.generator.frames
         pose(env, np.concatenate([frames.root_pos, frames.root_quat], axis=1), frames.joint_pos.numpy())
         env.judge.evaluate(env.physics)
         done |= env.judge.success.numpy() > 0
         if done.all():
             break
-    return done
+    return done, phases
 
 
 def pose(env, roots, joints):
@@ -133,10 +137,17 @@ def pose(env, roots, joints):
         env.physics._publish(world, data)
 
 
-@pytest.mark.parametrize("task", sorted(EXPERTS))
+@pytest.mark.parametrize("task", [name for name in tasks.names() if tasks.get(name).expert])
 def test_reference_solves_the_task(task):
-    """A robot that follows the expert's reference exactly solves the task in half of its step budget."""
-    assert play(task, EPISODES[task], 750).all()
+    """A robot that follows the expert's reference solves the task in half of its budget, phase by phase."""
+    done, phases = play(task, EPISODES[task], 750)
+    assert done.all()
+    for named in phases:
+        if task == "boxing":
+            assert named[:3] == ["approach", "step up", "strike"]
+        else:
+            walk = named[: named.index("goal") + 1]
+            assert walk == [f"waypoint {i}" for i in range(1, len(walk))] + ["goal"] and len(walk) > 1
 
 
 def test_boxing_through_twist2(shared):

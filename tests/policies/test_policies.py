@@ -193,7 +193,7 @@ def test_bad_spec(spec, text):
 
 def test_registration(monkeypatch):
     """A third party's policy is found under its name, with its argument."""
-    monkeypatch.setattr(policies.base, "_registered", {})
+    monkeypatch.setattr(policies.base.POLICIES, "_registered", {})
 
     class Mine(policies.Policy):
         def __init__(self, argument):

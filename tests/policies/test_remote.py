@@ -203,7 +203,7 @@ def test_single_action(server, policy):
         ("39", "39 numbers, expected 40"),
         ("words", "no number"),
         ("500", "status 500, CUDA out of memory"),
-        ("text", "no JSON"),
+        ("text", "not JSON"),
         ("empty", "neither action_chunk nor action"),
         ("long", "a chunk of 4100 actions, expected at most 4096"),
         ("escapes", "/infer: status 500, red back "),
@@ -398,7 +398,7 @@ def test_failures_in_a_row(server, policy):
     [
         (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "/reset: status 404"),
         (b"HTTP/1.1 401 No\r\nContent-Length: 0\r\n\r\n", f"status 401; a token .* variable {TOKEN_VARIABLE}"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 6\r\n\r\n<html>", "the reply is no JSON"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 6\r\n\r\n<html>", "the reply is not JSON"),
         (b"SSH-2.0-OpenSSH_9.6\r\n", "SSH-2.0"),
     ],
 )
