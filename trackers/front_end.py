@@ -1,6 +1,6 @@
-"""What stands around a tracker's network: command and state in, observation out; raw output in, joint targets out.
+"""What a tracker has around its network: command and state in, observation out; raw output in, joint targets out.
 
-Training and deployment share it, so that a network meets in a rollout what it met in training:
+Training and deployment share it, so that a network sees in a rollout what it saw in training:
 
     observation = front_end.observe(command, state)
     targets = front_end.act(network(observation))
@@ -12,69 +12,49 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import torch
 
-from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.robot import MUJOCO_JOINTS, DriveGains
+from arena_newton.trackers import interface
 from arena_newton.trackers.base import Tracker
-from arena_newton.trackers.inference import networks
+from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.blocks import BlockRunner
+from arena_newton.trackers.inference.networks import Symmetric
+from arena_newton.trackers.interface import JOINTS, ActionForm, residual_form
 
-if TYPE_CHECKING:
-    from arena_newton.trackers.inference.weights_file import Weights
-
-__all__ = ["ActionForm", "FrontEnd", "Mirror", "NetworkTracker", "residual_form"]
-
-JOINTS = len(MUJOCO_JOINTS)
+__all__ = ["JOINTS", "ActionForm", "FrontEnd", "Mirror", "NetworkTracker", "column", "plain", "residual_form", "store"]
 
 
-@dataclass(frozen=True)
-class ActionForm:
-    """How a network's raw output becomes joint targets: base + scale * clip(raw)."""
-
-    kind: str
-    """`default`: the base is the tracker's default pose. `residual`: the base is the reference of the tick."""
-    scale: tuple[float, ...]
-    """Radians per unit of raw output, 29, MuJoCo order."""
-    clip: float = 0.0
-    """Largest magnitude of the raw output that counts, 0 = no limit."""
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("default", "residual"):
-            raise InputError(f"action form {self.kind!r}: known are default, residual")
-        if len(self.scale) != JOINTS or self.clip < 0.0:
-            raise InputError(f"action form {self.kind!r}: needs {JOINTS} scales and a clip of at least 0")
+def column(mask: Sequence[bool] | torch.Tensor | None, device: torch.device) -> torch.Tensor | None:
+    """A mask of worlds as a bool column on `device`, shape [worlds, 1]; None (all worlds) stays None."""
+    return None if mask is None else torch.as_tensor(mask, device=device).to(torch.bool)[:, None]
 
 
-def residual_form(drive: DriveGains, clip: float = 6.0) -> ActionForm:
-    """Corrections of the reference joints; one unit asks a quarter of a joint's torque limit of its spring.
-
-    Args:
-        drive: The drive that executes the targets.
-        clip: Largest magnitude of the raw output that counts.
-    """
-    return ActionForm("residual", tuple(0.25 * e / k for e, k in zip(drive.effort, drive.kp, strict=True)), clip)
+def store(target: torch.Tensor, value: torch.Tensor, rows: torch.Tensor | None) -> None:
+    """Write `value` into `target`, where there is a `column` of worlds into their rows alone."""
+    if rows is not None:
+        rows = rows.view(-1, *[1] * (target.dim() - 1))
+        value = torch.where(rows, value, target)
+    target.copy_(value)
 
 
 class Mirror:
     """The mirror image (left for right) of rows of numbers: `mirror(x)[:, i] = sign[i] * x[:, index[i]]`."""
 
     def __init__(self, parts: Sequence[tuple[Sequence[int], Sequence[float]]], device: torch.device | str = "cpu"):
-        """Put parts side by side.
+        """Join parts to a row.
 
         Args:
             parts: For each part the index within it and the sign of every number.
             device: Torch device of the rows.
         """
         index: list[int] = []
-        for places, _ in parts:
+        for positions, _ in parts:
             start = len(index)
-            index += [start + i for i in places]
+            index += [start + i for i in positions]
         self.index = torch.tensor(index, device=device)
         self.sign = torch.tensor([float(s) for _, signs in parts for s in signs], device=device)
 
@@ -84,12 +64,12 @@ class Mirror:
 
 
 def plain(*signs: float) -> tuple[Sequence[int], Sequence[float]]:
-    """A part of a `Mirror` whose numbers stay in their places."""
+    """A part of a `Mirror` whose numbers keep their positions."""
     return range(len(signs)), signs
 
 
 class FrontEnd(abc.ABC):
-    """Base of all front ends; a subclass sets the widths and writes `reset`, `write` and `advance`."""
+    """Base of all front ends; a subclass sets the widths and writes `prefill`, `write` and `advance`."""
 
     interface: str = ""
     """Name of the interface in weights files, such as `twist2`."""
@@ -115,7 +95,7 @@ class FrontEnd(abc.ABC):
         """Keep the action form; `bind` allocates."""
         self.action_form = action_form
 
-    def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
+    def bind(self, worlds: int, device: torch.device | str = "cpu", obs: torch.Tensor | None = None) -> None:
         """Allocate buffers.
 
         Args:
@@ -131,19 +111,22 @@ class FrontEnd(abc.ABC):
         self.base = self._default.repeat(worlds, 1)
         self._targets = torch.zeros(worlds, JOINTS, device=self.device)
 
-    @abc.abstractmethod
+    @torch.no_grad()
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Forget the past of the worlds in `mask` (all without one); shape [worlds], bool."""
+        """Set observation and last action of the worlds in `mask`, bool, shape [worlds], to zero; all without one."""
+        rows = column(mask, self.device)
+        for buffer in (self.obs, self.last_action):
+            buffer.zero_() if rows is None else buffer.masked_fill_(rows, 0.0)
 
     @abc.abstractmethod
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
-        """Pretend that the worlds in `mask` have held this command and state for a while."""
+        """Fill the observation history of the masked worlds with the current frame."""
 
     @torch.no_grad()
     def observe(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
         """Observation of this tick, shape [worlds, obs_width]: the buffer itself, which `act` changes.
 
-        Calling it again before `act` replaces the tick's observation. Whoever keeps it must copy it.
+        Calling it again before `act` replaces the tick's observation. Copy what you keep.
         """
         if self.action_form.kind == "residual":
             self.base.copy_(command.joints)
@@ -151,14 +134,16 @@ class FrontEnd(abc.ABC):
         return self.obs
 
     @torch.no_grad()
-    def act(self, raw: torch.Tensor) -> torch.Tensor:
+    def act(self, raw: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Joint targets [rad], MuJoCo order, shape [worlds, 29]; ends the tick. The buffer is reused by the next call.
 
         Args:
             raw: The network's output, shape [worlds, action_width].
+            mask: Worlds whose histories advance, bool, shape [worlds]; all without one.
         """
-        self.last_action.copy_(raw)
-        self.advance()
+        rows = column(mask, self.device)
+        store(self.last_action, raw, rows)
+        self.advance(rows)
         raw = self.to_mujoco(raw)
         if self.action_form.clip > 0.0:
             torch.clamp(raw, -self.action_form.clip, self.action_form.clip, out=self._targets)
@@ -179,8 +164,13 @@ class FrontEnd(abc.ABC):
         """Write this tick's observation into `obs`."""
 
     @abc.abstractmethod
-    def advance(self) -> None:
-        """Move histories on, after `last_action` took the raw output."""
+    def advance(self, rows: torch.Tensor | None = None) -> None:
+        """Advance the histories by this tick, after `last_action` took the raw output.
+
+        Args:
+            rows: Worlds that advance, bool, shape [worlds, 1], for `store`; all without it. The histories of the others
+                must keep every bit; the current frame, which every tick writes again, need not.
+        """
 
     def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
         """The raw output in MuJoCo order."""
@@ -213,31 +203,27 @@ class NetworkTracker(Tracker):
         self.network = network
         self.checkpoint, self.checkpoint_hash = checkpoint, checkpoint_hash
 
-    def follow(self, weights: Weights, front_end: FrontEnd, checkpoint: str | Path) -> None:
-        """Become the tracker of a weights file: its network, its drive, its physics rate.
+    @classmethod
+    def from_weights(cls, path: str | Path) -> Self:
+        """The tracker of a weights file: its network, its drive, its physics rate.
 
-        Args:
-            weights: The file's content.
-            front_end: Front end of its interface and action form.
-            checkpoint: The file.
+        Raises:
+            InputError: The file is absent, damaged or of another interface.
         """
+        weights = weights_file.load(path, cls.name)
+        front_end = interface.get(cls.name).front_end(weights.action_form)
         network = weights.network.deployed()
         if weights.symmetric:
             obs, action = front_end.mirror_obs(), front_end.mirror_action()
-            network = networks.Symmetric(network, (obs.index, obs.sign), (action.index, action.sign)).eval()
-        NetworkTracker.__init__(
-            self,
-            front_end,
-            network,
-            checkpoint=str(checkpoint),
-            checkpoint_hash=weights.sha256[:12],
-        )
-        self.drive, self.card = weights.drive, weights.card
-        self.physics_rate = self.fast_physics_rate = weights.physics
+            network = Symmetric(network, (obs.index, obs.sign), (action.index, action.sign)).eval()
+        tracker = cls(front_end, network, checkpoint=str(path), checkpoint_hash=weights.sha256[:12])
+        tracker.drive, tracker.card = weights.drive, weights.card
+        tracker.physics_rate = tracker.fast_physics_rate = weights.physics
+        return tracker
 
-    def bind(self, worlds: int, device: Any = "cpu", scene: Any = None) -> None:
+    def bind(self, worlds: int, device: torch.device | str = "cpu") -> None:
         """Allocate observation buffers for `worlds` worlds on `device`."""
-        super().bind(worlds, device, scene)
+        super().bind(worlds, device)
         device = torch.device(device)
         if isinstance(self.network, torch.nn.Module):
             self.network.to(device)
@@ -282,24 +268,36 @@ class NetworkTracker(Tracker):
 
     @torch.inference_mode()
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
-        """Fill the history of the worlds in `mask` with the present: a start is then no jump for the network."""
+        """Fill the observation history of the masked worlds with the current frame: a start is then no jump."""
         self.front_end.prefill(command, state, mask)
 
     @torch.inference_mode()
-    def step(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
-        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; the buffer is reused by the next call."""
-        return self._tick(command, state) if self._graph is None else self._graph(command, state)
+    def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; the buffer is reused by the next call.
 
-    def _tick(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+        Args:
+            command: Reference of the tick.
+            state: Measured state.
+            mask: Worlds that advance, bool, shape [worlds]; all without one. The histories of the others keep every
+                bit, and their rows of the result mean nothing.
+        """
+        if mask is not None and mask.device.type == "cpu" and bool(mask.all()):
+            mask = None
+        return (self._graph or self._tick)(command, state, mask)
+
+    def _tick(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None) -> torch.Tensor:
         self.front_end.observe(command, state)
-        return self.front_end.act(self._runner.run())
+        return self.front_end.act(self._runner.run(), mask)
+
+
+Tick = Callable[[TrackerCommand, RobotState, torch.Tensor | None], torch.Tensor]
 
 
 class _TickGraph:
-    """A tick held in a CUDA graph: some sixty small launches become one."""
+    """A tick held in a CUDA graph: some sixty small launches become one; ticks with a mask have a second graph."""
 
-    def __init__(self, tick: Callable[[TrackerCommand, RobotState], torch.Tensor], worlds: int, device: torch.device):
-        """Allocate the inputs that the graph reads.
+    def __init__(self, tick: Tick, worlds: int, device: torch.device):
+        """Allocate the inputs that the graphs read.
 
         Args:
             tick: What to hold; it always writes the same result buffer.
@@ -314,26 +312,25 @@ class _TickGraph:
         self._command = TrackerCommand(mimic=row(35), joints=row(JOINTS), joint_vel=row(JOINTS), quat=row(4))
         self._state = RobotState(quat=row(4), ang_vel_body=row(3), joint_pos=row(JOINTS), joint_vel=row(JOINTS))
         self._inputs = [*vars(self._command).values(), *vars(self._state).values()]
-        self._graph: torch.cuda.CUDAGraph | None = None
-        self._targets = row(0)
+        self._mask = torch.ones(worlds, dtype=torch.bool, device=device)
+        self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, torch.Tensor]] = {}
         self._warm = False
 
-    def __call__(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+    def __call__(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None) -> torch.Tensor:
         """One tick; the first runs as it is, which makes libraries allocate what they need."""
         if not self._warm:
             self._warm = True
-            return self._tick(command, state)
+            return self._tick(command, state, mask)
         torch._foreach_copy_(self._inputs, [*vars(command).values(), *vars(state).values()])
-        if self._graph is None:
+        masked = mask is not None
+        if mask is not None:
+            self._mask.copy_(mask)
+        if masked not in self._graphs:
             graph = torch.cuda.CUDAGraph()
             # Other threads may use the device meanwhile.
             with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                self._targets = self._tick(self._command, self._state)
-            self._graph = graph
-        self._graph.replay()
-        return self._targets
-
-
-def column(values: Sequence[bool] | torch.Tensor, device: torch.device) -> torch.Tensor:
-    """A mask of worlds as a bool column on `device`, shape [worlds, 1]."""
-    return torch.as_tensor(values, device=device).to(torch.bool)[:, None]
+                targets = self._tick(self._command, self._state, self._mask if masked else None)
+            self._graphs[masked] = graph, targets
+        graph, targets = self._graphs[masked]
+        graph.replay()
+        return targets

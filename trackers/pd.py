@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
+from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import TWIST2_DRIVE
-from arena_newton.trackers.base import RobotState, Tracker, TrackerCommand
+from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:
     import torch
@@ -34,7 +35,7 @@ class PdTracker(Tracker):
     drive = PD_DRIVE
     ignores = ("root xy", "root height", "root orientation")
 
-    def step(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
+    def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
         """The reference joints themselves [rad], shape [worlds, 29] (no copy)."""
         return command.joints
 

@@ -2,68 +2,76 @@
 
 Facts are those of the released controller as the original benchmark drives it (its joint-reference mode): the encoder
 takes 1762 numbers of which mode 0 fills the joint positions, the joint velocities and the orientation anchor; there is
-no look-ahead, the present frame stands ten times. Inside, joints are in canonical order. The elementwise arithmetic is
-exactly rounded, so a world's bits do not depend on the other worlds.
+no look-ahead, the current frame is repeated ten times. Inside, joints are in canonical order. The elementwise
+arithmetic is exactly rounded, so a world's bits do not depend on the other worlds.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
+from torch import nn
 
 from arena_newton.errors import InputError
-from arena_newton.robot import (
-    CANONICAL_TO_MUJOCO,
-    MUJOCO_TO_CANONICAL,
-    SONIC_DRIVE,
-    PhysicsRate,
-)
-from arena_newton.trackers.base import RobotState, TrackerCommand
-from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
+from arena_newton.interfaces import RobotState, TrackerCommand
+from arena_newton.robot import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, SONIC_DRIVE, PhysicsRate
+from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
 from arena_newton.trackers.inference import onnx_session, weights_file
+from arena_newton.trackers.inference.networks import InputNorm, PartialNetwork, TrackerNetwork, folded, mlp, shrink_last
 from arena_newton.trackers.inference.quadratic import Quadratic, products
+from arena_newton.trackers.interface import JOINTS, ActionForm, Interface, slices
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
 
 __all__ = [
-    "ENCODER_INPUT",
-    "OBSERVATION",
-    "PROPRIOCEPTION",
+    "INTERFACE",
     "SONIC_DEFAULT_POSE",
     "SONIC_FORM",
     "SonicFrontEnd",
+    "SonicNet",
     "SonicTracker",
     "from_checkpoint",
     "official_pair",
 ]
 
 FRAMES = 10
-"""Frames of the reference window and of the histories."""
-ENCODER_INPUT = 1762
-"""Width of the encoder's input."""
-PROPRIOCEPTION = 930
-"""Width of the decoder's input besides the latent."""
+"""Frames of the reference window and of the histories, oldest first."""
+ENCODER_LAYOUT = {
+    "mode": 4,
+    "ref_pos": FRAMES * JOINTS,
+    "ref_vel": FRAMES * JOINTS,
+    "heights": FRAMES + 1,
+    "anchor": 6,
+    "anchors": FRAMES * 6,
+    "other_modes": 1101,
+}
+"""Parts of the encoder's input; `mode`, `heights` and `other_modes` stay zero in the joint-reference mode."""
+PROPRIOCEPTION_LAYOUT = {
+    "ang_vel": FRAMES * 3,
+    "joint_pos": FRAMES * JOINTS,
+    "joint_vel": FRAMES * JOINTS,
+    "actions": FRAMES * JOINTS,
+    "gravity": FRAMES * 3,
+}
+"""Parts of the decoder's input besides the latent, each a history."""
+LAYOUT = ENCODER_LAYOUT | PROPRIOCEPTION_LAYOUT
+"""The whole observation: encoder input, then proprioception."""
+AT = slices(LAYOUT)
+ENCODER_INPUT = sum(ENCODER_LAYOUT.values())
+PROPRIOCEPTION = sum(PROPRIOCEPTION_LAYOUT.values())
+OBSERVATION = ENCODER_INPUT + PROPRIOCEPTION
 LATENT = 64
 """Width of the latent."""
-DECODER_INPUT = LATENT + PROPRIOCEPTION
-"""Width of the decoder's input."""
-OBSERVATION = ENCODER_INPUT + PROPRIOCEPTION
-"""Width of the whole observation: encoder input, then proprioception."""
-
-# Encoder input: mode 4, joint positions 290, joint velocities 290, heights 10 + 1 (zero), anchor 6, anchors 60, then
-# 1101 numbers of the other modes (zero).
-_REF_POS = slice(4, 294)
-_REF_VEL = slice(294, 584)
-_ANCHOR = slice(595, 601)
-_ANCHORS = slice(601, 661)
-# Proprioception: each ten frames, oldest first.
-_ANG_VEL = slice(ENCODER_INPUT, ENCODER_INPUT + 30)
-_JOINT_POS = slice(_ANG_VEL.stop, _ANG_VEL.stop + 290)
-_JOINT_VEL = slice(_JOINT_POS.stop, _JOINT_POS.stop + 290)
-_ACTIONS = slice(_JOINT_VEL.stop, _JOINT_VEL.stop + 290)
-_GRAVITY = slice(_ACTIONS.stop, _ACTIONS.stop + 30)
+ENCODED = ("ref_pos", "ref_vel", "anchor", "anchors")
+"""Parts that the encoder reads in the joint-reference mode."""
+_ONE_FRAME = tuple(
+    slice(AT[name].start, AT[name].start + width)
+    for name, width in {"ref_pos": JOINTS, "ref_vel": JOINTS, "anchor": 6}.items()
+)
+"""One frame of them: the deployed encoder takes it once, since all ten are equal."""
 
 _LEG_POSE = (-0.312, 0.0, 0.0, 0.669, -0.363, 0.0)
 SONIC_DEFAULT_POSE: tuple[float, ...] = (
@@ -105,8 +113,104 @@ _MIRROR = (
 """Mirror image of joints in canonical order."""
 
 
+class SonicNet(TrackerNetwork):
+    """Encoder of the reference → bounded latent; latent and proprioception → decoder → 29 raw actions."""
+
+    obs_width = OBSERVATION
+
+    used: torch.Tensor
+    """Indices of the encoder inputs that the encoder reads, shape [646]."""
+
+    def __init__(
+        self,
+        encoder: Sequence[int] = (512, 256),
+        decoder: Sequence[int] = (512, 512, 256),
+        latent: int = LATENT,
+    ):
+        """Make the layers.
+
+        Args:
+            encoder: Widths of the encoder's hidden layers.
+            decoder: Widths of the decoder's hidden layers.
+            latent: Width of the latent.
+        """
+        super().__init__()
+        self.widths = tuple(encoder), tuple(decoder), latent
+        used = torch.cat([torch.arange(AT[name].start, AT[name].stop) for name in ENCODED])
+        self.register_buffer("used", used, persistent=False)
+        self.encoder_norm = InputNorm(len(used))
+        self.decoder_norm = InputNorm(PROPRIOCEPTION)
+        self.encoder = nn.Sequential(*mlp((len(used), *encoder, latent)), nn.Tanh())
+        self.decoder = mlp((latent + PROPRIOCEPTION, *decoder, JOINTS))
+        shrink_last(self.decoder)
+
+    def config(self) -> dict[str, Any]:
+        """Arguments that make this network again."""
+        encoder, decoder, latent = self.widths
+        return {"encoder": list(encoder), "decoder": list(decoder), "latent": latent}
+
+    def encode(self, reference: torch.Tensor) -> torch.Tensor:
+        """Latent in (-1, 1) of encoder inputs [rows, 1762], shape [rows, latent]."""
+        return self.encoder(self.encoder_norm(reference.index_select(1, self.used)))
+
+    def decode(self, latent: torch.Tensor, proprio: torch.Tensor) -> torch.Tensor:
+        """Raw actions of latents [rows, latent] and proprioception [rows, 930], shape [rows, 29]."""
+        return self.decoder(torch.cat((latent, self.decoder_norm(proprio)), 1))
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Raw actions of observations [rows, 2692], shape [rows, 29]."""
+        return self.decode(self.encode(obs), obs[:, ENCODER_INPUT:])
+
+    def update_norm(self, obs: torch.Tensor) -> None:
+        """Take a batch of observations into the input statistics."""
+        self.encoder_norm.update(obs.index_select(1, self.used))
+        self.decoder_norm.update(obs[:, ENCODER_INPUT:])
+
+    def deployed(self) -> nn.Module:
+        """The same function with normalisation inside the first layers and one frame of the reference instead of ten.
+
+        It needs what `SonicFrontEnd` gives: ten equal frames.
+        """
+        return _DeployedSonic(self).eval().requires_grad_(False)
+
+
+class _DeployedSonic(PartialNetwork):
+    def __init__(self, network: SonicNet):
+        super().__init__()
+        assert isinstance(network.encoder, nn.Sequential)
+        first = folded(network.encoder[0], network.encoder_norm)
+        weight = first.weight.detach().double()
+        pos, vel, anchor, anchors = weight.split([LAYOUT[name] for name in ENCODED], 1)
+        pos, vel, anchors = (part.unflatten(1, (FRAMES, -1)).sum(1) for part in (pos, vel, anchors))
+        merged = torch.cat([pos, vel, anchor + anchors], 1)
+        layer = nn.Linear(merged.shape[1], first.out_features, device=merged.device)
+        with torch.no_grad():
+            layer.weight.copy_(merged)
+            layer.bias.copy_(first.bias)
+        self.encoder = nn.Sequential(layer, *list(network.encoder)[1:])
+        self.decoder = nn.Sequential(
+            folded(network.decoder[0], network.decoder_norm, network.widths[2]), *list(network.decoder)[1:]
+        )
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return self._act(torch.cat([obs[:, part] for part in _ONE_FRAME], 1), obs[:, ENCODER_INPUT:])
+
+    def columns(self) -> torch.Tensor:
+        """Columns of the observation that are read, in the order of `from_columns`, shape [994]."""
+        read = (*_ONE_FRAME, slice(ENCODER_INPUT, OBSERVATION))
+        return torch.cat([torch.arange(part.start, part.stop) for part in read])
+
+    def from_columns(self, used: torch.Tensor) -> torch.Tensor:
+        """Raw actions of those columns, shape [rows, 29]."""
+        reference = used.shape[1] - PROPRIOCEPTION
+        return self._act(used[:, :reference], used[:, reference:])
+
+    def _act(self, reference: torch.Tensor, proprio: torch.Tensor) -> torch.Tensor:
+        return self.decoder(torch.cat((self.encoder(reference), proprio), 1))
+
+
 class SonicFrontEnd(FrontEnd):
-    """Encoder input (1762) and proprioception (930) side by side."""
+    """Encoder input (1762), then proprioception (930)."""
 
     interface = "sonic"
     obs_width = OBSERVATION
@@ -117,7 +221,7 @@ class SonicFrontEnd(FrontEnd):
         """Take SONIC's action form or another."""
         super().__init__(action_form)
 
-    def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
+    def bind(self, worlds: int, device: torch.device | str = "cpu", obs: torch.Tensor | None = None) -> None:
         """Allocate buffers for `worlds` worlds on `device`."""
         super().bind(worlds, device, obs)
         four = [JOINTS * part + joint for part in range(4) for joint in CANONICAL_TO_MUJOCO]
@@ -126,60 +230,56 @@ class SonicFrontEnd(FrontEnd):
         self._relative_and_down = Quadratic(_RELATIVE_AND_DOWN, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), self.device)
         self._rot6d = Quadratic(_ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
 
-        def frames(part: slice) -> torch.Tensor:
-            return self.obs[:, part].view(worlds, FRAMES, -1)
+        def frames(name: str) -> torch.Tensor:
+            return self.obs[:, AT[name]].view(worlds, FRAMES, -1)
 
-        self._ref_pos, self._ref_vel, self._anchors = frames(_REF_POS), frames(_REF_VEL), frames(_ANCHORS)
-        self._ang_vel, self._gravity = frames(_ANG_VEL), frames(_GRAVITY)
-        self._joint_pos, self._joint_vel, self._actions = frames(_JOINT_POS), frames(_JOINT_VEL), frames(_ACTIONS)
-        self._anchor = self.obs[:, None, _ANCHOR]
+        self._ref_pos, self._ref_vel, self._anchors = frames("ref_pos"), frames("ref_vel"), frames("anchors")
+        self._ang_vel, self._gravity = frames("ang_vel"), frames("gravity")
+        self._joint_pos, self._joint_vel, self._actions = frames("joint_pos"), frames("joint_vel"), frames("actions")
+        self._anchor = self.obs[:, None, AT["anchor"]]
         self._now_ang_vel, self._now_gravity = self._ang_vel[:, -1], self._gravity[:, -1]
         self._now_joint_pos, self._now_joint_vel = self._joint_pos[:, -1:], self._joint_vel[:, -1:]
         self._now_action = self._actions[:, -1]
         self._proprio = self.obs[:, ENCODER_INPUT:]
         # Column from which each column of the histories takes its value when a tick ends; the newest stay.
         source = []
-        for part in (_ANG_VEL, _JOINT_POS, _JOINT_VEL, _ACTIONS, _GRAVITY):
-            size = part.stop - part.start
+        for name, size in PROPRIOCEPTION_LAYOUT.items():
             newest = size - size // FRAMES
-            first = part.start - ENCODER_INPUT
+            first = AT[name].start - ENCODER_INPUT
             source += [first + (i if i >= newest else i + size // FRAMES) for i in range(size)]
         self._source = torch.tensor(source, device=self.device)
         self._shifted = torch.zeros(worlds, PROPRIOCEPTION, device=self.device)
-        self._fresh = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
+        self._first_tick = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
         # Saves two operations a tick on the CPU; elsewhere a graph may be recorded now and replayed after a reset.
-        self._may_be_fresh = True
+        self._may_be_first = True
 
     @torch.no_grad()
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Histories of the worlds in `mask` become zero; those of the joints take the first values measured."""
-        self._may_be_fresh = True
-        if mask is None:
-            self.obs.zero_()
-            self.last_action.zero_()
-            self._fresh.fill_(True)
-            return
-        row = column(mask, self.device)
-        self.obs.masked_fill_(row, 0.0)
-        self.last_action.masked_fill_(row, 0.0)
-        self._fresh.logical_or_(row[:, None])
+        super().reset(mask)
+        self._may_be_first = True
+        rows = column(mask, self.device)
+        self._first_tick.fill_(True) if rows is None else self._first_tick.logical_or_(rows[:, None])
 
     @torch.no_grad()
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
-        """Fill the measured histories of the worlds in `mask` with the present; past actions stay."""
+        """Fill the measured histories of the masked worlds with the current frame; past actions stay."""
         self.write(command, state)
+        rows = column(mask, self.device)
         for history in (self._ang_vel, self._joint_pos, self._joint_vel, self._gravity):
-            present = history[:, -1:].expand_as(history)
-            if mask is None:
-                history.copy_(present.clone())
-            else:
-                history.copy_(torch.where(column(mask, self.device)[:, None], present, history))
+            store(history, history[:, -1:].clone().expand_as(history), rows)
 
     def mirror_obs(self) -> Mirror:
         """Mirror image of an observation; the zeros of the other modes stay where they are."""
         anchor = plain(1, -1, -1, 1, 1, -1)
-        reference = [plain(*[1] * 4), *[_MIRROR] * (2 * FRAMES), plain(*[1] * 11), anchor, *[anchor] * FRAMES]
-        rest = plain(*[1] * (ENCODER_INPUT - _ANCHORS.stop))
+        reference = [
+            plain(*[1] * LAYOUT["mode"]),
+            *[_MIRROR] * (2 * FRAMES),
+            plain(*[1] * LAYOUT["heights"]),
+            anchor,
+            *[anchor] * FRAMES,
+        ]
+        rest = plain(*[1] * LAYOUT["other_modes"])
         past = [*[plain(-1, 1, -1)] * FRAMES, *[_MIRROR] * (3 * FRAMES), *[plain(1, -1, 1)] * FRAMES]
         return Mirror([*reference, rest, *past], self.device)
 
@@ -202,18 +302,18 @@ class SonicFrontEnd(FrontEnd):
         self._now_ang_vel.copy_(state.ang_vel_body)
         self._now_joint_pos.copy_(pos)
         self._now_joint_vel.copy_(vel)
-        if self._may_be_fresh:
-            self._joint_pos.copy_(torch.where(self._fresh, pos, self._joint_pos))
-            self._joint_vel.copy_(torch.where(self._fresh, vel, self._joint_vel))
+        if self._may_be_first:
+            self._joint_pos.copy_(torch.where(self._first_tick, pos, self._joint_pos))
+            self._joint_vel.copy_(torch.where(self._first_tick, vel, self._joint_vel))
 
-    def advance(self) -> None:
+    def advance(self, rows: torch.Tensor | None = None) -> None:
         """Shift the histories; the raw output becomes the newest action."""
         torch.index_select(self._proprio, 1, self._source, out=self._shifted)
-        self._proprio.copy_(self._shifted)
-        self._now_action.copy_(self.last_action)
-        if self._may_be_fresh:
-            self._fresh.fill_(False)
-            self._may_be_fresh = self.device.type != "cpu"
+        store(self._proprio, self._shifted, rows)
+        store(self._now_action, self.last_action, rows)
+        if self._may_be_first:
+            self._first_tick.fill_(False) if rows is None else self._first_tick.logical_and_(~rows[:, None])
+            self._may_be_first = rows is not None or self.device.type != "cpu"
 
     def to_mujoco(self, raw: torch.Tensor) -> torch.Tensor:
         """The raw output, which is in canonical order, in MuJoCo order."""
@@ -244,29 +344,23 @@ class SonicTracker(NetworkTracker):
     ignores = ("root xy", "root height")
     max_root_delta_deg = 26.0
 
-    def __init__(self, checkpoint: str | Path):
-        """Read the networks.
+    @classmethod
+    def official(cls, checkpoint: str | Path) -> Self:
+        """The tracker of the official networks.
 
         Args:
-            checkpoint: A `.safetensors` file of `trackers.weights_file`, or the official networks: the folder that
-                holds `model_encoder.onnx` and `model_decoder.onnx`, one of the two files, or both with a comma between.
+            checkpoint: What `official_pair` takes.
 
         Raises:
-            InputError: A file is absent or is no network of SONIC's widths.
+            InputError: A file is absent or not a network of SONIC's widths.
         """
-        if Path(checkpoint).suffix == ".safetensors":
-            weights = weights_file.load(checkpoint, "sonic")
-            self.follow(weights, SonicFrontEnd(weights.action_form), checkpoint)
-            return
         encoder, decoder = official_pair(checkpoint)
         networks = (
             onnx_session.load_any(encoder, in_width=ENCODER_INPUT, out_width=LATENT),
-            onnx_session.load_any(decoder, in_width=DECODER_INPUT, out_width=JOINTS),
+            onnx_session.load_any(decoder, in_width=LATENT + PROPRIOCEPTION, out_width=JOINTS),
         )
         digest = hashlib.sha256(encoder.read_bytes() + decoder.read_bytes()).hexdigest()
-        super().__init__(
-            SonicFrontEnd(), EncoderDecoder(*networks), checkpoint=str(checkpoint), checkpoint_hash=digest[:12]
-        )
+        return cls(SonicFrontEnd(), EncoderDecoder(*networks), checkpoint=str(checkpoint), checkpoint_hash=digest[:12])
 
 
 def official_pair(checkpoint: str | Path) -> tuple[Path, Path]:
@@ -309,4 +403,17 @@ def from_checkpoint(checkpoint: Path | None) -> SonicTracker:
         raise InputError(
             f"--checkpoint {checkpoint}: --tracker sonic reads a .safetensors file or a folder with two .onnx files"
         )
-    return SonicTracker(checkpoint)
+    own = checkpoint.suffix == ".safetensors"
+    return SonicTracker.from_weights(checkpoint) if own else SonicTracker.official(checkpoint)
+
+
+INTERFACE = Interface(
+    name="sonic",
+    front_end=SonicFrontEnd,
+    network=SonicNet,
+    layout=LAYOUT,
+    drive=SONIC_DRIVE,
+    rate=PhysicsRate(dt=0.005, substeps=4),
+    official_form=SONIC_FORM,
+    bars={"fall_rate": 0.03},
+)

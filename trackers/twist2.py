@@ -8,37 +8,33 @@ differ in their last bit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
+from torch import nn
 
 from arena_newton.errors import InputError
+from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
-from arena_newton.trackers.base import RobotState, TrackerCommand
-from arena_newton.trackers.front_end import JOINTS, ActionForm, FrontEnd, Mirror, NetworkTracker, column, plain
+from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
 from arena_newton.trackers.inference import onnx_mlp, weights_file
+from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, folded, mlp, shrink_last
 from arena_newton.trackers.inference.quadratic import Quadratic, products
+from arena_newton.trackers.interface import JOINTS, ActionForm, Interface, slices
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
 
-__all__ = ["FRAME", "HISTORY", "OBSERVATION", "OFFICIAL_FORM", "Twist2FrontEnd", "Twist2Tracker", "from_checkpoint"]
+__all__ = ["INTERFACE", "Twist2FrontEnd", "Twist2Net", "Twist2Tracker", "from_checkpoint"]
 
-COMMAND = 35
-"""Width of the mimic command."""
-FRAME = 127
-"""Width of one frame: command 35, angular velocity 3, roll and pitch 2, joints 29, their velocities 29, action 29."""
+FRAME_LAYOUT = {"command": 35, "ang_vel": 3, "tilt": 2, "joints": 29, "joint_vel": 29, "last_action": 29}
+"""Parts of one frame: mimic command, angular velocity, roll and pitch, joints, their velocities, last raw action."""
+FRAME = sum(FRAME_LAYOUT.values())
 HISTORY = 10
 """Past frames, oldest first."""
-OBSERVATION = FRAME + HISTORY * FRAME + COMMAND
-"""Width of the network's input: current frame, history, command once more."""
-
-_ANG_VEL = slice(35, 38)
-_TILT = slice(38, 40)
-_JOINTS = slice(40, 69)
-_JOINT_VEL = slice(69, 98)
-_LAST_ACTION = slice(98, 127)
-_PAST = slice(FRAME, FRAME + HISTORY * FRAME)
-_FUTURE = slice(FRAME + HISTORY * FRAME, OBSERVATION)
+LAYOUT = FRAME_LAYOUT | {"history": HISTORY * FRAME, "future": FRAME_LAYOUT["command"]}
+"""The network's input: current frame, history, command once more."""
+OBSERVATION = sum(LAYOUT.values())
 
 ANG_VEL_SCALE = 0.25
 JOINT_VEL_SCALE = 0.05
@@ -49,6 +45,40 @@ _TILT_TERMS = (((1, 2), (11, 2)), ((5, -2), (10, -2)), ((2, 2), (7, -2)))
 """2(wx + yz), -2(x² + y²), 2(wy - zx) from the products of a quaternion with itself (`Quadratic`)."""
 _VECTOR = 64
 """Rows are padded to a multiple of this for `atan2` and `asin`: two AVX-512 vectors and room."""
+
+
+class Twist2Net(TrackerNetwork):
+    """1432 observations → 29 raw actions."""
+
+    obs_width = OBSERVATION
+
+    def __init__(self, hidden: Sequence[int] = (512, 512, 256)):
+        """Make the layers.
+
+        Args:
+            hidden: Widths of the hidden layers.
+        """
+        super().__init__()
+        self.hidden = tuple(hidden)
+        self.norm = InputNorm(self.obs_width)
+        self.actor = mlp((self.obs_width, *self.hidden, JOINTS))
+        shrink_last(self.actor)
+
+    def config(self) -> dict[str, Any]:
+        """Arguments that make this network again."""
+        return {"hidden": list(self.hidden)}
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Raw actions, shape [rows, 29]."""
+        return self.actor(self.norm(obs))
+
+    def deployed(self) -> nn.Module:
+        """The same function with the normalisation inside the first layer."""
+        return nn.Sequential(folded(self.actor[0], self.norm), *list(self.actor)[1:]).eval().requires_grad_(False)
+
+    def update_norm(self, obs: torch.Tensor) -> None:
+        """Take a batch of observations into the input statistics."""
+        self.norm.update(obs)
 
 
 class Twist2FrontEnd(FrontEnd):
@@ -63,18 +93,17 @@ class Twist2FrontEnd(FrontEnd):
         """Take the official action form or another."""
         super().__init__(action_form)
 
-    def bind(self, worlds: int, device: Any = "cpu", obs: torch.Tensor | None = None) -> None:
+    def bind(self, worlds: int, device: torch.device | str = "cpu", obs: torch.Tensor | None = None) -> None:
         """Allocate buffers for `worlds` worlds on `device`."""
         super().bind(worlds, device, obs)
         self._frame = self.obs[:, :FRAME]
         # Views are made once: a tick of one world is mostly the cost of calls.
-        self._mimic, self._ang_vel, self._tilt = self._frame[:, :COMMAND], self.obs[:, _ANG_VEL], self.obs[:, _TILT]
-        self._joints, self._joint_vel = self.obs[:, _JOINTS], self.obs[:, _JOINT_VEL]
-        self._past_action = self.obs[:, _LAST_ACTION]
-        self._past = self.obs[:, _PAST]
+        views = {name: self.obs[:, part] for name, part in slices(LAYOUT).items()}
+        self._mimic, self._ang_vel, self._tilt = views["command"], views["ang_vel"], views["tilt"]
+        self._joints, self._joint_vel, self._past_action = views["joints"], views["joint_vel"], views["last_action"]
+        self._past, self._future = views["history"], views["future"]
         self._later, self._earlier = self._past[:, FRAME:], self._past[:, :-FRAME]
         self._newest = self._past[:, -FRAME:]
-        self._future = self.obs[:, _FUTURE]
         self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
         self._tilt_terms = Quadratic(_TILT_TERMS, (0.0, 1.0, 0.0), self.device)
@@ -86,32 +115,17 @@ class Twist2FrontEnd(FrontEnd):
         self._joint_vel_scale[[i for i, name in enumerate(MUJOCO_JOINTS) if "ankle" in name]] = 0.0
 
     @torch.no_grad()
-    def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Set history and last action of the worlds in `mask` to zero."""
-        if mask is None:
-            self.obs.zero_()
-            self.last_action.zero_()
-            return
-        row = column(mask, self.device)
-        self.obs.masked_fill_(row, 0.0)
-        self.last_action.masked_fill_(row, 0.0)
-
-    @torch.no_grad()
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
-        """Fill the history of the worlds in `mask` with the present frame: a start is then no jump for the network."""
+        """Fill the history of the masked worlds with the current frame: a start is then no jump for the network."""
         self.write(command, state)
         past = self._past.view(-1, HISTORY, FRAME)
-        if mask is None:
-            past.copy_(self._frame[:, None].expand_as(past))
-        else:
-            past.copy_(torch.where(column(mask, self.device)[:, None], self._frame[:, None], past))
+        store(past, self._frame[:, None].expand_as(past), column(mask, self.device))
 
-    def advance(self) -> None:
-        """Move the present frame into the history."""
-        # History takes the present frame only after the network has seen it.
+    def advance(self, rows: torch.Tensor | None = None) -> None:
+        """Move the current frame into the history, which takes it only after the network has seen it."""
         self._shifted.copy_(self._later)
-        self._earlier.copy_(self._shifted)
-        self._newest.copy_(self._frame)
+        store(self._earlier, self._shifted, rows)
+        store(self._newest, self._frame, rows)
 
     def mirror_obs(self) -> Mirror:
         """Mirror image of an observation: vy, roll and yaw rate change sign, limbs change sides."""
@@ -125,7 +139,7 @@ class Twist2FrontEnd(FrontEnd):
         return Mirror([(MIRROR_JOINTS, MIRROR_SIGNS)], self.device)
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
-        """Write the present frame and the command's second place."""
+        """Write the current frame and the command's second copy."""
         self._mimic.copy_(command.mimic)
         torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=self._ang_vel)
         self._tilt.copy_(self._roll_pitch(state.quat))
@@ -152,22 +166,17 @@ class Twist2Tracker(NetworkTracker):
     fast_physics_rate = PhysicsRate(dt=0.005, substeps=4)
     ignores = ("absolute heading", "absolute position")
 
-    def __init__(self, checkpoint: str | Path):
-        """Read the network.
-
-        Args:
-            checkpoint: The official `.onnx` file, or a `.safetensors` file of `trackers.weights_file`.
+    @classmethod
+    def official(cls, checkpoint: str | Path) -> Self:
+        """The tracker of an official `.onnx` file.
 
         Raises:
-            InputError: The file is absent or is no network of TWIST2's widths.
+            InputError: The file is absent or not a network of TWIST2's widths.
         """
-        if Path(checkpoint).suffix == ".safetensors":
-            weights = weights_file.load(checkpoint, "twist2")
-            self.follow(weights, Twist2FrontEnd(weights.action_form), checkpoint)
-            return
         network = onnx_mlp.load(checkpoint, in_width=OBSERVATION, out_width=JOINTS)
-        super().__init__(Twist2FrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
-        self.original_drive = TWIST2_HUMANOIDARENA_DRIVE
+        tracker = cls(Twist2FrontEnd(), network, checkpoint=str(checkpoint), checkpoint_hash=network.sha256[:12])
+        tracker.original_drive = TWIST2_HUMANOIDARENA_DRIVE
+        return tracker
 
 
 def from_checkpoint(checkpoint: Path | None) -> Twist2Tracker:
@@ -179,4 +188,17 @@ def from_checkpoint(checkpoint: Path | None) -> Twist2Tracker:
     checkpoint = checkpoint or weights_file.default("twist2", "--checkpoint with the official twist2_1017_20k.onnx")
     if checkpoint.suffix not in (".onnx", ".safetensors"):
         raise InputError(f"--checkpoint {checkpoint}: --tracker twist2 reads .onnx and .safetensors files")
-    return Twist2Tracker(checkpoint)
+    own = checkpoint.suffix == ".safetensors"
+    return Twist2Tracker.from_weights(checkpoint) if own else Twist2Tracker.official(checkpoint)
+
+
+INTERFACE = Interface(
+    name="twist2",
+    front_end=Twist2FrontEnd,
+    network=Twist2Net,
+    layout=LAYOUT,
+    drive=TWIST2_DRIVE,
+    rate=PhysicsRate(dt=0.005, substeps=4),
+    official_form=OFFICIAL_FORM,
+    bars={"fall_rate": 0.01, "drift, walk 0.3": 0.20, "drift, walk 0.6": 0.30},
+)

@@ -357,10 +357,11 @@ def safetensors(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], 
 
     from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
     from arena_newton.trackers.front_end import residual_form
-    from arena_newton.trackers.inference import networks, weights_file
+    from arena_newton.trackers.inference import weights_file
+    from arena_newton.trackers.interface import get
 
     torch.set_num_threads(1)
-    network = networks.make("twist2", {"hidden": [8, 8]})
+    network = get("twist2").make_network({"hidden": [8, 8]})
     rate = PhysicsRate(0.005, 4)
     weights = weights_file.Weights("twist2", network, residual_form(TWIST2_DRIVE), TWIST2_DRIVE, rate)
     weights_file.save(folder / "a.safetensors", weights)

@@ -1,5 +1,6 @@
 """Lets the tests of this folder import the networks they are made with, and keeps torch to one thread."""
 
+import importlib
 import sys
 from pathlib import Path
 
@@ -16,3 +17,11 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def falcon(monkeypatch):
+    """The example package's module, importable as when it is installed."""
+    monkeypatch.syspath_prepend(Path(__file__).parent / "falcon_package")
+    yield importlib.import_module("falcon_tracker")
+    sys.modules.pop("falcon_tracker", None)

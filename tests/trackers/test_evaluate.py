@@ -411,7 +411,7 @@ def test_without_matplotlib_nothing_is_drawn(tmp_path, monkeypatch):
         (["--checkpoint", "x.onnx"], "name its --tracker first"),
         (["--tracker", "nobody"], "unknown tracker"),
         (["--tracker", "nowhere:factory"], "nowhere"),
-        (["--tracker", "os:getcwd"], "--tracker os:getcwd: its factory takes no checkpoint"),
+        (["--tracker", "os:getcwd"], "--tracker os:getcwd: its factory does not take what it is given"),
         (["--tracker", "builtins:str"], "--tracker builtins:str: its factory makes a str, not a Tracker"),
         (["--tracker", "pd", "--tracker", "pd"], "--label"),
         (["--tracker", "pd", "--only", "nothing"], "no such cell"),

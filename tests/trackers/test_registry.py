@@ -1,5 +1,8 @@
 """Trackers are found by name and bad input is answered with one clear line."""
 
+import importlib.metadata
+from importlib.metadata import EntryPoint
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +10,7 @@ import torch
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
+from arena_newton.trackers import base
 from arena_newton.trackers.inference import weights_file
 
 
@@ -100,29 +104,21 @@ def test_registration():
 
 def test_entry_point(monkeypatch):
     """A tracker offered by another package's entry point is listed and loaded; a broken one is one line."""
-    from importlib.metadata import EntryPoint
-
-    from arena_newton.trackers import base
-
     points = [
         EntryPoint("theirs", "arena_newton.trackers.pd:from_checkpoint", base.ENTRY_POINT_GROUP),
         EntryPoint("broken", "no_such_package:make", base.ENTRY_POINT_GROUP),
     ]
-    monkeypatch.setattr(base.importlib.metadata, "entry_points", lambda group: points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
     assert {"theirs", "broken"} <= set(trackers.names())
     assert trackers.get("theirs").name == "pd"
     assert "no_such_package" in message("broken")
 
 
 def test_built_in_names_are_taken(monkeypatch):
-    """Who offers a tracker under a built-in name is told so: neither of the two is taken silently."""
-    from importlib.metadata import EntryPoint
-
-    from arena_newton.trackers import base
-
+    """A package that offers a tracker under a built-in name is refused: neither of the two is taken silently."""
     points = [EntryPoint("twist2", "theirs:make", base.ENTRY_POINT_GROUP)]
-    monkeypatch.setattr(base.importlib.metadata, "entry_points", lambda group: points)
-    assert "theirs:make" in message("twist2") and "built in" in message("twist2")
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    assert "offered by this package and by another package" in message("twist2")
     assert trackers.get("pd").name == "pd"
     with pytest.raises(InputError, match="'sonic': is built in"):
         trackers.register("sonic", lambda checkpoint: trackers.get("pd"))

@@ -8,8 +8,8 @@ from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand
-from arena_newton.trackers.inference.networks import SonicNet
-from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicTracker
+from arena_newton.trackers.front_end import NetworkTracker
+from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicNet, SonicTracker
 
 ORDER = [MUJOCO_JOINTS.index(name) for name in CANONICAL_JOINTS]
 
@@ -130,8 +130,6 @@ def test_prefill():
 
 def test_worlds_do_not_mix():
     """Twenty worlds, three, and one alone, in any order, give the same bits, also after a reset of some."""
-    from arena_newton.trackers.front_end import NetworkTracker
-
     torch.manual_seed(0)
     network = SonicNet().eval()
     order = torch.randperm(20, generator=torch.Generator().manual_seed(3))

@@ -12,7 +12,9 @@ from arena_newton.errors import InputError
 from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
 from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import residual_form
-from arena_newton.trackers.inference import networks, weights_file
+from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.inference.networks import InputNorm
+from arena_newton.trackers.interface import get
 from arena_newton.trackers.sonic import SONIC_FORM, SonicFrontEnd
 from arena_newton.trackers.twist2 import Twist2FrontEnd
 
@@ -20,14 +22,14 @@ CARD = {"commit": "abc", "samples": 12, "licences": ["CC0"]}
 RATE = PhysicsRate(dt=0.005, substeps=4)
 
 
-def trained(interface: str, seed: int = 0):
+def trained(name: str, seed: int = 0):
     """A network with input statistics that are far from the identity."""
     torch.manual_seed(seed)
-    network = networks.make(interface)
+    network = get(name).make_network()
     for _ in range(2):
         network.update_norm(3.0 + 2.0 * torch.randn(64, network.obs_width))
-    form, drive = (residual_form(TWIST2_DRIVE), TWIST2_DRIVE) if interface == "twist2" else (SONIC_FORM, SONIC_DRIVE)
-    return weights_file.Weights(interface, network, form, drive, RATE, CARD)
+    form, drive = (residual_form(TWIST2_DRIVE), TWIST2_DRIVE) if name == "twist2" else (SONIC_FORM, SONIC_DRIVE)
+    return weights_file.Weights(name, network, form, drive, RATE, CARD)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def test_round_trip(files, interface):
     for name in ("interface", "action_form", "drive", "physics", "card"):
         assert getattr(loaded, name) == getattr(saved, name)
     assert path.stat().st_size <= 8_000_000 and len(loaded.sha256) == 64
-    assert not list(files.glob("*.partial"))
+    assert not list(files.glob("*.part"))
 
 
 @pytest.mark.parametrize("interface", ["twist2", "sonic"])
@@ -107,7 +109,7 @@ def test_residual_form():
 
 def test_input_statistics():
     """Statistics taken batch by batch equal those of all samples at once."""
-    norm = networks.InputNorm(5)
+    norm = InputNorm(5)
     x = 100.0 + 3.0 * torch.randn(600, 5)
     for part in x.split([100, 300, 200]):
         norm.update(part)
@@ -187,11 +189,11 @@ def test_foreign_files(files, tmp_path):
         trackers.get("twist2", files / "sonic.safetensors")
 
 
-def test_save_refuses(tmp_path):
-    """A network that went non-finite is not written, and a folder that is absent is named."""
+def test_save_refuses(files, tmp_path):
+    """A network that went non-finite is not written, and a path that cannot be written is named."""
     weights = trained("twist2")
     with pytest.raises(InputError, match="cannot be written"):
-        weights_file.save(tmp_path / "none" / "x.safetensors", weights)
+        weights_file.save(files / "twist2.safetensors" / "x.safetensors", weights)
     weights.network.actor[0].bias.data[3] = float("inf")
     with pytest.raises(InputError, match="actor.0.bias"):
         weights_file.save(tmp_path / "x.safetensors", weights)

@@ -16,14 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as decode
+from safetensors.torch import save as encode
 
 from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.files import replace_atomically
 from arena_newton.foreign import read_bytes
 from arena_newton.robot import TICK, DriveGains, PhysicsRate
-from arena_newton.trackers import base
-from arena_newton.trackers.front_end import JOINTS, ActionForm
-from arena_newton.trackers.inference import networks
+from arena_newton.trackers import base, interface
+from arena_newton.trackers.inference.networks import TrackerNetwork
+from arena_newton.trackers.interface import JOINTS, ActionForm
 
 __all__ = ["FORMAT", "METADATA_KEY", "Weights", "default", "default_path", "load", "save"]
 
@@ -38,8 +42,8 @@ class Weights:
     """A network and everything a tracker must know about it."""
 
     interface: str
-    """`twist2` or `sonic`."""
-    network: networks.Twist2Net | networks.SonicNet
+    """Name of the interface (`trackers.interface`)."""
+    network: TrackerNetwork
     """The network with its input normalisation."""
     action_form: ActionForm
     """How raw outputs become joint targets."""
@@ -50,7 +54,7 @@ class Weights:
     card: dict[str, Any] = field(default_factory=dict)
     """How the weights came to be: `commit`, `command`, `samples`, `minutes`, `data`, `licences`, `metrics`, …"""
     symmetric: bool = False
-    """Whether the tracker answers the mean of both ways to a mirrored action (`networks.Symmetric`)."""
+    """Whether the tracker averages the action and its mirror image (`networks.Symmetric`)."""
     sha256: str = ""
     """SHA-256 of the file, after loading."""
 
@@ -70,32 +74,32 @@ class Weights:
         }
 
 
-def default_path(interface: str) -> Path:
-    """Where the weights that come with the package lie: `trackers/weights/<interface>.safetensors`."""
-    return base.weights_path(interface)
+def default_path(name: str) -> Path:
+    """Path of the weights that come with the package: `trackers/weights/<interface>.safetensors`."""
+    return base.weights_path(name)
 
 
-def default(interface: str, otherwise: str) -> Path:
+def default(name: str, otherwise: str) -> Path:
     """The weights that come with the package.
 
     Args:
-        interface: `twist2` or `sonic`.
+        name: Name of the interface.
         otherwise: What the user can pass instead, for the error.
 
     Raises:
         InputError: There are none.
     """
-    path = default_path(interface)
+    path = default_path(name)
     if not path.is_file():
         raise InputError(
-            f"--tracker {interface}: no weights come with this installation ({path} is absent); pass {otherwise}, "
+            f"--tracker {name}: no weights come with this installation ({path} is absent); pass {otherwise}, "
             "or use --tracker pd"
         )
     return path
 
 
 def save(path: str | Path, weights: Weights) -> None:
-    """Write a weights file (in one move: a reader never sees half of it).
+    """Write a weights file; a reader never sees a part of it.
 
     Args:
         path: The file, `.safetensors`.
@@ -104,36 +108,30 @@ def save(path: str | Path, weights: Weights) -> None:
     Raises:
         InputError: The path cannot be written, or a number of the network is not finite.
     """
-    from safetensors.torch import save as encode
-
     path = Path(path)
     tensors = {name: t.detach().cpu().contiguous() for name, t in _tensors(weights.network).items()}
     bad = [name for name, t in tensors.items() if not torch.isfinite(t).all()]
     if bad:
         raise InputError(f"{path}: not written, {bad[0]} holds numbers that are not finite")
     data = encode(tensors, {METADATA_KEY: json.dumps(weights.metadata(), sort_keys=True)})
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_bytes(data)
-        partial.replace(path)
+        with replace_atomically(path) as file:
+            file.write(data)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def load(path: str | Path, interface: str | None = None, *, flag: str = "--checkpoint") -> Weights:
+def load(path: str | Path, wanted: str | None = None, *, flag: str = "--checkpoint") -> Weights:
     """Read a weights file.
 
     Args:
         path: The file.
-        interface: Interface that the caller needs; any by default.
+        wanted: Interface that the caller needs; any by default.
         flag: Command-line flag that errors name.
 
     Raises:
         InputError: The file is absent, damaged, of another kind or interface, or its tensors do not fit.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load as decode
-
     where = f"{flag} {path}"
     data = read_bytes(path, limits.NETWORK_BYTES, where=where)
     try:
@@ -151,7 +149,7 @@ def load(path: str | Path, interface: str | None = None, *, flag: str = "--check
         meta = json.loads(text)
         if meta["format"] != FORMAT:
             raise InputError(f"{where}: format {meta['format']!r}, expected {FORMAT!r}")
-        if interface is not None and meta["interface"] != interface:
+        if wanted is not None and meta["interface"] != wanted:
             raise InputError(
                 f"{where}: weights of interface {meta['interface']!r}: use them with --tracker {meta['interface']}"
             )
@@ -180,17 +178,16 @@ def _tensors(network: torch.nn.Module) -> dict[str, torch.Tensor]:
     return {name: t for name, t in network.state_dict().items() if not name.endswith(".count")}
 
 
-def _network(
-    interface: str, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor], where: str
-) -> networks.Twist2Net | networks.SonicNet:
+def _network(name: str, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor], where: str) -> TrackerNetwork:
     """A network of the widths that a file states, once its tensors are known to be of these widths."""
     count = sum(len(value) for value in config.values() if isinstance(value, list))
     if count > limits.NETWORK_LAYERS:
         raise InputError(f"{where}: states {count} layers, expected at most {limits.NETWORK_LAYERS}")
+    make = interface.get(name).make_network
     with torch.device("meta"):
-        sketch = networks.make(interface, config)
+        sketch = make(config)
     _check_tensors(_tensors(sketch), tensors, where)
-    return networks.make(interface, config)
+    return make(config)
 
 
 def _check_tensors(expected: Mapping[str, torch.Tensor], tensors: Mapping[str, torch.Tensor], where: str) -> None:

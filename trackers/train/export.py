@@ -9,8 +9,8 @@ from typing import Any
 from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
 from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.trackers.front_end import ActionForm
-from arena_newton.trackers.inference import networks, weights_file
+from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.interface import ActionForm, get
 from arena_newton.trackers.train.checkpoint import Checkpoint
 from arena_newton.trackers.train.options import ExportOptions
 
@@ -38,7 +38,7 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     if not options.out.exists() and (taken := [c for c in cards if c.exists()]):
         raise InputError(f"--out {options.out}: its card would overwrite {taken[0]}, which is not of these weights")
     state = Checkpoint.read(checkpoint)
-    network = networks.make(state.card.tracker, state.network)
+    network = get(state.card.tracker).make_network(state.network)
     prefix = "net."
     tensors = {k[len(prefix) :]: v for k, v in state.actor_state_dict.items() if k.startswith(prefix)}
     try:

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from arena_newton.trackers.inference import networks
+from arena_newton.trackers.interface import get
 
 __all__ = ["TrackerActor", "TrackerCritic", "UncheckedGaussian"]
 
@@ -27,7 +28,7 @@ class UncheckedGaussian(GaussianDistribution):
 
 
 class TrackerActor(MLPModel):
-    """rsl_rl's model interface around `networks.make(interface)`."""
+    """rsl_rl's model interface around an interface's network."""
 
     def __init__(
         self,
@@ -48,15 +49,15 @@ class TrackerActor(MLPModel):
             obs_groups: Groups of observations by set.
             obs_set: The set that this model reads.
             output_dim: Width of the action.
-            interface: `twist2` or `sonic`.
-            network: Widths (`networks.make`).
+            interface: Name of the interface.
+            network: Widths (`Interface.make_network`).
             init_std: Initial standard deviation of the action noise.
             std_range: Bounds of the standard deviation.
         """
         nn.Module.__init__(self)
         self.obs_groups, self.obs_dim = self._get_obs_dim(obs, obs_groups, obs_set)
         self.obs_normalization = True
-        self.net = networks.make(interface, network)
+        self.net = get(interface).make_network(network)
         if self.obs_dim != self.net.obs_width:
             raise ValueError(
                 f"interface {interface}: {self.obs_dim} observations, the network takes {self.net.obs_width}"

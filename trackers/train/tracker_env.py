@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
-from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
+from arena_newton.robot import DEFAULT_POSE, TICK
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.train import critic, events, rotations
 from arena_newton.trackers.train.graphs import captured
@@ -34,6 +34,7 @@ from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
 
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
+    from arena_newton.trackers.interface import ActionForm, Interface
     from arena_newton.trackers.motions.library import DeviceLibrary
 
 __all__ = ["TrackerEnv"]
@@ -60,9 +61,8 @@ class TrackerEnv(VecEnv):
 
     def __init__(
         self,
-        front_end: FrontEnd,
-        drive: DriveGains,
-        rate: PhysicsRate,
+        interface: Interface,
+        form: ActionForm,
         library: DeviceLibrary,
         options: TrainOptions,
         device: str = "cpu",
@@ -76,9 +76,8 @@ class TrackerEnv(VecEnv):
         """Build the worlds.
 
         Args:
-            front_end: Observation and action of the tracker, not yet bound.
-            drive: Gains of the tracker.
-            rate: Physics rate of the tracker.
+            interface: Front end, drive and physics rate of the tracker.
+            form: How raw actions become joint targets.
             library: References on `device`.
             options: Number of worlds, length of the episodes, buffers and switches.
             device: `cpu` or `cuda:N`.
@@ -91,9 +90,10 @@ class TrackerEnv(VecEnv):
         self.cfg = options
         self.num_envs = worlds = options.worlds
         self.device = device
-        self.num_actions = front_end.action_width
         self.max_episode_length = round(options.episode_s / TICK)
-        self.front_end, self.drive = front_end, drive
+        self.interface = interface
+        self.front_end = front_end = interface.front_end(form)
+        self.num_actions = front_end.action_width
         self.rewards, self.terminations = dict(rewards), dict(terminations)
         self.events = dict(randomisation) if options.randomise else {}
         self.critic = dict(critic_terms)
@@ -104,8 +104,8 @@ class TrackerEnv(VecEnv):
         self.sim = Simulation(
             worlds,
             device,
-            drive,
-            rate,
+            interface.drive,
+            interface.rate,
             contacts_per_world=options.contacts_per_world,
             constraints_per_world=options.constraints_per_world,
             graph=options.graph,

@@ -18,10 +18,9 @@ from PIL import Image
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import train
+from arena_newton.trackers import interface, train
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.motions import frames
-from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
@@ -33,17 +32,17 @@ from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.tracker_env import TrackerEnv
-from arena_newton.trackers.twist2 import Twist2FrontEnd, Twist2Tracker
+from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
+TWIST2 = interface.get("twist2")
 
 
 @pytest.fixture(scope="module")
 def env(library):
     """Eight worlds with all of the randomisation."""
     torch.manual_seed(0)
-    front, drive, rate = session.front_end("twist2")
-    made = TrackerEnv(front, drive, rate, library.to("cpu"), TrainOptions(worlds=WORLDS), "cpu")
+    made = TrackerEnv(TWIST2, TWIST2.action_form("auto"), library.to("cpu"), TrainOptions(worlds=WORLDS))
     made.library = library.to("cpu")
     return made
 
@@ -70,8 +69,7 @@ def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
 def test_a_rollout_does_not_wait_for_the_device(library):
     """Torch reports each wait as an error: from observation to action to reward there is none."""
     share_stream("cuda:0")
-    front, drive, rate = session.front_end("twist2")
-    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), TrainOptions(worlds=WORLDS), "cuda:0")
+    env = TrackerEnv(TWIST2, TWIST2.action_form("auto"), library.to("cuda:0"), TrainOptions(worlds=WORLDS), "cuda:0")
     algorithm = make_runner(env).alg
     obs = env.get_observations()
     try:
@@ -171,9 +169,8 @@ def test_reward_improves(env):
     torch.manual_seed(0)
     wanted = Term(lambda motion: (motion.action[:, 0] - 1.0).square(), -5.0)
     easy = TrackerEnv(
-        session.front_end("twist2")[0],
-        TWIST2_DRIVE,
-        PhysicsRate(0.005, 4),
+        TWIST2,
+        TWIST2.action_form("auto"),
         env.library,
         TrainOptions(worlds=WORLDS, randomise=False),
         "cpu",
@@ -547,12 +544,10 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
 
 def test_what_is_no_interface_is_refused():
     """A tracker or an action form that training does not know is named, not taken for another."""
-    with pytest.raises(InputError, match="--tracker nosuch: .*there are twist2, sonic"):
-        session.front_end("nosuch")
+    with pytest.raises(InputError, match=r"--tracker .*nosuch.*sonic, twist2"):
+        session.build(TrainOptions(tracker="nosuch"))
     with pytest.raises(InputError, match="--action-form nosuch: expected auto, residual or default"):
-        session.front_end("sonic", "nosuch")
-    for name, kind in (("twist2", Twist2FrontEnd), ("sonic", SonicFrontEnd)):
-        assert type(session.front_end(name)[0]) is kind and type(session.front_end(name, "default")[0]) is kind
+        session.build(TrainOptions(action_form="nosuch"))
 
 
 def test_training_options_have_one_default():

@@ -11,7 +11,7 @@ import torch
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker
+from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker, column, store
 from arena_newton.trackers.inference import onnx_mlp
 
 FRAMES, FRAME = 5, 115
@@ -25,11 +25,11 @@ HEIGHT = 0.75
 WALKS_FROM = 0.08
 """Smoothed command above which it walks instead of standing [m/s, rad/s]."""
 SMOOTHING = 0.04
-"""Share of the newest command in the smoothed one: a gait's sway (0.9 s) is not a command to walk sideways."""
+"""Weight of the newest command in the smoothed one: a gait's sway (0.9 s) is not a command to walk sideways."""
 
 
 class FalconFrontEnd(FrontEnd):
-    """Five frames of 115 numbers, oldest first; within a frame the terms stand in the order of their names."""
+    """Five frames of 115 numbers, oldest first; within a frame the terms are in the order of their names."""
 
     interface = "falcon"
     obs_width = FRAMES * FRAME
@@ -45,14 +45,12 @@ class FalconFrontEnd(FrontEnd):
         self.pose = torch.tensor(self.default_pose, device=self.device)
 
     def reset(self, mask=None):
-        row = torch.ones(self.worlds, dtype=torch.bool, device=self.device) if mask is None else mask
-        for buffer in (self.obs, self.last_action, self.smoothed):
-            buffer.masked_fill_(row.to(self.device)[:, None], 0.0)
+        super().reset(mask)
+        store(self.smoothed, torch.zeros_like(self.smoothed), column(mask, self.device))
 
     def prefill(self, command: TrackerCommand, state: RobotState, mask=None):
-        row = torch.ones(self.worlds, dtype=torch.bool, device=self.device) if mask is None else mask
         self.write(command, state)
-        self.frames.copy_(torch.where(row.to(self.device)[:, None, None], self.frames[:, -1:], self.frames))
+        store(self.frames, self.frames[:, -1:].clone().expand_as(self.frames), column(mask, self.device))
 
     def write(self, command: TrackerCommand, state: RobotState):
         mimic, frame = command.mimic, self.frames[:, -1]
@@ -78,9 +76,9 @@ class FalconFrontEnd(FrontEnd):
         frame.copy_(torch.cat(terms, 1))
         self.base[:, 15:] = arms
 
-    def advance(self):
-        self.smoothed.copy_(self.now)
-        self.frames[:, :-1] = self.frames[:, 1:].clone()
+    def advance(self, rows=None):
+        store(self.smoothed, self.now, rows)
+        store(self.frames[:, :-1], self.frames[:, 1:].clone(), rows)
 
 
 class FalconTracker(NetworkTracker):
