@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Policy, world_mask
 from arena_newton.robot import TICK
-from arena_newton.trackers.motions.frames import heading
+from arena_newton.rotations import heading
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.commands import MotionCommand

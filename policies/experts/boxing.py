@@ -14,11 +14,11 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import Floor, plan, signed_distance
+from arena_newton.rotations import rotate_xy, wrap_angle
 from arena_newton.tasks.boxing import PALMS, TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
-from arena_newton.trackers.motions.frames import wrap_angle
 from arena_newton.trackers.motions.kinematics import HAND_POINT
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
 
 __all__ = ["BoxingExpert"]
 
@@ -216,4 +216,4 @@ class BoxingExpert(Expert):
 
     @staticmethod
     def _local(vector: Tensor, pose: Tensor) -> Tensor:
-        return torch.cat([rotate(vector[:, :2], -pose[:, 2]), vector[:, 2:]], dim=1)
+        return torch.cat([rotate_xy(-pose[:, 2], vector[:, :2]), vector[:, 2:]], dim=1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from arena_newton.trackers.motions.navigate import rotate
+from arena_newton.rotations import rotate_xy
 
 __all__ = ["Floor", "Ways", "footprint", "plan"]
 
@@ -68,14 +68,14 @@ def footprint(pos: Tensor, quat: Tensor, half: Tensor) -> Tensor:
     longest = torch.linalg.vector_norm(axes, dim=-1).argmax(dim=-1)
     along = torch.gather(axes, -2, longest[..., None, None].expand(*longest.shape, 1, 2))[..., 0, :]
     yaw = torch.atan2(along[..., 1], along[..., 0])
-    extent = rotate(axes, -yaw[..., None].expand(*yaw.shape, 3)).abs().sum(dim=-2)
+    extent = rotate_xy(-yaw[..., None].expand(*yaw.shape, 3), axes).abs().sum(dim=-2)
     return torch.cat([pos[..., :2], yaw[..., None], extent], dim=-1)
 
 
 def _local(points: Tensor, boxes: Tensor) -> Tensor:
     """Points in the frames of boxes: [W, N, 2] and [W, B, 5] to [W, N, B, 2]."""
     offset = points[:, :, None] - boxes[:, None, :, :2]
-    return rotate(offset, -boxes[:, None, :, 2].expand(offset.shape[:-1]))
+    return rotate_xy(-boxes[:, None, :, 2].expand(offset.shape[:-1]), offset)
 
 
 def signed_distance(points: Tensor, boxes: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ def _freed(point: Tensor, boxes: Tensor, grow: Tensor) -> Tensor:
         axis = lack.argmin(dim=1, keepdim=True)
         side = torch.where(torch.gather(local, 1, axis) < 0, -1.0, 1.0)
         moved = local.scatter(1, axis, side * torch.gather(half, 1, axis))
-        moved = box[:, 0, :2] + rotate(moved, box[:, 0, 2])
+        moved = box[:, 0, :2] + rotate_xy(box[:, 0, 2], moved)
         point = torch.where(inside[:, None], moved, point)
     return point
 
@@ -133,7 +133,7 @@ def plan(start: Tensor, goal: Tensor, floor: Floor, clearances: tuple[float, ...
 
     signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]], device=start.device)
     offset = signs * (boxes[:, :, None, 3:] + grow[:, None, None, None] + 2e-3)
-    corners = boxes[:, :, None, :2] + rotate(offset, boxes[:, :, None, 2].expand(offset.shape[:-1]))
+    corners = boxes[:, :, None, :2] + rotate_xy(boxes[:, :, None, 2].expand(offset.shape[:-1]), offset)
     nodes = torch.cat([begin[:, None], end[:, None], corners.flatten(1, 2)], dim=1)
 
     low = torch.tensor(floor.low, device=start.device) + grow[:, None, None]

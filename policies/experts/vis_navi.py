@@ -10,10 +10,10 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
+from arena_newton.rotations import heading, rotate_xy
 from arena_newton.tasks.vis_navi import SIGN
 from arena_newton.trackers.motions.commands import MotionCommand
-from arena_newton.trackers.motions.frames import heading
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
 
 __all__ = ["VisNaviExpert"]
 
@@ -84,7 +84,7 @@ class VisNaviExpert(Expert):
         half = torch.tensor(self._zone.half[:2], device=centre.device) - FEET
         steps = torch.linspace(-1.0, 1.0, 9, device=centre.device)
         grid = torch.cartesian_prod(steps, steps) * half
-        spots = centre[:, None] + rotate(grid.expand(len(centre), -1, 2), yaw[:, None].expand(-1, len(grid)))
+        spots = centre[:, None] + rotate_xy(yaw[:, None].expand(-1, len(grid)), grid.expand(len(centre), -1, 2))
         lack = (APART - signed_distance(spots, boxes)).clamp_min(0.0)
         price = 3.0 * lack + torch.linalg.vector_norm(grid, dim=1)
         best = price.argmin(dim=1)

@@ -5,9 +5,10 @@ import pytest
 import torch
 import warp as wp
 
+from arena_newton import rotations
 from arena_newton.kernels import ik
 from arena_newton.robot import DEFAULT_POSE
-from arena_newton.trackers.motions import frames, kinematics
+from arena_newton.trackers.motions import kinematics
 
 WORLDS = 24
 
@@ -58,7 +59,7 @@ class Solver:
     def poses(self) -> kinematics.Poses:
         """Kinematics of the result, by torch."""
         g = self.goal.astype(float)
-        half = 0.5 * g[:, [9, 10, 11]]
+        half = 0.5 * np.concatenate([g[:, ik.GOAL[name]] for name in ("yaw", "pitch", "roll")], 1)
         (cz, cy, cx), (sz, sy, sx) = np.cos(half).T, np.sin(half).T
         quat = np.stack(
             [
@@ -98,8 +99,8 @@ def posed(device) -> Solver:
     y = s.feet[:, :, 1] + rng.uniform(-0.02, 0.02, (n, 2))
     com = np.stack([x.mean(1) + 0.03, y.mean(1)], 1)
     s.goal[:, ik.GOAL["com"]] = np.concatenate([c * com[:, :1] - k * com[:, 1:], k * com[:, :1] + c * com[:, 1:]], 1)
-    s.goal[:, 12:22:5], s.goal[:, 13:22:5] = c * x - k * y, k * x + c * y
-    s.goal[:, 15:22:5] = yaw + rng.uniform(-0.2, 0.2, (n, 2))
+    s.feet[:, :, 0], s.feet[:, :, 1] = c * x - k * y, k * x + c * y
+    s.feet[:, :, 3] = yaw + rng.uniform(-0.2, 0.2, (n, 2))
     s.solve(30)
     return s
 
@@ -142,7 +143,7 @@ def test_hands_reach(device):
     poses = s.poses()
     wrist = [kinematics.link_index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
     palm = torch.tensor([kinematics.HAND_POINT, 0.0, 0.0], dtype=torch.float64).expand(s.worlds, 2, 3)
-    hands = poses.position[:, wrist] + frames.quat_apply(poses.quat[:, wrist], palm)
+    hands = poses.position[:, wrist] + rotations.quat_apply(poses.quat[:, wrist], palm)
     root = np.concatenate([s.state.pelvis.numpy(), s.goal[:, ik.GOAL["height"]]], 1)
     np.testing.assert_allclose(hands.numpy() - root[:, None], points, atol=3e-3)
     np.testing.assert_allclose(s.state.hands.numpy().reshape(-1, 2, 3), points, atol=3e-3)
@@ -152,8 +153,8 @@ def test_out_of_reach_stays_finite_and_comes_back(device):
     """A foot and a hand too far away stretch the limbs within limits; once back in reach they are met again."""
     s = Solver(device, worlds=4)
     here = s.goal.copy()
-    s.goal[:, 12] = here[:, 12] + (0.7, -0.7, 0.0, 0.7)
-    s.goal[:, 14] += (0.0, 0.0, -0.5, 0.5)
+    s.feet[:, 0, 0] += (0.7, -0.7, 0.0, 0.7)
+    s.feet[:, 0, 2] += (0.0, 0.0, -0.5, 0.5)
     s.goal[:, ik.GOAL["hand_point"]] = 2.0
     s.goal[:, ik.GOAL["reach"]] = 1.0
     s.solve(20)
@@ -175,7 +176,7 @@ def test_mask_leaves_worlds_alone(device):
 
 
 def test_seat_holds_the_pelvis_back(device):
-    """With the seat's share the pelvis stays behind its bound and the centre of mass is given up."""
+    """With the seat's weight the pelvis stays behind its bound and the centre of mass is given up."""
     s = Solver(device, worlds=2)
     s.goal[:, ik.GOAL["height"]] = 0.55
     s.goal[:, ik.GOAL["seat"]] = -0.30

@@ -13,9 +13,8 @@ import numpy as np
 import torch
 
 from arena_newton.robot import TICK
-from arena_newton.trackers.motions.frames import heading, wrap_angle
+from arena_newton.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
-from arena_newton.trackers.motions.navigate import rotate
 
 if TYPE_CHECKING:
     from arena_newton.trackers.evaluation.lab import Lab
@@ -152,11 +151,11 @@ class Meter:
         yaw, ref_yaw = heading(quat), heading(reference.quat)
 
         offset = lab.xpos[:, self._links] - position[:, None]
-        level = torch.cat([rotate(offset[..., :2], -yaw[:, None]), offset[..., 2:]], dim=-1)
+        level = torch.cat([rotate_xy(-yaw[:, None], offset[..., :2]), offset[..., 2:]], dim=-1)
         link = torch.linalg.vector_norm(level - reference.links, dim=-1).mean(1)
 
-        moved = rotate((position - last["position"])[:, :2], -yaw) / TICK
-        ref_moved = rotate((reference.position - last["ref_position"])[:, :2], -ref_yaw) / TICK
+        moved = rotate_xy(-yaw, (position - last["position"])[:, :2]) / TICK
+        ref_moved = rotate_xy(-ref_yaw, (reference.position - last["ref_position"])[:, :2]) / TICK
         turned, ref_turned = wrap_angle(yaw - last["yaw"]) / TICK, wrap_angle(ref_yaw - last["ref_yaw"]) / TICK
 
         feet = lab.xpos[:, self._feet]

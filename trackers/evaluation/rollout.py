@@ -252,7 +252,7 @@ def run(
     import warp as wp
 
     from arena_newton.kernels import canonical
-    from arena_newton.trackers.motions.frames import heading
+    from arena_newton.rotations import heading
     from arena_newton.trackers.motions.kinematics import neutral_stance
 
     began = time.perf_counter()

@@ -150,8 +150,9 @@ def tabulate(cells: list[Cell], device: torch.device) -> Tables:
 
     from arena_newton.canonical import ACTION, ACTION_WIDTH
     from arena_newton.env import STAND_ACTION
+    from arena_newton.rotations import heading, quat_apply, quat_from_yaw
     from arena_newton.trackers.evaluation.meter import FEET, LINKS
-    from arena_newton.trackers.motions.frames import actions_to_motion, heading, quat_apply, quat_from_yaw
+    from arena_newton.trackers.motions.frames import actions_to_motion
     from arena_newton.trackers.motions.kinematics import forward, link_index
 
     ticks = max(cell.ticks for cell in cells)

@@ -17,11 +17,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 
 from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.foreign import numbers, read_arrays, read_bytes
 from arena_newton.robot import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
+from arena_newton.trackers.motions.frames import actions_to_motion
+from arena_newton.trackers.motions.kinematics import forward
 from arena_newton.trackers.motions.library import FORMAT, UNKNOWN, MotionLibrary
 from arena_newton.trackers.motions.load import (
     JOINTS_23,
@@ -279,10 +282,6 @@ def _npz(path: Path, options: ReadOptions) -> Reading:
 
 
 def _from_actions(path: Path) -> Clip:
-    import torch
-
-    from arena_newton.trackers.motions.frames import actions_to_motion
-
     actions = load_actions(path, flag="")
     if len(actions) < 2:
         raise InputError(f"{path}: action has shape {list(actions.shape)}, expected 2 or more ticks")
@@ -319,10 +318,6 @@ def _beyond_mimic(path: Path, arrays: dict[str, np.ndarray], options: ReadOption
 
 def _link_distance(clip: Clip, joint_pos: np.ndarray, body_pos: np.ndarray) -> float:
     """Mean distance [m] of a file's bodies to the nearest link, over some frames; whatever the bodies' order is."""
-    import torch
-
-    from arena_newton.trackers.motions.kinematics import forward
-
     some: Any = np.unique(np.linspace(0, len(joint_pos) - 1, 20).astype(int))
     links = forward(*(torch.from_numpy(x[some]) for x in (clip.root_pos, clip.root_quat, joint_pos))).position
     return float(torch.cdist(torch.from_numpy(body_pos[some]), links).min(dim=-1).values.mean())

@@ -15,32 +15,32 @@ from torch import Tensor
 
 from arena_newton.canonical import ACTION, ACTION_WIDTH, HAND_CLOSED, MIMIC, MIMIC_WIDTH
 from arena_newton.robot import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, TICK
+from arena_newton.rotations import (
+    heading,
+    matrix_from_quat,
+    quat_apply,
+    quat_conjugate,
+    quat_from_rot6d,
+    quat_from_yaw,
+    quat_multiply,
+    roll_pitch,
+    wrap_angle,
+)
 
 __all__ = [
-    "Motion",
+    "MotionClip",
     "actions_to_motion",
     "frame_action",
     "frame_mimic",
-    "heading",
-    "matrix_from_quat",
     "motion_actions",
     "motion_mimic",
-    "quat_apply",
-    "quat_conjugate",
-    "quat_from_matrix",
-    "quat_from_rot6d",
-    "quat_from_yaw",
-    "quat_multiply",
-    "roll_pitch",
-    "rotation_vector",
-    "wrap_angle",
 ]
 
 _LEVEL_FLOOR = 1e-6
 """Below this |R22| height no longer tells the displacement along the root's z axis (`kernels.canonical`)."""
 
 
-class Motion(NamedTuple):
+class MotionClip(NamedTuple):
     """Frames in a row; leading axes are a batch."""
 
     root_pos: Tensor
@@ -57,116 +57,6 @@ class Motion(NamedTuple):
 def _order(indices: tuple[int, ...], device: torch.device) -> Tensor:
     """Indices on a device, uploaded once: a list would be uploaded at every use, which a CUDA graph cannot hold."""
     return torch.tensor(indices, dtype=torch.int64, device=device)
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle within -pi..pi [rad]."""
-    return torch.atan2(torch.sin(angle), torch.cos(angle))
-
-
-def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Product of quaternions wxyz, shapes [..., 4]."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
-
-
-def quat_conjugate(quat: Tensor) -> Tensor:
-    """The inverse of unit quaternions wxyz, shape [..., 4]."""
-    return torch.cat([quat[..., :1], -quat[..., 1:]], dim=-1)
-
-
-def quat_apply(quat: Tensor, vector: Tensor) -> Tensor:
-    """Vectors [..., 3] turned by unit quaternions wxyz [..., 4]."""
-    w, u = quat[..., :1], quat[..., 1:]
-    u, vector = torch.broadcast_tensors(u, vector)
-    t = 2.0 * torch.cross(u, vector, dim=-1)
-    return vector + w * t + torch.cross(u, t, dim=-1)
-
-
-def quat_from_yaw(yaw: Tensor) -> Tensor:
-    """Rotation by `yaw` [rad] about world z, wxyz, shape [..., 4]."""
-    zero = torch.zeros_like(yaw)
-    return torch.stack([torch.cos(0.5 * yaw), zero, zero, torch.sin(0.5 * yaw)], dim=-1)
-
-
-def heading(quat: Tensor) -> Tensor:
-    """Heading of unit quaternions [rad], atan2(2(wz + xy), 1 - 2(y² + z²))."""
-    w, x, y, z = quat.unbind(-1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
-def roll_pitch(quat: Tensor) -> Tensor:
-    """Roll and pitch of unit quaternions (ZYX angles) [rad], shape [..., 2]."""
-    w, x, y, z = quat.unbind(-1)
-    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
-    return torch.stack([roll, pitch], dim=-1)
-
-
-def rotation_vector(quat: Tensor) -> Tensor:
-    """Axis times angle [rad] of unit quaternions along the shorter way, shape [..., 3]."""
-    quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
-    sine = torch.linalg.vector_norm(quat[..., 1:], dim=-1, keepdim=True)
-    angle = 2.0 * torch.atan2(sine, quat[..., :1])
-    # angle / sine tends to 2 for small angles.
-    tiny = torch.finfo(quat.dtype).tiny
-    return quat[..., 1:] * torch.where(sine > 1e-9, angle / sine.clamp_min(tiny), torch.full_like(sine, 2.0))
-
-
-def matrix_from_quat(quat: Tensor) -> Tensor:
-    """Rotation matrices of unit quaternions wxyz, shape [..., 3, 3]."""
-    w, x, y, z = quat.unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
-    ]
-    return torch.stack(rows, dim=-2)
-
-
-def quat_from_matrix(matrix: Tensor) -> Tensor:
-    """Unit quaternions wxyz of rotation matrices [..., 3, 3], by the best conditioned of Shepperd's four formulas."""
-    m00, m11, m22 = matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 2, 2]
-    a, b, c = (
-        matrix[..., 2, 1] - matrix[..., 1, 2],
-        matrix[..., 0, 2] - matrix[..., 2, 0],
-        matrix[..., 1, 0] - matrix[..., 0, 1],
-    )
-    d, e, f = (
-        matrix[..., 1, 0] + matrix[..., 0, 1],
-        matrix[..., 0, 2] + matrix[..., 2, 0],
-        matrix[..., 2, 1] + matrix[..., 1, 2],
-    )
-    # Row i is 4 q_i q: the one with the largest diagonal has the least cancellation.
-    rows = torch.stack(
-        [
-            torch.stack([1 + m00 + m11 + m22, a, b, c], dim=-1),
-            torch.stack([a, 1 + m00 - m11 - m22, d, e], dim=-1),
-            torch.stack([b, d, 1 - m00 + m11 - m22, f], dim=-1),
-            torch.stack([c, e, f, 1 - m00 - m11 + m22], dim=-1),
-        ],
-        dim=-2,
-    )
-    best = torch.diagonal(rows, dim1=-2, dim2=-1).argmax(dim=-1)[..., None, None].expand(*rows.shape[:-2], 1, 4)
-    return torch.nn.functional.normalize(rows.gather(-2, best).squeeze(-2), dim=-1)
-
-
-def quat_from_rot6d(rot6d: Tensor) -> Tensor:
-    """Rotation next to each rot6d in row layout [..., 6] (Gram-Schmidt), wxyz, shape [..., 4]."""
-    columns = rot6d.unflatten(-1, (3, 2))
-    x = torch.nn.functional.normalize(columns[..., 0], dim=-1)
-    y = columns[..., 1] - x * (x * columns[..., 1]).sum(-1, keepdim=True)
-    y = torch.nn.functional.normalize(y, dim=-1)
-    return quat_from_matrix(torch.stack([x, y, torch.cross(x, y, dim=-1)], dim=-1))
 
 
 def frame_action(
@@ -248,7 +138,7 @@ def motion_mimic(root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor) -> Tens
     return frame_mimic(_delayed(root_pos), _delayed(root_quat), root_pos, root_quat, joint_pos)
 
 
-def actions_to_motion(actions: Tensor, root_xy: Tensor | None = None, yaw: Tensor | None = None) -> Motion:
+def actions_to_motion(actions: Tensor, root_xy: Tensor | None = None, yaw: Tensor | None = None) -> MotionClip:
     """The motion that canonical actions integrate to.
 
     Args:
@@ -275,7 +165,7 @@ def actions_to_motion(actions: Tensor, root_xy: Tensor | None = None, yaw: Tenso
     along = torch.where(standing, along / torch.where(standing, level, torch.ones_like(level)), torch.zeros_like(along))
     local = torch.cat([moved, along[..., None]], dim=-1)
     xy = root_xy[..., None, :] + (rotation @ local[..., None])[..., :2, 0].cumsum(dim=-2)
-    return Motion(
+    return MotionClip(
         torch.cat([xy, z], dim=-1),
         quat,
         actions[..., ACTION["joint_pos"]].index_select(-1, _order(MUJOCO_TO_CANONICAL, actions.device)),

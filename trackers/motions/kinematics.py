@@ -1,21 +1,19 @@
 """Forward kinematics of the G1 in torch: poses of all links and the centre of mass, batched, from the link table.
 
-The link table (`usd_scenes.g1.links`) is the one copy of the robot's numbers. Fingers stand open (angle zero).
+The link table (`usd_scenes.g1.links`) is the one copy of the robot's numbers. Fingers are open (angle zero).
 """
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS
+from arena_newton.rotations import matrix_from_quat_np, quat_apply, quat_multiply
 from arena_newton.usd_scenes.g1.links import LINKS
-
-if TYPE_CHECKING:
-    import torch
 
 __all__ = [
     "HAND_POINT",
@@ -34,9 +32,9 @@ __all__ = [
 SOLE_HEIGHT = 0.035
 """Height of the ankle roll frame above the ground with a flat foot [m]: contact spheres at -0.03, radius 0.005."""
 SOLE_CENTRE = 0.035
-"""Middle of the four contact spheres before the ankle roll frame [m]."""
+"""Middle of the four contact spheres ahead of the ankle roll frame [m]."""
 HAND_POINT = 0.10
-"""The point of a hand that reaches, so far before the wrist yaw frame [m]: the middle of the palm."""
+"""Distance of the point of a hand that reaches ahead of the wrist yaw frame [m]: the middle of the palm."""
 LINK_NAMES: tuple[str, ...] = tuple(link.name for link in LINKS)
 """Links in the order of `Poses`."""
 
@@ -68,9 +66,6 @@ def forward(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch.Te
         root_quat: Pelvis orientation, wxyz, shape [..., 4].
         joint_pos: Joint angles [rad], MuJoCo order, shape [..., 29].
     """
-    import torch
-
-    from arena_newton.trackers.motions import frames
 
     def constant(values: tuple[float, ...]) -> torch.Tensor:
         return root_pos.new_tensor(values)
@@ -84,23 +79,23 @@ def forward(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch.Te
         if link.parent is None:
             position, quat = root_pos, root_quat
         else:
-            up = link_index(link.parent)
-            position = positions[up] + frames.quat_apply(quats[up], constant(link.offset).expand(root_pos.shape))
-            quat = frames.quat_multiply(quats[up], constant(link.quat).expand(root_quat.shape))
+            parent = link_index(link.parent)
+            position = positions[parent] + quat_apply(quats[parent], constant(link.offset).expand(root_pos.shape))
+            quat = quat_multiply(quats[parent], constant(link.quat).expand(root_quat.shape))
             if link.hinge is not None and link.hinge.name in MUJOCO_JOINTS:
                 j = MUJOCO_JOINTS.index(link.hinge.name)
                 turn = torch.cat([cos[..., j : j + 1], sin[..., j : j + 1] * constant(_AXES[link.hinge.axis])], -1)
-                quat = frames.quat_multiply(quat, turn)
+                quat = quat_multiply(quat, turn)
         positions.append(position)
         quats.append(quat)
-        moment = moment + link.mass * (position + frames.quat_apply(quat, constant(link.com).expand(root_pos.shape)))
+        moment = moment + link.mass * (position + quat_apply(quat, constant(link.com).expand(root_pos.shape)))
     total = sum(link.mass for link in LINKS)
     return Poses(torch.stack(positions, -2), torch.stack(quats, -2), moment / total)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Pelvis and the 29 links that body joints carry, fingers lumped into the wrists; row 1 + j hangs on joint j."""
+    """Pelvis and the 29 links that body joints carry, fingers lumped into the wrists; row 1 + j is moved by joint j."""
 
     offset: np.ndarray
     """Origin in the parent's frame [m], shape [30, 3]."""
@@ -114,17 +109,8 @@ class Chain:
     """Mass [kg], shape [30]."""
     com: np.ndarray
     """Centre of mass in the link's frame [m], shape [30, 3]."""
-
-
-def _matrix(q: tuple[float, ...]) -> np.ndarray:
-    w, x, y, z = np.asarray(q) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    hand_point: float
+    """`HAND_POINT` [m]."""
 
 
 @functools.cache
@@ -137,7 +123,8 @@ def chain() -> Chain:
     for link in LINKS:
         point, at = np.asarray(link.com, dtype=float), link
         while at.name not in kept:
-            point = np.asarray(at.offset) + _matrix(at.quat) @ point
+            quat = np.asarray(at.quat) / np.linalg.norm(at.quat)
+            point = np.asarray(at.offset) + matrix_from_quat_np(quat) @ point
             at = table[at.parent or ""]
         mass[at.name] += link.mass
         moment[at.name] += link.mass * point
@@ -148,6 +135,7 @@ def chain() -> Chain:
         limits=np.array([k.hinge.limits if k.hinge else (0.0, 0.0) for k in rows], dtype=np.float32),
         mass=np.array([mass[k.name] for k in rows], dtype=np.float32),
         com=np.array([moment[k.name] / mass[k.name] for k in rows], dtype=np.float32),
+        hand_point=HAND_POINT,
     )
 
 
@@ -158,11 +146,11 @@ class Stance:
     height: float
     """Pelvis above the ground [m]."""
     ankle: float
-    """Ankles before the pelvis [m]."""
+    """Ankles ahead of the pelvis [m]."""
     width: float
     """Distance between the ankles [m]."""
     com: float
-    """Centre of mass before the pelvis [m]."""
+    """Centre of mass ahead of the pelvis [m]."""
     hands: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Hand points [m], left and right."""
 
@@ -170,10 +158,6 @@ class Stance:
 @functools.cache
 def neutral_stance() -> Stance:
     """Numbers of `robot.DEFAULT_POSE`, whose feet are flat when the pelvis is upright."""
-    import torch
-
-    from arena_newton.trackers.motions import frames
-
     poses = forward(
         torch.zeros(3, dtype=torch.float64),
         torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64),
@@ -182,7 +166,7 @@ def neutral_stance() -> Stance:
     feet = poses.position[[link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]]
     wrist = [link_index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
     palm = torch.tensor([HAND_POINT, 0.0, 0.0], dtype=torch.float64).expand(2, 3)
-    hands = poses.position[wrist] + frames.quat_apply(poses.quat[wrist], palm)
+    hands = poses.position[wrist] + quat_apply(poses.quat[wrist], palm)
     left, right = ((float(h[0]), float(h[1]), float(h[2])) for h in hands)
     return Stance(
         height=SOLE_HEIGHT - float(feet[:, 2].mean()),

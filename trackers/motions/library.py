@@ -6,24 +6,23 @@ evaluation read: torch tensors with velocities and mimic commands for every fram
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from arena_newton.errors import InputError
+from arena_newton.files import replace_atomically
 from arena_newton.foreign import numbers, read_arrays
 from arena_newton.robot import MUJOCO_JOINTS, TICK
+from arena_newton.rotations import quat_conjugate, quat_multiply, rotation_vector
+from arena_newton.trackers.motions.frames import frame_mimic
+from arena_newton.trackers.motions.load import Clip, resample
 from arena_newton.usd_scenes.g1.links import LINKS
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
-    from arena_newton.trackers.motions.load import Clip
 
 __all__ = [
     "FORMAT",
@@ -215,8 +214,6 @@ class MotionLibrary:
         Raises:
             InputError: No clips, or lists of unequal length.
         """
-        from arena_newton.trackers.motions.load import resample
-
         if not clips:
             raise InputError("motion library: holds no clip")
         families, licences, sources = (
@@ -342,16 +339,11 @@ class MotionLibrary:
         Raises:
             InputError: The file cannot be written.
         """
-        path = Path(path)
-        part = path.with_name(path.name + ".part")
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with open(part, "wb") as file:
-                arrays = {name: getattr(self, name) for name in _ARRAYS}
+            with replace_atomically(path) as file:
                 np.savez(file, format=np.array(FORMAT), fps=np.array(FPS), **arrays)
-            os.replace(part, path)
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
     @classmethod
@@ -421,9 +413,6 @@ class DeviceLibrary:
     @classmethod
     def build(cls, library: MotionLibrary, device: str | torch.device) -> DeviceLibrary:
         """Upload a library and derive its velocities."""
-        import torch
-
-        from arena_newton.trackers.motions import frames
 
         def up(array: np.ndarray) -> Tensor:
             return torch.as_tensor(np.array(array), device=device)
@@ -433,15 +422,15 @@ class DeviceLibrary:
         before = up(np.maximum(np.arange(library.frames) - 1, library.clip_start[clip]))
         # In double precision: a difference over a tick multiplies rounding by 50.
         pos64, quat64 = pos.double(), torch.nn.functional.normalize(quat.double(), dim=-1)
-        turned = frames.quat_multiply(frames.quat_conjugate(quat64[before]), quat64)
-        mimic = frames.frame_mimic(pos64[before], quat64[before], pos64, quat64, joints.double())
+        turned = quat_multiply(quat_conjugate(quat64[before]), quat64)
+        mimic = frame_mimic(pos64[before], quat64[before], pos64, quat64, joints.double())
         return cls(
             root_pos=pos,
             root_quat=quat,
             joint_pos=joints,
             joint_vel=(joints - joints[before]) / TICK,
             lin_vel=((pos64 - pos64[before]) / TICK).float(),
-            ang_vel=(frames.rotation_vector(turned) / TICK).float(),
+            ang_vel=(rotation_vector(turned) / TICK).float(),
             mimic=mimic.float(),
             hands=up(library.hands),
             frame_clip=up(clip),
@@ -466,8 +455,6 @@ class DeviceLibrary:
 
     def index(self, clip: Tensor, step: Tensor) -> Tensor:
         """Frame of a clip at a step; the first and the last frame stand for what is outside. Shapes [...]."""
-        import torch
-
         last = self.clip_length[clip] - 1
         return self.clip_start[clip] + torch.minimum(step.clamp_min(0), last)
 

@@ -6,8 +6,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from arena_newton.robot import MUJOCO_JOINTS, TICK
+from arena_newton.rotations import quat_apply
+from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
 from arena_newton.usd_scenes.g1.links import LINKS
 
@@ -70,10 +73,6 @@ def joint_limits() -> tuple[np.ndarray, np.ndarray]:
 
 def _soles(library: MotionLibrary) -> np.ndarray:
     """Middles of both soles [m], shape [frames, 2, 3]."""
-    import torch
-
-    from arena_newton.trackers.motions import frames, kinematics
-
     feet = [kinematics.link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]
     out = np.empty((library.frames, 2, 3), dtype=np.float32)
     for first in range(0, library.frames, 20000):
@@ -81,7 +80,7 @@ def _soles(library: MotionLibrary) -> np.ndarray:
         motion = (torch.from_numpy(x[part]) for x in (library.root_pos, library.root_quat, library.joint_pos))
         poses = kinematics.forward(*motion)
         sole = poses.position.new_tensor([kinematics.SOLE_CENTRE, 0.0, -kinematics.SOLE_HEIGHT])
-        at = poses.position[:, feet] + frames.quat_apply(poses.quat[:, feet], sole.expand(len(out[part]), 2, 3))
+        at = poses.position[:, feet] + quat_apply(poses.quat[:, feet], sole.expand(len(out[part]), 2, 3))
         out[part] = at.numpy()
     return out
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from arena_newton.trackers.motions.frames import wrap_angle
+from arena_newton.rotations import rotate_xy, wrap_angle
 
-__all__ = ["Command", "NavigationLimits", "Navigator", "rotate", "steer"]
+__all__ = ["Command", "NavigationLimits", "Navigator", "steer"]
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,6 @@ class Command:
     """Distance from the route [m], 0 without one, [worlds]."""
 
 
-def rotate(vector: Tensor, yaw: Tensor) -> Tensor:
-    """Planar vectors turned by yaw; shapes [..., 2] and [...]."""
-    c, s = torch.cos(yaw), torch.sin(yaw)
-    x, y = vector.unbind(-1)
-    return torch.stack([c * x - s * y, s * x + c * y], dim=-1)
-
-
 def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: NavigationLimits) -> Tensor:
     """Velocity command towards a point, slowing down for what is left of the way.
 
@@ -103,7 +96,7 @@ def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: Nav
     error = wrap_angle(wanted - yaw)
     turn = (limits.heading_gain * error).clamp(-limits.turn, limits.turn)
 
-    local = rotate(direction, -yaw)
+    local = rotate_xy(-yaw, direction)
     x, y = local.unbind(1)
     ahead = torch.where(x >= 0, limits.forward, limits.backward)
     # Largest speed in this direction: an ellipse of the limits along and across.
@@ -182,13 +175,13 @@ class Navigator:
         off = torch.linalg.vector_norm(goal[:, :2] - smooth, dim=1)
         stays = (off < k.leave_position) & (error.abs() < k.leave_heading)
         missed = every & self.holding & ~stays
-        miss = torch.cat([rotate(smooth - goal[:, :2], -yaw), -error[:, None]], dim=1)
+        miss = torch.cat([rotate_xy(-yaw, smooth - goal[:, :2]), -error[:, None]], dim=1)
         learned = self._bias + k.learning * miss
         most, most_turn = k.most_learned
         learned = torch.cat([learned[:, :2].clamp(-most, most), learned[:, 2:].clamp(-most_turn, most_turn)], dim=1)
         self._bias = torch.where(missed[:, None], learned, self._bias)
 
-        shift, turned = -rotate(self._bias[:, :2], yaw), goal[:, 2] - self._bias[:, 2]
+        shift, turned = -rotate_xy(yaw, self._bias[:, :2]), goal[:, 2] - self._bias[:, 2]
         aimed_off = torch.linalg.vector_norm(goal[:, :2] + shift - smooth, dim=1)
         close = (aimed_off < k.arrive_position) & (wrap_angle(turned - yaw).abs() < k.arrive_heading)
         holding = torch.where(self.holding, stays, close & (left < k.near))

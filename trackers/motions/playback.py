@@ -1,12 +1,14 @@
-"""Clips as streams of canonical actions, and the way from standing into them."""
+"""Clips as streams of canonical actions, and the transition from standing into them."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from arena_newton.canonical import ACTION
 from arena_newton.env import STAND_ACTION
 from arena_newton.robot import TICK
+from arena_newton.trackers.motions.frames import motion_actions
 from arena_newton.trackers.motions.load import Clip, resample
 
 __all__ = ["clip_actions", "startup_actions"]
@@ -22,14 +24,10 @@ def clip_actions(clip: Clip) -> np.ndarray:
     without the clip's first heading, so that integrating the actions rebuilds the clip's path (schema v3.1 of the
     original). The first action holds no displacement; hands are open where the clip says nothing.
     """
-    import torch
-
-    from arena_newton.trackers.motions import frames
-
     at = resample(clip, 1.0 / TICK)
     hands = np.zeros((len(at.root_pos), 2)) if at.hands is None else at.hands
     parts = (torch.from_numpy(np.array(v, dtype=np.float64)) for v in (at.root_pos, at.root_quat, at.joint_pos, hands))
-    return frames.motion_actions(*parts).numpy().astype(np.float32)
+    return motion_actions(*parts).numpy().astype(np.float32)
 
 
 def startup_actions(first: np.ndarray, *, stand: float, blend: float) -> np.ndarray:
@@ -45,8 +43,8 @@ def startup_actions(first: np.ndarray, *, stand: float, blend: float) -> np.ndar
     """
     waiting = np.repeat(STAND_ACTION[None], round(stand / TICK), axis=0)
     ticks = round(blend / TICK)
-    share = (np.arange(1, ticks + 1) / (ticks + 1))[:, None].astype(np.float32)
-    moving = (1 - share) * STAND_ACTION + share * first
+    weight = (np.arange(1, ticks + 1) / (ticks + 1))[:, None].astype(np.float32)
+    moving = (1 - weight) * STAND_ACTION + weight * first
     moving[:, _XY] = 0.0
     moving[:, _ROT] = _orthonormal(moving[:, _ROT])
     moving[:, ACTION["hands"]] = first[ACTION["hands"]]

@@ -1,7 +1,7 @@
-"""Named motions as short command programs: stand, shift, step, walk, squat, reach, kick, punch, sit, rise, carry, push.
+"""Named motions as short command programs, such as `walk`, `squat` or `kick`.
 
-A primitive is a `Script`, a row of timed segments; `+` joins scripts, `over` lays channels over all segments. A
-`Program` holds one script a world and turns a time into a `MotionCommand`. Nothing here limits a rate: the generator
+A primitive is a `Script`, a row of timed segments; `+` joins scripts, `over` sets channels in all segments. A
+`Program` holds one script per world and turns a time into a `MotionCommand`. Nothing here limits a rate: the generator
 does, so a segment may jump, and one with `ramp` moves its channels evenly over its time.
 """
 
@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import DEFAULT_POSE
-from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, MotionCommand, neutral_row
+from arena_newton.trackers.motions.commands import CHANNELS, COLUMNS, COMMAND_WIDTH, MotionCommand, neutral_row
 from arena_newton.trackers.motions.footwork import kick_seconds
-
-if TYPE_CHECKING:
-    import torch
 
 __all__ = [
     "CARRY_ARMS",
@@ -48,7 +46,7 @@ __all__ = [
 
 SIDES = {"left": 0, "right": 1}
 SEAT_APPROACH, SEAT_DEPTH = (0.24, 0.14), (0.25, 0.12)
-"""Pelvis behind its standing place and above the seat [m], first until it touches, then pressed into it."""
+"""Pelvis behind its standing position and above the seat [m], first until it touches, then pressed into it."""
 SEAT_CLEAR = 0.17
 """Pelvis above a seat that it is about to leave [m]."""
 
@@ -61,7 +59,7 @@ def mirrored_arms(left: Sequence[float]) -> tuple[float, ...]:
 
 DEFAULT_ARMS: tuple[float, ...] = tuple(DEFAULT_POSE[15:])
 GUARD_ARMS = mirrored_arms((-0.35, 0.25, 0.1, -0.45, 0.0, 0.0, 0.0))
-"""Fists before the chest [rad]."""
+"""Fists in front of the chest [rad]."""
 CARRY_ARMS = mirrored_arms((-0.15, 0.12, 0.0, 0.05, 0.0, 0.0, 0.0))
 """Forearms level, palms facing each other [rad]."""
 FORWARD_ARMS = mirrored_arms((-1.0, 0.2, 0.0, 0.9, 0.0, 0.0, 0.0))
@@ -69,7 +67,7 @@ FORWARD_ARMS = mirrored_arms((-1.0, 0.2, 0.0, 0.9, 0.0, 0.0, 0.0))
 PUNCH_ARM = (-1.45, 0.12, 0.0, 1.25, 0.0, 0.0, 0.0)
 """A stretched left arm [rad]."""
 PUSH_HANDS = ((0.36, 0.14, 0.20), (0.36, -0.14, 0.20))
-"""Palms before the chest [m]."""
+"""Palms in front of the chest [m]."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,10 @@ class Segment:
         for name, value in self.channels.items():
             if name not in CHANNELS:
                 raise InputError(f"motion command: no channel {name!r}, expected one of {', '.join(CHANNELS)}")
-            part = CHANNELS[name]
-            numbers = np.asarray(value, dtype=np.float32).ravel()
-            if numbers.size not in (1, part.stop - part.start):
-                raise InputError(f"motion command: {name} takes {part.stop - part.start} numbers, got {numbers.size}")
-            row[part] = numbers
+            numbers, width = np.asarray(value, dtype=np.float32).ravel(), CHANNELS[name].width
+            if numbers.size not in (1, width):
+                raise InputError(f"motion command: {name} takes {width} numbers, got {numbers.size}")
+            row[COLUMNS[name]] = numbers
         return row
 
 
@@ -122,17 +119,15 @@ class Script:
 
 
 class Program:
-    """One script a world; past its end a script holds its last segment."""
+    """One script per world; past its end a script holds its last segment."""
 
     def __init__(self, scripts: Sequence[Script], device: Any = "cpu"):
         """Packs the scripts.
 
         Args:
-            scripts: One a world.
+            scripts: One per world.
             device: Torch device of the commands.
         """
-        import torch
-
         longest = max(len(s.segments) for s in scripts)
         ends = np.full((len(scripts), longest), np.inf, dtype=np.float32)
         rows = np.empty((len(scripts), longest + 1, COMMAND_WIDTH), dtype=np.float32)
@@ -155,17 +150,15 @@ class Program:
         self.seconds = max(s.seconds for s in scripts)
 
     def __call__(self, time: float | torch.Tensor) -> MotionCommand:
-        """Commands at a time [s] since the start, one number or one a world."""
-        import torch
-
+        """Commands at a time [s] since the start, one number or one per world."""
         if not isinstance(time, torch.Tensor):
             time = torch.full((self.worlds,), float(time), device=self._ends.device)
         w = self._worlds
         k = (time[:, None] >= self._ends).sum(1)
-        share = ((time - self._starts[w, k]) / self._lengths[w, k]).clamp(0.0, 1.0)
-        share = torch.where(self._ramps[w, k] > 0.5, share, 1.0)[:, None]
-        before, row = self._rows[w, k], self._rows[w, k + 1]
-        return MotionCommand.unpack(before + share * (row - before))
+        fraction = ((time - self._starts[w, k]) / self._lengths[w, k]).clamp(0.0, 1.0)
+        fraction = torch.where(self._ramps[w, k] > 0.5, fraction, 1.0)[:, None]
+        previous, row = self._rows[w, k], self._rows[w, k + 1]
+        return MotionCommand.unpack(previous + fraction * (row - previous))
 
 
 def _script(*segments: tuple[float, dict[str, Any]] | Segment) -> Script:
@@ -203,10 +196,10 @@ def walk(
 def step_over(
     stride: float = 0.40, seconds: float = 6.0, *, swing_height: float = 0.18, step_time: float = 0.52
 ) -> Script:
-    """Walk with high steps, the right foot beside the left one, as over a sill.
+    """Walk with high steps, the right foot next to the left one, as over a sill.
 
     Args:
-        stride: Way of a foot in one swing [m]; two steps.
+        stride: Stride length [m] (two steps).
         seconds: Time of walking [s].
         swing_height: Height of a step [m].
         step_time: Time of a step [s].
@@ -227,13 +220,13 @@ def step_up(
     swing_height: float = 0.16,
     step_time: float = 0.56,
 ) -> Script:
-    """Walk with high steps, the right foot beside the left one, onto ground of another height, and stand there.
+    """Walk with high steps, the right foot next to the left one, onto ground of another height, and stand there.
 
     Args:
         height: Height of a platform [m], up to 0.2.
-        stride: Way of a foot in one swing [m]; two steps.
+        stride: Stride length [m] (two steps).
         pairs: Pairs of steps once the ground ahead is higher.
-        ahead: Time of walking before [s].
+        ahead: Time of walking before them [s].
         down: Go on and step down at the other end.
         swing_height: Height of a step above the ground that it leaves and meets [m].
         step_time: Time of a step [s].
@@ -254,11 +247,11 @@ def squat(height: float = 0.45, *, pitch: float = 0.3, down: float = 1.5, hold: 
 
 
 def reach(side: str, point: Sequence[float], *, hold: float = 1.5, arms: Sequence[float] = DEFAULT_ARMS) -> Script:
-    """Reach with one palm to a point of the pelvis' heading frame [m], hold, and let go."""
+    """Reach with one palm to a point of the pelvis' heading frame [m], hold, and return."""
     k = _sided(side)
-    points, share = np.array(neutral_row()[CHANNELS["hand_point"]]).reshape(2, 3), [0.0, 0.0]
-    points[k], share[k] = point, 1.0
-    out = {"hand_point": points, "reach": share, "arms": arms}
+    points, weights = np.array(neutral_row()[COLUMNS["hand_point"]]).reshape(2, 3), [0.0, 0.0]
+    points[k], weights[k] = point, 1.0
+    out = {"hand_point": points, "reach": weights, "arms": arms}
     return _script((hold + 1.2, out), (1.2, {"arms": arms}))
 
 
@@ -272,7 +265,7 @@ def crouch_reach(
     hold: float = 1.5,
     arms: Sequence[float] = DEFAULT_ARMS,
 ) -> Script:
-    """Squat, reach to a point of the pelvis' heading frame [m], let go, and rise."""
+    """Squat, reach to a point of the pelvis' heading frame [m], return, and rise."""
     low = {"height": height, "pitch": pitch}
     up = _script(Segment(down, {"arms": arms}, ramp=True), (0.5, {}))
     return (
@@ -305,7 +298,7 @@ def sit(seat: float = 0.42, *, hold: float = 3.0, depth: float = SEAT_DEPTH[0], 
     Args:
         seat: Height of the seat [m].
         hold: Time on the seat [s].
-        depth: How far behind its standing place the pelvis ends [m].
+        depth: How far behind its standing position the pelvis ends [m].
         press: Height of the pelvis above the seat at the end [m]; the robot's own touches it higher.
     """
     arms = {"arms": FORWARD_ARMS}
@@ -337,7 +330,7 @@ def rise(seat: float = 0.42, *, depth: float = SEAT_DEPTH[0], press: float = SEA
 def carry(
     forward: float = 0.25, left: float = 0.0, turn: float = 0.0, seconds: float = 4.0, *, width: float = 0.24
 ) -> Script:
-    """Walk with both palms at the sides of a box of a width [m] before the belly."""
+    """Walk with both palms at the sides of a box of a width [m] in front of the belly."""
     points = ((0.30, 0.5 * width, 0.10), (0.30, -0.5 * width, 0.10))
     held = {"hand_point": points, "reach": (1.0, 1.0), "arms": CARRY_ARMS}
     return _script((1.5, held), (seconds, {**held, "velocity": (forward, left, turn)}), (1.0, held), (1.5, {}))

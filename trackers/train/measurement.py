@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.trackers.motions import frames
-from arena_newton.trackers.train import rotations
+from arena_newton import rotations
 from arena_newton.trackers.train.references import Frame
 
 if TYPE_CHECKING:
@@ -46,17 +45,17 @@ class TickMeasurement:
     @cached_property
     def heading(self) -> torch.Tensor:
         """Shape [worlds]."""
-        return frames.heading(self.state.root_quat)
+        return rotations.heading(self.state.root_quat)
 
     @cached_property
     def reference_heading(self) -> torch.Tensor:
         """Shape [worlds]."""
-        return frames.heading(self.reference.root_quat)
+        return rotations.heading(self.reference.root_quat)
 
     @cached_property
     def heading_error(self) -> torch.Tensor:
         """Reference minus measured, wrapped, shape [worlds]."""
-        return frames.wrap_angle(self.reference_heading - self.heading)
+        return rotations.wrap_angle(self.reference_heading - self.heading)
 
     @cached_property
     def position_error(self) -> torch.Tensor:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.trackers.motions import frames, kinematics
-from arena_newton.trackers.train import rotations
+from arena_newton import rotations
+from arena_newton.trackers.motions import kinematics
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.library import DeviceLibrary
@@ -84,7 +84,7 @@ class ReferenceBank:
         self.family_names = [str(name) for name in library.family_names]
         self.support_kind = library.support_kind.to(device=device, dtype=torch.long)
         box = library.support_box.to(device=device, dtype=torch.float32)
-        self.support_pos, self.support_quat = box[:, :3].contiguous(), frames.quat_from_yaw(box[:, 3])
+        self.support_pos, self.support_quat = box[:, :3].contiguous(), rotations.quat_from_yaw(box[:, 3])
         """Centre of the support's top face [m] and its orientation wxyz, shapes [clips, 3] and [clips, 4]."""
         parts = {
             name: getattr(library, name).to(device=device, dtype=torch.float32) for name in _FIELDS if name != "keys"
@@ -121,6 +121,6 @@ def _key_links(root_pos: torch.Tensor, root_quat: torch.Tensor, joint_pos: torch
         part = slice(first, first + _CHUNK)
         at = root_pos[part] * root_pos.new_tensor((0.0, 0.0, 1.0))
         keys = kinematics.forward(at, root_quat[part], joint_pos[part]).position.index_select(1, index)
-        heading = frames.heading(root_quat[part])
+        heading = rotations.heading(root_quat[part])
         out.append(rotations.turn(-heading[:, None], keys).flatten(1))
     return torch.cat(out)

@@ -17,11 +17,11 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from arena_newton import rotations
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
 from arena_newton.robot import DEFAULT_POSE, TICK
-from arena_newton.trackers.motions import frames
-from arena_newton.trackers.train import critic, events, rotations
+from arena_newton.trackers.train import critic, events
 from arena_newton.trackers.train.graphs import captured
 from arena_newton.trackers.train.measurement import TickMeasurement
 from arena_newton.trackers.train.options import TrainOptions
@@ -304,8 +304,8 @@ class TrackerEnv(VecEnv):
         xy = around(start.root_pos[:, :2], "xy")
         z = start.root_pos[:, 2:] + noise["z"] * torch.rand(worlds, 1, device=self.device)
         tilt = noise["tilt"] * (2.0 * torch.rand(worlds, 3, device=self.device) - 1.0)
-        turned = frames.quat_from_yaw(noise["heading"] * (2.0 * torch.rand(worlds, device=self.device) - 1.0))
-        quat = rotations.turned_by(frames.quat_multiply(turned, start.root_quat), tilt)
+        turned = rotations.quat_from_yaw(noise["heading"] * (2.0 * torch.rand(worlds, device=self.device) - 1.0))
+        quat = rotations.turned_by(rotations.quat_multiply(turned, start.root_quat), tilt)
 
         def put(view: torch.Tensor, value: torch.Tensor | float) -> None:
             view.copy_(torch.where(row, value, view))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import CANONICAL_TO_MUJOCO
 from arena_newton.trackers.motions import frames, kinematics, measure
@@ -23,7 +24,7 @@ def motion(ticks: int = 80) -> Clip:
     yaw, lean = 1.0 + 0.8 * t, 0.1 + 0.1 * np.sin(2 * t)
     turn = np.stack([np.cos(yaw / 2), 0 * t, 0 * t, np.sin(yaw / 2)], axis=1)
     tilt = np.stack([np.cos(lean / 2), 0 * t, np.sin(lean / 2), 0 * t], axis=1)
-    quat = frames.quat_multiply(torch.from_numpy(turn), torch.from_numpy(tilt)).numpy()
+    quat = rotations.quat_multiply(torch.from_numpy(turn), torch.from_numpy(tilt)).numpy()
     pos = np.stack([0.5 * t, 0.2 * t, 0.75 + 0.02 * np.sin(4 * t)], axis=1)
     joints = 0.3 * np.sin(t[:, None] + np.arange(29)) * np.linspace(0.4, 1.0, 29)
     return Clip(FPS, pos, quat, joints)

@@ -1,6 +1,11 @@
 """The streaming reference generator."""
 
+import ast
+import importlib
 import math
+import sys
+import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +14,8 @@ import warp as wp
 
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate, launch_reset_reference
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
-from arena_newton.trackers.motions import kinematics
-from arena_newton.trackers.motions.commands import COMMAND_WIDTH, MotionCommand
+from arena_newton.trackers.motions import commands, kinematics
+from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, LIMITED_COLUMNS, MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 
@@ -352,9 +357,56 @@ def test_any_jumping_commands_stay_feasible():
     assert float(step.max()) / TICK < 1.6
 
 
-def test_unknown_seed_pose():
-    """A start pose that does not exist is named."""
-    from arena_newton.errors import InputError
+PACKAGE = "arena_newton.trackers.motions"
 
-    with pytest.raises(InputError, match="'lie'"):
-        ReferenceGenerator(1, seed_pose="lie")
+
+def with_channel(monkeypatch, after: str, row: str) -> types.ModuleType:
+    """The generator with one more row in `MotionCommand`, after a channel: nothing else of its source changes."""
+    path = Path(commands.__file__)
+    source = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    body = next(n for n in ast.parse("".join(source)).body if getattr(n, "name", "") == "MotionCommand").body
+    at = next(k for k, n in enumerate(body) if isinstance(n, ast.AnnAssign) and ast.unparse(n.target) == after)
+    source.insert(body[at + 1].end_lineno, f"    {row}\n")
+    changed = types.ModuleType(f"{PACKAGE}.commands")
+    monkeypatch.setitem(sys.modules, changed.__name__, changed)
+    exec(compile("".join(source), path, "exec"), vars(changed))
+    for name in ("footwork", "generator"):
+        monkeypatch.delitem(sys.modules, f"{PACKAGE}.{name}", raising=False)
+        monkeypatch.setattr(sys.modules[PACKAGE], name, None, raising=False)
+    return importlib.import_module(f"{PACKAGE}.generator")
+
+
+@pytest.mark.parametrize("after", CHANNELS)
+def test_a_new_channel_is_one_row(monkeypatch, after):
+    """A channel that is added after any other one moves at its rate, and leaves all other channels as they are."""
+    generator = with_channel(
+        monkeypatch, after, "toe_out: Tensor = _channel((), 0.0, 0.4, rate=0.25, acceleration=5.0)"
+    )
+    new, old = generator.ReferenceGenerator(1), ReferenceGenerator(1)
+    command = constant(1, velocity=[0.3, 0.0, 0.2], arms=0.1)
+    more = sys.modules[f"{PACKAGE}.commands"].MotionCommand(**vars(command), toe_out=torch.full((1,), 9.0))
+    for _ in range(50):
+        moved, same = new.step(more), old.step(command)
+    assert float(new._s.scalar("toe_out")) == pytest.approx(0.25 * (1.0 - 0.5 * 0.25 / 5.0), abs=0.01)
+    for _ in range(50):
+        moved, same = new.step(more), old.step(command)
+    assert float(new._s.scalar("toe_out")) == pytest.approx(0.4, abs=1e-6)
+    assert torch.equal(moved.joint_pos, same.joint_pos) and torch.equal(moved.root_pos, same.root_pos)
+    for name in LIMITED_COLUMNS:
+        assert torch.equal(new._s.channel(name), old._s.channel(name)), name
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "_channel((), 0.0, 0.4, rate=0.0, acceleration=5.0)",
+        "_channel((), 0.0, 0.4, rate=0.25)",
+        "_channel((), 0.4, 0.4)",
+        "_channel((2,), (0.0, 0.0, 0.0), 0.4)",
+        "field()",
+    ],
+)
+def test_a_channel_without_effect_is_refused_by_name(monkeypatch, row):
+    """A row with a rate of zero, half a limit, an empty range, a wrong width, or without a channel does not import."""
+    with pytest.raises(TypeError, match="motion command: channel toe_out: "):
+        with_channel(monkeypatch, "stagger", f"toe_out: Tensor = {row}")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from arena_newton import rotations
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS
-from arena_newton.trackers.motions import frames, kinematics
+from arena_newton.trackers.motions import kinematics
 
 
 def poses_of(worlds: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -55,7 +56,7 @@ def test_chain_keeps_the_mass_of_the_fingers():
         next(i for i, k in enumerate(kinematics.LINKS) if k.hinge and k.hinge.name == name) for name in MUJOCO_JOINTS
     ]
     com = torch.tensor(chain.com, dtype=torch.float64)
-    centres = whole.position[:, rows] + frames.quat_apply(whole.quat[:, rows], com.expand(3, 30, 3))
+    centres = whole.position[:, rows] + rotations.quat_apply(whole.quat[:, rows], com.expand(3, 30, 3))
     mass = torch.tensor(chain.mass, dtype=torch.float64)
     np.testing.assert_allclose((centres * mass[:, None]).sum(1) / mass.sum(), whole.com, atol=1e-6)
     assert float(mass.sum()) == pytest.approx(sum(k.mass for k in kinematics.LINKS), rel=1e-6)

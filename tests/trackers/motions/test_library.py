@@ -5,6 +5,7 @@ import pytest
 import torch
 import warp as wp
 
+from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate, launch_reset_reference
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
@@ -25,7 +26,7 @@ def wave(ticks: int = 90, seed: int = 0, fps: float = 50.0) -> Clip:
     for angle, axis in ((pitch, 2), (roll, 1)):
         turn = np.zeros((ticks, 4))
         turn[:, 0], turn[:, axis] = np.cos(angle / 2), np.sin(angle / 2)
-        quat = frames.quat_multiply(quat, torch.from_numpy(turn))
+        quat = rotations.quat_multiply(quat, torch.from_numpy(turn))
     pos = np.stack([4 + np.sin(t), -7 + 0.5 * t, 0.7 + 0.05 * np.sin(3 * t)], axis=1)
     joints = 0.4 * np.sin(t[:, None] + rng.uniform(0, 6, 29))
     hands = (np.stack([t, 1 - t], axis=1) > 0.5).astype(float)
@@ -65,7 +66,7 @@ def test_mimic_is_the_kernels(library):
         rows = library.rows(clip)
         pos, quat = got.root_pos[rows].double(), got.root_quat[rows].double()
         actions = frames.motion_actions(pos, quat, got.joint_pos[rows].double()).numpy()
-        yaw = float(frames.heading(quat[0]))
+        yaw = float(rotations.heading(quat[0]))
         kernel = integrated(actions, library.root_pos[rows][0, :2], yaw)
         mimic = got.mimic[rows].numpy()
         # The kernel's own yaw is a float32: its rounding over a tick is 2e-5 rad/s.
@@ -80,7 +81,7 @@ def test_actions_rebuild_the_motion():
         torch.from_numpy(x) for x in (clip.root_pos, clip.root_quat, clip.joint_pos, clip.hands)
     )
     actions = frames.motion_actions(pos, quat, joints, hands)
-    yaw = frames.heading(quat[0])
+    yaw = rotations.heading(quat[0])
     kernel = integrated(actions.numpy(), clip.root_pos[0, :2], float(yaw))
     np.testing.assert_allclose(kernel["position"], clip.root_pos, atol=1e-4)
     same_rotation(kernel["quat"], clip.root_quat, 1e-6)
@@ -102,7 +103,7 @@ def test_streaming_equals_whole():
     actions, mimic = frames.motion_actions(pos, quat, joints, hands), frames.motion_mimic(pos, quat, joints)
     for k in range(30):
         b = max(k - 1, 0)
-        one = frames.frame_action(pos[b], pos[k], quat[k], joints[k], hands[k], frames.heading(quat[0]))
+        one = frames.frame_action(pos[b], pos[k], quat[k], joints[k], hands[k], rotations.heading(quat[0]))
         torch.testing.assert_close(one, actions[k])
         torch.testing.assert_close(frames.frame_mimic(pos[b], quat[b], pos[k], quat[k], joints[k]), mimic[k])
 
@@ -112,7 +113,7 @@ def test_quat_from_matrix():
     generator = torch.Generator().manual_seed(0)
     quat = torch.nn.functional.normalize(torch.randn(500, 4, generator=generator, dtype=torch.float64), dim=-1)
     quat = torch.cat([quat, torch.eye(4, dtype=torch.float64)])
-    same_rotation(frames.quat_from_matrix(frames.matrix_from_quat(quat)).numpy(), quat.numpy(), 1e-12)
+    same_rotation(rotations.quat_from_matrix(rotations.matrix_from_quat(quat)).numpy(), quat.numpy(), 1e-12)
 
 
 def test_velocities(library):
@@ -128,7 +129,7 @@ def test_velocities(library):
     vector = got.ang_vel[k].double() * TICK
     half = vector.norm() / 2
     turn = torch.cat([half.cos()[None], half.sin() * vector / vector.norm()])
-    same_rotation(frames.quat_multiply(before, turn).numpy(), after.numpy(), 1e-9)
+    same_rotation(rotations.quat_multiply(before, turn).numpy(), after.numpy(), 1e-9)
 
 
 def test_index(library):

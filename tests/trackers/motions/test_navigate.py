@@ -4,15 +4,15 @@ import math
 
 import torch
 
-from arena_newton.trackers.motions.frames import heading, wrap_angle
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, rotate, steer
+from arena_newton.rotations import heading, rotate_xy, wrap_angle
+from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, steer
 
 DT = 0.02
 
 
 def drive(pose, velocity, dt=DT):
     """A robot that does exactly what it is told."""
-    moved = rotate(velocity[:, :2], pose[:, 2]) * dt
+    moved = rotate_xy(pose[:, 2], velocity[:, :2]) * dt
     return torch.cat([pose[:, :2] + moved, pose[:, 2:] + velocity[:, 2:] * dt], dim=1)
 
 
@@ -80,7 +80,7 @@ def test_stops_that_end_beside_the_goal_are_learned():
         command = navigator.command(pose, goal, DT)
         pose = drive(pose, command.velocity)
         if moving and bool(command.arrived):
-            pose[:, :2] += rotate(torch.tensor([[0.0, 0.06]]), pose[:, 2])
+            pose[:, :2] += rotate_xy(pose[:, 2], torch.tensor([[0.0, 0.06]]))
             stops += 1
         moving = not bool(command.arrived)
     assert command.arrived.all() and torch.linalg.vector_norm(pose[0, :2]) < 0.05

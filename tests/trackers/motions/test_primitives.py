@@ -180,7 +180,7 @@ def test_a_step_up_needs_room_for_the_edge():
     for tick in range(round((program.seconds + 3.0) / TICK)):
         generator.step(program(tick * TICK))
     height = generator.feet_pos[..., 2] - kinematics.SOLE_HEIGHT
-    assert float(height[0].max()) < 0.09 and generator._s["floor"][0].tolist() == [0.0, 0.0]
+    assert float(height[0].max()) < 0.09 and generator.floor[0].tolist() == [0.0, 0.0]
     assert height[1].tolist() == pytest.approx([0.1, 0.1], abs=1e-6)
 
 

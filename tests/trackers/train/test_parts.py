@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from arena_newton import rotations
 from arena_newton.errors import InputError
-from arena_newton.trackers.motions import frames, kinematics
-from arena_newton.trackers.train import events, rotations
+from arena_newton.trackers.motions import kinematics
+from arena_newton.trackers.train import events
 from arena_newton.trackers.train.measurement import TickMeasurement
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS, configured, maximum
@@ -26,7 +27,7 @@ def bank(library):
 def perfect(bank: ReferenceBank, frame: torch.Tensor) -> TickMeasurement:
     """A tick in which the robot does what it was asked for: the measured state is the reference's own."""
     reference = bank.gather(frame)
-    n, heading = len(frame), frames.heading(reference.root_quat)[:, None]
+    n, heading = len(frame), rotations.heading(reference.root_quat)[:, None]
     state = SimpleNamespace(
         qpos=torch.zeros(n, 36),
         qvel=torch.zeros(n, 35),
@@ -127,15 +128,11 @@ def test_pushes_strike_as_often_and_as_hard_as_set():
 
 def test_key_links_are_seen_from_the_heading_frame(library):
     """Key links do not change when a clip is moved and turned on the floor."""
+    yaw = rotations.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4)
     turned = dataclasses.replace(
         library,
-        root_pos=frames.quat_apply(
-            frames.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4), torch.tensor(library.root_pos)
-        ).numpy()
-        + [3.0, -2.0, 0.0],
-        root_quat=frames.quat_multiply(
-            frames.quat_from_yaw(torch.tensor(1.1)).float().expand(library.frames, 4), torch.tensor(library.root_quat)
-        ).numpy(),
+        root_pos=rotations.quat_apply(yaw, torch.tensor(library.root_pos)).numpy() + [3.0, -2.0, 0.0],
+        root_quat=rotations.quat_multiply(yaw, torch.tensor(library.root_quat)).numpy(),
     )
     here, there = (
         ReferenceBank(lib.to("cpu"), "cpu").gather(torch.tensor([70, 220])).keys for lib in (library, turned)
@@ -147,13 +144,13 @@ def test_key_links_are_seen_from_the_heading_frame(library):
 
 def test_turning_a_quaternion_by_a_small_vector():
     """`turned_by` turns in the body's frame, so that gravity seen from the body moves by the vector's length."""
-    quat = frames.quat_from_yaw(torch.tensor([0.7]))
+    quat = rotations.quat_from_yaw(torch.tensor([0.7]))
     turned = rotations.turned_by(quat, torch.tensor([[0.02, 0.0, 0.0]]))
-    assert torch.allclose(frames.roll_pitch(turned), torch.tensor([[0.02, 0.0]]), atol=1e-5)
-    assert torch.allclose(frames.heading(turned), torch.tensor([0.7]), atol=1e-5)
+    assert torch.allclose(rotations.roll_pitch(turned), torch.tensor([[0.02, 0.0]]), atol=1e-5)
+    assert torch.allclose(rotations.heading(turned), torch.tensor([0.7]), atol=1e-5)
     assert torch.allclose(
         rotations.gravity_in_body(turned),
-        frames.quat_apply(frames.quat_conjugate(turned), torch.tensor([[0.0, 0.0, -1.0]])),
+        rotations.quat_apply(rotations.quat_conjugate(turned), torch.tensor([[0.0, 0.0, -1.0]])),
         atol=1e-6,
     )
 

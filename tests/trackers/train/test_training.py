@@ -16,11 +16,11 @@ import torch
 import tyro
 from PIL import Image
 
+from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
 from arena_newton.trackers import interface, train
 from arena_newton.trackers.inference import weights_file
-from arena_newton.trackers.motions import frames
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
@@ -102,7 +102,7 @@ def test_episodes_start_on_the_reference_beside_its_support(env, library):
     noise = events.START_NOISE
     assert ((env.sim.joint_pos - now.joint_pos).abs() <= noise["joint_pos"] + 1e-6).all()
     assert ((env.sim.root_pos - now.root_pos)[:, :2].abs() <= noise["xy"] + 1e-6).all()
-    assert (frames.wrap_angle(frames.heading(env.sim.root_quat)).abs() < 0.2).all()
+    assert (rotations.wrap_angle(rotations.heading(env.sim.root_quat)).abs() < 0.2).all()
     seat = env.sim.mocap_pos[:, env.sim.scene.mocap_id("/World/Seat")]
     sits = env.bank.support_kind[env.bank.clip_of[env.frame]] == 1
     assert torch.allclose(seat[sits], torch.tensor([-0.6, 0.0, 0.4])) and (seat[~sits, 2] < -1.0).all()
