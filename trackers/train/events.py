@@ -1,7 +1,7 @@
-"""Randomisation: one function an event, all listed with their settings in `EVENTS`.
+"""Randomisation: one function per event, all listed with their settings in `EVENTS`.
 
 `start` events draw properties that a world keeps for the whole training, `reset` events draw at the start of an
-episode, `interval` events strike at random ticks. All of them work on every world at once and write only the rows of a
+episode, `interval` events happen at random ticks. All of them work on every world at once and write only the rows of a
 mask, so that nothing waits for the device.
 """
 
@@ -37,7 +37,7 @@ START_NOISE: dict[str, float] = {
 height is only ever added, so that no foot starts in the ground."""
 HANDS = ("left_wrist_yaw_link", "right_wrist_yaw_link")
 _PALM = 0.1
-"""A payload's place before the wrist yaw frame [m]."""
+"""Distance of a payload in front of the wrist yaw frame [m]."""
 _PAYLOAD_RADIUS = 0.05
 """Radius of gyration of a payload [m]."""
 
@@ -48,7 +48,7 @@ class World(Protocol):
     sim: Simulation
     """The physics."""
     privileged: dict[str, torch.Tensor]
-    """What the critic is told, by name, each of shape [worlds, n]."""
+    """What the start events drew, by name, each of shape [worlds, n]."""
     delay: torch.Tensor
     """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
     bank: ReferenceBank
@@ -81,14 +81,14 @@ def _chance(like: torch.Tensor, probability: float, worlds: int) -> torch.Tensor
 
 
 def friction(env: World, mask: torch.Tensor, low: float, high: float) -> None:
-    """Sliding friction of every geom of a world: of two geoms MuJoCo takes the larger."""
+    """Sliding friction of every geom of a world: MuJoCo takes the larger of two geoms."""
     value = uniform(env.sim.qpos, low, high, env.sim.worlds)
     env.sim.geom_friction[:, :, 0] = value[:, None]
     env.privileged["friction"] = value[:, None] - 0.8
 
 
 def link_mass(env: World, mask: torch.Tensor, low: float, high: float) -> None:
-    """Mass and inertia of every link of the robot, by a factor each."""
+    """Mass and inertia of every link of the robot, by one factor per link."""
     sim = env.sim
     links = list(sim.bodies.values())
     factor = torch.ones_like(sim.body_mass)
@@ -109,10 +109,10 @@ def centre_of_mass(env: World, mask: torch.Tensor, reach: float) -> None:
     env.privileged["centre_of_mass"] = 50.0 * torch.cat(moved, 1)
 
 
-def payload(env: World, mask: torch.Tensor, share: float, mass: float) -> None:
-    """Up to `mass` [kg] in either hand of a share of the worlds, each hand loaded with probability 2/3."""
+def payload(env: World, mask: torch.Tensor, fraction: float, mass: float) -> None:
+    """Up to `mass` [kg] in either hand in a fraction of the worlds, each hand loaded with probability 2/3."""
     sim = env.sim
-    loaded = _chance(sim.qpos, share, sim.worlds)
+    loaded = _chance(sim.qpos, fraction, sim.worlds)
     carried = []
     for name in HANDS:
         body = sim.bodies[name]
@@ -129,7 +129,7 @@ def payload(env: World, mask: torch.Tensor, share: float, mass: float) -> None:
 
 
 def motor_strength(env: World, mask: torch.Tensor, low: float, high: float) -> None:
-    """Stiffness, damping and torque limit of every joint, by one factor each."""
+    """Stiffness, damping and torque limit of every joint, by one factor per joint."""
     sim = env.sim
     factor = uniform(sim.qpos, low, high, sim.worlds, 29)
     sim.gain[:, :29, 0] *= factor
@@ -138,26 +138,26 @@ def motor_strength(env: World, mask: torch.Tensor, low: float, high: float) -> N
     env.privileged["motor_strength"] = 10.0 * (factor - 1.0)
 
 
-def action_delay(env: World, mask: torch.Tensor, share: float) -> None:
-    """Targets of a share of the episodes arrive one tick late."""
-    env.delay.copy_(torch.where(mask, _chance(env.sim.qpos, share, env.sim.worlds), env.delay))
+def action_delay(env: World, mask: torch.Tensor, fraction: float) -> None:
+    """Targets arrive one tick late in a fraction of the episodes."""
+    env.delay.copy_(torch.where(mask, _chance(env.sim.qpos, fraction, env.sim.worlds), env.delay))
 
 
-def hand_force(env: World, mask: torch.Tensor, share: float, force: float) -> None:
-    """A constant force of up to `force` [N] in a random direction on each hand, in a share of the episodes."""
+def hand_force(env: World, mask: torch.Tensor, fraction: float, force: float) -> None:
+    """A constant force of up to `force` [N] in a random direction on each hand, in a fraction of the episodes."""
     for name in HANDS:
         direction = torch.nn.functional.normalize(torch.randn(env.sim.worlds, 3, device=mask.device), dim=1)
-        _write_force(env, mask, name, direction, share, force)
+        _write_force(env, mask, name, direction, fraction, force)
 
 
-def trunk_force(env: World, mask: torch.Tensor, share: float, force: float, resistance: float) -> None:
-    """A constant horizontal force of up to `force` [N] on the torso, in a share of the episodes.
+def trunk_force(env: World, mask: torch.Tensor, fraction: float, force: float, resistance: float) -> None:
+    """A constant horizontal force of up to `force` [N] on the torso, in a fraction of the episodes.
 
     References of the family `push` lean into something: nothing but a force against their heading makes them feasible,
     so their torso always meets one of up to `resistance` [N].
     """
     flat = torch.nn.functional.normalize(torch.randn(env.sim.worlds, 2, device=mask.device), dim=1)
-    _write_force(env, mask, "torso_link", torch.nn.functional.pad(flat, (0, 1)), share, force)
+    _write_force(env, mask, "torso_link", torch.nn.functional.pad(flat, (0, 1)), fraction, force)
     bank = env.bank
     if "push" not in bank.family_names:
         return
@@ -169,10 +169,10 @@ def trunk_force(env: World, mask: torch.Tensor, share: float, force: float, resi
 
 
 def _write_force(
-    env: World, mask: torch.Tensor, link: str, direction: torch.Tensor, share: float, force: float
+    env: World, mask: torch.Tensor, link: str, direction: torch.Tensor, fraction: float, force: float
 ) -> None:
     worlds = env.sim.worlds
-    size = uniform(env.sim.qpos, 0.0, force, worlds) * _chance(mask, share, worlds)
+    size = uniform(env.sim.qpos, 0.0, force, worlds) * _chance(mask, fraction, worlds)
     applied = env.sim.body_force[:, env.sim.bodies[link], :3]
     applied.copy_(torch.where(mask[:, None], direction * size[:, None], applied))
 
@@ -182,32 +182,32 @@ def push(env: World, mask: torch.Tensor, every: float, planar: float, vertical: 
 
     Args:
         env: What is pushed.
-        mask: Worlds that may be struck.
-        every: Mean time between two pushes of a world [s].
+        mask: Worlds that may be pushed.
+        every: Mean time between two pushes of the same world [s].
         planar: Largest jump over the ground, in any direction [m/s].
         vertical: Largest jump up or down [m/s].
         turn: Largest jump of each component of the angular velocity [rad/s].
     """
     worlds = env.sim.worlds
-    struck = _chance(env.sim.qpos, TICK / every, worlds) & mask
-    hit = struck.float()[:, None]
+    pushed = _chance(env.sim.qpos, TICK / every, worlds) & mask
+    hit = pushed.float()[:, None]
     flat = torch.nn.functional.normalize(torch.randn(worlds, 2, device=mask.device), dim=1)
     env.sim.root_vel[:, :2].add_(flat * uniform(env.sim.qpos, 0.0, planar, worlds, 1) * hit)
     jump = uniform(env.sim.qpos, -1.0, 1.0, worlds, 4) * hit
     env.sim.root_vel[:, 2:].add_(jump[:, :1], alpha=vertical)
     env.sim.root_ang_vel.add_(jump[:, 1:], alpha=turn)
-    env.since_push.masked_fill_(struck, 0.0)
+    env.since_push.masked_fill_(pushed, 0.0)
 
 
 EVENTS: dict[str, Event] = {
     "friction": Event("start", friction, {"low": 0.4, "high": 1.2}),
     "link_mass": Event("start", link_mass, {"low": 0.95, "high": 1.05}),
     "centre_of_mass": Event("start", centre_of_mass, {"reach": 0.01}),
-    "payload": Event("start", payload, {"share": 0.25, "mass": 2.0}),
+    "payload": Event("start", payload, {"fraction": 0.25, "mass": 2.0}),
     "motor_strength": Event("start", motor_strength, {"low": 0.95, "high": 1.05}),
-    "action_delay": Event("reset", action_delay, {"share": 0.2}),
-    "hand_force": Event("reset", hand_force, {"share": 0.1, "force": 5.0}),
-    "trunk_force": Event("reset", trunk_force, {"share": 0.1, "force": 10.0, "resistance": 12.0}),
+    "action_delay": Event("reset", action_delay, {"fraction": 0.2}),
+    "hand_force": Event("reset", hand_force, {"fraction": 0.1, "force": 5.0}),
+    "trunk_force": Event("reset", trunk_force, {"fraction": 0.1, "force": 10.0, "resistance": 12.0}),
     "push": Event("interval", push, {"every": 5.0, "planar": 1.2, "vertical": 0.05, "turn": 0.5}),
 }
 

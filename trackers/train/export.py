@@ -9,9 +9,8 @@ from typing import Any
 from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
 from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.trackers import interface
-from arena_newton.trackers.front_end import ActionForm
 from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.interface import ActionForm, get
 from arena_newton.trackers.train.checkpoint import Checkpoint
 from arena_newton.trackers.train.options import ExportOptions
 
@@ -39,7 +38,7 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     if not options.out.exists() and (taken := [c for c in cards if c.exists()]):
         raise InputError(f"--out {options.out}: its card would overwrite {taken[0]}, which is not of these weights")
     state = Checkpoint.read(checkpoint)
-    network = interface.get(state.card.tracker).make_network(state.network)
+    network = get(state.card.tracker).make_network(state.network)
     prefix = "net."
     tensors = {k[len(prefix) :]: v for k, v in state.actor_state_dict.items() if k.startswith(prefix)}
     try:

@@ -1,4 +1,4 @@
-"""CUDA graphs of what a training does again and again: one launch instead of hundreds."""
+"""CUDA graphs of work that a training repeats: one launch instead of hundreds."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["captured"]
 
 
 def captured(work: Callable[[], None], option: str, stream: torch.cuda.Stream | None = None) -> torch.cuda.CUDAGraph:
-    """Hold work in a graph; it is recorded, not done.
+    """Capture work in a graph; it is recorded, not executed.
 
     Args:
-        work: What to hold: no host synchronisation, the same tensors each time.
+        work: What to capture: without host synchronisation, on the same tensors each time.
         option: The command line's switch of this graph, such as `tick-graph`.
-        stream: Where to record, a stream of torch's own choice by default.
+        stream: Stream of the capture; torch chooses one by default.
 
     Raises:
-        TrainingError: The work cannot be recorded. The device's random numbers may be unusable then.
+        TrainingError: The work cannot be captured. The device's random numbers may be unusable then.
     """
     graph = torch.cuda.CUDAGraph()
     try:
@@ -29,5 +29,5 @@ def captured(work: Callable[[], None], option: str, stream: torch.cuda.Stream | 
             work()
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise TrainingError(f"no CUDA graph could be captured, --no-{option} does without ({reason})") from error
+        raise TrainingError(f"no CUDA graph could be captured; --no-{option} trains without it ({reason})") from error
     return graph

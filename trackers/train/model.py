@@ -1,4 +1,4 @@
-"""The actor for rsl-rl, a tracker's own network, so that what was trained is what is shipped; and its critic."""
+"""Actor and critic for rsl_rl; the actor is the tracker's own network, so that what was trained is what is shipped."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch import nn
 from arena_newton.trackers.inference import networks
 from arena_newton.trackers.interface import get
 
-__all__ = ["TrackerActor", "TrackerCritic"]
+__all__ = ["TrackerActor", "TrackerCritic", "UncheckedGaussian"]
 
 
-class _Gaussian(GaussianDistribution):
-    """rsl-rl's, drawn without the check of the deviations, for which torch would wait for the device each tick."""
+class UncheckedGaussian(GaussianDistribution):
+    """rsl_rl's, sampled without the check of the deviations, for which torch would wait for the device each tick."""
 
     def sample(self) -> torch.Tensor:
         """Sample, shape [rows, actions]."""
@@ -28,7 +28,7 @@ class _Gaussian(GaussianDistribution):
 
 
 class TrackerActor(MLPModel):
-    """rsl-rl's model interface around a network of `trackers.interface`."""
+    """rsl_rl's model interface around an interface's network."""
 
     def __init__(
         self,
@@ -49,9 +49,9 @@ class TrackerActor(MLPModel):
             obs_groups: Groups of observations by set.
             obs_set: The set that this model reads.
             output_dim: Width of the action.
-            interface: `twist2` or `sonic`.
+            interface: Name of the interface.
             network: Widths (`Interface.make_network`).
-            init_std: Standard deviation of the action noise at the start.
+            init_std: Initial standard deviation of the action noise.
             std_range: Bounds of the standard deviation.
         """
         nn.Module.__init__(self)
@@ -62,7 +62,7 @@ class TrackerActor(MLPModel):
             raise ValueError(
                 f"interface {interface}: {self.obs_dim} observations, the network takes {self.net.obs_width}"
             )
-        self.distribution = _Gaussian(output_dim, init_std=init_std, std_range=std_range, std_type="log")
+        self.distribution = UncheckedGaussian(output_dim, init_std=init_std, std_range=std_range, std_type="log")
 
     def forward(
         self,
@@ -79,11 +79,11 @@ class TrackerActor(MLPModel):
         return self.distribution.sample()
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """Take a batch of observations into the network's input statistics."""
+        """Add a batch of observations to the network's input statistics."""
         self.net.update_norm(self._pick(obs))
 
     def counts(self) -> dict[str, torch.Tensor]:
-        """How many observations each input statistic has seen, by module; no part of the weights."""
+        """Number of observations behind each input statistic, by module; not a part of the weights."""
         return {n: m.count for n, m in self.net.named_modules() if isinstance(m, networks.InputNorm)}
 
     def _pick(self, obs: TensorDict) -> torch.Tensor:
@@ -92,10 +92,10 @@ class TrackerActor(MLPModel):
 
 
 class TrackerCritic(MLPModel):
-    """rsl-rl's critic with the input statistics of the trackers, which never move in memory: a graph may hold them."""
+    """rsl_rl's critic with the trackers' input statistics, whose addresses never change: a CUDA graph may use them."""
 
     def __init__(self, *args: Any, **kwargs: Any):
-        """Take rsl-rl's arguments."""
+        """Take rsl_rl's arguments."""
         super().__init__(*args, **kwargs)
         if self.obs_normalization:
             self.obs_normalizer = networks.InputNorm(self.obs_dim)

@@ -10,11 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from arena_newton.errors import InputError
+from arena_newton.trackers.interface import names
 
 __all__ = [
     "FAMILY_WEIGHTS",
@@ -44,7 +45,7 @@ def at_least(low: float) -> dict[str, tuple[float, float]]:
 class TrainOptions:
     """Train a tracker with PPO in the lab world."""
 
-    tracker: Literal["twist2", "sonic"] = "twist2"
+    tracker: Annotated[str, tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(names()))] = "twist2"
     """Interface to train."""
     worlds: int = field(default=8192, metadata=at_least(1))
     """Parallel worlds of each process."""

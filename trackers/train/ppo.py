@@ -28,7 +28,7 @@ _WARM = 3
 _LARGEST_CUT, _LARGEST_RISE = 0.6, 1.15
 """Bounds of the factor on the learning rate: the divergence of one iteration is a noisy measure."""
 _MIRRORED = 4
-"""One row in so many is mirrored for the mirror loss: a second pass of the actor costs time."""
+"""One row in four is mirrored for the mirror loss: the second pass of the actor costs time."""
 
 
 class TrackerPPO(PPO):
@@ -75,7 +75,7 @@ class TrackerPPO(PPO):
         return iteration
 
     def _fit_optimizer(self) -> None:
-        """On CUDA the optimiser keeps its rate and its counts there, so that a graph can hold a step; elsewhere not."""
+        """On CUDA the optimiser keeps its rate and its counts on the device, so that a graph can hold a step."""
         self.captured = None
         on_cuda = self.stream is not None
         for group in self.optimizer.param_groups:
@@ -107,7 +107,7 @@ class TrackerPPO(PPO):
 
     @contextlib.contextmanager
     def _own_stream(self) -> Iterator[None]:
-        """A graph of gradients must be recorded on the stream on which the parameters met autograd before."""
+        """Gradients must be captured on the stream on which autograd used the parameters before."""
         if self.stream is None:
             yield
             return

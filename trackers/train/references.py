@@ -1,4 +1,4 @@
-"""Reference motions on the device, packed so that one gather a tick fetches a whole frame of every world."""
+"""Reference motions on the device, packed so that one gather per tick fetches a whole frame of every world."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KEY_LINKS: tuple[str, ...] = (
     "left_wrist_yaw_link",
     "right_wrist_yaw_link",
 )
-"""Links whose places are rewarded; the feet come first."""
+"""Links whose positions are rewarded; the feet come first."""
 FEET = slice(0, 2)
 """The feet among `KEY_LINKS`."""
 _CHUNK = 1 << 16

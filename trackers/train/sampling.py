@@ -1,6 +1,6 @@
 """Where episodes start: clips and their phases, more often where the tracker fails.
 
-Clips are cut into bins of one second. A bin's weight is the share of its family, spread over the family's frames, times
+Clips are cut into bins of one second. A bin's weight is its family's weight, spread over the family's frames, times
 a factor that grows with its failure rate. All statistics live on the device; the table is renewed once an iteration.
 """
 
@@ -18,15 +18,15 @@ __all__ = ["ClipSampler"]
 BIN = 50
 """Frames of a bin."""
 LEAD = 50
-"""An episode may start so many frames before its bin, for what leads to a fall lies before it."""
+"""Largest number of frames by which an episode starts ahead of its bin: the cause of a fall precedes it."""
 TAIL = 25
-"""Frames that an episode has at least before its clip ends."""
+"""Smallest number of frames from the start of an episode to the end of its clip."""
 PRIOR = 10.0
-"""Seconds of evidence of the family that stand beside a bin's own."""
+"""Weight of the family's failure rate against a bin's own evidence [s]."""
 FORGET = 0.99
-"""What is kept of the evidence each iteration."""
+"""Fraction of the evidence that is kept per iteration."""
 CEILING = 5.0
-"""Largest factor of a bin over the mean: what no tracker can follow shall not take all the time."""
+"""Largest factor of a bin over the mean: clips that no tracker can follow must not take all the time."""
 
 
 class ClipSampler:
@@ -37,13 +37,13 @@ class ClipSampler:
 
         Args:
             bank: The references.
-            adaptive: Share of the starts that go by failure rate, 0 to 1.
+            adaptive: Fraction of the starts that are sampled by failure rate, 0 to 1.
             family_weights: Weights of families by name relative to their seconds of motion; 1 where not named.
         """
         self.bank, self.adaptive = bank, adaptive
         first = bank.data.index_select(0, bank.start).cpu().numpy().tobytes()
         self.library = hashlib.sha256(bank.length.cpu().numpy().tobytes() + first).hexdigest()[:16]
-        """Tells libraries apart, by the lengths and the first frames of their clips."""
+        """Hash of the library: lengths and first frames of its clips."""
         device = bank.start.device
         bins = (bank.length + BIN - 1) // BIN
         clip = torch.repeat_interleave(torch.arange(len(bins), device=device), bins)
@@ -72,7 +72,7 @@ class ClipSampler:
 
         Args:
             frame: Frame reached, shape [worlds].
-            failed: Whether the world fell out of its reference, bool, shape [worlds].
+            failed: Whether the world lost its reference, bool, shape [worlds].
             tick: Length of the tick [s].
         """
         bins = self.bin_of.index_select(0, frame)
@@ -87,7 +87,7 @@ class ClipSampler:
         return torch.minimum(torch.maximum(frame, self.earliest[bins]), self.latest[bins])
 
     def renew(self) -> None:
-        """Recompute the weights from the evidence, and let old evidence fade."""
+        """Recompute the weights from the evidence, and discount the evidence."""
         self.family_seconds.zero_().index_add_(0, self.family, self.seconds)
         self.family_failures.zero_().index_add_(0, self.family, self.failures)
         rate = (self.failures.sum() + 1.0) / (self.seconds.sum() + 10.0)
@@ -115,7 +115,7 @@ class ClipSampler:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> bool:
-        """Take up the evidence of a checkpoint; False where it is of another library and stays out."""
+        """Load the evidence of a checkpoint; False, and nothing is loaded, where it is of another library."""
         if state.get("library") != self.library:
             return False
         self.seconds.copy_(state["seconds"])

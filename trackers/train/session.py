@@ -19,10 +19,8 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError, naming
-from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.trackers import interface
-from arena_newton.trackers.front_end import FrontEnd
 from arena_newton.trackers.inference import weights_file
+from arena_newton.trackers.interface import get
 from arena_newton.trackers.motions import programs
 from arena_newton.trackers.motions.formats import read_library
 from arena_newton.trackers.motions.library import MotionLibrary
@@ -34,21 +32,7 @@ from arena_newton.trackers.train.runner import TrackerRunner
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 
-__all__ = ["build", "check_folder", "front_end", "make_library", "train"]
-
-
-def front_end(tracker: str, action_form: str = "auto") -> tuple[FrontEnd, DriveGains, PhysicsRate]:
-    """Front end, drive and physics rate of an interface.
-
-    Args:
-        tracker: `twist2` or `sonic`.
-        action_form: `auto`, `residual` or `default`.
-
-    Raises:
-        InputError: Another interface or form.
-    """
-    kind = interface.get(tracker)
-    return kind.front_end(kind.action_form(action_form)), kind.drive, kind.rate
+__all__ = ["build", "check_folder", "make_library", "train"]
 
 
 def make_library(options: TrainOptions, device: str, seed: int) -> MotionLibrary:
@@ -123,8 +107,8 @@ def _card(options: TrainOptions, library: MotionLibrary, env: TrackerEnv, proces
         data={"clips": library.clips, "families": families, "mirrored": options.mirror, "sources": sources[:64]},
         licences={str(n): int(c) for n, c in zip(*np.unique(library.licence, return_counts=True), strict=True)},
         action_form=dataclasses.asdict(env.front_end.action_form),
-        drive=dataclasses.asdict(env.drive),
-        physics=dataclasses.asdict(env.sim.rate),
+        drive=dataclasses.asdict(env.interface.drive),
+        physics=dataclasses.asdict(env.interface.rate),
         rewards={name: term.weight for name, term in env.rewards.items()},
     )
 
@@ -191,8 +175,11 @@ def build(options: TrainOptions) -> TrackerRunner:
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
     rewards = configured(options.rewards, options.reward_scales)
+    with naming("--tracker"):
+        interface = get(options.tracker)
     device = _device(options.device)
-    checkpoint, form = _checkpoint(options)
+    checkpoint, kind = _checkpoint(options)
+    form = interface.action_form(kind)
     if not options.bench:
         check_folder(options)
     rank, processes = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
@@ -202,9 +189,8 @@ def build(options: TrainOptions) -> TrackerRunner:
     began = time.monotonic()
     library = make_library(options, device, options.seed + 1000 * rank)
     generated = time.monotonic()
-    front, drive, rate = front_end(options.tracker, form)
     weights = _family_weights(options, library)
-    env = TrackerEnv(front, drive, rate, library.to(device), options, device, rewards=rewards, family_weights=weights)
+    env = TrackerEnv(interface, form, library.to(device), options, device, rewards=rewards, family_weights=weights)
     if rank == 0:
         print(
             f"{library.clips} clips, {library.seconds.sum() / 60.0:.1f} min of motion in {generated - began:.1f} s; "
@@ -220,11 +206,7 @@ def _runner(env: TrackerEnv, options: TrainOptions, card: Card, checkpoint: Chec
     """The runner, at the state from which it is to go on."""
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints both networks layer by layer
         runner = TrackerRunner(
-            env,
-            options,
-            interface.get(options.tracker).make_network().config(),
-            card,
-            None if options.bench else options.log_dir,
+            env, options, env.interface.make_network().config(), card, None if options.bench else options.log_dir
         )
     if checkpoint is not None:
         with naming("--resume"):

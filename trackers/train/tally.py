@@ -1,4 +1,4 @@
-"""Counters of a training: sums on the device, fetched once an iteration, and the guard against non-finite numbers."""
+"""Counters of a training: sums on the device, fetched once per iteration, and the guard against non-finite numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["ERRORS", "Tally", "TrainingError"]
 
 
 class TrainingError(ArenaError):
-    """Training cannot go on."""
+    """Training cannot continue."""
 
 
 def _rms(difference: torch.Tensor) -> torch.Tensor:
@@ -30,9 +30,9 @@ ERRORS: dict[str, Callable[[TickMeasurement], torch.Tensor]] = {
     "position_m": lambda m: m.position_error[:, :2].norm(dim=1),
     "heading_rad": lambda m: m.heading_error.abs(),
 }
-"""Tracking errors that are logged beside the rewards."""
+"""Tracking errors that are logged next to the rewards."""
 _LARGEST_ERROR = 100.0
-"""An error counts at most so much: one exploding world shall not hide the others."""
+"""Largest error that counts: one exploding world must not hide the others."""
 
 
 class Tally:
@@ -69,7 +69,7 @@ class Tally:
         Args:
             motion: The tick.
             earned: Weighted reward of each term, shape [worlds, terms].
-            ends: Which termination terms struck, bool, shape [worlds, terms].
+            ends: Which termination terms ended the episode, bool, shape [worlds, terms].
             failed: Whether the episode ended early, bool, shape [worlds].
             family: Family of the clip, shape [worlds].
             overflow: Non-zero where a contact buffer was full, shape [worlds].
@@ -86,7 +86,7 @@ class Tally:
         sums["overflow"].add_((overflow != 0).sum())
 
     def guard(self, values: torch.Tensor, *others: torch.Tensor) -> None:
-        """Remember a world for each guarded thing that is not finite.
+        """Remember a world for each guarded quantity that is not finite.
 
         Args:
             values: Reward terms, shape [worlds, terms].
@@ -102,10 +102,10 @@ class Tally:
         self._bad_world.fill_(-1)
 
     def collect(self) -> dict[str, float]:
-        """Means by name; waits for the device, then starts anew.
+        """Means by name; waits for the device, then clears the sums.
 
         Raises:
-            TrainingError: A guarded thing was not finite.
+            TrainingError: A guarded quantity was not finite.
         """
         packed = torch.cat([*self._sums.values(), self._bad_world.float()]).tolist()
         self.clear()

@@ -1,4 +1,4 @@
-"""The training environment: one class for all tracker interfaces, rsl-rl's `VecEnv`.
+"""The training environment: one class for all tracker interfaces, rsl_rl's `VecEnv`.
 
 A tick: raw actions become joint targets through the tracker's own front end, the physics advances 20 ms, the new state
 is rewarded against the reference frame that was commanded, worlds that ended start again elsewhere in the library, and
@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from arena_newton import rotations
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
-from arena_newton.robot import DEFAULT_POSE, TICK, DriveGains, PhysicsRate
+from arena_newton.robot import DEFAULT_POSE, TICK
 from arena_newton.trackers.train import critic, events
 from arena_newton.trackers.train.graphs import captured
 from arena_newton.trackers.train.measurement import TickMeasurement
@@ -34,6 +34,7 @@ from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
 
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
+    from arena_newton.trackers.interface import ActionForm, Interface
     from arena_newton.trackers.motions.library import DeviceLibrary
 
 __all__ = ["TrackerEnv"]
@@ -41,7 +42,7 @@ __all__ = ["TrackerEnv"]
 _PREFILL = 0.5
 """Fraction of the episodes that start with a history of the current frame; the others start with an empty one."""
 NO_PUSH = 1e3
-"""`since_push` of an episode in which none has struck yet [s]."""
+"""`since_push` of an episode without a push so far [s]."""
 
 
 class TrackerEnv(VecEnv):
@@ -60,9 +61,8 @@ class TrackerEnv(VecEnv):
 
     def __init__(
         self,
-        front_end: FrontEnd,
-        drive: DriveGains,
-        rate: PhysicsRate,
+        interface: Interface,
+        form: ActionForm,
         library: DeviceLibrary,
         options: TrainOptions,
         device: str = "cpu",
@@ -76,9 +76,8 @@ class TrackerEnv(VecEnv):
         """Build the worlds.
 
         Args:
-            front_end: Observation and action of the tracker, not yet bound.
-            drive: Gains of the tracker.
-            rate: Physics rate of the tracker.
+            interface: Front end, drive and physics rate of the tracker.
+            form: How raw actions become joint targets.
             library: References on `device`.
             options: Number of worlds, length of the episodes, buffers and switches.
             device: `cpu` or `cuda:N`.
@@ -91,9 +90,10 @@ class TrackerEnv(VecEnv):
         self.cfg = options
         self.num_envs = worlds = options.worlds
         self.device = device
-        self.num_actions = front_end.action_width
         self.max_episode_length = round(options.episode_s / TICK)
-        self.front_end, self.drive = front_end, drive
+        self.interface = interface
+        self.front_end = front_end = interface.front_end(form)
+        self.num_actions = front_end.action_width
         self.rewards, self.terminations = dict(rewards), dict(terminations)
         self.events = dict(randomisation) if options.randomise else {}
         self.critic = dict(critic_terms)
@@ -104,8 +104,8 @@ class TrackerEnv(VecEnv):
         self.sim = Simulation(
             worlds,
             device,
-            drive,
-            rate,
+            interface.drive,
+            interface.rate,
             contacts_per_world=options.contacts_per_world,
             constraints_per_world=options.constraints_per_world,
             graph=options.graph,
@@ -165,7 +165,7 @@ class TrackerEnv(VecEnv):
 
     @torch.no_grad()
     def _capture(self) -> None:
-        """Hold what a tick does around the physics in two CUDA graphs."""
+        """Capture the parts of a tick before and after the physics in two CUDA graphs."""
         for _ in range(3):
             self.step(self.reference_action())
         torch.cuda.synchronize(self.device)
@@ -183,7 +183,7 @@ class TrackerEnv(VecEnv):
         else:
             graph.replay()
 
-    # -- rsl-rl's interface -----------------------------------------------------------------------------------------
+    # -- rsl_rl's interface -----------------------------------------------------------------------------------------
 
     def get_observations(self) -> TensorDict:
         """Observations of the current state: groups `actor` and `critic`."""
@@ -220,13 +220,13 @@ class TrackerEnv(VecEnv):
         return self.get_observations(), self._reward, self._done, {"time_outs": self._time_out}
 
     def _before(self) -> None:
-        """Raw actions become targets, some of them a tick late."""
+        """Turn raw actions into targets, some of them one tick late."""
         targets = self.front_end.act(self._action)
         self.sim.targets.copy_(torch.where(self.delay[:, None], self._targets, targets))
         self._targets.copy_(targets)
 
     def _after(self) -> None:
-        """The new state is judged, ended worlds start again, the next observations are made."""
+        """Judge the new state, start ended worlds again, make the next observations."""
         self.frame.add_(1)
         self.episode_length_buf.add_(1)
         self.since_push.add_(TICK)
@@ -245,7 +245,7 @@ class TrackerEnv(VecEnv):
         self._observe(done)
 
     def reference_action(self) -> torch.Tensor:
-        """The raw action that asks for the next reference frame's joints, shape [worlds, actions]."""
+        """The raw action whose targets are the next reference frame's joints, shape [worlds, actions]."""
         form = self.front_end.action_form
         if form.kind == "residual":
             return torch.zeros(self.num_envs, self.num_actions, device=self.device)
@@ -253,7 +253,7 @@ class TrackerEnv(VecEnv):
         return asked.index_select(1, self._raw_order)
 
     def collect(self) -> dict[str, float]:
-        """Means since the last call, by name, and new sampling weights; waits for the device once.
+        """Means since the last call by name; renews the sampling weights and waits for the device once.
 
         Raises:
             TrainingError: A reward term, an observation or an action was not finite.
@@ -280,7 +280,7 @@ class TrackerEnv(VecEnv):
     def _judge(self, m: TickMeasurement) -> tuple[torch.Tensor, torch.Tensor]:
         """Reward [worlds] and early ends [worlds] of a tick; adds to the counters."""
         values = torch.stack([term.value(m) for term in self.rewards.values()], 1)
-        # What a broken physics state spoils is no fault of a term: the world ends and earns nothing.
+        # A state that is not finite is not a term's fault: the world's episode ends and earns nothing.
         values = torch.where(m.finite[:, None], values, 0.0)
         assert self._critic_obs is not None
         self.tally.guard(values, self.front_end.obs, self._critic_obs, self._action)

@@ -7,19 +7,20 @@ import json
 import os
 import pkgutil
 import signal
+import socket
 import subprocess
 import sys
 
 import pytest
 import torch
+import tyro
 from PIL import Image
 
 from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import train
+from arena_newton.trackers import interface, train
 from arena_newton.trackers.inference import weights_file
-from arena_newton.trackers.sonic import SonicFrontEnd
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
@@ -31,17 +32,17 @@ from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.tracker_env import TrackerEnv
-from arena_newton.trackers.twist2 import Twist2FrontEnd, Twist2Tracker
+from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
+TWIST2 = interface.get("twist2")
 
 
 @pytest.fixture(scope="module")
 def env(library):
     """Eight worlds with all of the randomisation."""
     torch.manual_seed(0)
-    front, drive, rate = session.front_end("twist2")
-    made = TrackerEnv(front, drive, rate, library.to("cpu"), TrainOptions(worlds=WORLDS), "cpu")
+    made = TrackerEnv(TWIST2, TWIST2.action_form("auto"), library.to("cpu"), TrainOptions(worlds=WORLDS))
     made.library = library.to("cpu")
     return made
 
@@ -68,8 +69,7 @@ def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
 def test_a_rollout_does_not_wait_for_the_device(library):
     """Torch reports each wait as an error: from observation to action to reward there is none."""
     share_stream("cuda:0")
-    front, drive, rate = session.front_end("twist2")
-    env = TrackerEnv(front, drive, rate, library.to("cuda:0"), TrainOptions(worlds=WORLDS), "cuda:0")
+    env = TrackerEnv(TWIST2, TWIST2.action_form("auto"), library.to("cuda:0"), TrainOptions(worlds=WORLDS), "cuda:0")
     algorithm = make_runner(env).alg
     obs = env.get_observations()
     try:
@@ -169,9 +169,8 @@ def test_reward_improves(env):
     torch.manual_seed(0)
     wanted = Term(lambda motion: (motion.action[:, 0] - 1.0).square(), -5.0)
     easy = TrackerEnv(
-        session.front_end("twist2")[0],
-        TWIST2_DRIVE,
-        PhysicsRate(0.005, 4),
+        TWIST2,
+        TWIST2.action_form("auto"),
         env.library,
         TrainOptions(worlds=WORLDS, randomise=False),
         "cpu",
@@ -292,10 +291,8 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
         (lambda state: state.update(critic_state_dict={"old": torch.zeros(1)}), "a checkpoint of another version"),
         (lambda state: state.update(network={"hidden": [8]}), "a network of other widths"),
         (lambda state: state["critic_widths"].update(height=2), "its critic term height has width 2, here it has 1"),
-        (
-            lambda state: state["critic_widths"].update(new=state["critic_widths"].pop("height")),
-            "term height has width 0",
-        ),
+        (lambda state: state["critic_widths"].update(new=3), "its critic term new has width 3, here it has 0"),
+        (lambda state: state["critic_widths"].update(height=state["critic_widths"].pop("height")), "in another order"),
         (lambda state: state.pop("rng"), "it lacks rng"),
         (lambda state: state["card"].pop("licences"), "it lacks licences"),
         (lambda state: state.update(card=5), "not a checkpoint of this training"),
@@ -430,27 +427,42 @@ def test_the_end_of_a_time_limit_is_annealed(env):
     assert (runner.alg.desired_kl, runner.alg.entropy_coef) == pytest.approx((0.01, 0.005))
 
 
-def test_two_processes_train_one_network(library, tmp_path):
-    """Torchrun on the CPU: both processes end after the same iteration with the same network and input statistics."""
+SECOND_PROCESS = """
+import sys, torch, tyro
+from arena_newton.trackers.train import session
+from arena_newton.trackers.train.options import TrainOptions
+options = tyro.cli(TrainOptions, args=sys.argv[2:])
+runner = session.build(options)
+runner.learn(options.iterations)
+torch.save(runner.alg.get_policy().state_dict(), sys.argv[1])
+"""
+
+
+def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
+    """As under torchrun on the CPU: both processes end with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
     flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "1", "--no-mirror"]
     flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
-    script = tmp_path / "train.py"
-    script.write_text(
-        "import os, sys, torch\n"
-        "from arena_newton.trackers.train import session\n"
-        "from arena_newton.trackers.train.options import TrainOptions\n"
-        "import tyro\n"
-        "options = tyro.cli(TrainOptions, args=sys.argv[1:])\n"
-        "runner = session.build(options)\n"
-        "runner.learn(options.iterations)\n"
-        f"torch.save(runner.alg.get_policy().state_dict(), {str(tmp_path)!r} + '/rank' + os.environ['RANK'])\n"
-        "torch.distributed.destroy_process_group()\n"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+    command = [sys.executable, "-c", SECOND_PROCESS, str(tmp_path / "second.pt"), *flags]
+    second = subprocess.Popen(
+        command, env=os.environ | group | {"RANK": "1", "LOCAL_RANK": "1"}, stderr=subprocess.PIPE
     )
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    done = subprocess.run([*command, *flags], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-2000:]
-    one, two = (torch.load(tmp_path / f"rank{k}", weights_only=True) for k in (0, 1))
+    for name, value in (group | {"RANK": "0", "LOCAL_RANK": "0"}).items():
+        monkeypatch.setenv(name, value)
+    precision = torch.get_float32_matmul_precision()
+    try:
+        runner = session.build(tyro.cli(TrainOptions, args=flags))
+        runner.learn(1)
+        assert second.wait(300) == 0, second.stderr.read().decode()[-2000:]
+    finally:
+        second.kill()
+        torch.set_float32_matmul_precision(precision)
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+    one, two = runner.alg.get_policy().state_dict(), torch.load(tmp_path / "second.pt", weights_only=True)
     assert one.keys() == two.keys()
     for name, value in one.items():
         assert torch.equal(value, two[name]), name
@@ -532,12 +544,10 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
 
 def test_what_is_no_interface_is_refused():
     """A tracker or an action form that training does not know is named, not taken for another."""
-    with pytest.raises(InputError, match="--tracker nosuch: .*there are twist2, sonic"):
-        session.front_end("nosuch")
+    with pytest.raises(InputError, match=r"--tracker .*nosuch.*sonic, twist2"):
+        session.build(TrainOptions(tracker="nosuch"))
     with pytest.raises(InputError, match="--action-form nosuch: expected auto, residual or default"):
-        session.front_end("sonic", "nosuch")
-    for name, kind in (("twist2", Twist2FrontEnd), ("sonic", SonicFrontEnd)):
-        assert type(session.front_end(name)[0]) is kind and type(session.front_end(name, "default")[0]) is kind
+        session.build(TrainOptions(action_form="nosuch"))
 
 
 def test_training_options_have_one_default():

@@ -10,8 +10,8 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.logger import Logger
 
-from arena_newton.trackers.train import model
 from arena_newton.trackers.train.logger import DeviceLogger
+from arena_newton.trackers.train.model import TrackerActor, TrackerCritic, UncheckedGaussian
 from arena_newton.trackers.train.ppo import TrackerPPO
 from arena_newton.trackers.train.runner import TrackerRunner
 from arena_newton.trackers.train.tracker_env import TrackerEnv
@@ -21,9 +21,9 @@ PAIRS = (
     (TrackerPPO, PPO),
     (DeviceLogger, Logger),
     (TrackerEnv, VecEnv),
-    (model.TrackerActor, MLPModel),
-    (model.TrackerCritic, MLPModel),
-    (model._Gaussian, GaussianDistribution),
+    (TrackerActor, MLPModel),
+    (TrackerCritic, MLPModel),
+    (UncheckedGaussian, GaussianDistribution),
 )
 UPSTREAM: dict[str, str] = {
     "OnPolicyRunner.__init__": "self env train_cfg log_dir device",
