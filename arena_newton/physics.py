@@ -1,6 +1,6 @@
 """The physics of a batch of worlds: native MuJoCo on the CPU, or mujoco_warp on CUDA and the Warp CPU backend.
 
-Both engines step the model that Newton compiled from the USD stage; `physics_batch.Physics` is what they share.
+Both engines step the model that Newton compiled from the USD stage; `physics_batch.Physics` is their interface.
 """
 
 from __future__ import annotations

@@ -20,6 +20,8 @@ from arena_newton.kernels import latch, newton_state
 from arena_newton.scene import Scene
 
 if TYPE_CHECKING:
+    import newton
+
     from arena_newton.robot import PhysicsRate
 
 __all__ = ["Physics"]
@@ -158,8 +160,8 @@ class Physics(ABC):
         """Lock the door's latch again in the worlds of a mask; int32 Warp array [worlds], 1 = lock."""
         latch.launch_lock(mask, self.latch_locked)
 
-    def write_newton_state(self, state: Any) -> None:
-        """Write body poses into a `newton.State` (for rendering)."""
+    def write_newton_state(self, state: newton.State) -> None:
+        """Write body poses into a Newton state (for rendering)."""
         newton_state.launch_body_q(self.xpos, self.xquat, self._newton_bodies, state.body_q)
 
     def _reset_all(self) -> None:

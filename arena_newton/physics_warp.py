@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import mujoco
 import mujoco_warp
@@ -232,7 +231,7 @@ def _own_batch(scene: Scene, rate: PhysicsRate) -> tuple[mujoco_warp.Model, mujo
     return model, data
 
 
-def _cloned(value: Any) -> Any:
+def _cloned[T](value: T) -> T:
     """A deep copy of a struct of Warp arrays; everything else in it is shared."""
     if isinstance(value, wp.array):
         return wp.clone(value)

@@ -317,8 +317,8 @@ def test_official_twist2_walks_the_reference(shared):
     """The official checkpoint reaches 90 % of 0.3 m/s on the generator's walk and goes to a goal."""
     from arena_newton.trackers.base import get
 
-    goal = Cell("near goal", "goal", 13.0, goal=Navigation(1.0, 0.3, 0.5), rollouts=1)
-    cells = [Cell("short walk", "walk", 5.0, primitives.walk(0.3, seconds=5.0)), goal]
+    goal = Cell("near goal", "goal", 9.0, goal=Navigation(0.6, 0.2, 0.4), rollouts=1)
+    cells = [Cell("short walk", "walk", 4.0, primitives.walk(0.3, seconds=4.0)), goal]
     tracker = get("twist2", shared / "reference/twist2/twist2_1017_20k.onnx")
     outcome = play(tracker, make_plan(cells, 2, 0), engine="mujoco", fast_physics=True, threads=1)
     m = outcome.measures

@@ -1,4 +1,4 @@
-"""The lab as a batch of worlds that differ: friction, payload, forces on the chest, and what stands on the floor.
+"""The lab as a batch of worlds that differ: friction, payload, forces on the chest, supports and a ball.
 
 The state is given as torch views of the engine's own buffers, and on CUDA nothing here waits for the device after the
 start.

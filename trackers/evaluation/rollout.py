@@ -172,7 +172,7 @@ def _start(plan: Plan, tables: Tables) -> Start:
 
 
 class _Forces:
-    """Forces on the chests by tick, made on the device."""
+    """Forces on the chests per tick, computed on the device."""
 
     def __init__(self, plan: Plan, device: torch.device):
         w = len(plan.cell)
@@ -212,20 +212,19 @@ class _Goals:
         self.goal = torch.tensor([[g.x, g.y, g.yaw] for g in goals if g is not None], device=device)
         self._generator = ReferenceGenerator(len(rows), device)
         self._navigator = Navigator(len(rows), device, NavigationLimits())
-        self._neutral = MotionCommand.neutral(len(rows), device)
+        self._command = MotionCommand.neutral(len(rows), device)
 
     def begin(self, pose: torch.Tensor) -> None:
-        """Start at measured poses x, y, yaw, [worlds, 3]."""
+        """Start at measured poses x, y, yaw [m, rad], shape [worlds, 3]."""
         here = pose.index_select(0, self.rows)
         self._generator.reset(root_xy=here[:, :2], yaw=here[:, 2])
         self._navigator.reset()
 
     def write(self, pose: torch.Tensor, actions: torch.Tensor) -> None:
-        """Put this tick's actions of the goal worlds into `actions` [worlds, 40]."""
+        """Write this tick's actions of the goal worlds into `actions` [worlds, 40]."""
         here = pose.index_select(0, self.rows)
-        asked = self._navigator.command(here, self.goal, g1.TICK)
-        self._neutral.velocity = asked.velocity
-        self._generator.step(self._neutral)
+        self._command.velocity = self._navigator.command(here, self.goal, g1.TICK).velocity
+        self._generator.step(self._command)
         actions.index_copy_(0, self.rows, self._generator.action())
 
 
@@ -382,7 +381,7 @@ def _add_goals(measures: dict[str, np.ndarray], plan: Plan) -> None:
     wanted = np.array([(g.x, g.y, g.yaw) if g is not None else (np.nan,) * 3 for g in goals])
     offset = np.stack([measures["end_x"], measures["end_y"]], axis=1) - wanted[:, :2]
     turn = measures["end_yaw"] - wanted[:, 2]
-    # The reference of a goal follows the robot, so that its distance from it says nothing.
+    # The reference of a goal follows the robot, so that the distance between them is not an error.
     for name in ("drift", "drift_10s", "heading_error", "velocity_error"):
         measures[name] = np.where(np.isfinite(wanted[:, 0]), np.nan, measures[name])
     measures["goal_distance"] = np.linalg.norm(offset, axis=1)
