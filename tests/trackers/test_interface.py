@@ -18,7 +18,7 @@ from arena_newton.trackers.evaluation.rollout import Outcome, plan
 from arena_newton.trackers.front_end import NetworkTracker
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, mlp
-from arena_newton.trackers.train.session import front_end
+from arena_newton.trackers.train.options import TrainOptions, check
 
 RATE = PhysicsRate(dt=0.005, substeps=4)
 
@@ -70,9 +70,11 @@ def small(monkeypatch):
 
 def test_training_finds_it(small):
     """Training's front end, drive and physics rate are those of the record."""
-    front, drive, rate = front_end("small")
-    assert isinstance(front, SmallFrontEnd) and (drive, rate) == (small.drive, RATE)
+    found = interface.get("small")
+    front = found.front_end(found.action_form("residual"))
+    assert isinstance(front, SmallFrontEnd) and (found.drive, found.rate) == (small.drive, RATE)
     assert "small" in interface.names() and front.obs_width == small.obs_width
+    check(TrainOptions(tracker="small"))
 
 
 def test_weights_round_trip(small, tmp_path):
@@ -91,7 +93,7 @@ def test_weights_round_trip(small, tmp_path):
 
 def test_figures_apply_its_bars(small):
     """Its bar of the fall rate applies to it; bars that it does not name do not."""
-    played = plan(suite("full"), 1, 0)
+    played = make_plan(suite("full"), 1, 0)
     worlds = len(played.cell)
     names = "leg_rmse drift_10s lowest speed_x ref_x goal_distance goal_turn seat_time end_z end_x support_x touch"
     measures = {name: np.full(worlds, 0.05) for name in [*names.split(), "ball_peak", "ball_end"]}
