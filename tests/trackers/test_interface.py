@@ -14,7 +14,7 @@ from arena_newton.robot import PhysicsRate
 from arena_newton.trackers import interface, sonic, twist2
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.figures import Result, figures
-from arena_newton.trackers.evaluation.rollout import Outcome, plan
+from arena_newton.trackers.evaluation.rollout import Outcome, make_plan
 from arena_newton.trackers.front_end import NetworkTracker
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, mlp
