@@ -25,6 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels import canonical
 from arena_newton.kernels import tick as kernels
+from arena_newton.kernels.launching import record
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import Physics, Tracker
@@ -121,6 +122,7 @@ class TrackerLoop:
         self._prefill = np.zeros(self.worlds, dtype=bool)
         self._ticking = WorldMask(self.worlds, self.device)
         self._chosen = WorldMask(self.worlds, self.device)
+        self._integrate, self._drive = record(self._launch_integrate), record(self._launch_drive)
         self._takes_mask = "mask" in inspect.signature(tracker.step).parameters
         tracker.bind(self.worlds, self.torch_device)
 
@@ -132,6 +134,20 @@ class TrackerLoop:
 
     def _indices(self, values: Sequence[int] | np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.long, device=self.torch_device)
+
+    def _launch_integrate(self) -> None:
+        """Check the actions and integrate them into the reference."""
+        canonical.launch_validate_action(self._action, self.bad_action)
+        kernels.launch_sanitize(self.bad_action, self._stand, self._action)
+        turn = self.tracker.max_root_delta_deg
+        canonical.launch_integrate(self.reference, self._action, self._ticking.warp, turn)
+
+    def _launch_drive(self) -> None:
+        """Check the targets and write them into the actuators."""
+        ctrl, fingers = self.physics.ctrl, (self._hand_ctrl, self._hand_open, self._hand_close)
+        kernels.launch_check_targets(self._targets, self._joint_ctrl, ctrl, self.bad_targets)
+        hands, mask = self.reference.hands, self._ticking.warp
+        kernels.launch_write_ctrl(self._targets, self._joint_ctrl, hands, *fingers, mask, ctrl)
 
     def anchor(self, mask: np.ndarray) -> None:
         """Take heading and reference of the masked worlds from the robot as it is now."""
@@ -163,12 +179,10 @@ class TrackerLoop:
         Raises:
             InputError: The tracker's answer is not a float32 tensor of one row per world.
         """
-        ticking = self._ticking.choose(mask)
+        ticking = self._ticking.choose(mask).torch
         if action is not self.action:
             self.action.copy_(action)
-        canonical.launch_validate_action(self._action, self.bad_action)
-        kernels.launch_sanitize(self.bad_action, self._stand, self._action)
-        canonical.launch_integrate(self.reference, self._action, ticking.warp, self.tracker.max_root_delta_deg)
+        self._integrate()
         command, state = self.command, self.state
         torch.index_select(self._ref_joints, 1, self._to_mujoco, out=command.joints)
         torch.index_select(self._ref_vel, 1, self._to_mujoco, out=command.joint_vel)
@@ -181,20 +195,10 @@ class TrackerLoop:
         if mask.all():
             self._take(self.tracker.step(command, state))
         elif self._takes_mask:
-            self._take(self.tracker.step(command, state, ticking.torch), ticking.torch)
+            self._take(self.tracker.step(command, state, ticking), ticking)
         else:
-            self._take(self.tracker.step(command, state), ticking.torch)
-        kernels.launch_check_targets(self._targets, self._joint_ctrl, self.physics.ctrl, self.bad_targets)
-        kernels.launch_write_ctrl(
-            self._targets,
-            self._joint_ctrl,
-            self.reference.hands,
-            self._hand_ctrl,
-            self._hand_open,
-            self._hand_close,
-            ticking.warp,
-            self.physics.ctrl,
-        )
+            self._take(self.tracker.step(command, state), ticking)
+        self._drive()
         return self.targets
 
     def _take(self, targets: torch.Tensor, mask: torch.Tensor | None = None) -> None:

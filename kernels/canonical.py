@@ -51,7 +51,7 @@ MIMIC_JOINTS = wp.constant(6)
 HAND_CLOSED_FROM = wp.constant(0.5)
 """A hand command from here on closes the hand."""
 LEVEL_FLOOR = wp.constant(1.0e-6)
-"""Below this |R22| the reference frame stands on edge and height no longer tells local z: its share is dropped."""
+"""Below this |R22| the reference frame is on its edge and height no longer gives local z: its part is dropped."""
 
 ACTION_NONFINITE = 1
 """Flag of `launch_validate_action`: a number of the action is NaN or infinite."""
@@ -107,7 +107,7 @@ class ReferencePose:
             device: Warp device.
             canonical_to_mujoco: MuJoCo index of each of the 29 canonical joints (`robot.CANONICAL_TO_MUJOCO`).
             tick: Control period [s] (`robot.TICK`).
-            requires_grad: Whether a `wp.Tape` shall differentiate through the arrays.
+            requires_grad: whether a `wp.Tape` differentiates through the arrays.
         """
 
         def zeros(*shape: int) -> wp.array:
@@ -139,7 +139,7 @@ def state64_kernel(
     heading0: wp.array[float],
     state: wp.array2d[float],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     q = wp.quat_inverse(heading_quat(heading0[w])) * load_quat2(qpos, w, root_qpos_adr + 3)
     r = rot6d_from_quat(q)
@@ -196,7 +196,7 @@ def reset_reference_kernel(
     mimic: wp.array2d[float],
     steps: wp.array[int],
 ):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     if mask[w] == 0:
         return
@@ -274,7 +274,7 @@ def integrate_kernel(
     out_mimic: wp.array2d[float],
     out_steps: wp.array[int],
 ):
-    """One thread a world. Outputs may be the inputs' own arrays; a tape needs them apart."""
+    """One thread per world. Outputs may be the inputs' own arrays; a tape needs separate arrays."""
     w = wp.tid()
     if mask[w] == 0:
         return
@@ -329,7 +329,7 @@ def launch_integrate(
     *,
     out: ReferencePose | None = None,
 ) -> None:
-    """Executes one action a world: advances the reference pose and writes the mimic command.
+    """Executes one action per world: advances the reference pose and writes the mimic command.
 
     Height enters as the difference between consecutive actions (none on the first step), which fixes the local z
     displacement and with it the world xy displacement. Velocities in `mimic` are the action's displacements divided by
@@ -377,7 +377,7 @@ def launch_integrate(
 
 @wp.kernel
 def validate_action_kernel(action: wp.array2d[float], bad: wp.array[int]):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     flag = int(0)
     for i in range(ACTION_SIZE):

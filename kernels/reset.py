@@ -24,7 +24,7 @@ def reset_state_kernel(
     qvel: wp.array2d[float],
     ctrl: wp.array2d[float],
 ):
-    """One thread a world and column."""
+    """One thread per world and column."""
     w, i = wp.tid()
     if mask[w] == 0:
         return
@@ -44,7 +44,7 @@ def reset_mocap_kernel(
     mocap_pos: wp.array3d[float],
     mocap_quat: wp.array3d[float],
 ):
-    """One thread a world and mocap body."""
+    """One thread per world and mocap body."""
     w, i = wp.tid()
     if mask[w] == 0:
         return
@@ -102,7 +102,7 @@ def launch_reset(
 
 @wp.kernel
 def clear_kernel(mask: wp.array[int], counter: wp.array[int]):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     if mask[w] != 0:
         counter[w] = 0
@@ -120,7 +120,7 @@ def launch_clear(mask: wp.array, counter: wp.array) -> None:
 
 @wp.kernel
 def nonfinite_kernel(qpos: wp.array2d[float], qvel: wp.array2d[float], bad: wp.array[int]):
-    """One thread a world."""
+    """One thread per world."""
     w = wp.tid()
     flag = int(0)
     for i in range(qpos.shape[1]):
