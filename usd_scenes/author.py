@@ -57,7 +57,7 @@ def new_stage(path: Path, default_prim: str = "/World", *, gravity: float = 9.81
     return stage
 
 
-def attribute(prim: Usd.Prim, name: str, value, kind: Sdf.ValueTypeName) -> Usd.Attribute:
+def attribute(prim: Usd.Prim, name: str, value: object, kind: Sdf.ValueTypeName) -> Usd.Attribute:
     """Author a custom attribute such as `mjc:solref`."""
     attr = prim.CreateAttribute(name, kind)
     attr.Set(value)
@@ -154,17 +154,17 @@ def box(
 
 
 def sphere(
-    stage,
-    path,
+    stage: Usd.Stage,
+    path: str,
     radius: float,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     *,
-    collide=True,
-    visual=True,
-    look=None,
-    surface=None,
-):
+    collide: bool = True,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
     """A sphere of `radius` [m]."""
     geom = UsdGeom.Sphere.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
@@ -173,19 +173,19 @@ def sphere(
 
 
 def capsule(
-    stage,
-    path,
+    stage: Usd.Stage,
+    path: str,
     radius: float,
     length: float,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
-    axis="Z",
+    axis: str = "Z",
     *,
-    collide=True,
-    visual=True,
-    look=None,
-    surface=None,
-):
+    collide: bool = True,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
     """A capsule of `radius` [m] and cylinder `length` [m] (caps come on top) along local `axis`."""
     geom = UsdGeom.Capsule.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
@@ -196,19 +196,19 @@ def capsule(
 
 
 def cylinder(
-    stage,
-    path,
+    stage: Usd.Stage,
+    path: str,
     radius: float,
     length: float,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
-    axis="Z",
+    axis: str = "Z",
     *,
-    collide=True,
-    visual=True,
-    look=None,
-    surface=None,
-):
+    collide: bool = True,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
     """A cylinder of `radius` [m] and `length` [m] along local `axis`."""
     geom = UsdGeom.Cylinder.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
@@ -219,19 +219,19 @@ def cylinder(
 
 
 def mesh(
-    stage,
-    path,
-    points,
-    faces,
+    stage: Usd.Stage,
+    path: str,
+    points: np.ndarray | Sequence[Vec],
+    faces: np.ndarray | Sequence[Sequence[int]],
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     *,
-    uv=None,
-    collide=False,
-    visual=True,
-    look=None,
-    surface=None,
-):
+    uv: np.ndarray | Sequence[Vec] | None = None,
+    collide: bool = False,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
     """A triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
     geom = UsdGeom.Mesh.Define(stage, path)
     faces = np.asarray(faces, dtype=np.int32)
@@ -251,16 +251,16 @@ def mesh(
 
 
 def quad(
-    stage,
-    path,
+    stage: Usd.Stage,
+    path: str,
     half_x: float,
     half_y: float,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     *,
     repeat: Vec = (1, 1),
-    look=None,
-):
+    look: Usd.Prim | None = None,
+) -> Usd.Prim:
     """A visual rectangle in the local xy plane facing +z, its texture repeated `repeat` times."""
     points = [(-half_x, -half_y, 0), (half_x, -half_y, 0), (half_x, half_y, 0), (-half_x, half_y, 0)]
     uv = [(0, 0), (repeat[0], 0), (repeat[0], repeat[1]), (0, repeat[1])]
@@ -275,7 +275,13 @@ def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0), qu
 
 
 def material(
-    stage, path, color: Vec = (0.8, 0.8, 0.8), *, roughness=0.8, metallic=0.0, texture: str | None = None
+    stage: Usd.Stage,
+    path: str,
+    color: Vec = (0.8, 0.8, 0.8),
+    *,
+    roughness: float = 0.8,
+    metallic: float = 0.0,
+    texture: str | None = None,
 ) -> Usd.Prim:
     """A UsdPreviewSurface look; `texture` is an asset path relative to the layer and replaces the colour."""
     look = UsdShade.Material.Define(stage, path)
@@ -309,7 +315,9 @@ def bind(prim: Usd.Prim, look: Usd.Prim) -> Usd.Prim:
     return prim
 
 
-def physics_material(stage, path, *, static: float = 1.0, dynamic: float = 1.0, restitution: float = 0.0) -> Usd.Prim:
+def physics_material(
+    stage: Usd.Stage, path: str, *, static: float = 1.0, dynamic: float = 1.0, restitution: float = 0.0
+) -> Usd.Prim:
     """A physics material (friction coefficients, restitution)."""
     prim = UsdShade.Material.Define(stage, path).GetPrim()
     api = UsdPhysics.MaterialAPI.Apply(prim)
@@ -327,7 +335,9 @@ def bind_physics(prim: Usd.Prim, surface: Usd.Prim) -> Usd.Prim:
     return prim
 
 
-def camera(stage, path, position: Vec, quat: Vec, *, focal: float, aperture: float, size: Vec = (640, 480)) -> Usd.Prim:
+def camera(
+    stage: Usd.Stage, path: str, position: Vec, quat: Vec, *, focal: float, aperture: float, size: Vec = (640, 480)
+) -> Usd.Prim:
     """A pinhole camera looking along local −z with +y up; `focal` and horizontal `aperture` share a unit."""
     cam = UsdGeom.Camera.Define(stage, path)
     cam.CreateFocalLengthAttr(float(focal))
@@ -339,7 +349,9 @@ def camera(stage, path, position: Vec, quat: Vec, *, focal: float, aperture: flo
     return prim
 
 
-def dome_light(stage, path="/World/Light", *, intensity: float = 3000.0, color: Vec = (0.75, 0.75, 0.75)) -> Usd.Prim:
+def dome_light(
+    stage: Usd.Stage, path: str = "/World/Light", *, intensity: float = 3000.0, color: Vec = (0.75, 0.75, 0.75)
+) -> Usd.Prim:
     """A uniform dome."""
     light = UsdLux.DomeLight.Define(stage, path)
     light.CreateIntensityAttr(float(intensity))
@@ -348,7 +360,12 @@ def dome_light(stage, path="/World/Light", *, intensity: float = 3000.0, color: 
 
 
 def distant_light(
-    stage, path="/World/Light", *, intensity=5000.0, color: Vec = (0.75, 0.75, 0.75), quat: Vec = IDENTITY
+    stage: Usd.Stage,
+    path: str = "/World/Light",
+    *,
+    intensity: float = 5000.0,
+    color: Vec = (0.75, 0.75, 0.75),
+    quat: Vec = IDENTITY,
 ) -> Usd.Prim:
     """A distant light shining along its local −z."""
     light = UsdLux.DistantLight.Define(stage, path)

@@ -9,6 +9,9 @@ from arena_newton import limits
 
 __all__ = ["Arc", "Contents", "count_prims"]
 
+Key = Any
+"""What the caller knows a layer by; hashable."""
+
 
 @dataclass(eq=False)
 class Arc:
@@ -22,7 +25,7 @@ class Arc:
     """The prim that is named; empty for the default prim."""
     of_class: bool = False
     """An inherit or a specialize, which also reaches the class of that name in every layer above."""
-    location: Any = None
+    location: Key = None
     """What the asset path leads to."""
 
 
@@ -44,7 +47,7 @@ class _TooMany(Exception):
     """The count is over a limit."""
 
 
-def count_prims(graph: Mapping[Any, Contents], start: Any) -> tuple[str, str] | None:
+def count_prims(graph: Mapping[Key, Contents], start: Key) -> tuple[str, str] | None:
     """What is wrong with the number of prims, as (prim path, message); None if nothing is.
 
     The count is at least that of the composed prims: a prim counts once for every layer that says something about it,
@@ -63,14 +66,14 @@ def count_prims(graph: Mapping[Any, Contents], start: Any) -> tuple[str, str] | 
 
 
 class _Counting:
-    def __init__(self, graph: Mapping[Any, Contents]):
+    def __init__(self, graph: Mapping[Key, Contents]):
         self._graph = graph
-        self._stacks: dict[Any, list[Any]] = {}
-        self._below: dict[Any, dict[str, dict[str, int]]] = {}
-        self._arcs: dict[Any, dict[str, list[Arc]]] = {}
-        self._totals: dict[tuple[Any, str], int] = {}
+        self._stacks: dict[Key, list[Key]] = {}
+        self._below: dict[Key, dict[str, dict[str, int]]] = {}
+        self._arcs: dict[Key, dict[str, list[Arc]]] = {}
+        self._totals: dict[tuple[Key, str], int] = {}
 
-    def total(self, location: Any, prim: str, depth: int) -> int:
+    def total(self, location: Key, prim: str, depth: int) -> int:
         """Prims at and below a prim of a layer and its sublayers, with all that they refer to."""
         key = (location, prim)
         if key in self._totals:
@@ -94,7 +97,7 @@ class _Counting:
         self._totals[key] = count
         return count
 
-    def _target(self, arc: Arc, location: Any, depth: int) -> int:
+    def _target(self, arc: Arc, location: Key, depth: int) -> int:
         if arc.of_class:
             # A class also takes what layers above say about the prim of that name.
             return sum(self.total(layer, arc.target, depth) for layer in self._graph)
@@ -104,16 +107,16 @@ class _Counting:
             return 0
         return self.total(arc.location, arc.target or self._default(arc.location), depth)
 
-    def _default(self, location: Any) -> str:
+    def _default(self, location: Key) -> str:
         """Path of the default prim; a layer without one is counted as a whole."""
         name = next((self._graph[layer].default_prim for layer in self._stack(location)), "")
         return f"/{name.lstrip('/')}" if name else ""
 
-    def _stack(self, location: Any) -> list[Any]:
+    def _stack(self, location: Key) -> list[Key]:
         """A layer and its sublayers, each as often as USD would take it."""
         if location not in self._stacks:
-            stack: list[Any] = []
-            waiting: list[tuple[Any, tuple[Any, ...]]] = [(location, ())]
+            stack: list[Key] = []
+            waiting: list[tuple[Key, tuple[Key, ...]]] = [(location, ())]
             while waiting:
                 layer, above = waiting.pop()
                 if layer in above or layer not in self._graph:
@@ -125,7 +128,7 @@ class _Counting:
             self._stacks[location] = stack
         return self._stacks[location]
 
-    def _tables(self, layer: Any) -> tuple[dict[str, dict[str, int]], dict[str, list[Arc]]]:
+    def _tables(self, layer: Key) -> tuple[dict[str, dict[str, int]], dict[str, list[Arc]]]:
         """Prims at and below each prim (the empty path for all) with how often they stand, and the arcs of each."""
         if layer not in self._below:
             prims = self._graph[layer].prims

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mujoco
+import newton
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -107,7 +107,7 @@ def _selected(target: str) -> str | None:
     return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None
 
 
-def _settled(scene: Scene) -> Any:
+def _settled(scene: Scene) -> newton.State:
     """Newton state with the robot in its spawn pose and every object at rest where it fell."""
     m = scene.mj_model
     data = mujoco.MjData(m)
@@ -134,7 +134,7 @@ def _settled(scene: Scene) -> Any:
     return state
 
 
-def _robot_coordinates(m: Any, links: set[int]) -> tuple[np.ndarray, np.ndarray]:
+def _robot_coordinates(m: mujoco.MjModel, links: set[int]) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the robot's own coordinates in qpos and qvel."""
     q, v = [], []
     for joint in range(m.njnt):

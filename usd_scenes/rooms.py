@@ -108,7 +108,9 @@ def variant_layer(path: Path, variant: str) -> None:
     layer.Save()
 
 
-def contact(prim: Usd.Prim, *, solref: Vec | None = None, condim: int | None = None, priority: int | None = None):
+def contact(
+    prim: Usd.Prim, *, solref: Vec | None = None, condim: int | None = None, priority: int | None = None
+) -> Usd.Prim:
     """Author MuJoCo contact parameters on a collision geom; returns the prim."""
     if solref is not None:
         author.attribute(prim, "mjc:solref", Gf.Vec2d(*map(float, solref)), Sdf.ValueTypeNames.Double2)
@@ -167,11 +169,13 @@ def workshop(
         axis = 1 if wall[1] == "x" else 0
         plane, inward = {"-x": (x0, 1), "+x": (x1, -1), "-y": (y0, 1), "+y": (y1, -1)}[wall]
 
-        def place(along: float, height: float, out: float, axis=axis, plane=plane, inward=inward) -> np.ndarray:
+        def place(
+            along: float, height: float, out: float, axis: int = axis, plane: float = plane, inward: int = inward
+        ) -> np.ndarray:
             off = plane + inward * out
             return np.array([along, off, height] if axis == 0 else [off, along, height])
 
-        def bar(half_along: float, half_height: float, out: float, axis=axis) -> tuple[float, float, float]:
+        def bar(half_along: float, half_height: float, out: float, axis: int = axis) -> tuple[float, float, float]:
             return (half_along, out, half_height) if axis == 0 else (out, half_along, half_height)
 
         head = 3.3

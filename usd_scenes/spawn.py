@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mujoco
 
@@ -11,6 +10,7 @@ from arena_newton import limits, rule_sets, tasks
 from arena_newton import robot as g1
 from arena_newton.rules import MODES
 from arena_newton.scene import Scene, load_scene, scene_path
+from arena_newton.tasks import Draws, TaskSpec
 from arena_newton.usd_scenes.dependencies import Problem
 
 __all__ = ["penetrations"]
@@ -60,7 +60,7 @@ def _pairs(path: str | Path, task: str) -> dict[tuple[str, str], tuple[float, li
     return found
 
 
-def _inside(scene: Scene, draws: Any, spec: Any) -> dict[tuple[str, str], float]:
+def _inside(scene: Scene, draws: Draws, spec: TaskSpec) -> dict[tuple[str, str], float]:
     """Pairs of prims of one episode's first instant, with their depth [m]."""
     m = scene.mj_model
     data = mujoco.MjData(m)

@@ -45,7 +45,7 @@ def boxes(
     path: str,
     parts: Iterable[tuple[Vec, Vec]],
     *,
-    look=None,
+    look: Usd.Prim | None = None,
     tile: float = 1.0,
 ) -> Usd.Prim:
     """One visual mesh made of several axis-aligned boxes `(half sizes, centre)`; its texture repeats every `tile` m."""
@@ -59,11 +59,11 @@ def rounded_box(
     stage: Usd.Stage,
     path: str,
     half: Vec,
-    position=(0, 0, 0),
+    position: Vec = (0, 0, 0),
     *,
     radius: float = 0.05,
     steps: int = 2,
-    look=None,
+    look: Usd.Prim | None = None,
 ) -> Usd.Prim:
     """A visual box with rounded edges, for cushions; `half` sizes include the rounding."""
     extent = np.asarray(half, dtype=float)
@@ -99,7 +99,7 @@ def rounded_box(
     return author.mesh(stage, path, np.round(points, 5), faces, position, uv=np.round(uv, 4), look=look)
 
 
-def _plane(stage: Usd.Stage, path: str, position, quat, surface: Usd.Prim) -> Usd.Prim:
+def _plane(stage: Usd.Stage, path: str, position: Vec, quat: Vec, surface: Usd.Prim) -> Usd.Prim:
     """An invisible collision plane whose normal is local +z."""
     plane = UsdGeom.Plane.Define(stage, path)
     plane.AddTranslateOp().Set(Gf.Vec3d(*map(float, position)))

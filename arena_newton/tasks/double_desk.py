@@ -47,7 +47,7 @@ class DoubleDeskRule(SuccessRule):
     min_z: float | None
     """Lowest height of the hammer's centre of mass that still counts [m]; None, with `crate_frame`: no such test."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse numbers that no predicate reads.
 
         Raises:

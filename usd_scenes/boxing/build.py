@@ -7,6 +7,7 @@ static, as the rule needs no contact and no force.
 from pathlib import Path
 
 import numpy as np
+from pxr import Usd
 
 from arena_newton.tasks.boxing import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
@@ -24,7 +25,7 @@ SEMANTIC_EDGE = 2 * TARGET_RADIUS
 """Edge of the cube that stands in for the sphere [m]: the paper's "green cube of equal bounding extent"."""
 
 
-def _bag(stage, name: str, centre, skin, metal, rough) -> None:
+def _bag(stage: Usd.Stage, name: str, centre: author.Vec, skin: Usd.Prim, metal: Usd.Prim, rough: Usd.Prim) -> None:
     path, (x, y) = f"/World/{name}", centre
     author.xform(stage, path, (x, y, 0.0))
     low, high = BAG_Z

@@ -25,7 +25,7 @@ NET_SPACING, CORD = 0.13, 0.02
 """Mesh and cord width of the net [m]; our choice, wide enough for a 224-pixel image."""
 
 
-def ball(stage: Usd.Stage, path: str, position, radius: float, mass: float, look: Usd.Prim) -> Usd.Prim:
+def ball(stage: Usd.Stage, path: str, position: author.Vec, radius: float, mass: float, look: Usd.Prim) -> Usd.Prim:
     """A rolling ball: unseen sphere that touches, textured sphere that is seen.
 
     A solid sphere's inertia, as PhysX gives a sphere collider (a rolling ball then keeps 5/7 of a kick's peak speed).

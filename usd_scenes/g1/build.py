@@ -147,7 +147,7 @@ def build(path: Path = PATH) -> None:
     stage.GetRootLayer().Save()
 
 
-def _dex3(stage, fingers, poses, looks, grip) -> None:
+def _dex3(stage: Usd.Stage, fingers: Sequence[Link], poses: dict, looks: dict[str, Usd.Prim], grip: Usd.Prim) -> None:
     """Moving fingers."""
     for side in ("left", "right"):
         wrist = next(link for link in LINKS if link.name == f"{side}_wrist_yaw_link")
@@ -163,7 +163,7 @@ def _dex3(stage, fingers, poses, looks, grip) -> None:
         _joint(stage, link)
 
 
-def _fixed(stage, fingers, poses, looks, grip) -> None:
+def _fixed(stage: Usd.Stage, fingers: Sequence[Link], poses: dict, looks: dict[str, Usd.Prim], grip: Usd.Prim) -> None:
     """Open fingers as one piece with the wrist: their mass, boxes and shapes."""
     for side in ("left", "right"):
         wrist = next(link for link in LINKS if link.name == f"{side}_wrist_yaw_link")
@@ -193,7 +193,7 @@ def _link(stage: Usd.Stage, link: Link, poses: dict) -> None:
         _mass(prim, link.mass, link.com, link.inertia, link.principal)
 
 
-def _mass(prim: Usd.Prim, mass: float, com, inertia, principal) -> None:
+def _mass(prim: Usd.Prim, mass: float, com: author.Vec, inertia: author.Vec, principal: author.Vec) -> None:
     api = UsdPhysics.MassAPI.Apply(prim)
     api.CreateMassAttr(float(mass))
     api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, com)))
@@ -224,7 +224,7 @@ def _joint(stage: Usd.Stage, link: Link) -> None:
     _attribute(prim, "arena:effort", hinge.effort, Sdf.ValueTypeNames.Float)
 
 
-def _attribute(prim: Usd.Prim, name: str, value, kind: Sdf.ValueTypeName) -> None:
+def _attribute(prim: Usd.Prim, name: str, value: object, kind: Sdf.ValueTypeName) -> None:
     """Author a vendor attribute; not `custom`, so that the text is the same with and without that vendor's schemas."""
     prim.CreateAttribute(name, kind, False).Set(value)
 
@@ -247,7 +247,14 @@ def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Bar | Rod], l
             _mesh(stage, path, *grid(shape), looks[shape.look])
 
 
-def _mesh(stage: Usd.Stage, path: str, points, normals, faces, look: Usd.Prim) -> None:
+def _mesh(
+    stage: Usd.Stage,
+    path: str,
+    points: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray | Sequence[Sequence[int]],
+    look: Usd.Prim,
+) -> None:
     geom = UsdGeom.Mesh(author.mesh(stage, path, _round(points), faces, look=look))
     geom.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.round(normals, 3).astype(np.float32)))
     geom.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
@@ -271,7 +278,14 @@ def _body_collisions(stage: Usd.Stage, skin: Usd.Prim) -> None:
         author.box(stage, f"{ROOT}/{side}_ankle_roll_link/collision", half, center, **hidden)
 
 
-def _hand_box(stage, path: str, size, side: str, grip: Usd.Prim, offset=(0.0, 0.0, 0.0)) -> None:
+def _hand_box(
+    stage: Usd.Stage,
+    path: str,
+    size: tuple[author.Vec, author.Vec],
+    side: str,
+    grip: Usd.Prim,
+    offset: author.Vec = (0.0, 0.0, 0.0),
+) -> None:
     half, (x, y, z) = size
     center = np.array([x, y if side == "left" else -y, z]) + offset
     prim = author.box(stage, path, half, _round(center), visual=False, surface=grip)
@@ -302,7 +316,7 @@ def _from_ros(quat: Sequence[float]) -> np.ndarray:
     return _multiply(_unit(quat), np.array([0.0, 1.0, 0.0, 0.0]))
 
 
-def _unit(quat: Sequence[float]) -> np.ndarray:
+def _unit(quat: author.Vec) -> np.ndarray:
     q = np.asarray(quat, dtype=float)
     return q / np.linalg.norm(q)
 

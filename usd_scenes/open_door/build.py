@@ -47,7 +47,9 @@ DOORWAY = (1.10, 0.04, 2.15)
 """The passage a rule tests [m]: |x| ≤ 0.55 and |y| ≤ 0.02 in the frame."""
 
 
-def _hinge(stage: Usd.Stage, path: str, parent: str, child: str, axis: str, at_parent, limits) -> Usd.Prim:
+def _hinge(
+    stage: Usd.Stage, path: str, parent: str, child: str, axis: str, at_parent: author.Vec, limits: author.Vec
+) -> Usd.Prim:
     joint = UsdPhysics.RevoluteJoint.Define(stage, path)
     joint.CreateAxisAttr(axis)
     joint.CreateBody0Rel().SetTargets([parent])
@@ -63,7 +65,7 @@ def _hinge(stage: Usd.Stage, path: str, parent: str, child: str, axis: str, at_p
     return joint.GetPrim()
 
 
-def _partition(stage, frame: str, rough) -> None:
+def _partition(stage: Usd.Stage, frame: str, rough: Usd.Prim) -> None:
     """Left panel, right panel and header collide; seams, posts and the door casing are drawn only."""
     x0, x1 = PARTITION_X
     opening, t = LEAF_SIZE[0] / 2 + GAP, PARTITION_THICKNESS / 2
@@ -93,7 +95,7 @@ def _partition(stage, frame: str, rough) -> None:
     warehouse.boxes(stage, f"{frame}/Rail", rail, look=bright)
 
 
-def _leaf(stage, path: str, origin, rough) -> None:
+def _leaf(stage: Usd.Stage, path: str, origin: author.Vec, rough: Usd.Prim) -> None:
     """The leaf's origin is its hinge line at the height of the frame's origin."""
     half = 0.5 * np.asarray(LEAF_SIZE)
     centre = (half[0], 0.0, LEAF_CLEARANCE + half[2])
@@ -102,7 +104,7 @@ def _leaf(stage, path: str, origin, rough) -> None:
     author.box(stage, f"{path}/Solid", half, centre, visual=False, surface=rough)
 
 
-def _tan_leaf(stage, path: str) -> None:
+def _tan_leaf(stage: Usd.Stage, path: str) -> None:
     """The leaf of the base look: tan with two framed panels."""
     half = 0.5 * np.asarray(LEAF_SIZE)
     cx, cz = half[0], LEAF_CLEARANCE + half[2]
@@ -116,7 +118,7 @@ def _tan_leaf(stage, path: str) -> None:
     warehouse.boxes(stage, f"{path}/Mouldings", lines, look=dark)
 
 
-def _blue_leaf(stage, path: str) -> None:
+def _blue_leaf(stage: Usd.Stage, path: str) -> None:
     """The leaf of the semantic look: blue steel with a window and hazard stripes."""
     half = 0.5 * np.asarray(LEAF_SIZE)
     cx, cz = half[0], LEAF_CLEARANCE + half[2]
@@ -130,7 +132,7 @@ def _blue_leaf(stage, path: str) -> None:
     )
 
 
-def _handle(stage, path: str, origin, rough) -> None:
+def _handle(stage: Usd.Stage, path: str, origin: author.Vec, rough: Usd.Prim) -> None:
     chrome = author.material(stage, "/World/Looks/Chrome", (0.12, 0.12, 0.13), roughness=0.3, metallic=0.8)
     author.rigid_body(stage, path, origin, mass=HANDLE_MASS, inertia=(5e-4, 5e-4, 5e-4))
     straight, middle = LEVER_LENGTH - 2 * LEVER_RADIUS, -LEVER_LENGTH / 2
@@ -146,7 +148,7 @@ def _handle(stage, path: str, origin, rough) -> None:
         author.cylinder(stage, f"{path}/{name}", 0.026, 0.008, (0, y, 0), axis="Y", collide=False, look=chrome)
 
 
-def _chain(stage, rough) -> None:
+def _chain(stage: Usd.Stage, rough: Usd.Prim) -> None:
     """Leaf on the frame, lever on the leaf; no contacts inside the door."""
     p = np.asarray(POSITION)
     hinge_in_frame = np.array([-LEAF_SIZE[0] / 2, 0.0, 0.0])
@@ -175,7 +177,7 @@ def _chain(stage, rough) -> None:
         pairs.CreateFilteredPairsRel().SetTargets([f"/World/Door/{name}" for name in others])
 
 
-def _back_room(stage) -> None:
+def _back_room(stage: Usd.Stage) -> None:
     """Behind the partition: a dark pit with a hazard stripe (drawn only)."""
     dark = author.material(stage, "/World/Looks/Pit", (0.02, 0.02, 0.02))
     hazard = author.material(stage, "/World/Looks/Hazard", (0.8, 0.7, 0.1), texture="../textures/hazard.png")

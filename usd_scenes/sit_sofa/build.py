@@ -7,6 +7,7 @@ friction 1): experts sit on it as well as on a soft one, and it is cheaper to si
 from pathlib import Path
 
 import numpy as np
+from pxr import Usd
 
 from arena_newton.tasks.sit_sofa import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
@@ -27,13 +28,13 @@ CARTONS = {"Carton_1": (-1.45, -0.68, 0.31), "Carton_2": (-1.35, 0.06, 0.31)}
 """Centres before the first draw: the original puts undersides at z 0.10 m, and the cartons drop."""
 
 
-def _span(x, y, z):
+def _span(x: author.Vec, y: author.Vec, z: author.Vec) -> tuple[author.Vec, author.Vec]:
     """Half sizes and centre of the box between the bounds."""
     low, high = np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
     return tuple((high - low) / 2), tuple((high + low) / 2)
 
 
-def _sofa(stage, rough) -> None:
+def _sofa(stage: Usd.Stage, rough: Usd.Prim) -> None:
     path = "/World/Sofa"
     author.xform(stage, path)
     look = stage.GetPrimAtPath("/World/Looks/Sofa")
@@ -75,7 +76,7 @@ def _sofa(stage, rough) -> None:
     warehouse.boxes(stage, f"{path}/Feet", parts, look=feet)
 
 
-def _table(stage, rough) -> None:
+def _table(stage: Usd.Stage, rough: Usd.Prim) -> None:
     path = "/World/CoffeeTable"
     author.xform(stage, path)
     look = stage.GetPrimAtPath("/World/Looks/Table")
@@ -89,7 +90,9 @@ def _table(stage, rough) -> None:
     warehouse.boxes(stage, f"{path}/Body", parts, look=look)
 
 
-def _carton(stage, name: str, position, looks, rough) -> None:
+def _carton(
+    stage: Usd.Stage, name: str, position: author.Vec, looks: tuple[Usd.Prim, Usd.Prim], rough: Usd.Prim
+) -> None:
     path, half = f"/World/{name}", CARTON_EDGE / 2
     # A thin-walled cube: 5/18 m a².
     inertia = (5.0 / 18.0 * CARTON_MASS * CARTON_EDGE**2,) * 3
@@ -100,7 +103,7 @@ def _carton(stage, name: str, position, looks, rough) -> None:
     warehouse.boxes(stage, f"{path}/Tape", tape, look=looks[1])
 
 
-def _look(stage, name: str, color, texture: str | None = None) -> None:
+def _look(stage: Usd.Stage, name: str, color: author.Vec, texture: str | None = None) -> None:
     path = None if texture is None else f"../textures/{texture}.png"
     author.material(stage, f"/World/Looks/{name}", color, texture=path)
 

@@ -9,7 +9,7 @@ original drops them form a ladder on which hardly any two touch (centred blocks 
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf
+from pxr import Sdf, Usd
 
 from arena_newton.tasks.vis_navi import TASK
 from arena_newton.usd_scenes import author, rooms, warehouse
@@ -38,7 +38,17 @@ OBSTACLES = {
 }
 
 
-def _obstacle(stage, name: str, position, size, mass: float, look, rough, *, on_base: bool) -> None:
+def _obstacle(
+    stage: Usd.Stage,
+    name: str,
+    position: author.Vec,
+    size: author.Vec,
+    mass: float,
+    look: Usd.Prim,
+    rough: Usd.Prim,
+    *,
+    on_base: bool,
+) -> None:
     half = 0.5 * np.asarray(size)
     inertia = mass / 3.0 * (np.sum(half**2) - half**2)
     centre = (0.0, 0.0, half[2] if on_base else 0.0)
@@ -46,7 +56,7 @@ def _obstacle(stage, name: str, position, size, mass: float, look, rough, *, on_
     author.box(stage, f"/World/{name}/Geom", half, centre, look=look, surface=rough)
 
 
-def _folding_sign(stage, parent: str) -> None:
+def _folding_sign(stage: Usd.Stage, parent: str) -> None:
     """Two leaning panels with a pictogram, standing on the far side of the outline."""
     yellow = author.material(stage, "/World/Looks/SignYellow", YELLOW)
     black = author.material(stage, "/World/Looks/SignBlack", (0.04, 0.04, 0.04))
@@ -76,7 +86,7 @@ def _folding_sign(stage, parent: str) -> None:
     )  # fmt: skip
 
 
-def _outline(stage, parent: str) -> None:
+def _outline(stage: Usd.Stage, parent: str) -> None:
     yellow = author.material(stage, "/World/Looks/OutlineYellow", YELLOW)
     (cx, cy), half, s = OUTLINE_CENTRE, OUTLINE / 2, OUTLINE_STRIPE / 2
     parts = [((half, s, 0.001), (cx, cy + k * (half - s), 0.002)) for k in (-1, 1)]
@@ -84,7 +94,7 @@ def _outline(stage, parent: str) -> None:
     warehouse.boxes(stage, f"{parent}/Outline", parts, look=yellow)
 
 
-def _ring_sign(stage, parent: str) -> None:
+def _ring_sign(stage: Usd.Stage, parent: str) -> None:
     """The semantic stand-in: a ring of the same diameter, painted in the instruction's yellow, and a round plate."""
     yellow = author.material(stage, "/World/Looks/OutlineYellow", YELLOW)
     orange = author.material(stage, "/World/Looks/SignOrange", (0.95, 0.36, 0.03))
