@@ -121,7 +121,7 @@ class Script:
 class Program:
     """One script per world; past its end a script holds its last segment."""
 
-    def __init__(self, scripts: Sequence[Script], device: Any = "cpu"):
+    def __init__(self, scripts: Sequence[Script], device: torch.device | str = "cpu"):
         """Packs the scripts.
 
         Args:

@@ -380,7 +380,7 @@ FAMILIES: dict[str, int] = {name: family.clips for name, family in _FAMILIES.ite
 """Clips of each family in the default library."""
 
 
-def _play(plans: list[_Plan], ticks: int, device: Any) -> dict[str, torch.Tensor]:
+def _play(plans: list[_Plan], ticks: int, device: torch.device | str) -> dict[str, torch.Tensor]:
     """Frames of all plans, and which of them are sound."""
     program = Program([plan.script for plan in plans], device)
     generator = ReferenceGenerator(len(plans), device)
@@ -523,7 +523,7 @@ def _drawn(family: str, number: int, seconds: float, seed: int, attempt: int) ->
 
 
 def random_clips(
-    families: Mapping[str, int] | None = None, seconds: float = 12.0, seed: int = 0, device: Any = "cpu"
+    families: Mapping[str, int] | None = None, seconds: float = 12.0, seed: int = 0, device: torch.device | str = "cpu"
 ) -> dict[str, Any]:
     """Random clips of the named families, all of the same length.
 
