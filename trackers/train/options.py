@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -26,6 +26,11 @@ __all__ = [
     "check",
     "runner_config",
 ]
+
+if TYPE_CHECKING:
+    TrackerName = str
+else:
+    TrackerName = Literal[names()]
 
 FAMILY_WEIGHTS: dict[str, float] = {"clips": 40.0}
 """Sampling weights of families per second of motion: there are minutes of captured motion, hours of generated one."""
@@ -45,7 +50,7 @@ def at_least(low: float) -> dict[str, tuple[float, float]]:
 class TrainOptions:
     """Train a tracker with PPO in the lab world."""
 
-    tracker: Annotated[str, tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(names()))] = "twist2"
+    tracker: TrackerName = "twist2"
     """Interface to train."""
     worlds: int = field(default=8192, metadata=at_least(1))
     """Parallel worlds of each process."""

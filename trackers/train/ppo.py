@@ -20,6 +20,7 @@ from torch import nn
 
 from arena_newton.trackers.front_end import Mirror
 from arena_newton.trackers.train.graphs import captured
+from arena_newton.trackers.train.model import TrackerActor
 
 __all__ = ["TrackerPPO"]
 
@@ -34,6 +35,7 @@ _MIRRORED = 4
 class TrackerPPO(PPO):
     """PPO whose learning rate is set once per iteration from the mean divergence of its last epoch."""
 
+    actor: TrackerActor
     learning_rate: float
     """Current learning rate."""
     lowest_rate: float = 2e-5

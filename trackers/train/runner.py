@@ -20,7 +20,6 @@ from arena_newton.errors import InputError, naming
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.logger import DeviceLogger, IterationTimes
-from arena_newton.trackers.train.model import TrackerActor
 from arena_newton.trackers.train.options import TrainOptions, runner_config
 from arena_newton.trackers.train.ppo import TrackerPPO
 from arena_newton.trackers.train.rewards import maximum
@@ -149,7 +148,7 @@ class TrackerRunner(OnPolicyRunner):
         Raises:
             InputError: The file is absent, of another interface or of other widths.
         """
-        actor = self._actor()
+        actor = self.alg.actor
         weights = weights_file.load(path, self.card.tracker, flag="--start-from")
         if weights.network.config() != actor.net.config():
             raise InputError(f"--start-from {path}: a network of other widths than this training's")
@@ -161,11 +160,6 @@ class TrackerRunner(OnPolicyRunner):
             count.fill_(_SEEN)
         self.card.started_from = weights.card.get("commit", path.name)
         self._started = True
-
-    def _actor(self) -> TrackerActor:
-        actor = self.alg.get_policy()
-        assert isinstance(actor, TrackerActor)
-        return actor
 
     # -- learning ---------------------------------------------------------------------------------------------------
 
@@ -252,7 +246,7 @@ class TrackerRunner(OnPolicyRunner):
         self.current_learning_iteration += 1
         self.samples += times.samples
         self.seconds += times.collect + times.learn
-        std = self._actor().distribution.log_std_param.detach().exp()
+        std = self.alg.actor.distribution.log_std_param.detach().exp()
         progress = {
             "iteration": self.current_learning_iteration,
             "samples": self.samples,
@@ -330,8 +324,7 @@ class TrackerRunner(OnPolicyRunner):
             slim: Leave out the optimiser's moments, two thirds of the file; a resumed training estimates them again.
         """
         on_cuda = str(self.device).startswith("cuda")
-        actor = self._actor()
-        networks = self.alg.save()
+        networks, actor = self.alg.save(), self.alg.actor
         Checkpoint(
             **networks | ({"optimizer_state_dict": None} if slim else {}),
             iter=self.current_learning_iteration,
@@ -368,24 +361,20 @@ class TrackerRunner(OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict[str, Any]:
-        """Continue the training of a checkpoint.
+        """Continue the training of a checkpoint file; all of its parts are loaded, whatever `load_cfg` says.
 
         Raises:
             InputError: The file is absent or not a checkpoint of this training.
         """
         with naming("--resume"):
-            return self.resume(Checkpoint.read(path, map_location or str(self.device)), path, load_cfg, strict)
+            return self.resume(Checkpoint.read(path, map_location or str(self.device)), path)
 
-    def resume(
-        self, checkpoint: Checkpoint, path: str | Path, load_cfg: dict | None = None, strict: bool = True
-    ) -> dict[str, Any]:
+    def resume(self, checkpoint: Checkpoint, path: str | Path) -> dict[str, Any]:
         """Continue the training of a checkpoint.
 
         Args:
             checkpoint: The checkpoint.
             path: Its file, for errors.
-            load_cfg: rsl_rl's choice of parts; all by default.
-            strict: Whether every parameter must be there.
 
         Raises:
             InputError: It is of another training.
@@ -395,11 +384,11 @@ class TrackerRunner(OnPolicyRunner):
         optimizer = checkpoint.optimizer_state_dict is not None
         parts = {"actor": True, "critic": True, "optimizer": optimizer, "iteration": True}
         try:
-            self.alg.load(vars(checkpoint), load_cfg or parts, strict)
+            self.alg.load(vars(checkpoint), parts, strict=True)
         except (RuntimeError, KeyError) as error:
             raise InputError(f"{path}: a checkpoint of another version of this training") from error
         self.alg.set_learning_rate(checkpoint.learning_rate)
-        for name, count in self._actor().counts().items():
+        for name, count in self.alg.actor.counts().items():
             count.copy_(checkpoint.norm_counts[name])
         self.current_learning_iteration = checkpoint.iter
         self.samples, self.seconds = checkpoint.samples, checkpoint.seconds
@@ -419,14 +408,10 @@ class TrackerRunner(OnPolicyRunner):
         if checkpoint.families != self.env.bank.family_names:
             theirs, ours = ", ".join(checkpoint.families), ", ".join(self.env.bank.family_names)
             raise InputError(f"{path}: its references are of the families {theirs}; these are {ours}")
-        if checkpoint.network != self._actor().net.config():
+        if checkpoint.network != self.alg.actor.net.config():
             raise InputError(f"{path}: a network of other widths than this training's")
         here = self.env.critic_widths
         there = checkpoint.critic_widths or here
-        for name in {**there, **here}:
-            if there.get(name, 0) != here.get(name, 0):
-                raise InputError(
-                    f"{path}: its critic term {name} has width {there.get(name, 0)}, here it has {here.get(name, 0)}"
-                )
-        if list(there) != list(here):
-            raise InputError(f"{path}: its critic terms are in another order than this training's")
+        if list(there.items()) != list(here.items()):
+            other = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+            raise InputError(f"{path}: other critic terms than this training's: {', '.join(other) or 'their order'}")

@@ -19,7 +19,7 @@ from PIL import Image
 from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import interface, train
+from arena_newton.trackers import interface, train, twist2
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
@@ -32,7 +32,6 @@ from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.tracker_env import TrackerEnv
-from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
 TWIST2 = interface.get("twist2")
@@ -244,7 +243,7 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
     runner.learn(1)
     for symmetric in (True, False):
         out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
-        tracker = Twist2Tracker(out)
+        tracker = twist2.from_checkpoint(out)
         mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
         seen = env.get_observations()["actor"]
         with torch.no_grad():
@@ -290,9 +289,12 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
         (lambda state: state.update(families=["walk"]), "of the families walk; these are stand, squat"),
         (lambda state: state.update(critic_state_dict={"old": torch.zeros(1)}), "a checkpoint of another version"),
         (lambda state: state.update(network={"hidden": [8]}), "a network of other widths"),
-        (lambda state: state["critic_widths"].update(height=2), "its critic term height has width 2, here it has 1"),
-        (lambda state: state["critic_widths"].update(new=3), "its critic term new has width 3, here it has 0"),
-        (lambda state: state["critic_widths"].update(height=state["critic_widths"].pop("height")), "in another order"),
+        (lambda state: state["critic_widths"].update(height=2), "other critic terms than this training's: height"),
+        (lambda state: state["critic_widths"].update(new=3), "other critic terms than this training's: new"),
+        (
+            lambda state: state["critic_widths"].update(height=state["critic_widths"].pop("height")),
+            "other critic terms than this training's: their order",
+        ),
         (lambda state: state.pop("rng"), "it lacks rng"),
         (lambda state: state["card"].pop("licences"), "it lacks licences"),
         (lambda state: state.update(card=5), "not a checkpoint of this training"),
