@@ -19,7 +19,7 @@ from PIL import Image
 from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import interface, train, twist2
+from arena_newton.trackers import interface, train
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
@@ -243,7 +243,7 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
     runner.learn(1)
     for symmetric in (True, False):
         out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
-        tracker = twist2.from_checkpoint(out)
+        tracker = Twist2Tracker.from_weights(out)
         mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
         seen = env.get_observations()["actor"]
         with torch.no_grad():
