@@ -23,7 +23,7 @@ _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dt
 
 
 def create(path: Path) -> BinaryIO:
-    """Open a new file for writing in a folder that may not be ours: a file of that name is removed, no link is followed.
+    """Open a new file for writing in a folder that may not be ours: a file of that name is removed, no link followed.
 
     Raises:
         OSError: It cannot be created; the error carries its name.
@@ -36,7 +36,7 @@ def check_size(path: str | Path, most: int, *, where: str = "") -> None:
     """Refuse what is not a regular file, or larger than `most` bytes; nothing is opened.
 
     Raises:
-        InputError: The file is absent, not a regular file, unreadable or larger; it is named as `where`, or by its path.
+        InputError: The file is absent, not a regular file, unreadable or larger; named as `where`, or by its path.
     """
     where = where or str(path)
     try:
@@ -45,7 +45,7 @@ def check_size(path: str | Path, most: int, *, where: str = "") -> None:
         raise InputError(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
     # A folder is refused where it is opened, with a message of its own.
     if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
-        raise InputError(f"{where}: is not a regular file")
+        raise InputError(f"{where}: is no regular file")
     if stat.S_ISREG(about.st_mode) and about.st_size > most:
         size, allowed = about.st_size / limits.MIB, most // limits.MIB
         raise InputError(f"{where}: has {size:.0f} MiB, expected at most {allowed}")

@@ -91,9 +91,9 @@ def test_only_regular_files_are_read(tmp_path):
     """A pipe is refused unopened; a file that is too large, or absent, is named."""
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "big").write_bytes(bytes(3 * 2**20))
-    with pytest.raises(InputError, match=r"pipe\.npz: is not a regular file"):
+    with pytest.raises(InputError, match=r"pipe\.npz: is no regular file"):
         read_arrays(tmp_path / "pipe.npz")
-    with pytest.raises(InputError, match=r"pipe\.npz: is not a regular file"):
+    with pytest.raises(InputError, match=r"pipe\.npz: is no regular file"):
         read_bytes(tmp_path / "pipe.npz", 10)
     with pytest.raises(InputError, match="big: has 3 MiB, expected at most 2"):
         read_bytes(tmp_path / "big", 2 * 2**20)

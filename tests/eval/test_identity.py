@@ -176,8 +176,8 @@ def test_difference_is_told_to_the_key():
         ({"repeats": 10**4000}, "--repeats 10{39}[.]{3}: makes too many episodes"),
         ({"policy": "remote:\x1b[2J"}, "--policy remote:: has control characters"),
         ({"repeats": 10**9}, "--repeats 1000000000: makes 3,000,000,000 episodes, at most 200,000"),
-        ({"variant": "/dev/zero"}, "--variant /dev/zero: is not a regular file"),
-        ({"checkpoint": "/dev/zero"}, "/dev/zero: is not a regular file"),
+        ({"variant": "/dev/zero"}, "--variant /dev/zero: is no regular file"),
+        ({"checkpoint": "/dev/zero"}, "/dev/zero: is no regular file"),
     ],
 )
 def test_unfit_options_are_named(options, message):

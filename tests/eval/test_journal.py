@@ -136,7 +136,7 @@ def test_writing_follows_no_link(tmp_path):
 
 
 def test_a_pipe_is_no_journal(tmp_path):
-    """What is not a regular file is refused at once instead of waiting for a writer."""
+    """What is no regular file is refused at once instead of waiting for a writer."""
     os.mkfifo(tmp_path / "episodes.jsonl")
     for read in (Journal, read_journal):
         with pytest.raises(InputError, match="no regular file"):
