@@ -1,7 +1,7 @@
 """Every command under one name: ``arena-newton eval``, or ``python -m arena_newton eval``, which is the same.
 
 A command is a module that is imported when it is called, so that the overview answers at once. Modules are named here
-and not imported at the top: this is the front door of all floors, and no floor knows those above it.
+and not imported at the top: this is the entry to all rooms, and no room imports those above it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Command:
 
 
 COMMANDS = (
-    Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to mend"),
+    Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),

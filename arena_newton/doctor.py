@@ -16,7 +16,7 @@ __all__ = ["Finding", "examine", "main", "versions"]
 USAGE = """usage: arena-newton doctor
 
 Examines packages, devices, engines, kernel cache, disk and scenes, and says what to do about what is missing.
-Exit code 0: a run can start; 1: something in the way must be mended first."""
+Exit code 0: a run can start; 1: a problem must be solved first."""
 _REQUIRED = {
     "newton": "physics, scenes and cameras",
     "warp-lang": "kernels",
@@ -153,8 +153,8 @@ def _storage() -> list[Finding]:
         else:
             advice = "nothing to do: the first run compiles for about a minute; WARP_CACHE_PATH moves it"
             findings.append(Finding("kernel cache", f"{cache}, empty", "note", advice))
-        place = next(p for p in (cache, *cache.parents) if p.exists())
-        if not os.access(place, os.W_OK):
+        existing = next(p for p in (cache, *cache.parents) if p.exists())
+        if not os.access(existing, os.W_OK):
             findings.append(Finding("kernel cache", "not writable", "bad", "set WARP_CACHE_PATH to a writable folder"))
     except Exception as error:
         findings.append(Finding("kernel cache", f"unknown ({_short(error)})", "bad", _INSTALL))
@@ -201,7 +201,7 @@ def main(argv: Sequence[str] = ()) -> int:
         argv: Arguments; there are none but ``--help``.
 
     Returns:
-        Exit code: 0 when a run can start, 1 when something in the way must be mended first.
+        Exit code: 0 when a run can start, 1 when a problem must be solved first.
     """
     if argv:
         helps = argv[0] in ("-h", "--help")

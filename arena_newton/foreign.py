@@ -1,4 +1,4 @@
-"""Files that somebody else made: how they are read without taking more than `limits` says, and written beside."""
+"""Files from unknown sources: read within the bounds of `limits`, and new files created next to them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dt
 
 
 def create(path: Path) -> BinaryIO:
-    """Open a new file for writing in a folder that may be a stranger's: what had its name is removed, no link followed.
+    """Open a new file for writing in a folder that may not be ours: a file of that name is removed, no link followed.
 
     Raises:
         OSError: It cannot be created; the error carries its name.
@@ -33,17 +33,17 @@ def create(path: Path) -> BinaryIO:
 
 
 def check_size(path: str | Path, most: int, *, where: str = "") -> None:
-    """Refuse what is no regular file, or larger than `most` bytes; nothing is opened.
+    """Refuse what is not a regular file, or larger than `most` bytes; nothing is opened.
 
     Raises:
-        InputError: The file is absent, no regular file, unreadable or larger; it is named as `where`, or by its path.
+        InputError: The file is absent, not a regular file, unreadable or larger; named as `where`, or by its path.
     """
     where = where or str(path)
     try:
         about = os.stat(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    # A folder is refused by whoever opens it, in words of its own.
+    # A folder is refused where it is opened, with a message of its own.
     if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
         raise InputError(f"{where}: is no regular file")
     if stat.S_ISREG(about.st_mode) and about.st_size > most:
@@ -60,7 +60,7 @@ def read_bytes(path: str | Path, most: int, *, where: str = "") -> bytes:
         where: What errors name; the path by default.
 
     Raises:
-        InputError: The file is absent, no regular file, unreadable or larger.
+        InputError: The file is absent, not a regular file, unreadable or larger.
     """
     where = where or str(path)
     check_size(path, most, where=where)
@@ -75,15 +75,15 @@ def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where:
 
     Args:
         path: The file.
-        wanted: Names of the arrays to read, where the file has them; all by default. The others stay packed, and are
-            given as arrays of no element.
+        wanted: Names of the arrays to read, where the file has them; all by default. The others are not
+            unpacked and are returned as empty arrays.
         where: What errors name; the path by default.
 
     Returns:
         Array by name, in the file's order.
 
     Raises:
-        InputError: The file is absent, damaged, no NPZ file, or holds more than is read.
+        InputError: The file is absent, damaged, not an NPZ file, or larger than allowed.
     """
     where = where or str(path)
     chosen = None if wanted is None else set(wanted)
@@ -141,7 +141,7 @@ def numbers(array: np.ndarray, where: str, dtype: Any) -> np.ndarray:
     """The array as floating-point numbers of type `dtype`.
 
     Raises:
-        InputError: It holds no real numbers.
+        InputError: It does not hold real numbers.
     """
     if array.dtype.kind not in "fiub":
         raise InputError(f"{where} holds {array.dtype}, expected numbers")

@@ -1,7 +1,7 @@
-"""Open files in a process of their own first, where a library's compiled reader takes them on trust.
+"""Open files in a separate process first, where a library's compiled reader does not validate them.
 
-A damaged binary layer can ask USD for any size of memory or keep it busy without end, and so can a network in
-onnxruntime. Here the file is opened once by a process that has little memory and little time; a crash is its own.
+A damaged binary layer can make USD allocate any amount of memory or run forever, and so can a network in
+onnxruntime. Here the file is opened once by a process with limited memory and time, which may crash.
 """
 
 import json
@@ -19,12 +19,12 @@ _KINDS = ("crate", "network")
 
 
 def faults(kind: str, paths: Sequence[str], *, memory: int, seconds: float) -> list[str | None]:
-    """What happens when files are opened: None for each that can be read, otherwise what its reader complains about.
+    """Try to open files: None for each that can be read, otherwise its reader's message.
 
     Args:
         kind: `crate` for USD layers, `network` for ONNX files (path, a tab, the width of the input).
         paths: The files.
-        memory: What each may take beyond the library itself [bytes].
+        memory: Memory that each may take in addition to the library itself [bytes].
         seconds: Time that each may take [s].
     """
     child = [sys.executable, "-P", str(Path(__file__)), kind, str(memory), str(seconds)]

@@ -9,7 +9,7 @@ __all__ = ["quiet_warp"]
 def quiet_warp() -> None:
     """Start Warp without its banner, and without its driver's complaint on a machine that has no GPU.
 
-    The complaint is written by native code to the error stream, where the answer to bad input shall be one line.
+    The complaint is written by native code to the error stream, where the answer to bad input must be one line.
     """
     import warp as wp
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import torch
+import torch
+import warp as wp
 
 __all__ = ["on_torch_stream"]
 
 
-def on_torch_stream(device: torch.device) -> contextlib.AbstractContextManager:
+def on_torch_stream(device: torch.device) -> contextlib.AbstractContextManager[object]:
     """Context in which Warp works on torch's current stream of a device; on the CPU there is nothing to do."""
-    import torch
-    import warp as wp
-
     if device.type != "cuda":
         return contextlib.nullcontext()
     # Where torch already works on Warp's own stream, a second handle of it would end the first one with its life.

@@ -15,8 +15,9 @@ from arena_newton.policies.replay import ReplayPolicy
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions import Clip, load_clip
 from arena_newton.trackers.motions.playback import clip_actions
+from tests.conftest import SHARED
 
-CLIPS = Path(__file__).parents[2] / ".." / "shared" / "reference" / "twist2" / "example_motions"
+CLIPS = SHARED / "reference" / "twist2" / "example_motions"
 
 
 def observation(worlds: int, mask=None) -> Observation:

@@ -81,7 +81,7 @@ def test_numbers_in_the_text():
     assert (policy.camera.width, policy.camera.height, policy.camera.fit) == (640, 480, "native")
     assert f"{ThreadingHTTPServer.request_queue_size} in Python's" in PLAIN
     assert set(re.findall(r"^\| `(\w+)(?::<\w+>)?` \| ", TEXT.split("## What a policy sees")[0], re.M)) == {
-        name for name in policies.names() if name in policies.base._BUILT_IN
+        name for name in policies.names() if name in policies.base.POLICIES.built_in
     }
 
 
@@ -144,7 +144,7 @@ def test_policy_in_python(monkeypatch):
     """The policy of the text runs, found by its name."""
     names = {}
     exec(compile(BLOCKS[1], "docs/policies.md", "exec"), names)
-    monkeypatch.setattr(policies.base, "_registered", {})
+    monkeypatch.setattr(policies.base.POLICIES, "_registered", {})
     policies.register("squat", names["Squat"])
     policy = policies.get("squat:0.2")
     policy.reset([1, 2], ["Isaac-Boxing"] * 2)

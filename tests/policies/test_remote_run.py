@@ -1,16 +1,11 @@
 """Runs with a policy server: what flags reach it, what results are known by, and what no results folder holds."""
 
 import json
-import sys
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "eval"))
-from eval_fakes import factories
 
 from arena_newton import policies, trackers
 from arena_newton.env import STAND_ACTION, ArenaEnv
@@ -18,6 +13,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
 from arena_newton.rollout import Rollout
+from tests.eval.eval_fakes import factories
 
 SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "3", "--seeds", "0"]
 
