@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
-from arena_newton.eval.records import counted
+from arena_newton.text import counted
 
 __all__ = ["Progress", "duration", "kernels_to_compile", "simulated"]
 

@@ -54,6 +54,8 @@ class PolicyError(ArenaError):
 class PolicyUnavailable(ArenaError):
     """The policy cannot go on at all (its server is gone); the run stops and its unfinished episodes stay unplayed."""
 
+    exit_code = 2
+
 
 class Policy:
     """Base of all policies; a subclass writes `act` and, where it has a memory, `reset`."""

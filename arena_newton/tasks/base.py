@@ -311,6 +311,9 @@ class TaskSpec:
     gym_id: str
     """The original's id; it seeds episodes and is sent to remote policies, so its spelling matters."""
     instruction: str
+    suite: str | None = None
+    """Group of the paper's tables that averages it, `HOI` (human-object) or `HSI` (human-scene interaction); None: no
+    group, as of every task that is not the paper's."""
     spawn_position: Vec3
     """Robot root at spawn [m]."""
     spawn_quat: Quat

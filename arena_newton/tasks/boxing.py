@@ -87,6 +87,7 @@ TASK = TaskSpec(
     name="boxing",
     gym_id="Isaac-Move-Boxing-Bag-G129-Dex3-Wholebody",
     instruction="Strike the green markers on the punching bag.",
+    suite="HSI",
     spawn_position=(-1.6, -2.0, 0.8),
     spawn_quat=FACE_MINUS_Y,
     objects=(

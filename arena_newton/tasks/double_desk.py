@@ -75,6 +75,7 @@ TASK = TaskSpec(
     name="double_desk",
     gym_id="Isaac-Move-PickPlace-DoubleDesk-G129-Dex3-Wholebody",
     instruction="Put the hammer from the right table into the basket on the left table.",
+    suite="HOI",
     spawn_position=(-3.7, -2.2, 0.8),
     spawn_quat=IDENTITY,
     objects=(

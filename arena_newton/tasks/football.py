@@ -84,6 +84,7 @@ TASK = TaskSpec(
     name="football",
     gym_id="Isaac-Move-Football-Single-G129-Dex3-Wholebody",
     instruction="Kick the soccer ball into the goal.",
+    suite="HOI",
     spawn_position=(0.0, -2.0, 0.8),
     spawn_quat=FACE_PLUS_Y,
     objects=(

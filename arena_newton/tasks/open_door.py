@@ -95,6 +95,7 @@ TASK = TaskSpec(
     name="open_door",
     gym_id="Isaac-Move-Open-Door-G129-Dex3-Wholebody",
     instruction="Open the door.",
+    suite="HSI",
     spawn_position=(-1.6, 0.2, 0.8),
     spawn_quat=FACE_PLUS_Y,
     objects=(

@@ -135,6 +135,7 @@ TASK = TaskSpec(
     name="pp_box",
     gym_id="Isaac-Move-PickPlace-Box-G129-Dex3-Wholedoby",
     instruction="Move the box from the table onto the shelf.",
+    suite="HOI",
     spawn_position=(-1.6, -5.0, 0.8),
     spawn_quat=IDENTITY,
     objects=(

@@ -133,6 +133,7 @@ TASK = TaskSpec(
     name="sit_sofa",
     gym_id="Isaac-Move-Sit-Sofa-G129-Dex3-Wholebody",
     instruction="Sit on the sofa.",
+    suite="HSI",
     spawn_position=(-1.6, 2.0, 0.8),
     spawn_quat=FACE_MINUS_Y,
     objects=(

@@ -121,6 +121,7 @@ TASK = TaskSpec(
     name="vis_navi",
     gym_id="Isaac-Move-SmallWarehouse-VisionNavigation-G129-Dex3-Wholebody",
     instruction="Avoid obstacles and move to the yellow marked area.",
+    suite="HSI",
     spawn_position=(-1.90, -5.20, 0.80),
     spawn_quat=FACE_PLUS_Y,
     objects=(
