@@ -18,14 +18,16 @@ from arena_newton.eval.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Verdict
 from arena_newton.kernels import tick as codes
 
-SLOW = 30
-"""Every episode that ends by itself has ended after so many ticks; from there on ten ticks pass at once."""
+SLOW = 10
+"""Every episode that ends by itself has ended after so many ticks; the others then leap from one leap to the next."""
+LEAP = 50
 
 
 class FakeEnv:
     """A world (`interfaces.World`) whose episodes end in another order than they start.
 
-    Half of them succeed, three of ten fall, the others run until their budget, which must be a multiple of ten.
+    Half of them succeed, three of ten fall, the others run until their budget: a multiple of `LEAP`, or at
+    most `SLOW`.
     """
 
     startup_ticks = 0
@@ -44,7 +46,8 @@ class FakeEnv:
 
     @property
     def judge(self):
-        return SimpleNamespace(margin=SimpleNamespace(numpy=lambda: [self.verdict(w).margin for w in range(self.worlds)]))
+        margins = [self.verdict(world).margin for world in range(self.worlds)]
+        return SimpleNamespace(margin=SimpleNamespace(numpy=lambda: margins))
 
     def reset(self, seeds, worlds=None, *, spawn=None):
         worlds = range(self.worlds) if worlds is None else worlds
@@ -60,8 +63,10 @@ class FakeEnv:
         return Observation(torch.zeros(self.worlds, 64), None, mask, self.task, self.spec.gym_id, self.spec.instruction)
 
     def step(self, action):
-        time.sleep(float(os.environ.get("FAKE_TICK_S", "0")))
-        self.tick[self.active] += np.where(self.tick[self.active] < SLOW, 1, 10)
+        if pause := float(os.environ.get("FAKE_TICK_S", "0")):
+            time.sleep(pause)
+        leapt = (self.tick // LEAP + 1) * LEAP
+        self.tick[self.active] = np.where(self.tick < SLOW, self.tick + 1, leapt)[self.active]
         kind, ends = self.seeds % 10, self.tick > self.seeds % SLOW
         status = np.where(ends & (kind < 5), codes.SUCCESS, np.where(ends & (kind < 8), codes.FALL, codes.RUNNING))
         return np.where(self.active, status, codes.RUNNING).astype(np.int32)
