@@ -17,6 +17,7 @@ __all__ = [
     "IDENTITY_ROT6D",
     "MIMIC",
     "MIMIC_WIDTH",
+    "STAND_ACTION",
     "STATE",
     "STATE_WIDTH",
     "element_name",
@@ -54,6 +55,9 @@ MIMIC_WIDTH = 35
 
 IDENTITY_ROT6D: tuple[float, ...] = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 """Row layout: the first two columns of the rotation matrix, flattened row by row."""
+_DEFAULT_JOINTS = [robot.DEFAULT_POSE[i] for i in robot.CANONICAL_TO_MUJOCO]
+STAND_ACTION = np.array([0.0, 0.0, robot.SPAWN_HEIGHT, *IDENTITY_ROT6D, *_DEFAULT_JOINTS, 0.0, 0.0], dtype=np.float32)
+"""Action of standing still: TWIST2's command when there is no input (root height 0.8 m, default pose)."""
 HAND_CLOSED = 0.5
 """A hand value at or above this closes the hand."""
 _MIN_CROSS = 1e-6

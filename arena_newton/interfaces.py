@@ -312,6 +312,8 @@ class Judge(Protocol):
     """0 nothing, otherwise one of the task's events, int32, shape [worlds]."""
     predicates: wp.array
     """1 where a predicate of the task holds at this tick, int32, [worlds, n], columns as `TaskSpec.predicates`."""
+    counters: list[wp.array]
+    """Everything else that the next tick's verdict depends on, rows are worlds: what `reset` clears."""
 
     def evaluate(self, physics: Any) -> None:
         """Fill the outputs for the state after this tick."""
@@ -354,8 +356,12 @@ class World(Protocol):
         """State of every world and, if asked, the head camera's picture of the worlds in `mask`."""
         ...
 
-    def step(self, action: torch.Tensor | np.ndarray) -> np.ndarray:
-        """Advance every active world by one tick; status codes of `arena_newton.kernels.tick`, int32, [worlds]."""
+    def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
+        """Advance active worlds (those of a bool mask, if given) by one tick.
+
+        Returns:
+            Status codes of `arena_newton.kernels.tick`, int32, shape [worlds].
+        """
         ...
 
     def render(self, camera: Any, mask: np.ndarray | None = None) -> torch.Tensor:
@@ -375,31 +381,31 @@ class World(Protocol):
         ...
 
 
-class Recorder(Protocol):
-    """Looks on while episodes run; `rollout.Rollout` calls it."""
+class Recorder:
+    """Base of what looks on while episodes run; `rollout.Rollout` calls it, a subclass overrides what it needs."""
+
+    wants_observation: bool = False
+    """Whether `before_physics` needs the observation of every tick, which costs a kernel launch."""
 
     def start(self, env: World, world: int, episode: Any) -> None:
         """An episode begins in a world: it was reset."""
-        ...
 
-    def before_physics(self, env: World, observation: Observation, action: torch.Tensor) -> None:
+    def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """A tick begins.
 
         Args:
             env: The worlds.
-            observation: State of this tick; no picture unless the policy asked for one at this tick.
+            observation: State of this tick, without a picture unless the policy asked for one at this tick; None where
+                no recorder wants observations.
             action: What the policy decided for this tick (the label), float32, shape [worlds, 40]; rows of worlds that
                 do not act mean nothing. A disturbance changes what is executed, never this.
         """
-        ...
 
     def tick(self, env: World) -> None:
         """A tick is over."""
-        ...
 
     def finish(self, env: World, world: int, result: EpisodeResult) -> None:
         """An episode ended; the world still shows its last state."""
-        ...
 
 
 Disturbance = Callable[["World", "torch.Tensor"], "torch.Tensor"]

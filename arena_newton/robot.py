@@ -7,6 +7,7 @@ Vectors over the 29 body joints are in MuJoCo order unless the name says otherwi
 from dataclasses import dataclass
 
 __all__ = [
+    "ARMS",
     "CANONICAL_JOINTS",
     "CANONICAL_TO_MUJOCO",
     "CRITICAL_BODY_WORDS",
@@ -16,6 +17,8 @@ __all__ = [
     "HAND_CLOSE_RIGHT",
     "HAND_JOINTS",
     "HAND_OPEN",
+    "KNEES",
+    "LEGS",
     "MUJOCO_JOINTS",
     "MUJOCO_TO_CANONICAL",
     "PhysicsRate",
@@ -24,6 +27,7 @@ __all__ = [
     "TICK",
     "TWIST2_DRIVE",
     "TWIST2_HUMANOIDARENA_DRIVE",
+    "WAIST",
 ]
 
 TICK = 0.02
@@ -43,6 +47,15 @@ MUJOCO_JOINTS: tuple[str, ...] = tuple(
     + [f"right_{j}_joint" for j in _ARM]
 )
 """29 body joints in MuJoCo actuator order, which is TWIST2's order."""
+
+LEGS: tuple[int, ...] = tuple(range(12))
+"""Leg joints in MuJoCo order, left leg first."""
+WAIST: tuple[int, ...] = (12, 13, 14)
+"""Waist joints in MuJoCo order: yaw, roll, pitch."""
+ARMS: tuple[int, ...] = tuple(range(15, 29))
+"""Arm joints in MuJoCo order, left arm first, wrists included."""
+KNEES: tuple[int, ...] = (3, 9)
+"""Knee joints in MuJoCo order, left, right."""
 
 CANONICAL_TO_MUJOCO: tuple[int, ...] = (
     0, 6, 12, 1, 7, 13, 2, 8, 14, 3, 9, 15, 22, 4, 10, 16, 23, 5, 11, 17, 24, 18, 25, 19, 26, 20, 27, 21, 28,

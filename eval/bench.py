@@ -1,4 +1,4 @@
-"""``python -m arena_newton.eval bench``: this machine against the figures the product is to reach."""
+"""``python -m arena_newton.eval bench``: this machine against the figures that the product must reach."""
 
 from __future__ import annotations
 
@@ -14,10 +14,15 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
 from arena_newton.quiet import quiet_warp
+
+if TYPE_CHECKING:
+    from arena_newton.env import ArenaEnv
+    from arena_newton.interfaces import Physics
+    from arena_newton.trackers.base import Tracker
 
 __all__ = ["BenchOptions", "Figure", "run"]
 
@@ -132,7 +137,7 @@ def _cores(count: int) -> Iterator[int]:
         torch.set_num_threads(threads)
 
 
-def _twist2(options: BenchOptions) -> tuple[Any, str]:
+def _twist2(options: BenchOptions) -> tuple[Tracker, str]:
     """TWIST2 tracker and how to call its weights in a note."""
     from arena_newton import trackers
 
@@ -173,7 +178,7 @@ def _write_random_network(path: Path) -> None:
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)]), path)
 
 
-def _sync(env: Any) -> None:
+def _sync(env: ArenaEnv) -> None:
     if env.device.is_cuda:
         import warp as wp
 
@@ -181,25 +186,11 @@ def _sync(env: Any) -> None:
 
 
 @contextlib.contextmanager
-def _as_before(physics: Any) -> Iterator[None]:
+def _as_before(physics: Physics) -> Iterator[None]:
     """Put the physics back into the state it had, so that the bare steps start where the full ticks do."""
-    if physics.engine == "mujoco":
-        import copy
-
-        import mujoco
-
-        kept = [copy.copy(data) for data in physics._data]
-        yield
-        for data, before in zip(physics._data, kept, strict=True):
-            mujoco.mj_copyData(data, physics._m, before)
-        return
-    import warp as wp
-
-    arrays = (physics._d.qpos, physics._d.qvel, physics._d.qacc_warmstart, physics._d.time)
-    copies = [wp.clone(array) for array in arrays]
+    kept = physics.snapshot()
     yield
-    for array, before in zip(arrays, copies, strict=True):
-        wp.copy(array, before)
+    physics.restore(kept)
 
 
 def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> tuple[float, float, str]:
@@ -240,7 +231,7 @@ def _tick_times(options: BenchOptions, worlds: int, engine: str, fast: bool) -> 
             alone.append(timed(bare))
         full.append(timed(ticks))
         ended = np.flatnonzero(status)
-        if len(ended):  # as in an evaluation, a world that ended begins anew
+        if len(ended):  # as in an evaluation, a world that ended starts its next episode
             env.reset([int(w) for w in ended], ended)
     return statistics.median(full), statistics.median(alone), note
 
@@ -283,13 +274,15 @@ def _frames(worlds: int, device: str, engine: str, rounds: int) -> tuple[float, 
         mode="visual",
         camera=CameraConfig(width=224, height=224),
     )
+    camera = env.camera
+    assert camera is not None
     env.reset(list(range(worlds)))
-    env.render(env.camera)
+    env.render(camera)
     times, processor = [], []
     for _ in range(rounds):
         _sync(env)
         began, used = time.perf_counter(), time.process_time()
-        env.render(env.camera)
+        env.render(camera)
         _sync(env)
         times.append(time.perf_counter() - began)
         processor.append(time.process_time() - used)
@@ -315,6 +308,7 @@ def _pictures(options: BenchOptions) -> Iterator[Figure]:
     from arena_newton.env import ArenaEnv
     from arena_newton.eval import plan
     from arena_newton.pictures.recorder import EpisodeRecorder
+    from arena_newton.rollout import Rollout
 
     env = ArenaEnv("vis_navi", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu")
     episodes = plan.expand(["vis_navi"], tracker="twist2", policy="expert", seeds=[0], repeats=2)
@@ -325,12 +319,12 @@ def _pictures(options: BenchOptions) -> Iterator[Figure]:
         def play(kind: str) -> None:
             with EpisodeRecorder(folder, video=kind == "video", strip=kind == "strip") as recorder:
                 began = time.perf_counter()
-                env.run_episodes(policy, episodes, recorder=None if kind == "none" else recorder)
+                Rollout(env, policy, episodes, recorder=() if kind == "none" else recorder).run()
                 times[kind].append(time.perf_counter() - began)
 
         # Kernels of tick and camera first.
         with EpisodeRecorder(folder, video=False) as recorder:
-            env.run_episodes(policy, episodes, recorder=recorder, max_steps=20)
+            Rollout(env, policy, episodes, recorder=recorder, max_steps=20).run()
         for _ in range(3):
             play("none")
             play("strip")
@@ -346,6 +340,7 @@ def _episodes(options: BenchOptions) -> Iterator[Figure]:
     from arena_newton import policies
     from arena_newton.env import ArenaEnv
     from arena_newton.eval import plan
+    from arena_newton.rollout import Rollout
 
     name = "60 episodes x 1300 ticks football, stand, TWIST2, no camera, 2 cores"
     if options.checkpoint is None:
@@ -357,7 +352,7 @@ def _episodes(options: BenchOptions) -> Iterator[Figure]:
         env = ArenaEnv("football", worlds=options.worlds, tracker=tracker, engine="mujoco")
         built = time.perf_counter()
         episodes = plan.expand(["football"], tracker="twist2", policy="stand", max_steps=1300)
-        results = env.run_episodes(policies.get("stand"), episodes)
+        results = Rollout(env, policies.get("stand"), episodes).run()
         wall = time.perf_counter() - built
     ticks = sum(result.steps for result in results)
     detail = f"{ticks:,} ticks on {cores} cores, built in {built - began:.1f} s; {note}"

@@ -10,9 +10,10 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,8 +24,9 @@ from arena_newton.intervals import wilson
 from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
-    from arena_newton.env import Spawn
+    from arena_newton.interfaces import Spawn
     from arena_newton.policies.base import Policy
+    from arena_newton.tasks.base import TaskSpec
 
 __all__ = ["EngineOptions", "Rates", "fisher", "measure", "run"]
 
@@ -102,8 +104,9 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
 
     from arena_newton import trackers
     from arena_newton.env import ArenaEnv
+    from arena_newton.rollout import Rollout
 
-    env: Any = ArenaEnv(
+    env = ArenaEnv(
         options.task,
         worlds=min(options.worlds, options.rollouts),
         tracker=trackers.get(options.tracker, options.checkpoint),
@@ -113,13 +116,14 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
     began = time.perf_counter()
     with tqdm(total=len(rollouts), desc=engine, unit="rollout", disable=None) as bar:  # none in a log file
-        results = env.run_episodes(
+        results = Rollout(
+            env,
             policy,
             rollouts,
-            on_finish=lambda _: bar.update(),
             max_steps=options.max_steps,
-            spawn=_moved_spawn(env.spec, options.noise),
-        )
+            spawn=moved_spawn(env.spec, options.noise),
+            on_finish=lambda _: bar.update(),
+        ).run()
     outcomes = [result.outcome for result in results]
     return Rates(
         engine=engine,
@@ -133,13 +137,13 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     )
 
 
-def _moved_spawn(spec: Any, noise: float) -> Spawn:
+def moved_spawn(spec: TaskSpec, noise: float) -> Spawn:
     """The task's spawn pose, moved by noise [m] that the episode seed alone decides."""
 
-    def spawn(seed: int) -> tuple[Any, Any]:
+    def spawn(seed: int) -> tuple[Sequence[float], Sequence[float]]:
         position = np.array(spec.spawn_position, dtype=np.float32)
         position[:2] += noise * np.random.default_rng(seed).standard_normal(2)
-        return position, spec.spawn_quat
+        return position.tolist(), spec.spawn_quat
 
     return spawn
 

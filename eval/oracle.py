@@ -283,8 +283,8 @@ def run_ours(
                 qpos[:, h.joint_qpos],
                 qpos[:, root : root + 3],
                 qpos[:, root + 3 : root + 7],
-                env.reference.position.numpy().astype(float),
-                env.reference.quat.numpy().astype(float),
+                env.loop.reference.position.numpy().astype(float),
+                env.loop.reference.quat.numpy().astype(float),
             )
         )
     return _tracks(streams, history)

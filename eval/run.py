@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
 
 import warp as wp
 
@@ -27,13 +26,14 @@ from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageErr
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
-from arena_newton.eval.recordings import RecordingPolicy
+from arena_newton.eval.recordings import ActionRecorder
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.results import load_run
-from arena_newton.interfaces import EpisodeResult, World
+from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.robot import TICK
+from arena_newton.rollout import Rollout
 from arena_newton.text import counted, plain_text
 from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
@@ -55,7 +55,7 @@ def _make_tracker(spec: str, checkpoint: Path | None) -> Tracker:
 class Factories:
     """What a run builds its parts with; tests put their own in."""
 
-    env: Callable[..., World] = cast("Callable[..., World]", ArenaEnv)
+    env: Callable[..., World] = ArenaEnv
     tracker: Callable[[str, Path | None], Tracker] = _make_tracker
     policy: Callable[..., Policy] = policies.get
     check_variant: Callable[[Path, str], None] = validate.check
@@ -260,26 +260,25 @@ class _Run:
             if flags.verbose:
                 self.progress.say(console.environment(f"{task} {mode}", facts))
             recorder = _recorder(config, self.folder.path)
-            actor = RecordingPolicy(self.policy, self.folder.path / "actions") if flags.actions else self.policy
+            recorders: list[Recorder] = [] if recorder is None else [recorder]
+            recorders += [ActionRecorder(self.folder.path / "actions")] if flags.actions else []
 
             def on_finish(result: EpisodeResult) -> None:
-                if isinstance(actor, RecordingPolicy):
-                    assert env is not None
-                    actor.write(result, env.spec.gym_id)
                 media = recorder.media(result.episode) if recorder is not None else {}
                 self.journal.append(_record(result, media, self.hashes))
                 left.pop(result.episode.index, None)
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK))
 
             self.hashes = self.folder.hashes(facts)
-            cast(ArenaEnv, env).run_episodes(
-                actor,
+            Rollout(
+                env,
+                self.policy,
                 episodes,
+                recorder=recorders,
+                max_steps=episodes[0].max_steps,
                 on_finish=on_finish,
                 on_tick=self.progress.tick,
-                recorder=recorder,
-                max_steps=episodes[0].max_steps,
-            )
+            ).run()
         finally:
             if recorder is not None:
                 recorder.close()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from arena_newton.kernels.launching import launch_again
+from arena_newton.kernels.launching import launch
 from arena_newton.kernels.rotations import (
     heading_quat,
     heading_yaw,
@@ -154,7 +154,6 @@ def launch_state64(
     qpos: wp.array,
     qvel: wp.array,
     root_qpos_adr: int,
-    root_qvel_adr: int,
     joint_qpos: wp.array,
     joint_qvel: wp.array,
     heading0: wp.array,
@@ -166,14 +165,12 @@ def launch_state64(
         qpos: Positions, MuJoCo layout, shape [worlds, nq].
         qvel: Velocities, MuJoCo layout, shape [worlds, nv].
         root_qpos_adr: Address of the robot's free joint in `qpos`.
-        root_qvel_adr: Address of the robot's free joint in `qvel`; the state holds no root velocity, so it is unused.
         joint_qpos: Addresses in `qpos`, canonical order, int32, shape [29].
         joint_qvel: Addresses in `qvel`, canonical order, int32, shape [29].
         heading0: Heading of the robot at reset [rad], shape [worlds].
         state: Output, shape [worlds, 64].
     """
-    del root_qvel_adr
-    launch_again(
+    launch(
         state64_kernel,
         dim=state.shape[0],
         inputs=[qpos, qvel, root_qpos_adr, joint_qpos, joint_qvel, heading0],
@@ -233,7 +230,7 @@ def launch_reset_reference(ref: ReferencePose, qpos: wp.array, root_qpos_adr: in
         root_qpos_adr: Address of the robot's free joint in `qpos`.
         mask: 1 = reset this world, int32, shape [worlds].
     """
-    launch_again(
+    launch(
         reset_reference_kernel,
         dim=mask.shape[0],
         inputs=[qpos, root_qpos_adr, mask, ref.canonical_to_mujoco],
@@ -346,7 +343,7 @@ def launch_integrate(
         out: Where to write instead, for differentiation.
     """
     to = ref if out is None else out
-    launch_again(
+    launch(
         integrate_kernel,
         dim=action.shape[0],
         inputs=[
@@ -400,4 +397,4 @@ def launch_validate_action(action: wp.array, bad: wp.array) -> None:
         action: Canonical actions, shape [worlds, 40].
         bad: Output: 0 good, `ACTION_NONFINITE`, or `ACTION_BAD_ROT6D` (|c0 x c1| < 1e-6), int32, shape [worlds].
     """
-    launch_again(validate_action_kernel, dim=action.shape[0], inputs=[action], outputs=[bad], device=action.device)
+    launch(validate_action_kernel, dim=action.shape[0], inputs=[action], outputs=[bad], device=action.device)

@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from arena_newton.kernels.launching import launch_again
+from arena_newton.kernels.launching import launch
 
 __all__ = ["launch_clear", "launch_nonfinite", "launch_reset"]
 
@@ -83,7 +83,7 @@ def launch_reset(
         mocap_quat: Written, shape [worlds, nmocap, 4], or None.
     """
     worlds = mask.shape[0]
-    launch_again(
+    launch(
         reset_state_kernel,
         dim=(worlds, max(qpos.shape[1], qvel.shape[1], ctrl.shape[1])),
         inputs=[mask, qpos0, qvel0, ctrl0],
@@ -91,7 +91,7 @@ def launch_reset(
         device=mask.device,
     )
     if mocap_pos is not None and mocap_pos.shape[1] > 0:
-        launch_again(
+        launch(
             reset_mocap_kernel,
             dim=(worlds, mocap_pos.shape[1]),
             inputs=[mask, mocap_pos0, mocap_quat0],
@@ -115,7 +115,7 @@ def launch_clear(mask: wp.array, counter: wp.array) -> None:
         mask: 1 = clear, int32, shape [worlds].
         counter: Streak or counter, int32, shape [worlds].
     """
-    launch_again(clear_kernel, dim=mask.shape[0], inputs=[mask], outputs=[counter], device=mask.device)
+    launch(clear_kernel, dim=mask.shape[0], inputs=[mask], outputs=[counter], device=mask.device)
 
 
 @wp.kernel
@@ -140,4 +140,4 @@ def launch_nonfinite(qpos: wp.array, qvel: wp.array, bad: wp.array) -> None:
         qvel: Velocities, shape [worlds, nv].
         bad: Output, 1 = broken, int32, shape [worlds].
     """
-    launch_again(nonfinite_kernel, dim=bad.shape[0], inputs=[qpos, qvel], outputs=[bad], device=bad.device)
+    launch(nonfinite_kernel, dim=bad.shape[0], inputs=[qpos, qvel], outputs=[bad], device=bad.device)

@@ -1,30 +1,39 @@
-"""Per-tick bookkeeping: joint targets into actuators, one status code a world."""
+"""Per-tick bookkeeping: joint targets into actuators, one status code per world, and what happened first when."""
+
+from dataclasses import dataclass
 
 import warp as wp
 
-from arena_newton.kernels.launching import launch_again
+from arena_newton.kernels.launching import launch
 
 __all__ = [
     "ERROR_ACTION",
     "ERROR_STATE",
     "ERROR_TARGETS",
+    "EVENT",
     "FALL",
+    "NEVER",
     "RUNNING",
     "SUCCESS",
+    "EpisodeLog",
     "launch_check_targets",
+    "launch_clear_log",
+    "launch_log",
     "launch_sanitize",
     "launch_status",
     "launch_write_ctrl",
 ]
 
-RUNNING = 0
-SUCCESS = 1
-FALL = 2
-ERROR_STATE = 3
-ERROR_ACTION = 4
-ERROR_TARGETS = 5
-EVENT = 8
-"""Codes from EVENT on carry a judge's event number."""
+RUNNING = wp.constant(0)
+SUCCESS = wp.constant(1)
+FALL = wp.constant(2)
+ERROR_STATE = wp.constant(3)
+ERROR_ACTION = wp.constant(4)
+ERROR_TARGETS = wp.constant(5)
+EVENT = wp.constant(8)
+"""Codes above EVENT carry a judge's event number."""
+NEVER = wp.constant(-1)
+"""Tick of something that has not happened since step 0."""
 
 
 @wp.kernel
@@ -35,9 +44,12 @@ def _write_ctrl(
     hand_ctrl: wp.array[wp.int32],
     hand_open: wp.array[wp.float32],
     hand_close: wp.array[wp.float32],
+    mask: wp.array[wp.int32],
     ctrl: wp.array2d[wp.float32],
 ):
     world, i = wp.tid()
+    if mask[world] == 0:
+        return
     joints = joint_ctrl.shape[0]
     if i < joints:
         ctrl[world, joint_ctrl[i]] = targets[world, i]
@@ -50,11 +62,31 @@ def _write_ctrl(
             ctrl[world, hand_ctrl[finger]] = hand_open[finger]
 
 
-def launch_write_ctrl(targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close, ctrl) -> None:
-    """Write joint targets [worlds, 29] and binary hands [worlds, 2] into actuator targets `ctrl` [worlds, nu]."""
+def launch_write_ctrl(
+    targets: wp.array,
+    joint_ctrl: wp.array,
+    hands: wp.array,
+    hand_ctrl: wp.array,
+    hand_open: wp.array,
+    hand_close: wp.array,
+    mask: wp.array,
+    ctrl: wp.array,
+) -> None:
+    """Write joint targets and binary hands of the masked worlds into the actuator targets.
+
+    Args:
+        targets: Joint targets [rad], shape [worlds, 29].
+        joint_ctrl: Actuator of each joint, int32, shape [29].
+        hands: Left and right hand, from 0.5 on closed, shape [worlds, 2].
+        hand_ctrl: Actuator of each finger joint, left hand first, int32, shape [14], or [0] with fixed hands.
+        hand_open: Finger targets of open hands [rad], shape as `hand_ctrl`.
+        hand_close: Finger targets of closed hands [rad], shape as `hand_ctrl`.
+        mask: 1 = write this world, int32, shape [worlds].
+        ctrl: Actuator targets [rad], written, shape [worlds, nu].
+    """
     dim = (ctrl.shape[0], joint_ctrl.shape[0] + hand_ctrl.shape[0])
-    inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close]
-    launch_again(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
+    inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close, mask]
+    launch(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
 
 
 @wp.kernel
@@ -82,7 +114,7 @@ def launch_check_targets(targets: wp.array, joint_ctrl: wp.array, ctrl: wp.array
         ctrl: Actuator targets [rad], shape [worlds, nu].
         bad: Output, 1 = a target was not finite, int32, shape [worlds].
     """
-    launch_again(_check_targets, dim=bad.shape[0], inputs=[targets, joint_ctrl, ctrl], outputs=[bad], device=bad.device)
+    launch(_check_targets, dim=bad.shape[0], inputs=[targets, joint_ctrl, ctrl], outputs=[bad], device=bad.device)
 
 
 @wp.kernel
@@ -94,7 +126,7 @@ def _sanitize(bad: wp.array[wp.int32], neutral: wp.array[wp.float32], action: wp
 
 def launch_sanitize(bad: wp.array, neutral: wp.array, action: wp.array) -> None:
     """Replace the actions of worlds flagged `bad` [worlds] by `neutral` [40]."""
-    launch_again(_sanitize, dim=action.shape, inputs=[bad, neutral], outputs=[action], device=action.device)
+    launch(_sanitize, dim=action.shape, inputs=[bad, neutral], outputs=[action], device=action.device)
 
 
 @wp.kernel
@@ -108,23 +140,159 @@ def _status(
     status: wp.array[wp.int32],
 ):
     world = wp.tid()
-    code = wp.int32(0)
+    code = wp.int32(RUNNING)
     if event[world] != 0:
-        code = wp.int32(8) + event[world]
+        code = EVENT + event[world]
     if fallen[world] != 0:
-        code = wp.int32(2)
+        code = FALL
     if success[world] != 0:
-        code = wp.int32(1)
+        code = SUCCESS
     if bad_state[world] != 0:
-        code = wp.int32(3)
+        code = ERROR_STATE
     if bad_targets[world] != 0:
-        code = wp.int32(5)
+        code = ERROR_TARGETS
     if bad_action[world] != 0:
-        code = wp.int32(4)
+        code = ERROR_ACTION
     status[world] = code
 
 
 def launch_status(success, fallen, event, bad_state, bad_action, bad_targets, status) -> None:
-    """One code a world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
+    """One code per world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
     inputs = [success, fallen, event, bad_state, bad_action, bad_targets]
-    launch_again(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)
+    launch(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)
+
+
+@dataclass
+class EpisodeLog:
+    """What happened first at which tick of each world's episode; int32, stored on the device."""
+
+    tick: wp.array
+    """Ticks since step 0, negative in the start-up, shape [worlds]."""
+    fall_trigger: wp.array
+    """Trigger of the first fall (`kernels.fall`), 0 before one, shape [worlds]."""
+    fall_tick: wp.array
+    """Its tick, shape [worlds]."""
+    event: wp.array
+    """The judge's first event, 0 before one, shape [worlds]."""
+    event_tick: wp.array
+    """Its tick, shape [worlds]."""
+    contact_tick: wp.array
+    """First tick at which a critical body was pressed, or `NEVER`, shape [worlds]."""
+    predicate_ticks: wp.array
+    """First tick at which each predicate held, or `NEVER`, shape [worlds, n]."""
+
+    @classmethod
+    def allocate(cls, worlds: int, predicates: int, device: wp.DeviceLike) -> "EpisodeLog":
+        """Allocate for a number of predicates; clear it before the first tick."""
+        one = [wp.zeros(worlds, dtype=wp.int32, device=device) for _ in range(6)]
+        return cls(*one, wp.zeros((worlds, predicates), dtype=wp.int32, device=device))
+
+
+@wp.kernel
+def _clear_log(
+    mask: wp.array[wp.int32],
+    first: wp.int32,
+    tick: wp.array[wp.int32],
+    fall_trigger: wp.array[wp.int32],
+    event: wp.array[wp.int32],
+    contact_tick: wp.array[wp.int32],
+    predicate_ticks: wp.array2d[wp.int32],
+):
+    world = wp.tid()
+    if mask[world] == 0:
+        return
+    tick[world] = first
+    fall_trigger[world] = 0
+    event[world] = 0
+    contact_tick[world] = NEVER
+    for i in range(predicate_ticks.shape[1]):
+        predicate_ticks[world, i] = NEVER
+
+
+def launch_clear_log(log: EpisodeLog, mask: wp.array, first: int) -> None:
+    """Begin the log of the masked worlds.
+
+    Args:
+        log: Cleared.
+        mask: 1 = clear, int32, shape [worlds].
+        first: Tick that they are at: 0, or minus the length of the start-up.
+    """
+    launch(
+        _clear_log,
+        dim=mask.shape[0],
+        inputs=[mask, first],
+        outputs=[log.tick, log.fall_trigger, log.event, log.contact_tick, log.predicate_ticks],
+        device=mask.device,
+    )
+
+
+@wp.kernel
+def _log(
+    mask: wp.array[wp.int32],
+    fall_now: wp.array[wp.int32],
+    event_now: wp.array[wp.int32],
+    pressed: wp.array[wp.int32],
+    predicates: wp.array2d[wp.int32],
+    tick: wp.array[wp.int32],
+    fall_trigger: wp.array[wp.int32],
+    fall_tick: wp.array[wp.int32],
+    event: wp.array[wp.int32],
+    event_tick: wp.array[wp.int32],
+    contact_tick: wp.array[wp.int32],
+    predicate_ticks: wp.array2d[wp.int32],
+):
+    world = wp.tid()
+    if mask[world] == 0:
+        return
+    now = tick[world] + 1
+    tick[world] = now
+    if fall_trigger[world] == 0 and fall_now[world] != 0:
+        fall_trigger[world] = fall_now[world]
+        fall_tick[world] = now
+    if now <= 0:
+        return
+    if event[world] == 0 and event_now[world] != 0:
+        event[world] = event_now[world]
+        event_tick[world] = now
+    if contact_tick[world] == NEVER and pressed[world] != 0:
+        contact_tick[world] = now
+    for i in range(predicate_ticks.shape[1]):
+        if predicate_ticks[world, i] == NEVER and predicates[world, i] != 0:
+            predicate_ticks[world, i] = now
+
+
+def launch_log(
+    log: EpisodeLog,
+    mask: wp.array,
+    fall_now: wp.array,
+    event_now: wp.array,
+    pressed: wp.array,
+    predicates: wp.array,
+) -> None:
+    """Count a tick of the masked worlds and keep what happens at it for the first time.
+
+    In the start-up only falls are kept.
+
+    Args:
+        log: Continued.
+        mask: 1 = this world has moved by one tick, int32, shape [worlds].
+        fall_now: Trigger of the fall rule at this tick, int32, shape [worlds].
+        event_now: The judge's event at this tick, int32, shape [worlds].
+        pressed: 1 = a critical body is pressed, int32, shape [worlds].
+        predicates: 1 where a predicate holds at this tick, int32, shape [worlds, n].
+    """
+    launch(
+        _log,
+        dim=mask.shape[0],
+        inputs=[mask, fall_now, event_now, pressed, predicates],
+        outputs=[
+            log.tick,
+            log.fall_trigger,
+            log.fall_tick,
+            log.event,
+            log.event_tick,
+            log.contact_tick,
+            log.predicate_ticks,
+        ],
+        device=mask.device,
+    )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arena_newton.canonical import ACTION_WIDTH
-from arena_newton.env import STAND_ACTION
+from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Observation, Policy
 

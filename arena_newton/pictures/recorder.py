@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.interfaces import Recorder
 from arena_newton.pictures import follow as following
 from arena_newton.pictures.video import VideoWriter, caption, evenly, film_strip
 from arena_newton.robot import TICK
@@ -90,8 +91,8 @@ class _Stream:
             self.ticks, self.poses, self.stride = self.ticks[::2], self.poses[::2], 2 * self.stride
 
 
-class EpisodeRecorder:
-    """Records the worlds of an `ArenaEnv`; give it to `ArenaEnv.run_episodes`, and close it after."""
+class EpisodeRecorder(Recorder):
+    """Records the worlds of an `ArenaEnv`; give it to `rollout.Rollout`, and close it after."""
 
     def __init__(
         self,
@@ -165,7 +166,7 @@ class EpisodeRecorder:
         self._walls = following.room_walls(env.scene.mj_model) if self.follow else ()
         self._headings: dict[int, float] = {}
         self._follower = following.Follower(self._headings, self._walls)
-        lights = env._lights()
+        lights = env.lights
         views = min(env.worlds, VIEWS)
         if self.video:
             self._cameras = {n: self._camera(env, n, size, lights, views) for n, size in self.video_sizes.items()}

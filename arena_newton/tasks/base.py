@@ -6,7 +6,7 @@ Drawing is pure: an episode's draws depend on its seed, its mode and the rule se
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ from arena_newton.rules import (
 if TYPE_CHECKING:
     import numpy as np
 
+    from arena_newton.interfaces import Predicate
     from arena_newton.physics import Physics
     from arena_newton.scene import Scene
 
@@ -270,6 +271,8 @@ class Judge:
             """Signed distance to success [m], at least 0 where the predicate holds at this instant, shape [worlds]."""
             self.event = wp.zeros(self.worlds, dtype=wp.int32)
             """0 nothing, 1 the ball left the field, shape [worlds]."""
+            self.predicates = wp.zeros((self.worlds, 0), dtype=wp.int32)
+            """1 where a predicate of the task holds at this tick, shape [worlds, n]."""
         self.counters: list[Any] = []
         """int32 arrays [worlds] that a reset clears."""
 
@@ -324,6 +327,10 @@ class TaskSpec:
     success: ByRules[SuccessRule]
     """The predicate's numbers and its sentence, one per rule set."""
     make_judge: Callable[[Scene, RuleSet], Judge]
+    predicates: tuple[Predicate, ...] = ()
+    """Steps on the way to success, in order."""
+    events: Mapping[int, str] = field(default_factory=dict)
+    """The judge's event number → reason of the timeout that it causes."""
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
     overlaps: tuple[Overlap, ...] = ()

@@ -102,5 +102,6 @@ TASK = TaskSpec(
         released=FootballRule(rear_bound=False, ball_out=False, ball_restitution=0.75),
     ),
     make_judge=FootballJudge,
+    events={1: "ball_out"},
     semantic_variant=ByRules(paper="semantic", released="semantic_released"),
 )

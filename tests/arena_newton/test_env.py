@@ -1,6 +1,4 @@
-"""Episodes: results do not depend on the batch, errors stay in their world, start-up falls are told apart."""
-
-from types import SimpleNamespace
+"""The batch of worlds: resets, observations, steps, verdicts; what happens to one world changes no bit of another."""
 
 import numpy as np
 import pytest
@@ -9,87 +7,10 @@ import torch
 from arena_newton import trackers
 from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.errors import InputError
-from arena_newton.interfaces import Chunk
+from arena_newton.interfaces import EpisodeEvent
 from arena_newton.kernels import tick as codes
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, SONIC_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
-
-STEPS = 30
-
-
-class Sway:
-    """A policy whose action depends on the world's own state, so that any mixing of worlds shows."""
-
-    needs_image = False
-
-    def __init__(self, worlds=1):
-        self.bad = {}
-        self.calls = 0
-
-    def reset(self, seeds, tasks, mask):
-        pass
-
-    def act(self, observation):
-        state = observation.state
-        actions = torch.from_numpy(STAND_ACTION).repeat(len(state), 5, 1)
-        actions[:, :, 9:38] += 0.05 * torch.sin(10.0 * state[:, None, 6:35])
-        actions[:, :, 0] = 0.004
-        self.calls += 1
-        return Chunk(actions)
-
-
-class Network(trackers.base.Tracker):
-    """A tracker with a random network in fixed blocks, of TWIST2's size."""
-
-    name = "network"
-
-    def bind(self, worlds, device="cpu", scene=None):
-        from arena_newton.trackers.inference.blocks import BlockRunner
-
-        torch.manual_seed(0)
-        layers = [
-            torch.nn.Linear(64, 512),
-            torch.nn.ELU(),
-            torch.nn.Linear(512, 256),
-            torch.nn.ELU(),
-            torch.nn.Linear(256, 29),
-        ]
-        self.run = BlockRunner(torch.nn.Sequential(*layers), 64, worlds, device)
-        self.default = torch.tensor(DEFAULT_POSE)
-
-    def step(self, command, state):
-        x = self.run.input[: state.joint_pos.shape[0]]
-        x[:, :29], x[:, 29:58], x[:, 58:61], x[:, 61:64] = state.joint_pos, command.joints, state.ang_vel_body, 0
-        return command.joints + 0.2 * self.run.run()[: len(x)]
-
-
-def _episodes(n):
-    return [SimpleNamespace(episode_seed=1000 + 7 * i, index=i) for i in range(n)]
-
-
-def _run(worlds, episodes):
-    env = ArenaEnv("football", tracker=Network(), worlds=worlds, engine="mujoco", device="cpu", fast_physics=True)
-    finals = {}
-
-    def keep(result):
-        w = next(i for i, d in enumerate(env.draws) if d is env_draw(env, result))
-        finals[result.episode.index] = env.physics.qpos.numpy()[w].copy()
-
-    def env_draw(env, result):
-        expected = env.spec.draw(result.episode.episode_seed, "base", env.rules)
-        return next(d for w, d in enumerate(env.draws) if d == expected)
-
-    results = env.run_episodes(Sway(), episodes, on_finish=keep, max_steps=STEPS)
-    return {r.episode.index: (r.outcome, r.steps, r.margin, finals[r.episode.index].tobytes()) for r in results}
-
-
-def test_results_do_not_depend_on_batch_or_order():
-    """Engine mujoco: 1, 3 and 20 worlds, forward and backward, give bit-identical episodes, tracker included."""
-    episodes = _episodes(6)
-    alone = _run(1, episodes)
-    three = _run(3, episodes)
-    twenty = _run(20, episodes[::-1])
-    assert alone == three == twenty
-    assert len({v[3] for v in alone.values()}) == 6
+from arena_newton.robot import SONIC_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+from arena_newton.tasks.football import FootballJudge
 
 
 @pytest.fixture(scope="module")
@@ -98,63 +19,11 @@ def env():
     return ArenaEnv("football", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", fast_physics=True)
 
 
-def test_bad_action_ends_only_its_world(env):
-    """A NaN in one world's action is that world's error; the other runs to its end."""
-
-    class OneBad(Sway):
-        def act(self, observation):
-            chunk = super().act(observation)
-            chunk.actions[0, 2, 12] = float("nan")
-            return chunk
-
-    first, second = env.run_episodes(OneBad(), _episodes(2), max_steps=8)
-    assert (first.outcome, first.reason, first.steps) == ("error", "bad_action", 3)
-    assert second.outcome == "timeout" and second.steps == 8
-
-
-def test_policy_error_ends_only_its_world(env):
-    """A policy that fails for one world ends that episode as error with its message."""
-
-    class Half(Sway):
-        def act(self, observation):
-            chunk = super().act(observation)
-            chunk.errors = {1: "server said no"} if observation.mask[1] else {}
-            return chunk
-
-    first, second = env.run_episodes(Half(), _episodes(2), max_steps=8)
-    assert first.outcome == "timeout"
-    assert (second.outcome, second.error) == ("error", "server said no")
-
-
-def test_nonfinite_state_is_an_error(env):
-    """A world whose state becomes NaN ends as error, the other goes on."""
-    done = []
-
-    def poison(_):
-        if env.tick[0] == 2 and not done:
-            done.append(1)
-            env.physics._data[0].qpos[:] = np.nan
-
-    first, second = env.run_episodes(Sway(), _episodes(2), on_tick=poison, max_steps=8)
-    assert (first.outcome, first.reason) == ("error", "nonfinite_state")
-    assert second.outcome == "timeout"
-
-
-def test_startup_fall_is_told_apart():
-    """A robot that falls before step 0 is reported as a start-up fall with no steps."""
-
-    class Drop(trackers.base.Tracker):
-        name = "drop"
-
-        def step(self, command, state):
-            target = command.joints.clone()
-            target[:, 4] = target[:, 10] = -1.0
-            target[:, 0] = target[:, 6] = -2.0
-            return target
-
-    env = ArenaEnv("football", tracker=Drop(), worlds=1, engine="mujoco", device="cpu", fast_physics=True)
-    (result,) = env.run_episodes(Sway(), _episodes(1), max_steps=8)
-    assert result.outcome == "fall" and result.startup_fall and result.steps == 0
+@pytest.fixture
+def won(monkeypatch):
+    """Two worlds of football whose success predicate always holds."""
+    monkeypatch.setattr(FootballJudge, "evaluate", lambda self, physics: self.success.fill_(1))
+    return ArenaEnv("football", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", fast_physics=True)
 
 
 def test_settle_ticks_precede_step_zero(env):
@@ -163,67 +32,10 @@ def test_settle_ticks_precede_step_zero(env):
     assert (env.tick == -env.startup_ticks).all()
 
 
-class Broken(trackers.base.Tracker):
-    """Answers the reference, spoiled by `spoil`."""
-
-    name = "broken"
-
-    def __init__(self, spoil):
-        self.spoil = spoil
-
-    def step(self, command, state):
-        return self.spoil(command.joints.clone())
-
-
-def _broken(env, spoil):
-    """The environment of this module with another tracker."""
-    tracker = Broken(spoil)
-    tracker.bind(env.worlds)
-    return tracker
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_nonfinite_targets_are_the_trackers_error(env, monkeypatch, value):
-    """A joint target that is not finite ends that world as error under the tracker's name; the other runs on."""
-
-    def spoil(targets):
-        if env.tick[0] == 3:
-            targets[0, 7] = value
-        return targets
-
-    monkeypatch.setattr(env, "tracker", _broken(env, spoil))
-    first, second = env.run_episodes(Sway(), _episodes(2), max_steps=8)
-    assert (first.outcome, first.reason, first.steps) == ("error", "tracker", 4)
-    assert "tracker broken" in first.error
-    assert second.outcome == "timeout" and second.steps == 8
-
-
-@pytest.mark.parametrize(
-    ("spoil", "said"),
-    [
-        (lambda targets: targets[:, :28], r"\[2, 28\]"),
-        (lambda targets: targets[:1], r"\[1, 29\]"),
-        (lambda targets: targets.double(), "float64"),
-        (lambda targets: targets.numpy(), "float32"),
-        (lambda targets: None, "NoneType"),
-    ],
-)
-def test_targets_of_another_kind_are_refused(env, monkeypatch, spoil, said):
-    """An answer of another shape or type stops the run with one line that names the tracker."""
-    monkeypatch.setattr(env, "tracker", _broken(env, spoil))
-    with pytest.raises(InputError, match=f"tracker broken: joint targets are .*{said}"):
-        env.run_episodes(Sway(), _episodes(2), max_steps=8)
-
-
-def test_startup_gives_no_success(env, monkeypatch):
+def test_startup_gives_no_success(won):
     """While the robot takes its stance neither success nor an event is reported; falls and errors are."""
-
-    def evaluate(physics):
-        env.judge.success.fill_(1)
-
-    monkeypatch.setattr(env.judge, "evaluate", evaluate)
-    env.reset([1, 2])
-    seen = [env.step(np.tile(STAND_ACTION, (2, 1))) for _ in range(env.startup_ticks + 1)]
+    won.reset([1, 2])
+    seen = [won.step(np.tile(STAND_ACTION, (2, 1))) for _ in range(won.startup_ticks + 1)]
     assert all((status == codes.RUNNING).all() for status in seen[:-1])
     assert (seen[-1] == codes.SUCCESS).all()
 
@@ -241,18 +53,18 @@ def test_statuses_are_kept(env):
     assert (first == kept).all() and first.tolist() == [codes.ERROR_ACTION, codes.RUNNING]
 
 
-def test_observe_lays_the_frame_down(env):
+def test_observe_anchors(env):
     """At step 0 the state's heading is zero, whoever asks first, and stays relative to that moment."""
-    env.reset([1, 2])
+    turned = (env.spec.spawn_position, (np.cos(0.4), 0.0, 0.0, np.sin(0.4)))
+    env.reset([1, 2], spawn=lambda seed: turned if seed == 2 else (env.spec.spawn_position, env.spec.spawn_quat))
     for _ in range(env.startup_ticks):
         env.step(np.tile(STAND_ACTION, (2, 1)))
-    turned = env.physics._data[1]
-    turned.qpos[env.scene.robot.root_qpos + 3 :][:4] = [np.cos(0.4), 0, 0, np.sin(0.4)]
-    env.physics._publish(1, turned)
+    w, x, y, z = env.physics.qpos.numpy()[1, env.scene.robot.root_qpos + 3 :][:4]
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     state = env.observe().state
     heading = torch.atan2(state[:, 2], state[:, 0])
     assert heading.abs().max() < 1e-5
-    assert env.reference.heading.numpy()[1] == pytest.approx(0.8, abs=1e-5)
+    assert env.loop.reference.heading.numpy()[1] == pytest.approx(yaw, abs=1e-5) and yaw != pytest.approx(0.8, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -273,10 +85,10 @@ def test_wrong_calls_are_named(env, call, said):
 
 def test_step_before_reset_is_refused():
     """An environment in which nothing runs does not step."""
-    fresh = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco")
+    idle = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco")
     with pytest.raises(InputError, match=r"reset\(\) first"):
-        fresh.step(np.tile(STAND_ACTION, (1, 1)))
-    fresh.close()
+        idle.step(np.tile(STAND_ACTION, (1, 1)))
+    idle.close()
 
 
 def test_spawn_replaces_the_tasks_pose(env):
@@ -284,26 +96,6 @@ def test_spawn_replaces_the_tasks_pose(env):
     env.reset([3, 4], spawn=lambda seed: ((0.1 * seed, -5.0, 0.9), (1.0, 0.0, 0.0, 0.0)))
     root = env.physics.qpos.numpy()[:, env.scene.robot.root_qpos :][:, :7]
     assert np.allclose(root[:, :3], [[0.3, -5.0, 0.9], [0.4, -5.0, 0.9]]) and (root[:, 3] == 1.0).all()
-
-
-def test_released_asks_at_the_spawn_pose(env):
-    """`released` has no start-up: the policy's first state is the spawn pose at rest."""
-
-    class First(Sway):
-        state = None
-
-        def act(self, observation):
-            self.state = observation.state.clone() if self.state is None else self.state
-            return super().act(observation)
-
-    other = ArenaEnv("football", tracker=trackers.get("pd"), worlds=2, engine="mujoco", rules="released")
-    assert (other.startup_ticks, env.startup_ticks) == (0, 50)
-    policy = First()
-    results = other.run_episodes(policy, _episodes(2), max_steps=3)
-    assert [r.steps for r in results] == [3, 3] and results[0].sim_s == pytest.approx(0.06)
-    spawn = np.array(DEFAULT_POSE, np.float32)[list(CANONICAL_TO_MUJOCO)]
-    assert np.array_equal(policy.state[0, 6:35].numpy(), spawn)
-    assert not policy.state[:, 35:].any()
 
 
 @pytest.mark.parametrize("interface", ["twist2", "sonic"])
@@ -347,44 +139,67 @@ def test_a_drive_can_be_chosen():
         assert np.allclose(gains, env.drive.kp)
 
 
-def test_a_fall_counts_in_the_startup_whatever_the_predicate_says(env, monkeypatch):
+def test_a_fall_counts_in_the_startup_whatever_the_predicate_says(won):
     """A robot that lies on the ground before step 0 has fallen, also where the success predicate holds."""
-
-    def evaluate(physics):
-        env.judge.success.fill_(1)
-
     lying = lambda seed: ((0.0, -8.0, 0.15), (0.7071068, 0.7071068, 0.0, 0.0))  # noqa: E731
-    monkeypatch.setattr(env.judge, "evaluate", evaluate)
-    env.reset([1, 2], spawn=lying)
+    won.reset([1, 2], spawn=lying)
     for _ in range(6):
-        status = env.step(np.tile(STAND_ACTION, (2, 1)))
+        status = won.step(np.tile(STAND_ACTION, (2, 1)))
     assert status.tolist() == [codes.FALL, codes.FALL]
+    assert won.verdict(1).events == (EpisodeEvent("fall", 1 - won.startup_ticks, "tilt"),)
 
 
-def test_errors_of_worlds_that_did_not_ask_are_ignored(env):
-    """A policy that names a world without a question ends nothing and breaks nothing."""
+def _play(engine, tracker, visit):
+    """States and verdicts of worlds 0 and 2 over eight ticks; with `visit` world 1 is reset twice and led on alone.
 
-    class Loud(Sway):
-        def act(self, observation):
-            chunk = super().act(observation)
-            chunk.errors = {w: "not asked" for w in range(2) if not observation.mask[w]}
-            return chunk
+    The first visit happens while the others stand still between two ticks, the second while they run.
+    """
+    env = ArenaEnv("football", tracker=trackers.get(tracker), worlds=3, engine=engine, device="cpu", fast_physics=True)
+    others, seen = [0, 2], []
+    env.reset([5, 6, 7])
+    action = torch.from_numpy(STAND_ACTION).repeat(3, 1)
+    for tick in range(8):
+        action[:, 9:38] += 0.02 * np.sin(np.arange(29) + tick)
+        if visit and tick == 3:
+            env.reset([9], [1])
+            for _ in range(4):
+                env.step(action, np.array([False, True, False]))
+        if visit and tick == 6:
+            env.reset([11], [1])
+        status = env.step(action)
+        arrays = (env.physics.qpos, env.physics.qvel, env.physics.ctrl, env.physics.xpos, env.loop.reference.mimic)
+        bits = b"".join(np.ascontiguousarray(a.numpy()[others]).tobytes() for a in arrays)
+        seen.append((bits, status[others].tolist(), [env.verdict(world) for world in others]))
+    env.close()
+    return seen
 
-    results = env.run_episodes(Loud(), _episodes(3), max_steps=7)
-    assert [r.outcome for r in results] == ["timeout"] * 3
+
+@pytest.mark.parametrize("tracker", ["twist2", "sonic", "pd"])
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_resetting_and_settling_a_world_changes_no_bit_of_another(engine, tracker):
+    """One world is reset and led through its start-up while the others run or wait: they keep every bit."""
+    assert _play(engine, tracker, visit=True) == _play(engine, tracker, visit=False)
 
 
-@pytest.mark.parametrize("cut", [lambda a: a[:, :0], lambda a: a[:, :, :39], lambda a: a[:1], lambda a: a[:, 0]])
-def test_chunks_of_another_shape_are_refused(env, cut):
-    """A chunk without actions or of another width stops the run with one line that names the policy."""
+def test_counters_of_waiting_worlds_stand_still(env):
+    """Ticks, streaks and verdicts of a world that does not step stay as they are."""
+    lying = lambda seed: ((0.0, -8.0, 0.25), (0.8, 0.6, 0.0, 0.0))  # noqa: E731
+    action, first = np.tile(STAND_ACTION, (2, 1)), np.array([True, False])
+    env.reset([1, 2], spawn=lying)
+    env.step(action)
+    before, tick = env.verdict(1), env.tick[1]
+    for _ in range(8):
+        assert env.step(action, first)[1] == codes.RUNNING
+    assert (env.verdict(1), env.tick[1]) == (before, tick) and env.tick[0] == tick + 8
 
-    class Cut(Sway):
-        name = "cut"
 
-        def act(self, observation):
-            chunk = super().act(observation)
-            chunk.actions = cut(chunk.actions)
-            return chunk
-
-    with pytest.raises(InputError, match=r"policy cut: a chunk of shape .*expected \[2, n, 40\]"):
-        env.run_episodes(Cut(), _episodes(2), max_steps=7)
+def test_released_worlds_stand_still(env):
+    """A released world takes part in no step; when none is left, a step is refused."""
+    env.reset([1, 2])
+    env.release([0])
+    still = env.physics.qpos.numpy()[0].copy()
+    env.step(np.tile(STAND_ACTION, (2, 1)))
+    assert np.array_equal(env.physics.qpos.numpy()[0], still) and env.tick.tolist() == [-50, -49]
+    env.release([1])
+    with pytest.raises(InputError, match="no world runs an episode"):
+        env.step(np.tile(STAND_ACTION, (2, 1)))

@@ -147,7 +147,7 @@ def test_follow_camera_keeps_the_robot_large(env, tmp_path):
         height=54,
         focal_length=18.0,
         horizontal_aperture=20.955,
-        lights=env._lights(),
+        lights=env.lights,
         views=1,
     )
     walls = room_walls(env.scene.mj_model)
@@ -172,7 +172,7 @@ def test_views_show_the_worlds_that_are_asked_for():
     """A camera of two views shows any two of three worlds, in any order, as the full camera does."""
     env = environment(3)
     env.reset([1, 2, 3])
-    options = {"prim": "world", "width": 64, "height": 48, "lights": env._lights()}
+    options = {"prim": "world", "width": 64, "height": 48, "lights": env.lights}
     state = env.scene.model.state()
     env.physics.write_newton_state(state)
     every = Camera.from_scene(env.scene, **options).render(state).clone()

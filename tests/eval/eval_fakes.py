@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from arena_newton import rule_sets, tasks
-from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Verdict
@@ -31,8 +30,7 @@ class FakeEnv:
     """
 
     startup_ticks = 0
-    physics = SimpleNamespace(overflowed=lambda world: False)
-    scene = None
+    physics = scene = None
     torch_device = torch.device("cpu")
 
     def __init__(self, task, *, worlds=1, mode="base", rules="paper", tracker=None, **options):
@@ -43,11 +41,6 @@ class FakeEnv:
         self.seeds = np.zeros(worlds, np.int64)
         self.ended = 0
         """Episodes whose world got the next one."""
-
-    @property
-    def judge(self):
-        margins = [self.verdict(world).margin for world in range(self.worlds)]
-        return SimpleNamespace(margin=SimpleNamespace(numpy=lambda: margins))
 
     def reset(self, seeds, worlds=None, *, spawn=None):
         worlds = range(self.worlds) if worlds is None else worlds
@@ -62,7 +55,7 @@ class FakeEnv:
         mask = self.active.copy() if mask is None else mask
         return Observation(torch.zeros(self.worlds, 64), None, mask, self.task, self.spec.gym_id, self.spec.instruction)
 
-    def step(self, action):
+    def step(self, action, worlds=None):
         if pause := float(os.environ.get("FAKE_TICK_S", "0")):
             time.sleep(pause)
         leapt = (self.tick // LEAP + 1) * LEAP
@@ -82,8 +75,6 @@ class FakeEnv:
 
     def close(self):
         """Nothing to release."""
-
-    run_episodes = getattr(ArenaEnv, "run_episodes", None)
 
 
 class FakePolicy:

@@ -33,7 +33,7 @@ def test_spawn_noise_follows_the_seed():
     from arena_newton.env import ArenaEnv
 
     env = ArenaEnv("football", worlds=2, tracker=trackers.get("pd"), engine="mujoco")
-    spawn = engines._moved_spawn(env.spec, noise=1e-3)
+    spawn = engines.moved_spawn(env.spec, noise=1e-3)
     root = env.scene.robot.root_qpos
     env.reset([1, 2], spawn=spawn)
     first = env.physics.qpos.numpy()[:, root : root + 2].copy()

@@ -5,11 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval import __main__ as command_line
-from arena_newton.eval.recordings import RecordingPolicy
+from arena_newton.eval.recordings import ActionRecorder
+from arena_newton.files import PARTIAL
 from arena_newton.interfaces import Observation
 
 RUN = ["--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco", "--max-steps", "50", "--worlds", "2"]
@@ -112,18 +114,23 @@ def test_unfit_folders_are_refused(recorded, tmp_path):
 
 
 def test_recordings_follow_no_link(tmp_path):
-    """A link that lies where a recording is written, under its name or its partial name, leads nowhere."""
+    """A link that lies where a recording is written, under its name or its temporary name, leads nowhere."""
     victim = tmp_path / "victim"
     victim.write_text("mine")
     folder = tmp_path / "actions"
     folder.mkdir()
-    for name in ("boxing_base_s0_r0.npz", "boxing_base_s0_r0.npz.partial"):
+    for name in ("boxing_base_s0_r0.npz", f"boxing_base_s0_r0.npz{PARTIAL}"):
         (folder / name).symlink_to(victim)
-    actor = RecordingPolicy(policies.get("stand"), folder)
-    actor.reset([7], ["boxing"], np.ones(1, dtype=bool))
-    actor._chunks[7].append(np.zeros((5, 40), np.float32))
+    recorder = ActionRecorder(folder)
+    env = SimpleNamespace(active=np.array([True, True]), tick=np.array([-1, 0]), spec=SimpleNamespace(gym_id="gym"))
+    for world in (0, 1):
+        recorder.start(env, world, None)
+    for _ in range(3):
+        recorder.before_physics(env, None, torch.ones(2, 40))
     episode = SimpleNamespace(episode_seed=7, key="boxing/base/s0/r0", mode="base")
-    path = actor.write(SimpleNamespace(episode=episode, steps=3), "gym")
-    assert victim.read_text() == "mine" and not path.is_symlink() and list(folder.iterdir()) == [path]
+    recorder.finish(env, 0, SimpleNamespace(episode=episode, steps=0))  # it never acted
+    recorder.finish(env, 1, SimpleNamespace(episode=episode, steps=3))
+    (path,) = folder.iterdir()
+    assert victim.read_text() == "mine" and not path.is_symlink() and path.name == "boxing_base_s0_r0.npz"
     with np.load(path) as arrays:
         assert arrays["action"].shape == (3, 40)

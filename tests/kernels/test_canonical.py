@@ -91,7 +91,6 @@ def test_state_is_rot6d_without_heading_and_joints(device, twin):
         _array(qpos, device),
         _array(qvel, device),
         adr,
-        0,
         _array(joint_qpos, device, wp.int32),
         _array(joint_qvel, device, wp.int32),
         _array(heading0, device),

@@ -15,6 +15,7 @@ from arena_newton.interfaces import Observation
 from arena_newton.policies.experts import EXPERTS
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.robot import DEFAULT_POSE
+from arena_newton.rollout import Rollout
 
 EPISODES = {"boxing": (0, 21), "vis_navi": (4, 15)}
 """Short episodes of the protocol: both bags, both hands; a way to each side of the beams."""
@@ -146,5 +147,5 @@ def test_boxing_through_twist2(shared):
     episodes = [
         SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, i // 20, i % 20)) for i in EPISODES["boxing"]
     ]
-    results = env.run_episodes(policies.get("expert"), episodes, max_steps=600)
+    results = Rollout(env, policies.get("expert"), episodes, max_steps=600).run()
     assert [r.outcome for r in results] == ["success", "success"]

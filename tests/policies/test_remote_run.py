@@ -17,6 +17,7 @@ from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
+from arena_newton.rollout import Rollout
 
 SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "3", "--seeds", "0"]
 
@@ -130,7 +131,7 @@ def test_example_server_with_pictures(monkeypatch):
     policy = policies.get(spec)
     policy.check()
     env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", camera=policy.camera)
-    results = env.run_episodes(policy, [SimpleNamespace(episode_seed=3)], max_steps=21)
+    results = Rollout(env, policy, [SimpleNamespace(episode_seed=3)], max_steps=21).run()
     assert [(r.outcome, r.steps, r.error) for r in results] == [("timeout", 21, None)]
     assert shapes == [((480, 640, 3), (64,), "Strike the green markers on the punching bag.", True)] * 2
 
@@ -140,7 +141,7 @@ def test_example_server_with_pictures(monkeypatch):
     policy.close()
     policy.retries, finished = 0, []
     with pytest.raises(PolicyUnavailable, match="the server is gone"):
-        env.run_episodes(policy, [SimpleNamespace(episode_seed=3)], on_finish=finished.append, max_steps=21)
+        Rollout(env, policy, [SimpleNamespace(episode_seed=3)], on_finish=finished.append, max_steps=21).run()
     assert finished == []
     policy.close()
 
@@ -193,7 +194,7 @@ def test_episode_after_an_error_is_asked_for_its_first_action(rules):
     ends = []
     env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", rules=rules)
     for seeds in ((5,), (3, 3, 5)):
-        results = env.run_episodes(Sway(), [SimpleNamespace(episode_seed=s) for s in seeds], max_steps=10)
+        results = Rollout(env, Sway(), [SimpleNamespace(episode_seed=s) for s in seeds], max_steps=10).run()
         assert [r.outcome for r in results[:-1]] == ["error"] * (len(seeds) - 1)
         ends.append((results[-1].outcome, results[-1].steps, results[-1].margin, results[-1].sim_s))
     assert ends[0] == ends[1] and ends[0][1] == 10

@@ -13,6 +13,7 @@ from arena_newton import trackers
 from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.policies import Observation
 from arena_newton.policies.remote import RemotePolicy
+from arena_newton.rollout import Rollout
 
 CHUNK = 4
 STEPS = 10
@@ -111,7 +112,7 @@ def run(server, worlds, seeds=SEEDS, loop=play, **options):
 def simulate(policy, seeds, worlds):
     """The same with the simulator."""
     env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", device="cpu")
-    results = env.run_episodes(policy, [SimpleNamespace(episode_seed=s) for s in seeds], max_steps=STEPS)
+    results = Rollout(env, policy, [SimpleNamespace(episode_seed=s) for s in seeds], max_steps=STEPS).run()
     return {r.episode.episode_seed: (r.outcome, r.steps, r.margin, r.error) for r in results}
 
 

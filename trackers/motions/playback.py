@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arena_newton.canonical import ACTION
-from arena_newton.env import STAND_ACTION
+from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.robot import TICK
 from arena_newton.trackers.motions.load import Clip, resample
 

@@ -1,0 +1,233 @@
+"""Episodes of a plan over a batch of worlds: each world takes the next one as soon as it is free.
+
+Chunks, budgets, endings and a policy's errors are handled here; how a world moves and is judged is the `World`'s.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from arena_newton.canonical import ACTION_WIDTH
+from arena_newton.errors import InputError
+from arena_newton.interfaces import (
+    Chunk,
+    Disturbance,
+    EpisodeResult,
+    Observation,
+    Planned,
+    Policy,
+    Recorder,
+    Spawn,
+    World,
+)
+from arena_newton.kernels import tick as codes
+from arena_newton.robot import TICK
+
+__all__ = ["Rollout"]
+
+
+@dataclass
+class _Running:
+    """The episode that a world runs."""
+
+    index: int
+    """Its position in the plan."""
+    episode: Planned
+    began: float
+    """Wall-clock time of its reset [s]."""
+    phases: list[tuple[str, int]] = field(default_factory=list)
+    """The policy's phases and their first ticks so far."""
+
+
+class Rollout:
+    """A policy plays episodes in a batch of worlds; `run` returns when all have ended."""
+
+    def __init__(
+        self,
+        env: World,
+        policy: Policy,
+        episodes: Sequence[Planned],
+        *,
+        recorder: Recorder | Sequence[Recorder] = (),
+        disturbance: Disturbance | None = None,
+        max_steps: int | None = None,
+        spawn: Spawn | None = None,
+        on_finish: Callable[[EpisodeResult], None] | None = None,
+        on_tick: Callable[[int], None] | None = None,
+    ):
+        """Prepare the run.
+
+        Args:
+            env: The worlds.
+            policy: A policy (`arena_newton.policies`).
+            episodes: Objects with `episode_seed` and whatever the caller needs back; they start in this order.
+            recorder: One recorder or several, which are called in their order.
+            disturbance: Makes the executed actions of a tick from the policy's; recorders see the policy's.
+            max_steps: Step budget instead of the rule set's [ticks].
+            spawn: The robot's pose at a reset instead of the task's spawn pose.
+            on_finish: Called with each result, in the order of ending.
+            on_tick: Called each tick with the number of active worlds.
+        """
+        self.env, self.policy = env, policy
+        self.recorders: Sequence[Recorder] = [recorder] if isinstance(recorder, Recorder) else recorder
+        self.disturbance, self.spawn = disturbance, spawn
+        self.budget = max_steps or env.budget
+        self.on_finish, self.on_tick = on_finish, on_tick
+        self._observing = any(one.wants_observation for one in self.recorders)
+        self._waiting = deque(enumerate(episodes))
+        self._running: dict[int, _Running] = {}
+        self._results: dict[int, EpisodeResult] = {}
+        self._chunk = torch.zeros((env.worlds, 1, ACTION_WIDTH), device=env.torch_device)
+        self._next, self._length = np.zeros(env.worlds, np.int64), np.zeros(env.worlds, np.int64)
+        """Next action of each world's chunk, and the chunk's length."""
+        self._rows = torch.arange(env.worlds, device=env.torch_device)
+
+    def run(self) -> list[EpisodeResult]:
+        """Play all episodes.
+
+        Returns:
+            Results in the order of the plan.
+
+        Raises:
+            InputError: A chunk of the policy or targets of the tracker have another shape than the interface says.
+        """
+        env = self.env
+        self.policy.attach(env)
+        self._assign(range(env.worlds))
+        while env.active.any():
+            asks = env.active & (env.tick >= 0) & (self._next >= self._length)
+            observation = None
+            if asks.any():
+                observation = env.observe(asks, image=self.policy.needs_image)
+                failed = self._ask(observation)
+                if failed:
+                    self._assign(failed)
+                    continue  # without a start-up the new episodes ask before this tick
+            self._assign(self._endings(self._tick(observation)))
+            if self.on_tick is not None:
+                self.on_tick(int(env.active.sum()))
+        return [self._results[index] for index in sorted(self._results)]
+
+    def _assign(self, free: Iterable[int]) -> None:
+        """Give free worlds the next episodes; those for which none is left are released."""
+        env, free = self.env, list(free)
+        if not free:
+            return
+        taken = {world: self._waiting.popleft() for world in free[: len(self._waiting)]}
+        env.release(free)
+        if not taken:
+            return
+        env.reset([episode.episode_seed for _, episode in taken.values()], list(taken), spawn=self.spawn)
+        mask, seeds = np.zeros(env.worlds, dtype=bool), [0] * env.worlds
+        for world, (index, episode) in taken.items():
+            self._running[world] = _Running(index, episode, time.perf_counter())
+            mask[world], seeds[world] = True, episode.episode_seed
+            self._length[world] = self._next[world] = 0
+            for one in self.recorders:
+                one.start(env, world, episode)
+        self.policy.reset(seeds, [env.spec.gym_id] * env.worlds, mask)
+
+    def _ask(self, observation: Observation) -> list[int]:
+        """Take new chunks from the policy; ends the episodes for which it has none, and returns their worlds."""
+        answer, asks = self.policy.act(observation), observation.mask
+        self._take(answer, asks)
+        failed = {world: message for world, message in answer.errors.items() if asks[world]}
+        for world in np.flatnonzero(asks).tolist():
+            phase = None if answer.phases is None else answer.phases[world]
+            phases = self._running[world].phases
+            if phase is not None and (not phases or phases[-1][0] != phase):
+                phases.append((phase, int(self.env.tick[world])))
+        for world, message in failed.items():
+            self._finish(world, "error", "policy", message)
+        return list(failed)
+
+    def _take(self, answer: Chunk, asks: np.ndarray) -> None:
+        """Keep the rows of a chunk that were asked for."""
+        worlds = self.env.worlds
+        actions = torch.as_tensor(answer.actions, dtype=torch.float32, device=self.env.torch_device)
+        if actions.ndim != 3 or actions.shape[::2] != (worlds, ACTION_WIDTH) or not actions.shape[1]:
+            raise InputError(
+                f"policy {self.policy.name}: a chunk of shape {list(actions.shape)}, expected "
+                f"[{worlds}, n, {ACTION_WIDTH}] with n of at least 1"
+            )
+        longer = actions.shape[1] - self._chunk.shape[1]
+        if longer > 0:
+            self._chunk = torch.nn.functional.pad(self._chunk, (0, 0, 0, longer))
+        rows = torch.from_numpy(asks).to(self.env.torch_device)
+        self._chunk[rows, : actions.shape[1]] = actions[rows]
+        self._next[asks], self._length[asks] = 0, actions.shape[1]
+
+    def _tick(self, observation: Observation | None) -> np.ndarray:
+        """Play the next action of every chunk; `observation` is what the policy saw at this tick, if it was asked."""
+        env = self.env
+        acting = env.active & (env.tick >= 0)
+        index = np.where(acting, np.minimum(self._next, self._chunk.shape[1] - 1), 0)
+        action = self._chunk[self._rows, torch.from_numpy(index).to(env.torch_device)]
+        if self._observing and observation is None:
+            observation = env.observe()
+        for one in self.recorders:
+            one.before_physics(env, observation if self._observing else None, action)
+        status = env.step(action if self.disturbance is None else self.disturbance(env, action))
+        self._next[acting] += 1
+        for one in self.recorders:
+            one.tick(env)
+        return status
+
+    def _endings(self, status: np.ndarray) -> list[int]:
+        """Finish the episodes that a tick ended; returns their worlds."""
+        ended = []
+        for world in np.flatnonzero(self.env.active).tolist():
+            ending = self._ending(int(status[world]), int(self.env.tick[world]))
+            if ending is not None:
+                self._finish(world, *ending)
+                ended.append(world)
+        return ended
+
+    def _ending(self, code: int, tick: int) -> tuple[str, str, str | None] | None:
+        """Outcome, reason and message of an episode with this status at this tick; None while it goes on."""
+        if code == codes.ERROR_STATE:
+            return "error", "nonfinite_state", "the simulation state of this world became non-finite"
+        if code == codes.ERROR_TARGETS:
+            return "error", "tracker", f"tracker {self.env.tracker.name}: a joint target is not finite"
+        if code == codes.ERROR_ACTION:
+            return "error", "bad_action", "the policy's action is non-finite or its rot6d is degenerate"
+        if code == codes.SUCCESS:
+            return "success", "success", None
+        if code == codes.FALL:
+            return "fall", "fall", None
+        if code > codes.EVENT:
+            return "timeout", self.env.spec.events[code - codes.EVENT], None
+        return ("timeout", "timeout", None) if tick >= self.budget else None
+
+    def _finish(self, world: int, outcome: str, reason: str, error: str | None) -> None:
+        """Report how a world's episode ended."""
+        env, running = self.env, self._running.pop(world)
+        tick, verdict = int(env.tick[world]), env.verdict(world)
+        startup = outcome == "fall" and tick <= 0
+        result = EpisodeResult(
+            episode=running.episode,
+            outcome=outcome,
+            reason="startup_fall" if startup else reason,
+            steps=max(tick, 0),
+            margin=verdict.margin,
+            startup_fall=startup,
+            overflow=verdict.overflow,
+            sim_s=float((tick + env.startup_ticks) * TICK),
+            wall_s=time.perf_counter() - running.began,
+            error=error,
+            phases=tuple(running.phases),
+            predicates=verdict.predicates,
+            progress=verdict.progress,
+            events=verdict.events,
+        )
+        self._results[running.index] = result
+        for one in self.recorders:
+            one.finish(env, world, result)
+        if self.on_finish is not None:
+            self.on_finish(result)
