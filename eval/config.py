@@ -1,4 +1,4 @@
-"""A run as it is executed: flags are checked and resolved once, and only go down from here."""
+"""A run as it is executed: flags are checked and resolved once, and only go down from there."""
 
 from __future__ import annotations
 

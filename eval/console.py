@@ -1,4 +1,4 @@
-"""What a run tells its user besides the progress: its beginning, what broke, and its end."""
+"""What a run prints besides the progress: its beginning, what broke, and its end."""
 
 from __future__ import annotations
 

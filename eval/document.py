@@ -1,4 +1,4 @@
-"""config.json of a results folder: what a run is known by, where it stands, and what its journal must agree with."""
+"""config.json of a results folder: what a run is known by, how it ended, and what its journal must agree with."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Identity(_Identity, total=False):
 
 
 class Status(TypedDict):
-    """Where a run stands: how the last `run` or `resume` in its folder ended."""
+    """How the last `run` or `resume` in its folder ended."""
 
     state: Literal["started", "success", "cancelled", "error"]
     """`started`: is running, or was killed; `success`: every planned episode is in the journal."""

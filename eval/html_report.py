@@ -236,7 +236,7 @@ def _strips(records: Sequence[EpisodeRecord]) -> tuple[list[EpisodeRecord], list
         return FAILURES_FIRST.index(record.outcome) if record.outcome in FAILURES_FIRST else 0
 
     ordered = sorted(filmed, key=order)  # stable: plan order within an outcome
-    # Every task and mode is to be seen, before a second one of any.
+    # One episode of every task and mode comes first, then the second ones.
     turns: dict[tuple[str, str, bool], int] = {}
     turn = {}
     for record in ordered:

@@ -20,7 +20,7 @@ import typing
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
@@ -97,14 +97,14 @@ def read_regular(path: Path, limit: int) -> bytes:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def parse(data: bytes) -> Any:
+def parse(data: bytes) -> Json:
     """Strict JSON: no NaN, no infinity, no number beyond float, nothing nested too deep, no unpaired surrogate.
 
     Raises:
         ValueError: It is not.
     """
 
-    def refuse(name: str) -> Any:
+    def refuse(name: str) -> NoReturn:
         raise ValueError(f"{name} is not JSON")
 
     try:
@@ -174,7 +174,7 @@ Mode = Annotated[str, Known(lambda: MODES)]
 Count = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_COUNT)]
 Positive = Annotated[int, Fit("a number of at least 1", lambda value: 1 <= value <= MAX_COUNT)]
 Seed = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_SEED)]
-Facts = Annotated[dict[str, Any], Fit("facts by name", _facts)]
+Facts = Annotated[dict[str, Json], Fit("facts by name", _facts)]
 
 
 def tester(hint: object) -> Callable[[Json], bool]:

@@ -35,7 +35,7 @@ class RunRecord:
 
     @property
     def status(self) -> Status | None:
-        """How the last run or resume ended; None in a folder of before there was a status."""
+        """How the last run or resume ended; None in a folder of a version without status."""
         return self.document.get("status")
 
 
@@ -51,7 +51,7 @@ class Results(_Results, total=False):
     """Content of results.json."""
 
     status: str
-    """State of `document.Status`; absent in a folder of before there was one."""
+    """State of `document.Status`; absent in a folder of a version without status."""
 
 
 def in_plan_order(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
