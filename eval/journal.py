@@ -129,7 +129,7 @@ class EpisodeRecord:
                 f"{SCHEMA}"
             )
         fit(where, line, cls)
-        known = {key.name: line[key.name] for key in dataclasses.fields(cls) if key.name in line}
+        known = {key: line[key] for key in cls.__dataclass_fields__ if key in line}
         known["phases"] = tuple((name, tick) for name, tick in line.get("phases", ()))
         known["events"] = tuple(EpisodeEvent(**event) for event in line.get("events", ()))
         return cls(**known)

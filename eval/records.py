@@ -143,6 +143,10 @@ class Known:
 
     names: Callable[[], Collection[str]]
 
+    def test(self, value: Json) -> bool:
+        """Whether a text is one of the names."""
+        return value in self.names()
+
 
 def is_name(value: Json) -> bool:
     """Whether a value is a text that names something: not empty, not long, printable."""
@@ -183,9 +187,11 @@ def tester(hint: object) -> Callable[[Json], bool]:
         return tester(hint.__value__)
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        inner, fits = tester(parts[0]), [part.test for part in parts[1:] if isinstance(part, Fit)]
-        known = [part.names for part in parts[1:] if isinstance(part, Known)]
-        return lambda v: inner(v) and all(test(v) for test in fits) and all(v in names() for names in known)
+        tests = [tester(parts[0]), *(part.test for part in parts[1:] if isinstance(part, Fit | Known))]
+        if len(tests) == 2:  # the usual case, without a loop: a journal has up to millions of values
+            first, second = tests
+            return lambda v: first(v) and second(v)
+        return lambda v: all(test(v) for test in tests)
     if origin is Literal:
         return lambda v: isinstance(v, str) and v in parts
     if origin in (types.UnionType, typing.Union):
