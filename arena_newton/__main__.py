@@ -41,7 +41,6 @@ COMMANDS = (
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
     Command("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
-    Command("trackers oracle", "arena_newton.trackers.oracle", "compare official TWIST2 with its own MJCF in MuJoCo"),
     Command("trackers motions", "arena_newton.trackers.motions.__main__", "convert, inspect, render, generate motions"),
 )
 

@@ -1,24 +1,36 @@
 """What a command line answers when its work fails."""
 
+import os
 import sys
 from collections.abc import Callable
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.errors import ArenaError
+from arena_newton.text import plain_text
 
-__all__ = ["exit_code"]
+__all__ = ["INTERRUPTED", "exit_code"]
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
 
 
-def exit_code(work: Callable[[], object]) -> int:
-    """Do the work: 0 done, 1 failed, 2 bad input, 130 interrupted; an error is one line on the error stream."""
+def exit_code(work: Callable[[], int | None]) -> int:
+    """Do the work; an error is one line on the error stream.
+
+    Args:
+        work: Returns an exit code, or None for 0.
+
+    Returns:
+        What the work returned: 0 done, or a code of its own; after an error its `exit_code`: 1 failed, 2 bad input; 130
+        interrupted. Whoever closes the output has seen enough: 0.
+    """
     try:
-        work()
-    except InputError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return work() or 0
     except ArenaError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+        print(f"error: {plain_text(error)}", file=sys.stderr)
+        return error.exit_code
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
-        return 130
-    return 0
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0

@@ -30,6 +30,7 @@ _REQUIRED = {
     "onnx": "official tracker checkpoints",
     "tyro": "command line",
     "tqdm": "progress bar",
+    "jinja2": "reports",
     "pillow": "textures and picture strips",
 }
 _OPTIONAL = {

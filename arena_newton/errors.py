@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from typing import ClassVar
 
 __all__ = ["ArenaError", "InputError", "naming"]
 
@@ -9,14 +10,19 @@ __all__ = ["ArenaError", "InputError", "naming"]
 class ArenaError(Exception):
     """Base of every error that arena_newton raises on purpose."""
 
+    exit_code: ClassVar[int] = 1
+    """What a command line that ends with the error returns."""
+
 
 class InputError(ArenaError):
     """The user's input (flag, file, prim, field) is wrong; the command line prints it and exits with code 2."""
 
+    exit_code = 2
+
 
 @contextlib.contextmanager
 def naming(flag: str) -> Iterator[None]:
-    """Put the flag that brought an input before what is wrong with it."""
+    """Put the flag that brought an input in front of what is wrong with it."""
     try:
         yield
     except InputError as error:

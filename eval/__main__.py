@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
 import io
-import re
 import signal
 import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.command_line import INTERRUPTED, exit_code
+from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
-    from arena_newton.eval.config import RunOptions
+    from arena_newton.eval.options import RunOptions
     from arena_newton.eval.run import Factories
 
 __all__ = ["main"]
 
-INTERRUPTED = 130
 PROG = "python -m arena_newton.eval"
 COMMANDS = ("run", "resume", "report", "bench", "engines", "list")
 OVERVIEW = f"""commands:
@@ -56,56 +56,58 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments.pop(0) if arguments and arguments[0] in COMMANDS else "run"
-    if command == "run" and arguments and not arguments[0].startswith("-"):
-        print(f"error: {arguments[0]}: unknown command, known are {' '.join(COMMANDS)}", file=sys.stderr)
-        return 2
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+
+    def work() -> int:
+        if command == "run" and arguments and not arguments[0].startswith("-"):
+            raise InputError(f"{arguments[0]}: unknown command, known are {' '.join(COMMANDS)}")
         return _COMMANDS[command](arguments, factories)
-    except InputError as error:
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        return 2
-    except ArenaError as error:
-        from arena_newton.eval.journal import StorageError
-        from arena_newton.eval.run import RunStopped
-        from arena_newton.policies.base import PolicyUnavailable
 
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        return 2 if isinstance(error, (StorageError, RunStopped, PolicyUnavailable)) else 1
-    except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
-
-
-def _one_line(error: BaseException) -> str:
-    from arena_newton.eval.records import plain_text
-
-    return plain_text(error)
+    return exit_code(work)
 
 
 def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | None = None) -> T:
-    """Parse flags with tyro; its multi-line complaint becomes one line."""
+    """Parse flags with tyro; a complaint becomes one line of our own."""
     import tyro
 
-    complaint = io.StringIO()
-    given: dict[str, Any] = {} if default is None else {"default": default}
+    prog = f"{PROG} {command}".rstrip()
+    missing = tyro.MISSING_NONPROP if default is None else default
     try:
-        with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, args=arguments, prog=f"{PROG} {command}".rstrip(), **given)
+        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there is said again in one line
+            return tyro.cli(kind, args=arguments, prog=prog, default=missing)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        text = re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue())
-        lines = [line.strip(" │╭╮╰╯─┃") for line in text.splitlines()]
-        lines = [line for line in lines if line]
-        message = " ".join(lines[1:] or lines)  # the first is the title of tyro's box
-        message = re.sub(r"\s*(Argument helptext:|For full helptext,?) .*$", "", message)
-        unread = re.match(r"Error parsing (--[\w-]+): .*arguments: (\[.*\])", message)
-        raise InputError(f"{unread[1]}: cannot read {unread[2]}" if unread else message) from None
+        raise InputError(_complaint(kind, arguments, prog)) from None
+
+
+def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
+    """What is wrong with arguments that tyro refuses: each flag with its values is given to it alone.
+
+    tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
+    """
+    import tyro
+
+    groups: list[list[str]] = []
+    for argument in arguments:
+        if not groups or argument[:1] == "-" and not argument[1:2].isdigit():
+            groups.append([])
+        groups[-1].append(argument)
+    for flag, *values in groups:
+        flag, equals, joined = flag.partition("=")
+        alone = [flag, *([joined] if equals else []), *values]
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):
+                _, unknown = tyro.cli(kind, args=alone, prog=prog, return_unknown_args=True)
+        except SystemExit:
+            return f"{flag}: cannot read {' '.join(alone[1:]) or 'it without a value'}"
+        if unknown:
+            known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(kind)]
+            near = difflib.get_close_matches(unknown[0], known, 1)
+            hint = f", did you mean {near[0]}?" if near else f"; see {prog} --help"
+            return f"{unknown[0]}: unknown argument{hint}"
+    return f"these arguments cannot be read together: {' '.join(arguments)}; see {prog} --help"
 
 
 def _folder(arguments: list[str], command: str) -> Path:
@@ -119,17 +121,18 @@ def _wants_help(arguments: Sequence[str]) -> bool:
 
 
 def _run(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.config import RunOptions
+    from arena_newton.eval.options import RunOptions
 
     if _wants_help(arguments):
         print(OVERVIEW)
     options = _parse(RunOptions, arguments, "run")
-    from arena_newton.eval.config import is_quick
-    from arena_newton.eval.run import execute, results_folder
+    from arena_newton.eval.folder import results_folder
+    from arena_newton.eval.options import is_quick
+    from arena_newton.eval.run import execute
 
     if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
         return execute(options, factories)
-    folder = results_folder(options)
+    folder = results_folder(options.out)
     code = execute(dataclasses.replace(options, out=str(folder)), factories)
     return code if code == INTERRUPTED else max(code, _show_expert(options, folder / "expert", factories))
 
@@ -149,13 +152,14 @@ def _show_expert(options: RunOptions, folder: Path, factories: Factories | None)
 
 
 def _resume(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.config import RunOptions
+    from arena_newton.eval.options import RunOptions
 
     if _wants_help(arguments):
         print(f"usage: {PROG} resume <out> [flags]; flags that change the results are refused\n")
         _parse(RunOptions, ["--help"], "resume <out>")
     folder = _folder(arguments, "resume")
-    from arena_newton.eval.run import execute, stored_options
+    from arena_newton.eval.folder import stored_options
+    from arena_newton.eval.run import execute
 
     options = _parse(RunOptions, arguments, "resume", default=stored_options(folder))
     if options.out != str(folder):
@@ -171,32 +175,32 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
     import json
 
     from arena_newton.eval import report
+    from arena_newton.eval.results import load_run
 
-    results = report.write_reports(report.load_run(folder))
+    run = load_run(folder)
+    results = report.write_reports(run)
     if options.json:
         print(json.dumps(results, indent=2))
         return 0
     print(report.table(results))
-    for note in report.notes(results):
+    for note in report.notes(run, results):
         print(note)
     print(f"report: {folder / 'report.html'}")
     return 0
 
 
 def _list(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.config import RunOptions
+    from arena_newton.eval.options import RunOptions
 
     as_json = "--json" in arguments
     if _wants_help(arguments):
         print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
     options = _parse(RunOptions, [a for a in arguments if a != "--json"], "list")
-    from arena_newton.eval import config as configs
-
-    config = configs.resolve(options)
+    from arena_newton.eval.config import resolve
     from arena_newton.eval.progress import simulated
-    from arena_newton.eval.records import counted
+    from arena_newton.text import counted
 
-    episodes = configs.episodes(config)
+    episodes = resolve(options).episodes
     if as_json:
         import json
 

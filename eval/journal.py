@@ -2,24 +2,143 @@
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import errno
 import fcntl
 import json
 import os
 import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.records import MAX_JOURNAL_BYTES, check_record, counted, parse, read_regular
-from arena_newton.foreign import create
+from arena_newton.eval.records import (
+    MAX_JOURNAL_BYTES,
+    Count,
+    Fit,
+    Json,
+    JsonObject,
+    Mode,
+    Name,
+    Positive,
+    Seed,
+    Task,
+    fit,
+    is_name,
+    parse,
+    read_regular,
+    shown,
+)
+from arena_newton.files import replace_atomically
+from arena_newton.interfaces import EpisodeEvent
+from arena_newton.text import counted
 
-__all__ = ["Journal", "StorageError", "read_journal", "write_atomic"]
+__all__ = ["JOURNAL_FILE", "SCHEMA", "EpisodeRecord", "Journal", "StorageError", "read_journal", "write_atomic"]
+
+JOURNAL_FILE = "episodes.jsonl"
+SCHEMA = 2
+"""Newest form of a journal line. 1: without phases, predicates, progress and events, and without this key."""
+
+OUTCOMES = ("success", "fall", "timeout", "error")
+PlanNumber = Annotated[Count, Fit("a number of the plan")]
+Ticks = Annotated[Count, Fit("a number of ticks")]
+Outcome = Annotated[str, Fit(" ".join(OUTCOMES), lambda value: value in OUTCOMES)]
+Cause = Annotated[str | None, Fit("a name", lambda value: value in (None, "") or is_name(value))]
+
+Fraction = Annotated[float, Fit("a number from 0 to 1", lambda value: 0 <= value <= 1)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRecord:
+    """A line of the journal: how one episode of the plan ended. Its fields are the keys, in this order.
+
+    A field with a default may be missing in a line. Annotations say what a stored value must be (`records.Fit`).
+    """
+
+    schema: Positive = 1
+    """Form of the line; see `SCHEMA`."""
+    index: PlanNumber
+    """Number in the plan, from 0."""
+    task: Task
+    tracker: Name
+    policy: Name
+    """Spec of the policy, a local path shortened to its file name."""
+    mode: Mode
+    rules: Name = ""
+    engine: Name = ""
+    group_seed: Seed
+    repeat: Count
+    episode_seed: Seed
+    object_seed: Seed
+    max_steps: Ticks
+    """Step budget."""
+    hashes: Annotated[dict[Name, Name | None], Fit("hashes by name")] = field(default_factory=dict)
+    """Of configuration, rules, checkpoint, policy, variant, the libraries' versions and the environment."""
+    outcome: Outcome
+    reason: Cause = ""
+    """Finer cause, such as `startup_fall`."""
+    steps: Ticks
+    """Ticks from the policy's first action."""
+    margin: float | None = None
+    """Signed distance to success at the end [m or the task's unit]; None where it is not finite."""
+    startup_fall: bool = False
+    overflow: bool = False
+    """A contact or constraint buffer overflowed in this episode's world."""
+    error: str | None = None
+    """Message of an `error`."""
+    durations: Annotated[dict[Name, float] | None, Fit("numbers by name")] = None
+    """`wall_s` and `sim_s` [s]."""
+    started_at: Annotated[str | None, Fit("text")] = None
+    """ISO 8601, UTC."""
+    finished_at: Annotated[str | None, Fit("text")] = None
+    media: Annotated[dict[Name, str] | None, Fit("paths by name")] = None
+    """Recordings, below the results folder."""
+    video: Annotated[str | None, Fit("a path")] = None
+    """The head camera's video; empty without one."""
+    phases: Annotated[tuple[tuple[Name, Ticks], ...], Fit("pairs of a name and a tick")] = ()
+    """The policy's phases: name and first tick, each time one begins."""
+    predicates: Annotated[dict[Name, Ticks | None], Fit("ticks by name")] = field(default_factory=dict)
+    """Predicate of the task, in its order → first tick at which it held; None where it never did."""
+    progress: Fraction | None = None
+    """Fraction of the task's predicates that have held; None in a line of schema 1."""
+    events: Annotated[tuple[EpisodeEvent, ...], Fit("objects with kind, tick and detail")] = ()
+    """What happened once in the episode, in the order of its ticks."""
+
+    def to_json(self) -> JsonObject:
+        """The line as a JSON object."""
+        values = {key.name: getattr(self, key.name) for key in dataclasses.fields(self)}
+        return values | {"events": [dataclasses.asdict(event) for event in self.events]}
+
+    @classmethod
+    def from_json(cls, where: str, line: Mapping[str, Json]) -> EpisodeRecord:
+        """The record of a line; keys that this version does not know are left out.
+
+        Args:
+            where: File and line, for messages.
+            line: What the line holds.
+
+        Raises:
+            InputError: It is not a record of an episode, or a newer version wrote it.
+        """
+        schema = line.get("schema", 1)
+        if type(schema) is int and schema > SCHEMA:
+            raise InputError(
+                f"{where}: schema {shown(schema)} was written by a newer version of arena_newton, this one reads up to "
+                f"{SCHEMA}"
+            )
+        fit(where, line, cls)
+        known = {key: line[key] for key in cls.__dataclass_fields__ if key in line}
+        known["phases"] = tuple((name, tick) for name, tick in line.get("phases", ()))
+        known["events"] = tuple(EpisodeEvent(**event) for event in line.get("events", ()))
+        return cls(**known)
 
 
 class StorageError(ArenaError):
     """The results folder cannot be written (full disk, no permission); what was journalled before is whole."""
+
+    exit_code = 2
 
 
 def _explain(error: OSError, path: Path, kept: str) -> StorageError:
@@ -28,21 +147,21 @@ def _explain(error: OSError, path: Path, kept: str) -> StorageError:
     return StorageError(f"{path}: cannot be written ({error.strerror}); {kept}")
 
 
-def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
+def read_journal(path: Path) -> tuple[list[EpisodeRecord], int]:
     """Read a journal.
 
     Returns:
         The records in file order, and the length of the part that is whole [bytes]. A last line that lacks its line
-        end, as ``kill -9`` or a full disk leaves it, is no part of it.
+        end, as `kill -9` or a full disk leaves it, is not part of it.
 
     Raises:
-        InputError: a line other than the last is no JSON object, or a line is no record of an episode.
+        InputError: A line other than the last is not a JSON object, or a line is not a record of an episode.
     """
     try:
         data = read_regular(path, MAX_JOURNAL_BYTES)
     except FileNotFoundError:
         return [], 0
-    records: list[dict[str, Any]] = []
+    records: list[EpisodeRecord] = []
     start = 0
     number = 0
     while start < len(data):
@@ -51,14 +170,14 @@ def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
         if end < 0:
             break
         try:
-            record = parse(data[start:end])
-            if not isinstance(record, dict):
+            line = parse(data[start:end])
+            if not isinstance(line, dict):
                 raise ValueError
         except ValueError:
             if end + 1 == len(data):
                 break
-            raise InputError(f"{path}: line {number} is no JSON object; the journal was changed by hand") from None
-        records.append(check_record(f"{path}: line {number}", record))
+            raise InputError(f"{path}: line {number} is not a JSON object; the journal was changed by hand") from None
+        records.append(EpisodeRecord.from_json(f"{path}: line {number}", line))
         start = end + 1
     return records, start
 
@@ -66,16 +185,16 @@ def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
 class Journal:
     """Append-only journal, locked against a second writer.
 
-    Opening cuts a torn last line. ``append`` returns after the line is on disk; when the disk is full it takes the
+    Opening cuts a torn last line. `append` returns after the line is on disk; when the disk is full it takes the
     partial line back, so that the file stays whole.
     """
 
     def __init__(self, path: Path):
-        """Open or create the journal at ``path``.
+        """Open or create the journal at `path`.
 
         Raises:
-            InputError: another process writes it, or it is damaged.
-            StorageError: it cannot be created.
+            InputError: Another process writes it, or it is damaged.
+            StorageError: It cannot be created.
         """
         self.path = path
         try:
@@ -86,7 +205,7 @@ class Journal:
             raise _explain(error, path, "nothing was run") from None
         if not stat.S_ISREG(os.fstat(self._file).st_mode):
             os.close(self._file)
-            raise InputError(f"{path}: is no regular file")
+            raise InputError(f"{path}: is not a regular file")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -105,9 +224,9 @@ class Journal:
             os.close(self._file)
             raise
 
-    def append(self, record: dict[str, Any]) -> None:
+    def append(self, record: EpisodeRecord) -> None:
         """Write one record and wait until it is on disk."""
-        line = json.dumps(record, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        line = json.dumps(record.to_json(), separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
             written = 0
             while written < len(line):
@@ -118,7 +237,7 @@ class Journal:
                 os.ftruncate(self._file, self._size)
             except OSError:
                 pass  # the torn line is cut by the next opening
-            kept = len({record["index"] for record in self.records})
+            kept = len({record.index for record in self.records})
             raise _explain(error, self.path, f"kept: {counted(kept, 'episode')}") from None
         self._size += len(line)
         self.records.append(record)
@@ -139,16 +258,13 @@ class Journal:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text file so that a reader sees the old content or the new, never a part; links are not followed."""
-    temporary = path.with_name(path.name + ".part")
+    """Write a text file so that a reader sees the old content or the new, never a part; links are not followed.
+
+    Raises:
+        StorageError: It cannot be written.
+    """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with create(temporary) as file:
+        with replace_atomically(path, sync=True) as file:
             file.write(text.encode("utf-8"))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise _explain(error, path, "the journal is kept") from None

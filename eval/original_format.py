@@ -1,7 +1,7 @@
 """Results in the file formats of the original HumanoidArena evaluation, so that its users' scripts read them.
 
-One run folder of the original holds one task, mode and tracker; here each is ``original/<task>__<tracker>__<mode>/``
-with ``episodes/*.json``, ``summary.csv``, ``summary.jsonl``, ``summary.json`` and ``final.csv``.
+One run folder of the original holds one task, mode and tracker; here each is `original/<task>__<tracker>__<mode>/`
+with `episodes/*.json`, `summary.csv`, `summary.jsonl`, `summary.json` and `final.csv`.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from arena_newton.errors import InputError
-from arena_newton.eval.journal import write_atomic
+from arena_newton.eval.journal import EpisodeRecord, write_atomic
+from arena_newton.eval.records import JsonObject
 from arena_newton.eval.stats import population_std, seed_rates
 
 __all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]
@@ -47,13 +47,11 @@ SUMMARY_COLUMNS = (
     "server_url",
     "returncode",
 )
-"""Columns of ``summary.csv`` and keys of ``summary.jsonl``, in the original's order."""
+"""Columns of `summary.csv` and keys of `summary.jsonl`, in the original's order."""
 
 EPISODE_SEED_FORMULA = "sha256(task_name|group_seed|repeat_idx)_positive_int32"
 REWARD_SCALE = 0.02
 """The original's reward manager multiplies a reward by the control step [s]."""
-
-
 MAX_LABEL = 120
 """Characters of a label; with seed, repeat and episode a file name stays below 255."""
 
@@ -66,65 +64,65 @@ def label(policy: str) -> str:
     return f"{name[: MAX_LABEL - 9]}_{hashlib.sha256(policy.encode()).hexdigest()[:8]}"
 
 
-def _reason(record: dict[str, Any]) -> str:
-    return "sim_error" if record["outcome"] == "error" else record["outcome"]
+def _reason(record: EpisodeRecord) -> str:
+    return "sim_error" if record.outcome == "error" else record.outcome
 
 
-def _reward(record: dict[str, Any]) -> float:
+def _reward(record: EpisodeRecord) -> float:
     """Raw reward of the last step: 1 on success; otherwise 0, and -1 in football."""
-    if record["outcome"] == "success":
+    if record.outcome == "success":
         return 1.0
-    return -1.0 if record["task"] == "football" else 0.0
+    return -1.0 if record.task == "football" else 0.0
 
 
-def _common(record: dict[str, Any], gym_id: str, seeds: Sequence[int], repeats: int) -> dict[str, Any]:
+def _common(record: EpisodeRecord, gym_id: str, seeds: Sequence[int], repeats: int) -> JsonObject:
     reward = _reward(record)
     return {
         "task": gym_id,
-        "model_path": record["policy"],
-        "model_label": label(record["policy"]),
-        "seed": record["group_seed"],
-        "repeat_idx": record["repeat"],
-        "episode_seed": record["episode_seed"],
-        "episode_index": list(seeds).index(record["group_seed"]) * repeats + record["repeat"],
-        "success": record["outcome"] == "success",
+        "model_path": record.policy,
+        "model_label": label(record.policy),
+        "seed": record.group_seed,
+        "repeat_idx": record.repeat,
+        "episode_seed": record.episode_seed,
+        "episode_index": list(seeds).index(record.group_seed) * repeats + record.repeat,
+        "success": record.outcome == "success",
         "failure_reason": _reason(record),
-        "episode_steps": record["steps"],
-        "max_steps": record["max_steps"],
+        "episode_steps": record.steps,
+        "max_steps": record.max_steps,
         "final_reward": reward,
         "final_reward_scaled": reward * REWARD_SCALE,
         "max_reward": reward,
         "max_reward_scaled": reward * REWARD_SCALE,
-        "video_path": record.get("video") or "",
-        "server_url": record["policy"].removeprefix("remote:") if record["policy"].startswith("remote:") else "",
-        "episode_object_seed": record["object_seed"],
+        "video_path": record.video or "",
+        "server_url": record.policy.removeprefix("remote:") if record.policy.startswith("remote:") else "",
+        "episode_object_seed": record.object_seed,
         "episode_object_seed_source": "env_seed",
     }
 
 
-def episode_json(record: dict[str, Any], gym_id: str, seeds: Sequence[int], repeats: int) -> dict[str, Any]:
-    """Content of one ``episodes/*.json``."""
+def episode_json(record: EpisodeRecord, gym_id: str, seeds: Sequence[int], repeats: int) -> JsonObject:
+    """Content of one `episodes/*.json`."""
     return _common(record, gym_id, seeds, repeats) | {
-        "video_recorded": bool(record.get("video")),
-        "started_at": record.get("started_at"),
-        "finished_at": record.get("finished_at"),
-        "duration_sec": (record.get("durations") or {}).get("wall_s"),
-        "error": record.get("error"),
+        "video_recorded": bool(record.video),
+        "started_at": record.started_at,
+        "finished_at": record.finished_at,
+        "duration_sec": (record.durations or {}).get("wall_s"),
+        "error": record.error,
         "terminal_detail": {
-            "reason": record.get("reason", ""),
-            "margin": record.get("margin"),
-            "startup_fall": bool(record.get("startup_fall")),
+            "reason": record.reason,
+            "margin": record.margin,
+            "startup_fall": record.startup_fall,
         },
     }
 
 
-def _row(record: dict[str, Any], gym_id: str, seeds: Sequence[int], repeats: int) -> dict[str, Any]:
+def _row(record: EpisodeRecord, gym_id: str, seeds: Sequence[int], repeats: int) -> JsonObject:
     common = _common(record, gym_id, seeds, repeats)
-    rest = {"log_path": "", "vla_trace_path": "", "returncode": int(record["outcome"] == "error")}
+    rest = {"log_path": "", "vla_trace_path": "", "returncode": int(record.outcome == "error")}
     return {column: (common | rest)[column] for column in SUMMARY_COLUMNS}
 
 
-def _counts(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _counts(records: Sequence[EpisodeRecord]) -> JsonObject:
     reasons = [_reason(record) for record in records]
     successes = reasons.count("success")
     return {
@@ -137,14 +135,14 @@ def _counts(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def summary_json(records: Sequence[dict[str, Any]], repeats: int) -> dict[str, Any]:
-    """Content of ``summary.json``."""
+def summary_json(records: Sequence[EpisodeRecord], repeats: int) -> JsonObject:
+    """Content of `summary.json`."""
     per_model = {}
-    for name in dict.fromkeys(label(record["policy"]) for record in records):
-        own = [record for record in records if label(record["policy"]) == name]
+    for name in dict.fromkeys(label(record.policy) for record in records):
+        own = [record for record in records if label(record.policy) == name]
         rates = seed_rates(own)
         per_model[name] = _counts(own) | {
-            "per_seed": {str(seed): _counts([r for r in own if r["group_seed"] == seed]) for seed in rates},
+            "per_seed": {str(seed): _counts([r for r in own if r.group_seed == seed]) for seed in rates},
             "per_seed_success_rate": {str(seed): rate for seed, rate in rates.items()},
             "repeats_per_seed": repeats,
             "seed_success_rate_mean": math.fsum(rates.values()) / len(rates),
@@ -163,30 +161,30 @@ def summary_json(records: Sequence[dict[str, Any]], repeats: int) -> dict[str, A
     }
 
 
-def final_csv(records: Sequence[dict[str, Any]]) -> str:
-    """Content of ``final.csv``, e.g. ``stand,44/60 (73.3%),4.7%,512.0,0/16 (0.0%)``."""
+def final_csv(records: Sequence[EpisodeRecord]) -> str:
+    """Content of `final.csv`, e.g. `stand,44/60 (73.3%),4.7%,512.0,0/16 (0.0%)`."""
     rows = []
-    for name in dict.fromkeys(label(record["policy"]) for record in records):
-        own = [record for record in records if label(record["policy"]) == name]
-        won = [record["steps"] for record in own if record["outcome"] == "success"]
-        failures, falls = len(own) - len(won), sum(record["outcome"] == "fall" for record in own)
+    for name in dict.fromkeys(label(record.policy) for record in records):
+        own = [record for record in records if label(record.policy) == name]
+        won = [record.steps for record in own if record.outcome == "success"]
+        failures, falls = len(own) - len(won), sum(record.outcome == "fall" for record in own)
         rows.append(
             {
                 "model": name,
-                "success_rate": _share(len(won), len(own)),
+                "success_rate": _fraction(len(won), len(own)),
                 "seed_success_rate_std": f"{100 * (population_std(list(seed_rates(own).values())) or 0):.1f}%",
                 "avg_success_steps": f"{math.fsum(won) / len(won):.1f}" if won else "",
-                "fall_in_failures": _share(falls, failures),
+                "fall_in_failures": _fraction(falls, failures),
             }
         )
     return _csv(rows, ("model", "success_rate", "seed_success_rate_std", "avg_success_steps", "fall_in_failures"))
 
 
-def _share(part: int, whole: int) -> str:
+def _fraction(part: int, whole: int) -> str:
     return f"{part}/{whole} ({100 * part / whole if whole else 0:.1f}%)"
 
 
-def _csv(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> str:
+def _csv(rows: Iterable[JsonObject], columns: Sequence[str]) -> str:
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
@@ -196,16 +194,16 @@ def _csv(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> str:
 
 def write_original(
     folder: Path,
-    records: Sequence[dict[str, Any]],
+    records: Sequence[EpisodeRecord],
     *,
-    gym_ids: dict[str, str],
+    gym_ids: Mapping[str, str],
     seeds: Sequence[int],
     repeats: int,
 ) -> None:
-    """Write the original's files for every task, tracker and mode among ``records`` (sorted by plan order).
+    """Write the original's files for every task, tracker and mode among `records` (sorted by plan order).
 
     Raises:
-        InputError: a record's names would lead out of ``folder``, or a folder inside is a link to another place.
+        InputError: A record's names would lead out of `folder`, or a folder inside is a link to another one.
     """
     inside = folder.parent.resolve() / folder.name
 
@@ -214,8 +212,8 @@ def write_original(
             raise InputError(f"{path}: lies outside {folder}; nothing is written there")
         write_atomic(path, text)
 
-    for task, tracker, mode in dict.fromkeys((r["task"], r["tracker"], r["mode"]) for r in records):
-        own = [r for r in records if (r["task"], r["tracker"], r["mode"]) == (task, tracker, mode)]
+    for task, tracker, mode in dict.fromkeys((r.task, r.tracker, r.mode) for r in records):
+        own = [r for r in records if (r.task, r.tracker, r.mode) == (task, tracker, mode)]
         run = folder / f"{task}__{label(tracker)}__{mode}"
         rows = [_row(record, gym_ids[task], seeds, repeats) for record in own]
         for record in own:

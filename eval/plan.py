@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from arena_newton import rule_sets, seeding, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.records import MAX_COUNT, MAX_EPISODES, MAX_SEED
+from arena_newton.eval.records import MAX_COUNT, MAX_EPISODES, MAX_SEED, JsonObject
 from arena_newton.rules import MODES
 
 __all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "to_list_json"]
@@ -25,7 +24,7 @@ class Episode:
     """One planned episode."""
 
     index: int
-    """Place in the plan, from 0."""
+    """Position in the plan, from 0."""
     task: str
     mode: str
     rules: str
@@ -40,7 +39,7 @@ class Episode:
     max_steps: int
     """Step budget [50 Hz ticks]."""
     rank: int = 0
-    """Place among the episodes of its task and mode, from 0."""
+    """Position among the episodes of its task and mode, from 0."""
 
     @property
     def key(self) -> str:
@@ -70,7 +69,7 @@ def expand(
         rules: Name of the rule set.
         engine: Name of the physics engine.
         seeds: Group seeds.
-        repeats: Episodes a group seed.
+        repeats: Episodes per group seed.
         max_steps: Cap on the rule set's step budgets, or None.
 
     Raises:
@@ -105,7 +104,7 @@ def expand(
         spec = tasks.get(name)
         budget = spec.max_steps(rule_set)
         for mode in modes:
-            for place, group_seed in enumerate(seeds):
+            for position, group_seed in enumerate(seeds):
                 for repeat in range(repeats):
                     seed = seeding.episode_seed(spec.gym_id, group_seed, repeat)
                     episodes.append(
@@ -122,7 +121,7 @@ def expand(
                             episode_seed=seed,
                             object_seed=seeding.object_seed(seed),
                             max_steps=budget if max_steps is None else min(budget, max_steps),
-                            rank=place * repeats + repeat,
+                            rank=position * repeats + repeat,
                         )
                     )
     return episodes
@@ -133,7 +132,7 @@ def _cut(number: int) -> str:
     return str(number) if number < 10**40 else f"{str(number)[:40]}..."
 
 
-def to_list_json(episodes: Iterable[Episode]) -> list[dict[str, Any]]:
+def to_list_json(episodes: Iterable[Episode]) -> list[JsonObject]:
     """What `list --json` prints: one object per episode.
 
     `sampled` and `placed` are keyed by the object's name in the original's records. A placed object names its prim, its
@@ -142,7 +141,7 @@ def to_list_json(episodes: Iterable[Episode]) -> list[dict[str, Any]]:
     return [_listed(episode) for episode in episodes]
 
 
-def _listed(episode: Episode) -> dict[str, Any]:
+def _listed(episode: Episode) -> JsonObject:
     spec = tasks.get(episode.task)
     draws = spec.draw(episode.episode_seed, episode.mode, rule_sets.get(episode.rules))
     placed = {}

@@ -6,9 +6,12 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import NoReturn, TextIO
 
-from arena_newton.eval.records import counted
+from tqdm import tqdm
+
+from arena_newton.robot import TICK
+from arena_newton.text import counted
 
 __all__ = ["Progress", "duration", "kernels_to_compile", "simulated"]
 
@@ -33,10 +36,10 @@ def duration(seconds: float) -> str:
 
 
 def simulated(ticks: int) -> str:
-    """Size of a run in words: its largest number of ticks of 0.02 s, and the time that they simulate."""
-    seconds = 0.02 * ticks
-    told = f"{seconds:g} s" if seconds < 1.0 else duration(seconds)
-    return f"at most {counted(ticks, 'world-tick')} ({told} simulated)"
+    """Size of a run in words: its largest number of ticks, and the time that they simulate."""
+    seconds = TICK * ticks
+    length = f"{seconds:g} s" if seconds < 1.0 else duration(seconds)
+    return f"at most {counted(ticks, 'world-tick')} ({length} simulated)"
 
 
 def kernels_to_compile(cache: Path, engine: str, device: str) -> bool:
@@ -89,10 +92,8 @@ class Progress:
         self._window = [0.0, 0.0]
         self._rate = 0.0
         self._estimated = False
-        self._bar: Any = None
+        self._bar: tqdm[NoReturn] | None = None
         if self._stream.isatty():
-            from tqdm import tqdm
-
             bar = "{desc} {percentage:3.0f}%|{bar}|{postfix}"
             self._bar = tqdm(
                 total=self.budget, initial=done, file=self._stream, dynamic_ncols=True, bar_format=bar, mininterval=0.2
@@ -142,14 +143,14 @@ class Progress:
         self._describe()
 
     def say(self, text: str) -> None:
-        """Print a line beside the bar."""
+        """Print a line next to the bar."""
         if self._bar is not None:
             self._bar.write(text, file=self._stream)
         else:
             print(text, file=self._stream, flush=True)
 
     def close(self) -> None:
-        """Leave the bar, or the last line, as it stands."""
+        """Leave the bar, or the last line, as it is."""
         if self._bar is not None:
             self._bar.close()
         elif self.done != self._line_done:
@@ -192,5 +193,5 @@ class Progress:
             self.say(self._text())
 
     def _text(self) -> str:
-        share = f"{self._name}: {self.finished} of {counted(self.planned, 'episode')}"
-        return ", ".join(filter(None, (share, f"{self.done / self.budget:.0%} of the tick budget", self._speed())))
+        finished = f"{self._name}: {self.finished} of {counted(self.planned, 'episode')}"
+        return ", ".join(filter(None, (finished, f"{self.done / self.budget:.0%} of the tick budget", self._speed())))

@@ -6,18 +6,17 @@ import csv
 import io
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-from arena_newton.eval.html_report import Page, environment_facts, media_of, page, plain, rules_that_ran, tasks_of
-from arena_newton.eval.journal import read_journal, write_atomic
+from arena_newton.eval import html_report
+from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.original_format import write_original
-from arena_newton.eval.records import JOURNAL_FILE, check_plan, counted, read_document
-from arena_newton.eval.stats import aggregate, error_reasons, outside_suites
+from arena_newton.eval.results import Results, RunRecord, results_json
+from arena_newton.eval.stats import Cell, Suite, error_reasons, outside_suites
+from arena_newton.eval.wording import environment_facts, media_of, plain, rules_that_ran, tasks_of
+from arena_newton.robot import TICK
+from arena_newton.text import counted
 
-__all__ = ["RunRecord", "load_run", "notes", "results_json", "table", "write_reports"]
+__all__ = ["notes", "table", "write_reports"]
 
 _COLUMNS = (
     "task",
@@ -39,62 +38,15 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class RunRecord:
-    """What a results folder holds."""
-
-    folder: Path
-    document: dict[str, Any]
-    """Content of config.json."""
-    records: list[dict[str, Any]]
-    """Finished episodes in plan order; of an episode that was run twice the last."""
-
-    @property
-    def planned(self) -> int:
-        """Number of episodes of the plan."""
-        return self.document["planned"]
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The run's identity."""
-        return self.document["config"]
-
-
-def in_plan_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Records by plan order; of two with the same index the later one in the journal counts."""
-    latest = {record["index"]: record for record in records}
-    return [latest[index] for index in sorted(latest)]
-
-
-def load_run(folder: Path) -> RunRecord:
-    """Read a results folder."""
-    document = read_document(folder)
-    records, _ = read_journal(folder / JOURNAL_FILE)
-    check_plan(folder / JOURNAL_FILE, records, document)
-    return RunRecord(folder, document, in_plan_order(records))
-
-
-def results_json(run: RunRecord) -> dict[str, Any]:
-    """Content of results.json."""
-    return {
-        "config_hash": run.document["config_hash"],
-        "config": run.config,
-        "planned": run.planned,
-        "finished": len(run.records),
-        "complete": len(run.records) == run.planned,
-        **aggregate(run.records),
-    }
-
-
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _cell_text(cell: dict[str, Any]) -> list[str]:
+def _cell_text(cell: Cell) -> list[str]:
     low_high = "-" if cell["ci95"] is None else f"{100 * cell['ci95'][0]:.1f} to {100 * cell['ci95'][1]:.1f}"
     running = cell["falls"] - cell["startup_falls"]
     return [
-        *(plain(cell[name]) for name in ("task", "tracker", "policy", "mode")),
+        *map(plain, (cell["task"], cell["tracker"], cell["policy"], cell["mode"])),
         str(cell["episodes"]),
         f"{_percent(cell['sr'])} ± {_percent(cell['sr_seed_std'])}",
         low_high,
@@ -110,9 +62,9 @@ _HEAD = ["task", "tracker", "policy", "mode", "n", "SR % ± seed std", "95 % CI"
 _HEAD += ["falls running + at start", "timeouts", "errors", "mean steps"]
 
 
-def _suite_text(suite: dict[str, Any]) -> list[str]:
+def _suite_text(suite: Suite) -> list[str]:
     return [
-        *(plain(suite[name]) for name in ("suite", "tracker", "policy", "mode")),
+        *map(plain, (suite["suite"], suite["tracker"], suite["policy"], suite["mode"])),
         str(suite["episodes"]),
         f"{_percent(suite['sr'])} ± {_percent(suite['sr_std'])}",
         "",
@@ -124,11 +76,11 @@ def _suite_text(suite: dict[str, Any]) -> list[str]:
     ]
 
 
-def _rows(results: dict[str, Any]) -> list[list[str]]:
+def _rows(results: Results) -> list[list[str]]:
     return [_cell_text(cell) for cell in results["cells"]] + [_suite_text(suite) for suite in results["suites"]]
 
 
-def table(results: dict[str, Any]) -> str:
+def table(results: Results) -> str:
     """The result table as Markdown with aligned columns; it is also what the command line prints."""
     rows = [_HEAD, *([_escaped(text) for text in row] for row in _rows(results))]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
@@ -141,21 +93,30 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join([line(_HEAD), rule, *(line(row) for row in rows[1:])]) + "\n"
 
 
-def table_csv(results: dict[str, Any]) -> str:
+def table_csv(results: Results) -> str:
     """The cells as CSV, rates as fractions."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
     for cell in results["cells"]:
         low, high = cell["ci95"] or (None, None)
-        names = {name: plain(cell[name]) for name in ("task", "tracker", "policy", "mode")}
-        writer.writerow(cell | names | {"ci95_low": low, "ci95_high": high})
+        row = {key: plain(value) if isinstance(value, str) else value for key, value in cell.items()}
+        writer.writerow(row | {"ci95_low": low, "ci95_high": high})
     return text.getvalue()
 
 
-def notes(results: dict[str, Any]) -> list[str]:
+_STATES = {
+    "started": "The run has not ended: it is going on, or it was killed.",
+    "cancelled": "The run was cancelled.",
+    "error": "The run ended with an error",
+}
+
+
+def notes(run: RunRecord, results: Results) -> list[str]:
     """What a reader of the table must know besides it."""
     found = []
+    if run.status is not None and run.status["state"] != "success":
+        found.append(_STATES[run.status["state"]] + (f": {run.status['error']}" if run.status["error"] else ""))
     if not results["complete"]:
         found.append(f"Incomplete: {results['finished']} of {results['planned']} episodes are finished.")
     errors = sum(cell["errors"] for cell in results["cells"])
@@ -169,7 +130,7 @@ def notes(results: dict[str, Any]) -> list[str]:
         found.append(f"The averages are those of the paper's seven tasks; not in them: {' '.join(outside)}.")
     cap = results["config"]["max_steps"]
     if cap is not None:
-        found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * 0.02:g} s): no benchmark result.")
+        found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")
     return found
 
 
@@ -183,10 +144,10 @@ def _code(text: object) -> str:
     return f"`{plain(text).replace('`', "'")}`"
 
 
-def _markdown(run: RunRecord, results: dict[str, Any]) -> str:
+def _markdown(run: RunRecord, results: Results) -> str:
     lines = [f"# HumanoidArena results {_escaped(results['config_hash'])}", ""]
-    lines += [f"> {_escaped(note)}" for note in notes(results)]
-    lines += [f"> The scene is a variant: {_escaped(text)}" for text in run.document.get("variant_changes") or []]
+    lines += [f"> {_escaped(note)}" for note in notes(run, results)]
+    lines += [f"> The scene is a variant: {_escaped(text)}" for text in run.document.get("variant_changes", [])]
     lines += ["", table(results)]
     lines += [
         "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
@@ -202,15 +163,15 @@ def _markdown(run: RunRecord, results: dict[str, Any]) -> str:
     strips = [(r, media_of(r)) for r in run.records if media_of(r)]
     if strips:
         lines += ["## Recordings", ""]
-        strips.sort(key=lambda entry: entry[0]["outcome"] == "success")
+        strips.sort(key=lambda entry: entry[0].outcome == "success")
         lines += [
-            f"- {_escaped(r['task'])} {_escaped(r['mode'])} seed {_escaped(r['group_seed'])} repeat "
-            f"{_escaped(r['repeat'])} ({_escaped(r['outcome'])}): "
+            f"- {_escaped(r.task)} {_escaped(r.mode)} seed {_escaped(r.group_seed)} repeat "
+            f"{_escaped(r.repeat)} ({_escaped(r.outcome)}): "
             + ", ".join(f"[{name}]({path})" for name, path in media.items())
             for r, media in strips
         ]
         lines += [""]
-    for name, facts in (run.document.get("environments") or {}).items():
+    for name, facts in run.document.get("environments", {}).items():
         lines += [f"## What ran: {_escaped(name)}", ""]
         lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in environment_facts(facts)] + [""]
     lines += ["## Configuration", ""]
@@ -221,21 +182,12 @@ def _markdown(run: RunRecord, results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _html(run: RunRecord, results: dict[str, Any]) -> str:
-    return page(
-        Page(
-            document=run.document,
-            records=run.records,
-            results=results,
-            notes=notes(results),
-            head=_HEAD,
-            rows=_rows(results),
-            reasons=error_reasons(run.records),
-        )
-    )
+def _html(run: RunRecord, results: Results) -> str:
+    reasons = error_reasons(run.records)
+    return html_report.page(run, results, notes=notes(run, results), head=_HEAD, rows=_rows(results), reasons=reasons)
 
 
-def write_reports(run: RunRecord) -> dict[str, Any]:
+def write_reports(run: RunRecord) -> Results:
     """Write results.json, table.md, table.csv, report.md, report.html and original/ into the folder.
 
     Returns:

@@ -5,13 +5,19 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TypedDict
 
-from arena_newton import intervals
-from arena_newton.eval.records import plain_text
+from arena_newton import intervals, tasks
+from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.text import plain_text
 
 __all__ = [
-    "SUITES",
+    "Aggregate",
+    "Cell",
+    "ErrorReason",
+    "Figures",
+    "PooledFigures",
+    "Suite",
     "aggregate",
     "cell",
     "error_reasons",
@@ -19,15 +25,86 @@ __all__ = [
     "pooled",
     "population_std",
     "seed_rates",
+    "suites",
     "wilson",
 ]
 
-SUITES: dict[str, tuple[str, ...]] = {
-    "HOI_AVG": ("football", "double_desk", "pp_box"),
-    "HSI_AVG": ("open_door", "sit_sofa", "boxing", "vis_navi"),
-    "ALL_AVG": ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"),
-}
-"""Task groups of the paper's tables: human-object and human-scene interaction; `outside_suites` names other tasks."""
+
+class Figures(TypedDict):
+    """Figures of some episodes, as in results.json."""
+
+    episodes: int
+    successes: int
+    falls: int
+    startup_falls: int
+    timeouts: int
+    errors: int
+    overflows: int
+    sr: float | None
+    """Success rate."""
+    sr_seed_mean: float | None
+    sr_seed_std: float | None
+    sr_per_seed: dict[str, float]
+    ci95: list[float] | None
+    """Wilson interval of the success rate."""
+    afr: float | None
+    """Average fall rate."""
+    mean_steps: float | None
+    """Over the episodes without error [ticks]."""
+
+
+class Cell(Figures):
+    """Figures of one task x tracker x policy x mode."""
+
+    task: str
+    tracker: str
+    policy: str
+    mode: str
+
+
+class PooledFigures(TypedDict):
+    """Figures of a suite's episodes."""
+
+    episodes: int
+    falls: int
+    errors: int
+    sr: float
+    sr_std: float | None
+    afr: float
+
+
+class Suite(PooledFigures):
+    """Average of one suite x tracker x policy x mode."""
+
+    suite: str
+    tracker: str
+    policy: str
+    mode: str
+
+
+class Aggregate(TypedDict):
+    """Figures of a run."""
+
+    cells: list[Cell]
+    suites: list[Suite]
+
+
+class ErrorReason(TypedDict):
+    """One cause of errors."""
+
+    reason: str
+    message: str
+    """One line without terminal escapes."""
+    count: int
+
+
+def suites() -> dict[str, tuple[str, ...]]:
+    """Task groups of the paper's tables by name, from the tasks: human-object and human-scene interaction, both.
+
+    `outside_suites` names other tasks.
+    """
+    named = {suite: tuple(t for t in tasks.names() if tasks.get(t).suite == suite) for suite in ("HOI", "HSI")}
+    return {f"{suite}_AVG": names for suite, names in named.items()} | {"ALL_AVG": named["HOI"] + named["HSI"]}
 
 
 def population_std(values: Sequence[float]) -> float | None:
@@ -46,54 +123,50 @@ def wilson(successes: int, episodes: int) -> list[float] | None:
     return list(intervals.wilson(successes, episodes)) if episodes else None
 
 
-def outside_suites(tasks: Iterable[str]) -> list[str]:
+def outside_suites(names: Iterable[str]) -> list[str]:
     """Tasks that no average of the paper's tables counts, such as one that was added to its seven."""
-    return [task for task in dict.fromkeys(tasks) if task not in SUITES["ALL_AVG"]]
+    return [task for task in dict.fromkeys(names) if task not in suites()["ALL_AVG"]]
 
 
-def error_reasons(records: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Why episodes ended as errors, the most frequent cause first.
-
-    Returns:
-        One object per cause: ``reason``, ``message`` (one line without terminal escapes) and ``count``.
-    """
+def error_reasons(records: Iterable[EpisodeRecord]) -> list[ErrorReason]:
+    """Why episodes ended as errors, the most frequent cause first."""
     counts: Counter[tuple[str, str]] = Counter(
-        (plain_text(record.get("reason") or "error", 80), plain_text(record.get("error") or "no message", 400))
+        (plain_text(record.reason or "error", 80), plain_text(record.error or "no message", 400))
         for record in records
-        if record["outcome"] == "error"
+        if record.outcome == "error"
     )
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return [{"reason": reason, "message": message, "count": count} for (reason, message), count in ordered]
 
 
-def seed_rates(records: Iterable[dict[str, Any]]) -> dict[int, float]:
+def seed_rates(records: Iterable[EpisodeRecord]) -> dict[int, float]:
     """Success rate per group seed, in order of the seeds."""
     counts: dict[int, list[int]] = {}
     for record in records:
-        entry = counts.setdefault(record["group_seed"], [0, 0])
-        entry[0] += record["outcome"] == "success"
+        entry = counts.setdefault(record.group_seed, [0, 0])
+        entry[0] += record.outcome == "success"
         entry[1] += 1
     return {seed: counts[seed][0] / counts[seed][1] for seed in sorted(counts)}
 
 
-def cell(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def cell(records: Sequence[EpisodeRecord]) -> Figures:
     """Figures of one task x tracker x policy x mode.
 
     An episode that ended with an error counts as an episode without success, and is shown as an error: a policy cannot
-    raise its rate by breaking off. ``mean_steps`` is taken over the episodes without error [ticks].
+    raise its rate by breaking off. `mean_steps` is taken over the episodes without error [ticks].
     """
-    outcomes = [record["outcome"] for record in records]
+    outcomes = [record.outcome for record in records]
     episodes, successes, falls = len(outcomes), outcomes.count("success"), outcomes.count("fall")
     rates = seed_rates(records)
-    steps = [record["steps"] for record in records if record["outcome"] != "error"]
+    steps = [record.steps for record in records if record.outcome != "error"]
     return {
         "episodes": episodes,
         "successes": successes,
         "falls": falls,
-        "startup_falls": sum(r["outcome"] == "fall" and bool(r.get("startup_fall")) for r in records),
+        "startup_falls": sum(r.outcome == "fall" and r.startup_fall for r in records),
         "timeouts": outcomes.count("timeout"),
         "errors": outcomes.count("error"),
-        "overflows": sum(bool(record.get("overflow")) for record in records),
+        "overflows": sum(record.overflow for record in records),
         "sr": successes / episodes if episodes else None,
         "sr_seed_mean": math.fsum(rates.values()) / len(rates) if rates else None,
         "sr_seed_std": population_std(list(rates.values())),
@@ -104,41 +177,40 @@ def cell(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def pooled(records_by_task: Mapping[str, Sequence[dict[str, Any]]], tasks: Sequence[str]) -> dict[str, Any] | None:
+def pooled(records_by_task: Mapping[str, Sequence[EpisodeRecord]], names: Sequence[str]) -> PooledFigures | None:
     """Average over a suite: mean and population std over all task x seed rates pooled, falls over all its episodes.
 
     For instance 3 tasks x 3 seeds for HOI. Returns None unless every task of the suite has episodes.
     """
-    if any(not records_by_task.get(task) for task in tasks):
+    if any(not records_by_task.get(task) for task in names):
         return None
-    rates = [rate for task in tasks for rate in seed_rates(records_by_task[task]).values()]
-    records = [record for task in tasks for record in records_by_task[task]]
-    falls = sum(record["outcome"] == "fall" for record in records)
+    rates = [rate for task in names for rate in seed_rates(records_by_task[task]).values()]
+    records = [record for task in names for record in records_by_task[task]]
+    falls = sum(record.outcome == "fall" for record in records)
     return {
         "episodes": len(records),
         "falls": falls,
-        "errors": sum(record["outcome"] == "error" for record in records),
+        "errors": sum(record.outcome == "error" for record in records),
         "sr": math.fsum(rates) / len(rates),
         "sr_std": population_std(rates),
         "afr": falls / len(records),
     }
 
 
-def aggregate(records: Iterable[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Cells and suite averages of a run, in the order of the plan (``index``), whatever order the episodes ended in."""
-    groups: dict[tuple[str, str, str, str], list[dict[str, Any]]] = {}
-    for record in sorted(records, key=lambda r: r["index"]):
-        key = (record["task"], record["tracker"], record["policy"], record["mode"])
-        groups.setdefault(key, []).append(record)
-    cells = [
-        {"task": key[0], "tracker": key[1], "policy": key[2], "mode": key[3], **cell(group)}
-        for key, group in groups.items()
+def aggregate(records: Iterable[EpisodeRecord]) -> Aggregate:
+    """Cells and suite averages of a run, in the order of the plan (`index`), whatever order the episodes ended in."""
+    groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
+    for record in sorted(records, key=lambda r: r.index):
+        groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
+    cells: list[Cell] = [
+        {"task": task, "tracker": tracker, "policy": policy, "mode": mode, **cell(group)}
+        for (task, tracker, policy, mode), group in groups.items()
     ]
-    suites: list[dict[str, Any]] = []
+    averages: list[Suite] = []
     for tracker, policy, mode in dict.fromkeys(key[1:] for key in groups):
         by_task = {key[0]: group for key, group in groups.items() if key[1:] == (tracker, policy, mode)}
-        for name, tasks in SUITES.items():
-            figures = pooled(by_task, tasks)
+        for name, names in suites().items():
+            figures = pooled(by_task, names)
             if figures is not None:
-                suites.append({"suite": name, "tracker": tracker, "policy": policy, "mode": mode, **figures})
-    return {"cells": cells, "suites": suites}
+                averages.append({"suite": name, "tracker": tracker, "policy": policy, "mode": mode, **figures})
+    return {"cells": cells, "suites": averages}

@@ -48,6 +48,8 @@ class PolicyError(ArenaError):
 class PolicyUnavailable(ArenaError):
     """The policy cannot continue (its server is gone); the run stops and its unfinished episodes stay open."""
 
+    exit_code = 2
+
 
 class Policy:
     """Base of all policies; a subclass writes `act` and, where it has a memory, `reset`."""

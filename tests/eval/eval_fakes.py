@@ -1,6 +1,6 @@
 """Stand-ins for world, tracker and policy: outcomes follow from the episode seed, no physics runs.
 
-As a script it is the command line with these stand-ins, so that a test can kill it: ``eval_fakes.py run --out ...``.
+As a script it is the command line with these stand-ins, so that a test can kill it: `eval_fakes.py run --out ...`.
 """
 
 import os
@@ -8,63 +8,106 @@ import sys
 import time
 from types import SimpleNamespace
 
+import numpy as np
+import torch
+
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.run import Factories
+from arena_newton.interfaces import Chunk, Observation, Verdict
+from arena_newton.kernels import tick as codes
 
-
-def outcome_of(episode):
-    """Outcome, steps and margin that this world gives an episode."""
-    number = episode.episode_seed % 10
-    outcome = "success" if number < 5 else "fall" if number < 8 else "timeout"
-    steps = episode.max_steps if outcome == "timeout" else 1 + episode.episode_seed % min(30, episode.max_steps)
-    return outcome, steps, (episode.episode_seed % 997) / 997 - 0.5
+SLOW = 10
+"""Every episode that ends by itself has ended after so many ticks; the others then leap from one leap to the next."""
+LEAP = 50
 
 
 class FakeEnv:
-    """Keeps its worlds busy as the real one does; episodes end in another order than they start."""
+    """A world (`interfaces.World`) whose episodes end in another order than they start.
 
-    def __init__(self, task, *, worlds=1, mode="base", **options):
-        """Take what the real one takes."""
-        self.task, self.worlds, self.mode, self.options = task, worlds, mode, options
+    Half of them succeed, three of ten fall, the others run until their budget: a multiple of `LEAP`, or at
+    most `SLOW`.
+    """
+
+    startup_ticks = 0
+    physics = scene = None
+    torch_device = torch.device("cpu")
+
+    def __init__(self, task, *, worlds=1, mode="base", rules="paper", tracker=None, **options):
+        self.task, self.worlds, self.mode, self.options, self.tracker = task, worlds, mode, options, tracker
+        self.spec, self.rules = tasks.get(task), rule_sets.get(rules)
+        self.budget = self.spec.max_steps(self.rules)
+        self.tick, self.active = np.zeros(worlds, np.int64), np.zeros(worlds, bool)
+        self.seeds = np.zeros(worlds, np.int64)
+        self.ended = 0
+        """Episodes whose world got the next one."""
+
+    def reset(self, seeds, worlds=None, *, spawn=None):
+        worlds = range(self.worlds) if worlds is None else worlds
+        for world, seed in zip(worlds, seeds, strict=True):
+            self.ended += bool(self.tick[world])
+            self.seeds[world], self.tick[world], self.active[world] = seed, 0, True
+
+    def release(self, worlds):
+        self.active[worlds] = False
+
+    def observe(self, mask=None, *, image=False):
+        mask = self.active.copy() if mask is None else mask
+        return Observation(torch.zeros(self.worlds, 64), None, mask, self.task, self.spec.gym_id, self.spec.instruction)
+
+    def step(self, action, worlds=None):
+        if pause := float(os.environ.get("FAKE_TICK_S", "0")):
+            time.sleep(pause)
+        leapt = (self.tick // LEAP + 1) * LEAP
+        self.tick[self.active] = np.where(self.tick < SLOW, self.tick + 1, leapt)[self.active]
+        kind, ends = self.seeds % 10, self.tick > self.seeds % SLOW
+        status = np.where(ends & (kind < 5), codes.SUCCESS, np.where(ends & (kind < 8), codes.FALL, codes.RUNNING))
+        return np.where(self.active, status, codes.RUNNING).astype(np.int32)
+
+    def render(self, camera, mask=None):
+        raise NotImplementedError
+
+    def verdict(self, world):
+        return Verdict(margin=self.seeds[world] % 997 / 997 - 0.5)
 
     def describe(self):
-        """What the real one says of itself."""
         return {"engine": self.options["engine"], "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
 
     def close(self):
-        """Nothing to let go of."""
+        """Nothing to release."""
 
-    def run_episodes(self, policy, episodes, on_finish=None, on_tick=None, recorder=None, max_steps=None):
-        """Tick until all episodes have ended."""
-        waiting, running = list(episodes), {}
-        pause = float(os.environ.get("FAKE_TICK_S", "0"))
-        while waiting or running:
-            while waiting and len(running) < self.worlds:
-                episode = waiting.pop(0)
-                running[episode.index] = [episode, 0]
-            time.sleep(pause)
-            for index, slot in sorted(running.items(), reverse=True):
-                slot[1] += 10
-                episode = slot[0]
-                outcome, steps, margin = outcome_of(episode)
-                if slot[1] >= min(steps, 40):
-                    del running[index]
-                    on_finish(
-                        SimpleNamespace(
-                            episode=episode,
-                            outcome=outcome,
-                            reason=outcome,
-                            steps=steps,
-                            margin=margin,
-                            startup_fall=outcome == "fall" and episode.repeat == 0,
-                            overflow=False,
-                            sim_s=steps * 0.02,
-                            wall_s=time.perf_counter() % 1,
-                            error=None,
-                        )
-                    )
-            if on_tick is not None:
-                on_tick(len(running))
+
+class FakePolicy:
+    """A policy that does not see and does nothing."""
+
+    needs_image = depends_on_worlds = False
+    camera = None
+    chunk_size = 100
+
+    def __init__(self, spec, **options):
+        self.name, self.options, self.seeds = spec, options, []
+
+    def check(self):
+        """It can always work."""
+
+    def check_task(self, task, mode=None, seeds=()):
+        """It can do every task."""
+
+    def attach(self, env):
+        """It does not look at the world."""
+
+    def reset(self, seeds, tasks, mask=None):
+        old = [*self.seeds, *seeds[len(self.seeds) :]]
+        self.seeds = [new if mask is None or mask[world] else old[world] for world, new in enumerate(seeds)]
+
+    def act(self, observation):
+        return Chunk(torch.zeros(len(observation.mask), self.chunk_size, 40))
+
+    def describe(self):
+        return {"name": self.name}
+
+    def close(self):
+        """Nothing to release."""
 
 
 def fake_tracker(spec, checkpoint):
@@ -74,22 +117,9 @@ def fake_tracker(spec, checkpoint):
     return SimpleNamespace(name=spec, describe=lambda: {"name": spec, "drive": "none"})
 
 
-def fake_policy(spec, **options):
-    """A policy that does not see."""
-    return SimpleNamespace(
-        name=spec,
-        needs_image=False,
-        depends_on_worlds=False,
-        check=lambda: None,
-        check_task=lambda *episodes: None,
-        describe=lambda: {"name": spec},
-        close=lambda: None,
-    )
-
-
 def factories(**changes):
     """Builders of the stand-ins."""
-    parts = {"env": FakeEnv, "tracker": fake_tracker, "policy": fake_policy, "check_variant": lambda path, task: None}
+    parts = {"env": FakeEnv, "tracker": fake_tracker, "policy": FakePolicy, "check_variant": lambda path, task: None}
     return Factories(**(parts | changes))
 
 

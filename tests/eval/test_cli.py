@@ -8,11 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 from eval_fakes import factories
 
 from arena_newton.errors import InputError
+from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
 
 TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
@@ -22,6 +21,7 @@ SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "1", "--seeds"
 def test_default_run(tmp_path, capsys, monkeypatch):
     """Without flags all seven tasks run, a table is printed and the report lies where the last line says."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
     assert main(["--device", "cpu"], factories()) == 0
     output = capsys.readouterr().out
     assert all(re.search(rf"^\| {task} ", output, re.M) for task in TASKS)
@@ -109,8 +109,12 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["--video", "--video-size", "40x4000"], "--video-size 40x4000: .* a height of at most 3072"),
         (["--task", "football", "--out", ""], "--out: is empty, name a folder"),
         (["--out", " "], "--out: is empty, name a folder"),
-        (["--repeats", "two"], "repeats"),
-        (["--tasks", "football"], "--tasks"),
+        (["--repeats", "two"], "--repeats: cannot read two"),
+        (["--worlds=x"], "--worlds: cannot read x"),
+        (["--worlds"], "--worlds: cannot read it without a value"),
+        (["--tasks", "football"], "--tasks: unknown argument, did you mean --task"),
+        (["--worlds", "3", "4"], "4: unknown argument; see"),
+        (["list", "--seeds", "1.5"], "--seeds: cannot read 1.5"),
         (["resume"], "name the results folder"),
         (["resume", "absent"], "no results folder"),
         (["report", "absent"], "no results folder"),
@@ -235,11 +239,12 @@ def test_broken_variant_is_one_line(command, tmp_path, capsys):
 def test_identity_covers_scenes_and_code():
     """Scenes and code count by content, so that a resumed run cannot mix two worlds."""
     from arena_newton.eval import config
+    from arena_newton.eval.options import RunOptions
 
-    identity = config.resolve(config.RunOptions(task=("football",))).identity()
+    identity = config.resolve(RunOptions(task=("football",))).identity()
     assert len(identity["code"]) == len(identity["scenes"]) == 12
     assert identity["tracker_facts"] is None  # known when the tracker is made
-    other = config.resolve(config.RunOptions(task=("boxing",))).identity()
+    other = config.resolve(RunOptions(task=("boxing",))).identity()
     assert identity["scenes"] != other["scenes"] and identity["code"] == other["code"]
 
 

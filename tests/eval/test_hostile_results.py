@@ -6,19 +6,16 @@ import random
 import re
 import resource
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 from eval_fakes import factories
 
 from arena_newton import doctor
-from arena_newton.eval import config
+from arena_newton.eval import config, identity, run
 from arena_newton.eval.__main__ import main
 
-COUNT = 240
+COUNT = 160
 """Mutated files a reader."""
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "2"]
 VALUES = (
@@ -90,9 +87,11 @@ def spoiled(data, rng):
 def base(tmp_path, monkeypatch):
     """A small results folder two floors down, and files beside it that must not change."""
     installed = doctor.versions()
-    monkeypatch.setattr(doctor, "versions", lambda: installed)
+    monkeypatch.setattr(run, "versions", lambda: installed)
+    cached = functools.cache(identity.hash_path)
     monkeypatch.setattr(config, "code_hash", lambda: "0" * 12)
-    monkeypatch.setattr(config, "hash_path", functools.cache(config.hash_path))
+    for module in (config, identity):
+        monkeypatch.setattr(module, "hash_path", cached)
     monkeypatch.setattr("os.fsync", lambda file: None)
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "outer" / "inner" / "run"

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from arena_newton.errors import InputError
-from arena_newton.eval import config
+from arena_newton.eval import identity
+from arena_newton.eval.config import resolve
+from arena_newton.eval.options import RunOptions
 from arena_newton.rule_sets import get
 
 TASKS = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
@@ -17,30 +19,31 @@ TASKS = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing",
 
 def names(files):
     """Paths below the package as text."""
-    return {file.relative_to(config.PACKAGE).as_posix() for file in files}
+    return {file.relative_to(identity.PACKAGE).as_posix() for file in files}
 
 
 def modules():
     """Every module of the package, by its path."""
-    return {
-        name: config.PACKAGE / name for name in sorted(names(config._files(config.PACKAGE))) if name.endswith(".py")
-    }
+    found = names(identity.package_files(identity.PACKAGE))
+    return {name: identity.PACKAGE / name for name in sorted(found) if name.endswith(".py")}
 
 
 def excluded(name):
     """Whether the list of exceptions names a module or a folder above it."""
-    return any(part.as_posix() in config.UNHASHED for part in (Path(name), *Path(name).parents))
+    return any(part.as_posix() in identity.UNHASHED for part in (Path(name), *Path(name).parents))
 
 
 def test_every_module_counts():
     """Touching any module changes the hash of the code, one at a time; only those of the list of exceptions do not."""
-    contents = {file: config.hash_path(file) for file in config._files(config.PACKAGE) if file.suffix == ".py"}
-    files = config.code_files()
-    before = config._digest(config.PACKAGE, files, contents.__getitem__)
-    assert before == config.code_hash()
+    contents = {
+        file: identity.hash_path(file) for file in identity.package_files(identity.PACKAGE) if file.suffix == ".py"
+    }
+    files = identity.code_files()
+    before = identity.hash_paths(identity.PACKAGE, files, contents.__getitem__)
+    assert before == identity.code_hash()
     for name, file in modules().items():
         touched = contents | {file: "touched"}
-        after = config._digest(config.PACKAGE, files, touched.__getitem__)
+        after = identity.hash_paths(identity.PACKAGE, files, touched.__getitem__)
         assert (after == before) == excluded(name), name
     counted = names(files)
     for name in ("usd_scenes/g1/links.py", "eval/plan.py", "eval/run.py", "env.py", "policies/experts/vis_navi.py"):
@@ -50,21 +53,21 @@ def test_every_module_counts():
 def test_a_new_module_anywhere_counts(tmp_path):
     """A file or folder that is added to the package changes the hash without being named anywhere."""
     (tmp_path / "env.py").write_text("one")
-    before = config.code_hash(tmp_path)
+    before = identity.code_hash(tmp_path)
     for name in ("pictures/camera.py", "trackers/inference/blocks.py", "eval/loop.py", "new.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
-        assert config.code_hash(tmp_path) != before
-        before = config.code_hash(tmp_path)
+        assert identity.code_hash(tmp_path) != before
+        before = identity.code_hash(tmp_path)
     for name in ("trackers/train/ppo.py", "eval/report.py", "__pycache__/env.py", "notes.md"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
-    assert config.code_hash(tmp_path) == before
+    assert identity.code_hash(tmp_path) == before
 
 
 def test_the_exceptions_move_nothing():
-    """No hashed module imports an exception of trackers; of eval's only the run uses those that keep and tell."""
-    told = ("journal", "records", "progress", "report", "stats", "config")
+    """No hashed module imports an exception of trackers; of eval's only the run uses those that keep and report."""
+    used = "config console folder journal options progress records report results".split()
     for name, file in modules().items():
         if excluded(name):
             continue
@@ -79,16 +82,16 @@ def test_the_exceptions_move_nothing():
                 for part in (Path(path), *Path(path).parents):
                     if (
                         imported.startswith("arena_newton.")
-                        and f"{part}.py" in config.UNHASHED
-                        or str(part) in config.UNHASHED
+                        and f"{part}.py" in identity.UNHASHED
+                        or str(part) in identity.UNHASHED
                     ):
                         assert name in ("eval/run.py", "eval/recordings.py", "eval/plan.py"), (name, imported)
-                        assert part.name in told, (name, imported)
+                        assert part.name in used, (name, imported)
 
 
 def test_scenes_of_the_run_count():
     """Layers, variants, textures and robot count; scenes of other tasks and the trackers' lab do not."""
-    counted = names(config.scene_files(config.PACKAGE, ("boxing",), TASKS))
+    counted = names(identity.scene_files(identity.PACKAGE, ("boxing",), TASKS))
     for name in ("boxing/scene.usda", "boxing/variants/semantic.usda", "g1/g1.usda", "textures/brick.png"):
         assert f"usd_scenes/{name}" in counted
     assert not any(name.split("/")[1] in (*TASKS[:5], "vis_navi", "lab") for name in counted)
@@ -100,7 +103,7 @@ def test_a_new_folder_of_scenes_counts(tmp_path):
     (tmp_path / "usd_scenes" / "materials" / "oak.usda").write_text("")
     (tmp_path / "usd_scenes" / "football").mkdir()
     (tmp_path / "usd_scenes" / "football" / "scene.usda").write_text("")
-    found = config.scene_files(tmp_path, ("boxing",), TASKS)
+    found = identity.scene_files(tmp_path, ("boxing",), TASKS)
     assert [file.name for file in found] == ["oak.usda"]
 
 
@@ -111,49 +114,50 @@ def test_code_of_other_packages_counts(tmp_path, monkeypatch):
     for name, text in (("__init__.py", ""), ("act.py", "class Theirs:\n    pass\n"), ("weights.bin", "")):
         (tmp_path / "their_policy" / name).write_text(text)
     part = importlib.import_module("their_policy.act").Theirs()
-    before = config.own_code(part)
+    before = identity.own_code(part)
     (tmp_path / "their_policy" / "network.py").write_text("")
-    assert before is not None and config.own_code(part) != before
-    assert config.own_code(object()) is None
+    assert before is not None and identity.own_code(part) != before
+    assert identity.own_code(object()) is None
     from arena_newton import policies
 
-    assert config.own_code(policies.get("stand")) is None
+    assert identity.own_code(policies.get("stand")) is None
     del sys.modules["their_policy"], sys.modules["their_policy.act"]
 
 
 def test_identity_names_what_changes_results():
     """Drive, what tracker and policy say of themselves and, for a policy that depends on it, the number of worlds."""
-    one = config.resolve(config.RunOptions(task=("football",)))
+    one = resolve(RunOptions(task=("football",)))
     changes = (
-        {"drive": "humanoidarena"},
+        {"flags": dataclasses.replace(one.flags, drive="humanoidarena")},
         {"tracker_facts": {"drive": "stiff"}},
         {"policy_facts": {"url": "http://b"}},
         {"worlds_matter": True},
         {"rules_hash": "0"},
     )
     assert len({one.hash, *(dataclasses.replace(one, **change).hash for change in changes)}) == 6
-    same = {"video": True, "strip": True, "video_episodes": 2, "video_size": (64, 48), "follow": True, "worlds": 3}
-    assert dataclasses.replace(one, **same).hash == one.hash
+    same = {"video": True, "strip": True, "video_episodes": 2, "video_size": "64x48", "follow": True, "worlds": 3}
+    same |= {"out": "elsewhere", "verbose": True, "skip_broken": True}
+    assert dataclasses.replace(one, flags=dataclasses.replace(one.flags, **same)).hash == one.hash
 
 
 def test_rules_of_other_tasks_do_not_count():
     """The rules' hash is of the tasks that a run uses: another task's rules leave it alone."""
     rules = get("paper")
     fewer = dataclasses.replace(rules, tasks=tuple(t for t in rules.tasks if t.task in ("football", "boxing")))
-    resolved = config.resolve(config.RunOptions(task=("football",), rules="paper"))
+    resolved = resolve(RunOptions(task=("football",), rules="paper"))
     assert resolved.rules_hash == fewer.hash_for(("football",)) != fewer.hash_for(("football", "boxing"))
 
 
 def test_difference_is_told_to_the_key():
     """Of a table within an identity the key that differs is named."""
     stored = {"a": 1, "facts": {"drive": "soft", "dt": 0.001}}
-    assert config.differing_key(stored, stored) is None
-    assert config.differing_key(stored, {"a": 1, "facts": {"drive": "stiff", "dt": 0.001}}) == (
+    assert identity.differing_key(stored, stored) is None
+    assert identity.differing_key(stored, {"a": 1, "facts": {"drive": "stiff", "dt": 0.001}}) == (
         "facts.drive", "soft", "stiff"
     )  # fmt: skip
-    assert config.differing_key(stored, {"a": 1, "facts": None}) == ("facts", stored["facts"], None)
-    assert config.differing_key(stored, {"a": 1}) == ("facts", stored["facts"], None)
-    assert config.differing_key(stored, {"a": 1}, ignored=("facts",)) is None
+    assert identity.differing_key(stored, {"a": 1, "facts": None}) == ("facts", stored["facts"], None)
+    assert identity.differing_key(stored, {"a": 1}) == ("facts", stored["facts"], None)
+    assert identity.differing_key(stored, {"a": 1}, ignored=("facts",)) is None
 
 
 @pytest.mark.parametrize(
@@ -176,18 +180,19 @@ def test_difference_is_told_to_the_key():
         ({"repeats": 10**4000}, "--repeats 10{39}[.]{3}: makes too many episodes"),
         ({"policy": "remote:\x1b[2J"}, "--policy remote:: has control characters"),
         ({"repeats": 10**9}, "--repeats 1000000000: makes 3,000,000,000 episodes, at most 200,000"),
-        ({"variant": "/dev/zero"}, "--variant /dev/zero: is no regular file"),
-        ({"checkpoint": "/dev/zero"}, "/dev/zero: is no regular file"),
+        ({"variant": "/dev/zero"}, "--variant /dev/zero: is not a regular file"),
+        ({"checkpoint": "/dev/zero"}, "/dev/zero: is not a regular file"),
     ],
 )
 def test_unfit_options_are_named(options, message):
     """Unknown names, sizes and files without end are refused before anything is read."""
     with pytest.raises(InputError, match=message):
-        config.resolve(config.RunOptions(**({"task": ("football",)} | options)))
+        resolve(RunOptions(**({"task": ("football",)} | options)))
 
 
 def test_video_size_is_two_numbers():
     """--video-size becomes width and height."""
-    options = config.RunOptions(task=("football",), strip=True, video_size="960x540", video_episodes=3, follow=True)
-    resolved = config.resolve(options)
-    assert (resolved.video_size, resolved.video_episodes, resolved.follow) == ((960, 540), 3, True)
+    options = RunOptions(task=("football",), strip=True, video_size="960x540", video_episodes=3, follow=True)
+    resolved = resolve(options)
+    assert resolved.video_size == (960, 540)
+    assert (resolved.flags.video_episodes, resolved.flags.follow) == (3, True)

@@ -1,23 +1,23 @@
 """The journal survives whatever kills its writer."""
 
+import dataclasses
 import errno
 import json
 import os
 
 import pytest
-from test_report import full
-from test_stats import episodes
+import rows
 
 from arena_newton.errors import InputError
 from arena_newton.eval import journal as module
 from arena_newton.eval.journal import Journal, StorageError, read_journal, write_atomic
 
-ROWS = episodes("football", (1, 0, 0))
+ROWS = rows.episodes("football", (1, 0, 0))
 
 
 def record(number, **changes):
     """A journal record."""
-    return full(ROWS[number] | changes)
+    return rows.record(ROWS[number] | changes)
 
 
 def fill(path, n):
@@ -36,7 +36,7 @@ def test_torn_last_line_is_cut(tmp_path, tail):
         handle.write(tail)
     with Journal(path) as journal:
         assert journal.torn_bytes == len(tail)
-        assert [r["index"] for r in journal.records] == [0, 1]
+        assert [r.index for r in journal.records] == [0, 1]
         journal.append(record(2))
     assert [json.loads(line)["index"] for line in path.read_text().splitlines()] == [0, 1, 2]
 
@@ -46,7 +46,10 @@ def test_any_cut_leaves_whole_lines(tmp_path):
     path = tmp_path / "episodes.jsonl"
     fill(path, 3)
     whole = path.read_bytes()
-    for length in range(len(whole) + 1):
+    # Every seventh byte, and all about the line ends.
+    ends = [at for at, byte in enumerate(whole) if byte == ord("\n")]
+    lengths = {*range(0, len(whole), 7), *(at + near for at in ends for near in (-1, 0, 1, 2)), len(whole)}
+    for length in sorted(length for length in lengths if length <= len(whole)):
         path.write_bytes(whole[:length])
         records, size = read_journal(path)
         assert len(records) == whole[:length].count(b"\n")
@@ -103,7 +106,7 @@ def test_atomic_write_onto_a_full_disk(tmp_path, monkeypatch):
     def no_room(file):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(module.os, "fsync", no_room)
+    monkeypatch.setattr(os, "fsync", no_room)
     with pytest.raises(StorageError, match="disk full"):
         write_atomic(target, "new" * 10000)
     assert target.read_text() == "old"
@@ -139,7 +142,7 @@ def test_a_pipe_is_no_journal(tmp_path):
     """What is no regular file is refused at once instead of waiting for a writer."""
     os.mkfifo(tmp_path / "episodes.jsonl")
     for read in (Journal, read_journal):
-        with pytest.raises(InputError, match="no regular file"):
+        with pytest.raises(InputError, match="not a regular file"):
             read(tmp_path / "episodes.jsonl")
 
 
@@ -163,7 +166,7 @@ def test_a_pipe_is_no_journal(tmp_path):
 def test_unfit_record_is_named(tmp_path, key, value, message):
     """A record with an unknown name or a value of another kind is refused with line and key."""
     path = tmp_path / "episodes.jsonl"
-    path.write_text(json.dumps(record(0)) + "\n" + json.dumps(record(1, **{key: value})) + "\n")
+    path.write_text(json.dumps(rows.full(ROWS[0])) + "\n" + json.dumps(rows.full(ROWS[1] | {key: value})) + "\n")
     with pytest.raises(InputError, match=f"line 2: {message}"):
         read_journal(path)
 
@@ -172,5 +175,5 @@ def test_nan_never_enters(tmp_path):
     """The journal is strict JSON: NaN is an error of the caller, not a line."""
     path = tmp_path / "episodes.jsonl"
     with Journal(path) as journal, pytest.raises(ValueError):
-        journal.append({"margin": float("nan")})
+        journal.append(dataclasses.replace(record(0), margin=float("nan")))
     assert path.read_bytes() == b""

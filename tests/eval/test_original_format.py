@@ -4,8 +4,7 @@ import csv
 import json
 
 import pytest
-from test_report import full
-from test_stats import episodes
+from rows import episodes, made
 
 from arena_newton.errors import InputError
 from arena_newton.eval.original_format import SUMMARY_COLUMNS, final_csv, label, write_original
@@ -15,7 +14,7 @@ GYM = {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"}
 
 def written(tmp_path, rows):
     """Write and return the run's folder."""
-    write_original(tmp_path, [full(row) for row in rows], gym_ids=GYM, seeds=(0, 1, 2), repeats=20)
+    write_original(tmp_path, [made(row) for row in rows], gym_ids=GYM, seeds=(0, 1, 2), repeats=20)
     return tmp_path / "football__t__base"
 
 
@@ -62,7 +61,7 @@ def test_episode_files(tmp_path):
 def test_nothing_is_written_outside(tmp_path, key, value):
     """Names that lead out of the folder are refused, and nothing appears there."""
     folder = tmp_path / "a" / "original"
-    rows = [full(row) | {key: value} for row in episodes("football", (1, 0, 0))]
+    rows = [made(row | {key: value}) for row in episodes("football", (1, 0, 0))]
     with pytest.raises(InputError, match="lies outside"):
         write_original(folder, rows, gym_ids={"football": "G", value: "G"}, seeds=(0, 1, 2), repeats=20)
     assert list(tmp_path.iterdir()) == []
@@ -77,8 +76,9 @@ def test_long_names_are_cut(tmp_path):
 
 
 def test_final_csv():
-    """final.csv prints shares as the original does, e.g. "44/60 (73.3%)" and "0/16 (0.0%)"."""
-    rows = list(csv.DictReader(final_csv(episodes("football", (13, 15, 16))).splitlines()))
+    """final.csv prints fractions as the original does, e.g. "44/60 (73.3%)" and "0/16 (0.0%)"."""
+    records = [made(row) for row in episodes("football", (13, 15, 16))]
+    rows = list(csv.DictReader(final_csv(records).splitlines()))
     assert rows == [
         {
             "model": "p",

@@ -1,7 +1,6 @@
 """Reports are derived from configuration and journal alone, and hold what a reader needs."""
 
 import base64
-import dataclasses
 import hashlib
 import json
 import random
@@ -9,22 +8,19 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from rows import episodes, made, record
 
-sys.path.insert(0, str(Path(__file__).parent))
-from test_stats import episodes
-
-from arena_newton import seeding, tasks
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import report
-from arena_newton.eval.config import RunOptions
-from arena_newton.eval.html_report import REMOTE, replay_command, rules_that_ran
 from arena_newton.eval.journal import Journal
+from arena_newton.eval.results import RunRecord, load_run, results_json
 from arena_newton.eval.stats import error_reasons, wilson
+from arena_newton.eval.wording import REMOTE, replay_command, rules_that_ran
 
 
 def document_of(planned, **config):
@@ -46,24 +42,13 @@ def folder_with(tmp_path, rows, planned, **config):
     (tmp_path / "config.json").write_text(json.dumps(document_of(planned, **config)))
     with Journal(tmp_path / "episodes.jsonl") as journal:
         for row in rows:
-            journal.append(full(row))
+            journal.append(record(row))
     return tmp_path
-
-
-def full(row):
-    """A record with all journal keys."""
-    known = row["task"] in tasks.names()
-    seed = seeding.episode_seed(tasks.get(row["task"]).gym_id, row["group_seed"], row["repeat"]) if known else 7
-    rest = {"rules": "paper", "engine": "mujoco", "episode_seed": seed, "object_seed": seeding.object_seed(seed)}
-    rest |= {"max_steps": 1300, "margin": 0.1, "hashes": {"config": "0123456789ab"}}
-    rest |= {"reason": row["outcome"], "overflow": False, "error": None, "media": {}, "video": ""}
-    rest |= {"durations": {"wall_s": 1.0, "sim_s": 2.0}, "started_at": "a", "finished_at": "b"}
-    return rest | row
 
 
 def test_results_json(tmp_path):
     """results.json holds one cell per task, tracker, policy and mode, with the published keys."""
-    run = report.load_run(folder_with(tmp_path / "a", episodes("football", (4, 5, 7), falls=3), 60))
+    run = load_run(folder_with(tmp_path / "a", episodes("football", (4, 5, 7), falls=3), 60))
     results = report.write_reports(run)
     assert json.loads((tmp_path / "a" / "results.json").read_text()) == results
     (cell,) = results["cells"]
@@ -77,8 +62,8 @@ def test_wall_clock_is_nowhere_in_the_tables(tmp_path):
     rows = episodes("football", (4, 5, 7), falls=3)
     late = [row | {"durations": {"wall_s": 99.0, "sim_s": 2.0}, "started_at": "x", "finished_at": "y"} for row in rows]
     stale = [rows[5] | {"outcome": "error"}]
-    report.write_reports(report.load_run(folder_with(tmp_path / "a", rows, 60)))
-    report.write_reports(report.load_run(folder_with(tmp_path / "b", stale + late[::-1], 60)))
+    report.write_reports(load_run(folder_with(tmp_path / "a", rows, 60)))
+    report.write_reports(load_run(folder_with(tmp_path / "b", stale + late[::-1], 60)))
     for name in ("results.json", "table.md", "table.csv", "report.md", "report.html"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
@@ -126,7 +111,7 @@ class Tree(HTMLParser):
 
 def html(folder):
     """The parsed page of a results folder."""
-    report.write_reports(report.load_run(folder))
+    report.write_reports(load_run(folder))
     return Tree((folder / "report.html").read_text(encoding="utf-8"))
 
 
@@ -228,15 +213,18 @@ def test_reasons_environments_and_variants_are_told(tmp_path):
         text = (folder / name).read_text()
         assert "5 ms × 4" in text and "gravity is 0 m/s²" in text and "\x1b" not in text
         assert "resume . --retry-errors" in text and "50 ticks" in text
-    counts = [(r["message"], r["count"]) for r in error_reasons([full(row) for row in rows])]
+    counts = [(r["message"], r["count"]) for r in error_reasons([record(row) for row in rows])]
     assert counts[0] == ("server gone", 2) and len(counts) == 2
+
+
+EMPTY = episodes("boxing", (1,))[0]
 
 
 def test_command_plays_the_episode_again(tmp_path):
     """An episode's command names its task, mode, seed and repeat and all that it depends on, quoted for a shell."""
     options = {"policy": "replay:a b;rm", "tracker": "twist2", "max_steps": 50, "rules": "paper", "out": "secret"}
-    record = {"task": "boxing", "mode": "visual", "group_seed": 2, "repeat": 3}
-    command = replay_command(options, record)
+    row = {"task": "boxing", "mode": "visual", "group_seed": 2, "repeat": 3}
+    command = replay_command(options, record(EMPTY | row))
     words = shlex.split(command)
     assert words[:3] == ["python", "-m", "arena_newton.eval"] and "secret" not in words
     assert words[3:11] == ["--task", "boxing", "--mode", "visual", "--seeds", "2", "--repeats", "4"]
@@ -247,23 +235,21 @@ def test_command_plays_the_episode_again(tmp_path):
 
 def test_command_asks_a_policy_server_in_the_same_way():
     """Of a policy server the command keeps how it was asked, and the worlds at once if they matter."""
-    record = {"task": "boxing", "mode": "base", "group_seed": 0, "repeat": 0}
+    episode = record(EMPTY)
     options = {"policy": "remote:https://host:1", "remote_timeout": 3.5, "remote_retries": 4, "worlds": 7}
     options |= {"remote_insecure": True, "remote_sequential": True}
-    words = shlex.split(replay_command(options, record, 7))
+    words = shlex.split(replay_command(options, episode, 7))
     assert {"--remote-insecure", "--remote-sequential"} <= set(words) and "--remote-retries" not in words
     assert words[words.index("--remote-timeout") + 1] == "3.5" and words[words.index("--worlds") + 1] == "7"
-    defaults = {f.name: f.default for f in dataclasses.fields(RunOptions) if f.name.startswith("remote_")}
-    assert defaults == REMOTE
-    plain = {"policy": "remote:http://host:1"} | defaults
-    assert not [word for word in shlex.split(replay_command(plain, record)) if word.startswith("--remote")]
+    plain = {"policy": "remote:http://host:1"} | REMOTE
+    assert not [word for word in shlex.split(replay_command(plain, episode)) if word.startswith("--remote")]
 
 
 def test_worlds_of_a_policy_that_depends_on_them_stand_in_the_command(tmp_path):
     """The page's commands name --worlds only where the configuration says that results depend on it."""
     for name, worlds in (("a", None), ("b", 5)):
         folder = folder_with(tmp_path / name, episodes("football", (1, 0, 0)), 60, worlds=worlds)
-        report.write_reports(report.load_run(folder))
+        report.write_reports(load_run(folder))
         assert ("--worlds 5" in (folder / "report.html").read_text()) == (worlds == 5)
 
 
@@ -320,8 +306,8 @@ def hostile_run(number):
     document["variant_changes"] = [text()]
     document["environments"] = {text(): {"engine": text(), text(): {text(): text()}}}
     document["versions"] = {text(): text()}
-    document, rows = json.loads(json.dumps([document, [full(row) for row in rows]]))
-    return report.RunRecord(Path("nowhere"), document, rows)
+    document, rows = json.loads(json.dumps([document, rows]))
+    return RunRecord(Path("nowhere"), document, [made(row) for row in rows])
 
 
 def test_strangers_results_carry_nothing_into_the_page(tmp_path):
@@ -348,15 +334,15 @@ def test_strangers_results_carry_nothing_into_the_page(tmp_path):
         assert not any(c in text for c in "\x00\x1b\x07\u202e\u2066\u2028")
         text.encode("utf-8")
         if number % 8 == 0:
-            markdown = report._markdown(run, report.results_json(run))
+            markdown = report._markdown(run, results_json(run))
             assert not re.search(r"(?<!\\)<|(?<!\\)\]\((?!videos/|strips/)", re.sub(r"`[^`]*`", "", markdown)), number
             assert "\x1b" not in markdown
-            report.table_csv(report.results_json(run)).encode("utf-8")
+            report.table_csv(results_json(run)).encode("utf-8")
 
 
 def html_page(run):
     """The page of a run without writing it."""
-    return report._html(run, report.results_json(run))
+    return report._html(run, results_json(run))
 
 
 def test_policy_names_the_one_script(tmp_path):
@@ -395,7 +381,7 @@ def test_page_in_a_browser(tmp_path, browser):
     policy = "remote:http://a-policy-server.with-a-long-name.example:8000/v1"
     rows = [row | {"policy": policy} for row in rows]
     folder = folder_with(tmp_path / "a", rows, 12)
-    report.write_reports(report.load_run(folder))
+    report.write_reports(load_run(folder))
     (folder / "strips").mkdir()
     tree = Tree(dump(browser, tmp_path, folder / "report.html", 1280).split("<!DOCTYPE html>")[-1])
     (controls,) = tree.find("div", id="controls")
@@ -425,8 +411,8 @@ def test_notes_tell_what_the_table_hides(tmp_path):
     rows = episodes("football", (1, 0, 0))[:30]
     rows[3] |= {"outcome": "error"}
     rows[4] |= {"overflow": True}
-    run = report.load_run(folder_with(tmp_path / "a", rows, 60, max_steps=50))
-    text = " ".join(report.notes(report.results_json(run)))
+    run = load_run(folder_with(tmp_path / "a", rows, 60, max_steps=50))
+    text = " ".join(report.notes(run, results_json(run)))
     for words in ("30 of 60", "1 episode ended with an error", "overflowed", "50 ticks"):
         assert words in text
 
@@ -434,7 +420,7 @@ def test_notes_tell_what_the_table_hides(tmp_path):
 def test_folder_without_run_is_named(tmp_path):
     """A folder that holds no run, or a broken config.json, is bad input."""
     with pytest.raises(InputError, match=r"no config\.json"):
-        report.load_run(tmp_path)
+        load_run(tmp_path)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(InputError, match="cannot be read"):
-        report.load_run(tmp_path)
+        load_run(tmp_path)

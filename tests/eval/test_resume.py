@@ -13,12 +13,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from eval_fakes import FakeEnv, FakePolicy, factories
 
-sys.path.insert(0, str(Path(__file__).parent))
-from eval_fakes import FakeEnv, factories
-
-from arena_newton import doctor
+from arena_newton import doctor, seeding, tasks
+from arena_newton.errors import InputError
 from arena_newton.eval import journal as journal_module
+from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
 from arena_newton.policies.base import PolicyUnavailable
 
@@ -47,7 +47,7 @@ def lines(folder):
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
-def start(folder, *flags, pause="0.05"):
+def start(folder, *flags, pause="0.02"):
     """The command line in a process of its own."""
     script = Path(__file__).parent / "eval_fakes.py"
     command = [sys.executable, str(script), "run", *FLAGS, *flags, "--out", str(folder)]
@@ -153,22 +153,21 @@ def test_resume_stays_in_its_folder(tmp_path, uninterrupted, capsys):
 
 
 class BreaksOnce(FakeEnv):
-    """Breaks after two episodes of boxing."""
+    """Breaks when two episodes of boxing have ended."""
 
     error: Exception = RuntimeError("device lost")
 
-    def run_episodes(self, policy, episodes, on_finish=None, **options):
-        """Two episodes, then the simulator dies."""
-        if self.task != "boxing":
-            return super().run_episodes(policy, episodes, on_finish=on_finish, **options)
-        super().run_episodes(policy, episodes[:2], on_finish=on_finish, **options)
-        raise self.error
+    def step(self, action):
+        """The simulator dies."""
+        if self.task == "boxing" and self.ended >= 2:
+            raise self.error
+        return super().step(action)
 
 
 @pytest.mark.parametrize(
     ("error", "says"),
     [
-        (RuntimeError("device lost"), "boxing base: RuntimeError: device lost; running were s0/r2 s0/r3 s1/r0"),
+        (RuntimeError("device lost"), "boxing base: RuntimeError: device lost; running were s0/r1 s0/r3 s1/r0"),
         (RuntimeError("CUDA out of memory"), "fewer --worlds"),
         (SystemExit(0), "boxing base: SystemExit: 0; running were"),
         (OSError(errno.ENOSPC, "No space left on device", "v.mp4.part"), "v.mp4.part: disk full"),
@@ -191,14 +190,14 @@ def test_a_break_stops_the_run_and_leaves_episodes_unplayed(tmp_path, uninterrup
 
 
 class Poison(FakeEnv):
-    """Breaks whenever one certain episode of boxing has started."""
+    """Breaks whenever one certain episode of boxing starts."""
 
-    def run_episodes(self, policy, episodes, on_finish=None, **options):
-        """Episodes one after the other, in the plan's order."""
-        for episode in episodes:
-            if (self.task, self.mode, episode.group_seed, episode.repeat) == ("boxing", "base", 1, 1):
-                raise RuntimeError("always here")
-            super().run_episodes(policy, [episode], on_finish=on_finish, **options)
+    def reset(self, seeds, worlds=None, **options):
+        """The poison is known by its seed; both modes have it."""
+        poison = seeding.episode_seed(self.spec.gym_id, 1, 1)
+        if (self.task, self.mode) == ("boxing", "base") and poison in seeds:
+            raise RuntimeError("always here")
+        super().reset(seeds, worlds, **options)
 
 
 def test_an_episode_that_always_breaks_can_be_passed(tmp_path, uninterrupted, capsys):
@@ -238,18 +237,18 @@ def test_errors_are_told_with_reasons(tmp_path, capsys):
     """Terminal and counts name why episodes ended as errors, without what a server put between, and how to go on."""
     said = ["policy: HTTP 500\x1b[31m busy", "policy: HTTP 500 busy", "no answer"]
 
-    class Failing(FakeEnv):
-        def run_episodes(self, policy, episodes, on_finish=None, **options):
-            def failed(result):
-                if result.episode.repeat < 3:
-                    result.outcome, result.reason, result.error = "error", "policy", said[result.episode.repeat]
-                on_finish(result)
+    gym_id = tasks.get("football").gym_id
+    broken = {seeding.episode_seed(gym_id, seed, repeat): said[repeat] for seed in (0, 1) for repeat in range(3)}
 
-            super().run_episodes(policy, episodes, on_finish=failed, **options)
+    class Failing(FakePolicy):
+        def act(self, observation):
+            chunk = super().act(observation)
+            chunk.errors = {w: broken[seed] for w, seed in enumerate(self.seeds) if seed in broken}
+            return chunk
 
     folder = tmp_path / "e"
     flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "1", "--repeats", "4", "--out", str(folder)]
-    assert main(flags, factories(env=Failing)) == 1
+    assert main(flags, factories(policy=Failing)) == 1
     captured = capsys.readouterr()
     told = [line for line in captured.out.splitlines() if " x " in line]
     assert told == ["     4 x policy: policy: HTTP 500 busy", "     2 x policy: no answer"]
@@ -262,8 +261,8 @@ def test_partial_recordings_are_swept_away(tmp_path):
     folder = tmp_path / "s"
 
     class Leaves(FakeEnv):
-        def run_episodes(self, policy, episodes, **options):
-            for part in ("videos/a.mp4.part", "strips/a.png.part", "actions/a.npz.partial"):
+        def step(self, action):
+            for part in ("videos/a.mp4.part", "strips/a.png.part", "actions/a.npz.part"):
                 (folder / part).parent.mkdir(exist_ok=True)
                 (folder / part).write_text("half")
             raise KeyboardInterrupt
@@ -279,7 +278,8 @@ def test_environments_stand_in_configuration_and_journal(uninterrupted):
     facts = {"engine": "mujoco", "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
     assert all(value == facts for value in document["environments"].values())
     assert document["config"]["tracker_facts"] == {"name": "twist2", "drive": "none"}
-    assert document["config"]["policy_facts"] == {"name": "stand"}
+    facts = document["config"]["policy_facts"]
+    assert facts.pop("code") and facts == {"name": "stand"}
     hashes = [json.loads(line)["hashes"] for line in (uninterrupted / "episodes.jsonl").read_text().splitlines()]
     assert len({h["environment"] for h in hashes}) == len({h["versions"] for h in hashes}) == 1
 
@@ -327,12 +327,12 @@ def test_other_versions_are_refused_unless_accepted(tmp_path, uninterrupted, cap
     kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
     (folder / "episodes.jsonl").write_text("".join(kept))
     installed = doctor.versions()
-    monkeypatch.setattr(doctor, "versions", lambda: installed | {"tqdm": "9.9"})
+    monkeypatch.setattr(run, "versions", lambda: installed | {"tqdm": "9.9"})
     assert (
         main(["resume", str(folder), "--worlds", "1", "--task", "football", "boxing", "--seeds", "9"], factories()) == 2
     )
     assert "seeds was 0 1 2, now 9" in capsys.readouterr().err  # a progress bar changes nothing
-    monkeypatch.setattr(doctor, "versions", lambda: installed | {"torch": "9.9"})
+    monkeypatch.setattr(run, "versions", lambda: installed | {"torch": "9.9"})
     assert main(["resume", str(folder)], factories()) == 2
     assert f"torch {installed['torch']}, installed is 9.9" in capsys.readouterr().err
     for _ in range(2):
@@ -351,6 +351,60 @@ def test_a_killed_beginning_can_be_begun_again(tmp_path):
     (folder / "episodes.jsonl").touch()
     flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "1", "--out", str(folder)]
     assert main(flags, factories()) == 0
+
+
+def status(folder):
+    """Where config.json says that the run stands."""
+    return json.loads((folder / "config.json").read_text())["status"]
+
+
+def test_a_run_has_a_status(tmp_path, uninterrupted, capsys):
+    """config.json says how the last run or resume ended, with times; reports say it when that was no success."""
+    assert status(uninterrupted) | {"started_at": "", "finished_at": ""} == {
+        "state": "success", "started_at": "", "finished_at": "", "error": None
+    }  # fmt: skip
+    folder = tmp_path / "s"
+    seen = []
+
+    class Watched(FakeEnv):
+        stop: BaseException = KeyboardInterrupt()
+
+        def step(self, action):
+            seen.append(status(folder))
+            raise self.stop
+
+    def shown():
+        assert main(["report", str(folder)]) == 0
+        return capsys.readouterr().out
+
+    assert main(["run", *FLAGS, "--out", str(folder)], factories(env=Watched)) == 130
+    assert seen[0]["state"] == "started" and seen[0]["finished_at"] is None
+    assert status(folder)["state"] == "cancelled" and status(folder)["finished_at"] >= status(folder)["started_at"]
+    assert "The run was cancelled." in shown()
+    Watched.stop = RuntimeError("device \x1b[2J lost")
+    assert main(["resume", str(folder)], factories(env=Watched)) == 2
+    assert status(folder)["state"] == "error" and "football base: RuntimeError: device lost" in status(folder)["error"]
+    assert "The run ended with an error: football base: RuntimeError: device lost" in shown()
+    before = status(folder)
+    Watched.stop = InputError("not that world")
+    assert main(["resume", str(folder)], factories(env=Watched)) == 2
+    assert status(folder) == before
+    assert main(["resume", str(folder)], factories()) == 0
+    assert status(folder)["state"] == "success" and tables(folder) == tables(uninterrupted)
+    assert "The run" not in (folder / "report.html").read_text()
+
+
+def test_a_killed_run_says_so(tmp_path, uninterrupted, capsys):
+    """A run that was killed after its last episode shows as started; resume, with nothing to play, mends that."""
+    folder = tmp_path / "k"
+    shutil.copytree(uninterrupted, folder)
+    document = json.loads((folder / "config.json").read_text())
+    document["status"] |= {"state": "started", "finished_at": None}
+    (folder / "config.json").write_text(json.dumps(document))
+    assert main(["report", str(folder)]) == 0
+    assert "it is going on, or it was killed" in capsys.readouterr().out
+    assert main(["resume", str(folder)], factories()) == 0
+    assert status(folder)["state"] == "success"
 
 
 def test_linked_folders_are_refused(tmp_path, uninterrupted, capsys):

@@ -6,31 +6,20 @@ import math
 from pathlib import Path
 
 import pytest
+from rows import episodes, record
 
 from arena_newton.eval.stats import (
-    SUITES,
     aggregate,
     cell,
     error_reasons,
     outside_suites,
     pooled,
     population_std,
+    suites,
     wilson,
 )
 
 PAPER = Path(__file__).resolve().parents[2] / ".." / "shared" / "paper" / "in_gmt.csv"
-
-
-def episodes(task, per_seed, repeats=20, falls=0, index=0):
-    """Records of one cell with the given successes per group seed."""
-    rows = []
-    for seed, won in enumerate(per_seed):
-        for repeat in range(repeats):
-            outcome = "success" if repeat < won else "fall" if falls > 0 else "timeout"
-            falls -= outcome == "fall"
-            row = {"task": task, "tracker": "t", "policy": "p", "mode": "base", "group_seed": seed, "repeat": repeat}
-            rows.append(row | {"outcome": outcome, "steps": 100 + repeat, "index": index + len(rows)})
-    return rows
 
 
 def test_cell_counts_and_rates():
@@ -39,7 +28,7 @@ def test_cell_counts_and_rates():
     rows[0]["outcome"] = "error"
     rows[0]["steps"] = 0
     rows[19]["startup_fall"] = True
-    result = cell(rows)
+    result = cell([record(row) for row in rows])
     assert (result["episodes"], result["successes"], result["falls"], result["errors"]) == (60, 15, 3, 1)
     assert result["startup_falls"] == (rows[19]["outcome"] == "fall")
     assert result["sr"] == 0.25
@@ -66,20 +55,21 @@ def test_empty_input_gives_no_rate():
 def test_order_of_journal_is_irrelevant():
     """Cells come in plan order, whatever order the episodes ended in."""
     rows = episodes("football", (1, 2, 3)) + episodes("boxing", (3, 2, 1), index=60)
-    assert aggregate(rows) == aggregate(rows[::-1])
-    assert [c["task"] for c in aggregate(rows[::-1])["cells"]] == ["football", "boxing"]
+    records = [record(row) for row in rows]
+    assert aggregate(records) == aggregate(records[::-1])
+    assert [c["task"] for c in aggregate(records[::-1])["cells"]] == ["football", "boxing"]
 
 
 def test_suite_needs_all_its_tasks():
     """A suite average is given only when each of its tasks was run."""
-    rows = episodes("football", (1, 2, 3))
+    rows = [record(row) for row in episodes("football", (1, 2, 3))]
     assert aggregate(rows)["suites"] == []
-    assert pooled({"football": rows}, SUITES["HOI_AVG"]) is None
+    assert pooled({"football": rows}, suites()["HOI_AVG"]) is None
 
 
 def test_a_task_outside_the_averages_is_named():
     """A task that the paper's averages lack is told; its seven are not."""
-    assert outside_suites(SUITES["ALL_AVG"]) == []
+    assert outside_suites(suites()["ALL_AVG"]) == []
     assert outside_suites(["football", "golf", "golf"]) == ["golf"]
 
 
@@ -88,11 +78,11 @@ def test_reasons_of_errors_are_counted():
     rows = episodes("football", (20, 20, 20))
     for number, message in enumerate(("a\x1b[31mb\nc", "a b c", "\x1b]0;title\x07late", None, "a\u202eb c" * 200)):
         rows[number] |= {"outcome": "error", "reason": "policy", "error": message}
-    first, *others = error_reasons(rows)
+    first, *others = error_reasons([record(row) for row in rows])
     assert first == {"reason": "policy", "message": "a b c", "count": 2}
     assert [other["message"][:8] for other in others] == ["ab cab c", "late", "no messa"]
     assert max(len(other["message"]) for other in others) == 400
-    assert error_reasons(rows[10:]) == []
+    assert error_reasons([record(row) for row in rows[10:]]) == []
 
 
 def _seed_counts(mean, std):
@@ -115,29 +105,29 @@ def test_suite_averages_match_the_paper():
     for key, rows in table.items():
         choices = {
             task: _seed_counts(float(rows[task]["sr_mean_pct"]), float(rows[task]["sr_std_pct"]))
-            for task in SUITES["ALL_AVG"]
+            for task in suites()["ALL_AVG"]
             if task in rows
         }
         for suite in ("HOI_AVG", "HSI_AVG"):
-            tasks = SUITES[suite]
+            tasks = suites()[suite]
             if suite not in rows or any(len(choices.get(task, ())) != 1 for task in tasks):
                 continue
-            records = {task: episodes(task, choices[task][0]) for task in tasks}
+            records = {task: [record(row) for row in episodes(task, choices[task][0])] for task in tasks}
             result = pooled(records, tasks)
             assert 100 * result["sr"] == pytest.approx(float(rows[suite]["sr_mean_pct"]), abs=0.006), (key, suite)
             assert 100 * result["sr_std"] == pytest.approx(float(rows[suite]["sr_std_pct"]), abs=0.006), (key, suite)
             checked += 1
     assert checked > 20
     act = table["twist2", "base", "act"]
-    tasks = SUITES["ALL_AVG"]
+    tasks = suites()["ALL_AVG"]
     per_task = [_seed_counts(float(act[t]["sr_mean_pct"]), float(act[t]["sr_std_pct"]))[0] for t in tasks]
     records = [
-        record
+        record(row)
         for i, (task, counts) in enumerate(zip(tasks, per_task, strict=True))
-        for record in episodes(task, counts, falls=27 if i == 0 else 0, index=60 * i)
+        for row in episodes(task, counts, falls=27 if i == 0 else 0, index=60 * i)
     ]
-    suites = {suite["suite"]: suite for suite in aggregate(records)["suites"]}
-    assert 100 * suites["HOI_AVG"]["sr"] == pytest.approx(28.33, abs=0.005)
-    assert 100 * suites["HOI_AVG"]["sr_std"] == pytest.approx(13.94, abs=0.005)
-    assert (suites["ALL_AVG"]["falls"], suites["ALL_AVG"]["episodes"]) == (27, 420)
-    assert 100 * suites["ALL_AVG"]["afr"] == pytest.approx(float(act["football"]["afr_pct"]), abs=0.005)
+    found = {suite["suite"]: suite for suite in aggregate(records)["suites"]}
+    assert 100 * found["HOI_AVG"]["sr"] == pytest.approx(28.33, abs=0.005)
+    assert 100 * found["HOI_AVG"]["sr_std"] == pytest.approx(13.94, abs=0.005)
+    assert (found["ALL_AVG"]["falls"], found["ALL_AVG"]["episodes"]) == (27, 420)
+    assert 100 * found["ALL_AVG"]["afr"] == pytest.approx(float(act["football"]["afr_pct"]), abs=0.005)

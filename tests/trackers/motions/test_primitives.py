@@ -239,7 +239,7 @@ def test_a_clip_depends_on_its_seed_family_and_number_alone():
 
 def test_official_tracker_walks_these_references(shared):
     """TWIST2's released weights, in plain MuJoCo, reach 90 % of a commanded 0.3 and 0.6 m/s and stay up."""
-    from arena_newton.trackers import oracle
+    from tests import oracle
 
     names = {0.3: "walk 0.3", 0.6: "walk 0.6"}
     program = Program([primitives.stand(0.5) + primitives.walk(v, seconds=8.0) for v in names])

@@ -243,7 +243,7 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
     runner.learn(1)
     for symmetric in (True, False):
         out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
-        tracker = Twist2Tracker.from_weights(out)
+        tracker = twist2.Twist2Tracker.from_weights(out)
         mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
         seen = env.get_observations()["actor"]
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Does a tracker drive our G1 as it drives its own MJCF in plain MuJoCo? `python -m arena_newton.trackers.oracle`.
+"""Does a tracker drive our G1 as it drives its own MJCF in plain MuJoCo? `python tests/oracle.py`.
 
 One stream of canonical actions per reference goes to both sides: (a) the lab of this package, engine `mujoco`, through
 `TrackerLoop`; (b) the official MJCF in plain MuJoCo with the same drive gains, physics step and tracker class. The
@@ -49,7 +49,7 @@ __all__ = [
     "run_ours",
 ]
 
-PROG = "python -m arena_newton.trackers.oracle"
+PROG = "python tests/oracle.py"
 FALL_TILT = 60.0
 """A pelvis tilted beyond this has fallen [deg]."""
 FALL_HEIGHT = 0.3

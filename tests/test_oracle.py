@@ -9,7 +9,7 @@ import pytest
 from arena_newton import robot as g1
 from arena_newton.canonical import STAND_ACTION
 from arena_newton.errors import InputError
-from arena_newton.trackers import oracle
+from tests import oracle
 
 CLIPS = ("0807_yanjie_walk_002", "0807_yanjie_walk_003")
 TOLERANCE = 0.15

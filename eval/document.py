@@ -1,0 +1,219 @@
+"""config.json of a results folder: what a run is known by, how it ended, and what its journal must agree with."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Literal, TypedDict
+
+from arena_newton import rule_sets, seeding, tasks
+from arena_newton.errors import InputError
+from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord
+from arena_newton.eval.records import (
+    MAX_CONFIG_BYTES,
+    MAX_EPISODES,
+    Count,
+    Facts,
+    Fit,
+    Json,
+    JsonObject,
+    Name,
+    Positive,
+    Seed,
+    fit,
+    is_name,
+    parse,
+    read_regular,
+    shown,
+)
+
+__all__ = ["CONFIG_FILE", "Document", "Identity", "Status", "check_plan", "read_document"]
+
+CONFIG_FILE = "config.json"
+
+
+def _distinct(values: list[Json]) -> bool:
+    return bool(values) and len(set(values)) == len(values)
+
+
+ConfigHash = Annotated[str, Fit("12 hex digits", lambda value: bool(re.fullmatch("[0-9a-f]{12}", value)))]
+Hash = Annotated[str | None, Fit("a hash or null", lambda value: value is None or is_name(value))]
+FactsOrNone = Annotated[Facts | None, Fit("facts by name or null")]
+Versions = Annotated[dict[Name, Name | None], Fit("versions by library")]
+
+
+class _Identity(TypedDict):
+    rules: Name
+    seeds: Annotated[list[Seed], Fit("distinct numbers", _distinct)]
+    repeats: Positive
+    max_steps: Annotated[Positive | None, Fit("a number of ticks or null")]
+
+
+class Identity(_Identity, total=False):
+    """What the results depend on, by flag name; only the first four were in every version's config.json."""
+
+    version: Name
+    task: Annotated[list[Name], Fit("names of tasks", _distinct)]
+    mode: Annotated[list[Name], Fit("names of modes", _distinct)]
+    tracker: Name
+    checkpoint: Hash
+    policy: Name
+    policy_file: Hash
+    worlds: Annotated[float | None, Fit("a number or null")]
+    rules_hash: Name
+    engine: Name
+    device: Name
+    variant: Hash
+    fast_physics: bool
+    drive: Name
+    scenes: Annotated[str, Fit("a hash")]
+    code: Annotated[str, Fit("a hash")]
+    tracker_facts: FactsOrNone
+    policy_facts: FactsOrNone
+
+
+class Status(TypedDict):
+    """How the last `run` or `resume` in its folder ended."""
+
+    state: Literal["started", "success", "cancelled", "error"]
+    """`started`: is running, or was killed; `success`: every planned episode is in the journal."""
+    started_at: str
+    """ISO 8601, UTC."""
+    finished_at: str | None
+    error: str | None
+    """Message of an `error`."""
+
+
+class _Document(TypedDict):
+    config_hash: ConfigHash
+    config: Annotated[Identity, Fit("an object")]
+    rule_set: Annotated[dict[Name, str], Fit("texts by item")]
+    gym_ids: Annotated[dict[Name, Name], Fit("Gym ids by task")]
+    options: Annotated[dict[str, Json], Fit("an object")]
+    planned: Annotated[Count, Fit("a number of episodes")]
+
+
+class Document(_Document, total=False):
+    """Content of config.json."""
+
+    versions: Versions
+    environments: Annotated[dict[Name, Facts], Fit("facts by task and mode")]
+    """What each environment said of itself, by task and mode."""
+    variant_changes: Annotated[list[str], Fit("sentences")]
+    later_versions: Annotated[list[Versions], Fit("versions by library")]
+    """Of the libraries that a later `resume --accept-versions` ran with."""
+    status: Annotated[Status, Fit("state, times and error of the run")]
+
+
+def read_document(folder: Path) -> Document:
+    """Read a results folder's config.json.
+
+    Raises:
+        InputError: The folder holds no run, or its config.json is not the configuration of one.
+    """
+    path = folder / CONFIG_FILE
+    where = f"{path}: cannot be read as the configuration of a run"
+    try:
+        document = parse(read_regular(path, MAX_CONFIG_BYTES))
+    except FileNotFoundError:
+        raise InputError(f"{folder}: no results folder (it has no {CONFIG_FILE})") from None
+    except ValueError:
+        raise InputError(where) from None
+    if not isinstance(document, dict):
+        raise InputError(where)
+    if isinstance(config := document.get("config"), dict):
+        fit(f"{where}: config", config, Identity)
+        for key, value in config.items():
+            if not is_name(key) or (isinstance(value, str) and not is_name(value)):
+                raise InputError(f"{where}: config: {shown(key)} is {shown(value)}, expected plain text")
+    fit(where, document, Document)
+    for task in document["gym_ids"]:
+        if task not in tasks.names():
+            raise InputError(f"{path}: gym_ids: task is {shown(task)}, known are {' '.join(tasks.names())}")
+    return document  # type: ignore[return-value]  # what `fit` has tested
+
+
+_Key = tuple[str, str, int, int]
+"""Task, mode, group seed, repeat."""
+_PARTS: tuple[Literal["tracker", "policy", "rules", "engine"], ...] = ("tracker", "policy", "rules", "engine")
+
+
+def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Document) -> None:
+    """Hold a journal to its configuration.
+
+    No episode that the plan lacks or that another run played, none twice under two numbers, and none again that had
+    ended as something else than an error; seeds and step budgets are the plan's.
+
+    Args:
+        folder: The results folder, for messages.
+        records: Lines of its journal, in their order.
+        document: Content of config.json.
+
+    Raises:
+        InputError: A record belongs to another plan or another run.
+    """
+    config = document["config"]
+    by_hand = "the journal was changed by hand"
+    numbers: dict[_Key, int] = {}
+    ended: dict[int, str] = {}
+    budgets, plan = _budgets(config), _plan_numbers(folder / CONFIG_FILE, config)
+    if plan and document["planned"] != len(plan):
+        count = f"planned is {document['planned']}, the plan has {len(plan)}"
+        raise InputError(f"{folder / CONFIG_FILE}: {count}; it was changed by hand")
+    run: JsonObject = {key: config[key] for key in _PARTS if key in config}
+    for record in records:
+        key = (record.task, record.mode, record.group_seed, record.repeat)
+        name = f"{folder / JOURNAL_FILE}: episode {record.index} ({key[0]} {key[1]} seed {key[2]} repeat {key[3]})"
+        if (
+            record.index >= document["planned"]
+            or record.task not in document["gym_ids"]
+            or record.group_seed not in config["seeds"]
+            or record.repeat >= config["repeats"]
+            or ("mode" in config and record.mode not in config["mode"])
+        ):
+            raise InputError(f"{name}: is not in the plan of {CONFIG_FILE}; {by_hand}")
+        if numbers.setdefault(key, record.index) != record.index:
+            raise InputError(f"{name}: is in the journal as episode {numbers[key]} too")
+        seed = seeding.episode_seed(document["gym_ids"][record.task], record.group_seed, record.repeat)
+        planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
+        if record.task in budgets:
+            planned["max_steps"] = budgets[record.task]
+        if key in plan:
+            planned["index"] = plan[key]
+        recorded = {field: getattr(record, field) for field in planned} | {"config hash": record.hashes.get("config")}
+        for field, wanted in (planned | {"config hash": document["config_hash"]}).items():
+            if recorded[field] != wanted:
+                raise InputError(
+                    f"{name}: {field} is {shown(recorded[field])}, this run's is {shown(wanted)}; {by_hand}"
+                )
+        if record.steps > record.max_steps:
+            raise InputError(f"{name}: {record.steps} steps of at most {record.max_steps}; {by_hand}")
+        if ended.get(record.index, "error") != "error":
+            raise InputError(f"{name}: is in the journal again after it had ended ({ended[record.index]}); {by_hand}")
+        ended[record.index] = record.outcome
+
+
+def _budgets(config: Identity) -> dict[str, int]:
+    """Step budgets by task; empty where the run's rule set is not known here."""
+    names = config.get("task", [])
+    if config["rules"] not in rule_sets.names() or not set(names) <= set(tasks.names()):
+        return {}
+    rule_set = rule_sets.get(config["rules"])
+    if config.get("rules_hash") != rule_set.hash_for(tuple(names)):
+        return {}
+    cap = config["max_steps"]
+    budgets = {name: tasks.get(name).max_steps(rule_set) for name in names}
+    return {name: budget if cap is None else min(budget, cap) for name, budget in budgets.items()}
+
+
+def _plan_numbers(path: Path, config: Identity) -> dict[_Key, int]:
+    """Numbers of the plan's episodes by task, mode, group seed and repeat; empty where they are not known."""
+    if "task" not in config or "mode" not in config:
+        return {}
+    parts = (config["task"], config["mode"], config["seeds"], range(config["repeats"]))
+    if math.prod(len(part) for part in parts) > MAX_EPISODES:
+        raise InputError(f"{path}: plans more than {MAX_EPISODES:,} episodes")
+    return {key: number for number, key in enumerate(itertools.product(*parts))}

@@ -1,0 +1,174 @@
+"""What a run is known by: hashes of files, code and scenes, and how two identities are compared."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+
+import arena_newton
+from arena_newton.errors import InputError
+
+__all__ = [
+    "PACKAGE",
+    "UNHASHED",
+    "UNVERSIONED",
+    "code_files",
+    "code_hash",
+    "config_hash",
+    "differing_key",
+    "hash_path",
+    "hash_paths",
+    "moving_versions",
+    "own_code",
+    "package_files",
+    "scene_files",
+]
+
+PACKAGE = Path(arena_newton.__file__).resolve().parent
+UNHASHED = (
+    "eval/__main__.py",
+    "eval/bench.py",
+    "eval/config.py",
+    "eval/console.py",
+    "eval/document.py",
+    "eval/engines.py",
+    "eval/folder.py",
+    "eval/html_report.py",
+    "eval/identity.py",
+    "eval/journal.py",
+    "eval/options.py",
+    "eval/original_format.py",
+    "eval/progress.py",
+    "eval/records.py",
+    "eval/report.py",
+    "eval/results.py",
+    "eval/stats.py",
+    "eval/wording.py",
+    "trackers/evaluate.py",
+    "trackers/evaluation",
+    "trackers/train",
+)
+"""Code that prepares, reports or measures but moves and judges no episode of a run. All other code counts, whatever is
+added to the package."""
+UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
+"""Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
+
+
+def config_hash(value: object) -> str:
+    """First 12 hex digits of the SHA-256 of the canonical JSON of a value."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def hash_path(path: Path) -> str:
+    """First 12 hex digits of the SHA-256 of a file, or of names and contents of all files in a folder."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is not a regular file")
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(file.relative_to(path).as_posix().encode() + b"\0")
+        try:
+            with file.open("rb") as handle:
+                while block := handle.read(1 << 20):
+                    digest.update(block)
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    return digest.hexdigest()[:12]
+
+
+def differing_key(
+    stored: Mapping[str, object], wanted: Mapping[str, object], ignored: Collection[str] = ()
+) -> tuple[str, object, object] | None:
+    """First key whose value differs between two identities, with both values; None when they are equal.
+
+    Of values that are tables themselves the key within is named, such as `tracker.drive`.
+    """
+    for key in [*wanted, *(k for k in stored if k not in wanted)]:
+        was, now = stored.get(key), wanted.get(key)
+        if key in ignored or was == now:
+            continue
+        if isinstance(was, dict) and isinstance(now, dict):
+            inner = differing_key(was, now)
+            if inner is not None:
+                return f"{key}.{inner[0]}", inner[1], inner[2]
+        return key, was, now
+    return None
+
+
+def moving_versions(versions: Mapping[str, str | None]) -> dict[str, str | None]:
+    """Of all versions those that an episode may depend on; of Python's the first two numbers."""
+    kept = {name: version for name, version in versions.items() if name not in UNVERSIONED}
+    if kept.get("python"):
+        kept["python"] = ".".join(str(kept["python"]).split(".")[:2])
+    return kept
+
+
+def package_files(root: Path) -> list[Path]:
+    """All files below a folder, sorted; linked folders, as in a checkout, are entered, caches are not."""
+    found = []
+    for folder, names, files in os.walk(root, followlinks=True):
+        names[:] = sorted(name for name in names if name != "__pycache__" and not name.startswith("."))
+        found += [Path(folder) / name for name in files]
+    return sorted(found)
+
+
+def code_files(root: Path = PACKAGE) -> list[Path]:
+    """Modules of a package folder whose change may change a result: all but `UNHASHED`."""
+
+    def counts(file: Path) -> bool:
+        name = file.relative_to(root)
+        return file.suffix == ".py" and not any(part.as_posix() in UNHASHED for part in (name, *name.parents))
+
+    return [file for file in package_files(root) if counts(file)]
+
+
+def code_hash(root: Path = PACKAGE, digest: Callable[[Path], str] = hash_path) -> str:
+    """Hash of the code that a run executes, by names and contents.
+
+    Args:
+        root: Package folder.
+        digest: Hash of one file.
+    """
+    return hash_paths(root, code_files(root), digest)
+
+
+def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> list[Path]:
+    """Layers, textures and what else is stored next to the built-in scenes of a run's tasks.
+
+    Args:
+        root: Package folder.
+        tasks: Tasks of the run.
+        known: All tasks; the folders of those that the run lacks do not count, nor does the trackers' `lab`.
+    """
+    others = {"lab", *known} - set(tasks)
+    scenes = root / "usd_scenes"
+    found = [file for file in package_files(scenes) if file.suffix not in (".py", ".pyc")]
+    return [file for file in found if file.relative_to(scenes).parts[0] not in others]
+
+
+def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str]) -> str:
+    """Hash of files below a folder, by names and contents."""
+    return config_hash([[file.relative_to(root).as_posix(), digest(file)] for file in files])
+
+
+def own_code(part: object) -> str | None:
+    """Hash of the package, or the single module, that a tracker or policy of others was written in.
+
+    Returns:
+        None for the parts of this package, whose code is hashed as a whole.
+    """
+    module = sys.modules.get(type(part).__module__)
+    name = module.__name__.partition(".")[0] if module is not None else ""
+    top = sys.modules.get(name)
+    if top is None or getattr(top, "__file__", None) is None or name in {"arena_newton", *sys.stdlib_module_names}:
+        return None
+    file = Path(str(top.__file__)).resolve()
+    if not hasattr(top, "__path__"):
+        return hash_path(file)
+    return hash_paths(file.parent, [f for f in package_files(file.parent) if f.suffix == ".py"], hash_path)

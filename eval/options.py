@@ -1,0 +1,94 @@
+"""Flags of a run, as a user gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+__all__ = ["QUICK_MAX_STEPS", "QUICK_REPEATS", "QUICK_SEEDS", "RunOptions", "is_quick"]
+
+QUICK_SEEDS = (0,)
+QUICK_REPEATS = 4
+"""Repeats of the default look at all tasks, sized to end within two minutes on a bare CPU."""
+QUICK_MAX_STEPS = 250
+"""Step cap of that look [ticks of 0.02 s]."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
+
+    Without --task, --mode, --seeds, --repeats and --max-steps a quick look at all seven tasks runs (about two minutes
+    on a CPU). As soon as one of them is given, the rest follows the benchmark's protocol: 3 seeds x 20 repeats.
+    """
+
+    task: tuple[str, ...] = ()
+    """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
+    tracker: str = "twist2"
+    """Tracker that executes the 40D action: twist2, sonic, pd, ..."""
+    checkpoint: str | None = None
+    """The tracker's weights: a .safetensors or official .onnx file (SONIC: a folder or two files with a comma between);
+    those that come with the package when none is named."""
+    policy: str = "stand"
+    """Policy that decides it: stand, expert, replay:<clip, or actions of --actions>, remote:<url>."""
+    mode: tuple[str, ...] = ()
+    """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
+    rules: str = "paper"
+    """Rule set: paper or released."""
+    drive: str = "auto"
+    """Gains of the joints' drives: auto (what rule set and tracker ask for), twist2, humanoidarena."""
+    seeds: tuple[int, ...] = ()
+    """Group seeds; the protocol's are 0 1 2."""
+    repeats: int | None = None
+    """Episodes per group seed; the protocol's are 20."""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "auto"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1; the best there is when none is named."""
+    variant: str | None = None
+    """USD file that replaces or extends the scene of the one task named."""
+    fast_physics: bool = False
+    """Run a 1 ms tracker at 5 ms x 4 substeps."""
+    max_steps: int | None = None
+    """Cap on the step budget of the rule set [ticks of 0.02 s]."""
+    video: bool = False
+    """Write ego and world videos (H.264 MP4), one pair per episode."""
+    strip: bool = False
+    """Write the 10-frame picture strip of each episode."""
+    video_episodes: int | None = None
+    """Videos of only the first so many episodes of each task and mode; of all when not given."""
+    video_size: str | None = None
+    """Size of the world camera's pictures, such as 960x540 [px]."""
+    follow: bool = False
+    """Let the world camera follow the robot."""
+    actions: bool = False
+    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker."""
+    out: str | None = None
+    """Results folder; results/<date>_<time> when none is named."""
+    verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
+    """Print the whole configuration."""
+    accept_versions: bool = False
+    """Continue a folder that was begun with other versions of the libraries; the journal then names both."""
+    skip_broken: bool = False
+    """When simulator or tracker break down as a whole, end the episodes that were running as errors and go on.
+    Without it such a break stops the run and leaves them unplayed."""
+    retry_errors: bool = False
+    """On resume, run episodes again that ended with an error."""
+    remote_timeout: float = 60.0
+    """For --policy remote: deadline of a request with all its attempts [s]."""
+    remote_retries: int = 4
+    """For --policy remote: repeated attempts after a connection error, with pauses of 0.25, 0.5, 1 ... s."""
+    remote_sequential: bool = False
+    """For --policy remote: ask for one world after the other, in their order."""
+    remote_insecure: bool = False
+    """For --policy remote: do not check the certificate of an https server."""
+
+
+def is_quick(options: RunOptions) -> bool:
+    """Whether the flags leave the plan open: a quick look at all tasks."""
+    named = options.task or options.mode or options.seeds
+    return not named and (options.repeats, options.max_steps) == (None, None)

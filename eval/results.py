@@ -1,0 +1,89 @@
+"""What a results folder holds, read and checked, and the figures that results.json gives of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
+from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
+from arena_newton.eval.stats import Aggregate, aggregate
+
+__all__ = ["Results", "RunRecord", "in_plan_order", "load_run", "results_json"]
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a results folder holds."""
+
+    folder: Path
+    document: Document
+    """Content of config.json."""
+    records: list[EpisodeRecord]
+    """Finished episodes in plan order; of an episode that was run twice the last."""
+
+    @property
+    def planned(self) -> int:
+        """Number of episodes of the plan."""
+        return self.document["planned"]
+
+    @property
+    def config(self) -> Identity:
+        """The run's identity."""
+        return self.document["config"]
+
+    @property
+    def status(self) -> Status | None:
+        """How the last run or resume ended; None in a folder of a version without status."""
+        return self.document.get("status")
+
+
+class _Results(Aggregate):
+    config_hash: str
+    config: Identity
+    planned: int
+    finished: int
+    complete: bool
+
+
+class Results(_Results, total=False):
+    """Content of results.json."""
+
+    status: str
+    """State of `document.Status`; absent in a folder of a version without status."""
+
+
+def in_plan_order(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """Records by plan order; of two with the same index the later one in the journal counts."""
+    latest = {record.index: record for record in records}
+    return [latest[index] for index in sorted(latest)]
+
+
+def load_run(folder: Path) -> RunRecord:
+    """Read a results folder.
+
+    Raises:
+        InputError: It holds no run, or one that was changed by hand.
+    """
+    document = read_document(folder)
+    records, _ = read_journal(folder / JOURNAL_FILE)
+    check_plan(folder, records, document)
+    return RunRecord(folder, document, in_plan_order(records))
+
+
+def results_json(run: RunRecord) -> Results:
+    """Content of results.json."""
+    figures = aggregate(run.records)
+    results: Results = {
+        "config_hash": run.document["config_hash"],
+        "config": run.config,
+        "planned": run.planned,
+        "finished": len(run.records),
+        "complete": len(run.records) == run.planned,
+        "cells": figures["cells"],
+        "suites": figures["suites"],
+    }
+    if run.status is not None:
+        results["status"] = run.status["state"]
+    return results

@@ -1,0 +1,108 @@
+"""Journals of every schema are read, and a line says all that an episode's result holds."""
+
+import dataclasses
+import json
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+from rows import episodes, full, record
+
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, read_journal
+from arena_newton.eval.plan import expand
+from arena_newton.eval.results import load_run
+from arena_newton.eval.run import _record
+from arena_newton.interfaces import EpisodeEvent, EpisodeResult
+
+JOURNALS = Path(__file__).parent / "journals"
+NEW_KEYS = ("schema", "phases", "predicates", "progress", "events")
+
+
+def stored(schema, folder):
+    """A results folder that a real run of two episodes wrote, with a journal of this schema."""
+    folder.mkdir()
+    shutil.copy(JOURNALS / f"schema_{schema}.jsonl", folder / "episodes.jsonl")
+    shutil.copy(JOURNALS / f"schema_{schema}.config.json", folder / "config.json")
+    return folder
+
+
+@pytest.mark.parametrize("schema", range(1, SCHEMA + 1))
+def test_journals_of_every_schema_are_reported(tmp_path, capsys, schema):
+    """A folder that any version wrote is read whole and gives all reports."""
+    folder = stored(schema, tmp_path / "run")
+    run = load_run(folder)
+    assert [(r.schema, r.task, r.outcome, r.steps) for r in run.records] == [(schema, "boxing", "timeout", 20)] * 2
+    assert (run.status is None) == (schema == 1)
+    assert main(["report", str(folder)]) == 0
+    assert "| boxing | twist2  | stand  | base | 2 |" in capsys.readouterr().out
+    assert {"report.html", "table.csv", "results.json", "original"} <= {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("schema", range(1, SCHEMA + 1))
+def test_old_keys_keep_name_order_and_format(schema):
+    """What a line of an older schema holds is a part of the same line today, in the same order and bytes."""
+    lines = [json.loads(line) for line in (JOURNALS / f"schema_{schema}.jsonl").read_text().splitlines()]
+    for line, found in zip(lines, read_journal(JOURNALS / f"schema_{schema}.jsonl")[0], strict=True):
+        written = found.to_json()
+        assert json.dumps({key: written[key] for key in written if key in line}) == json.dumps(line)
+        assert set(written) - set(line) == (set(NEW_KEYS) if schema == 1 else set())
+
+
+def test_a_journal_from_the_future_is_refused(tmp_path, capsys):
+    """A line of a newer schema is refused by number instead of being read in part."""
+    folder = stored(SCHEMA, tmp_path / "run")
+    text = (folder / "episodes.jsonl").read_text()
+    (folder / "episodes.jsonl").write_text(text.replace(f'"schema":{SCHEMA}', f'"schema":{SCHEMA + 1}'))
+    for command in ("report", "resume"):
+        assert main([command, str(folder)]) == 2
+        error = capsys.readouterr().err
+        if command == "report":
+            assert error.count("\n") == 1 and "line 1: schema 3 was written by a newer version" in error
+
+
+def test_a_line_says_what_the_result_holds(tmp_path):
+    """Phases, predicates, progress and events of a result are in its line and come back from it."""
+    (episode,) = expand(["boxing"], tracker="twist2", policy="expert", seeds=(0,), repeats=1)
+    events = (EpisodeEvent("contact", 12, "left_palm"), EpisodeEvent("fall", 40, "tilt"))
+    result = EpisodeResult(episode, "fall", "fall", 40, math.inf, phases=(("walk", 0), ("strike", 31)))
+    result = dataclasses.replace(result, predicates={"approach": 30, "contact": None}, progress=0.5, events=events)
+    line = _record(result, {"ego": "videos/a.mp4"}, {"config": "0123456789ab"})
+    with Journal(tmp_path / "episodes.jsonl") as journal:
+        journal.append(line)
+    text = (tmp_path / "episodes.jsonl").read_text()
+    assert '"phases":[["walk",0],["strike",31]],"predicates":{"approach":30,"contact":null},"progress":0.5' in text
+    assert '"events":[{"kind":"contact","tick":12,"detail":"left_palm"},' in text
+    assert read_journal(tmp_path / "episodes.jsonl")[0] == [line]
+    assert (line.schema, line.margin, line.video) == (SCHEMA, None, "videos/a.mp4")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("schema", 0, "schema is 0, expected a number of at least 1"),
+        ("schema", True, "schema is true"),
+        ("progress", 1.5, "progress is 1.5, expected a number from 0 to 1"),
+        ("progress", "half", "progress is"),
+        ("phases", [["walk"]], "phases is"),
+        ("phases", [["walk\x1b[2J", 3]], "phases is"),
+        ("phases", [["walk", -1]], "phases is"),
+        ("predicates", {"": 3}, "predicates is"),
+        ("predicates", [3], "predicates is"),
+        ("events", [{"kind": "fall"}], "events is"),
+        ("events", [{"kind": "fall", "tick": 3, "more": 1}], "events is"),
+        ("events", [{"kind": "fall", "tick": "3"}], "events is"),
+    ],
+)
+def test_unfit_values_of_new_keys_are_named(key, value, message):
+    """New keys are held to their types and ranges as the old ones are."""
+    with pytest.raises(InputError, match=f"here: {message}"):
+        EpisodeRecord.from_json("here", full(episodes("football", (1,))[0]) | {key: value})
+
+
+def test_unknown_keys_are_left_out():
+    """A key that this version does not know does not keep a line of the same schema from being read."""
+    line = full(episodes("football", (1,))[0])
+    assert EpisodeRecord.from_json("here", line | {"more": [1]}) == record(line)
