@@ -13,7 +13,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "eval"))
 from eval_fakes import factories
 
 from arena_newton import policies, trackers
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
@@ -28,7 +27,7 @@ class Undeclared(Handler):
 
     def do_POST(self):  # noqa: N802 (the name that http.server calls)
         self.rfile.read(int(self.headers["Content-Length"]))
-        reply = json.dumps({"ok": True, "action_chunk": [STAND_ACTION.tolist()] * 50}).encode()
+        reply = json.dumps({"ok": True, "action_chunk": [[float(v) for v in STAND_ACTION]] * 50}).encode()
         self.send_response(200)
         self.send_header("Content-Length", str(len(reply)))
         self.end_headers()
