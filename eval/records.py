@@ -187,11 +187,11 @@ def tester(hint: object) -> Callable[[Json], bool]:
         return tester(hint.__value__)
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        tests = [tester(parts[0]), *(part.test for part in parts[1:] if isinstance(part, Fit | Known))]
-        if len(tests) == 2:  # the usual case, without a loop: a journal has up to millions of values
-            first, second = tests
+        both = [tester(parts[0]), *(part.test for part in parts[1:] if isinstance(part, Fit | Known))]
+        if len(both) == 2:  # the usual case, without a loop: a journal has up to millions of values
+            first, second = both
             return lambda v: first(v) and second(v)
-        return lambda v: all(test(v) for test in tests)
+        return lambda v: all(test(v) for test in both)
     if origin is Literal:
         return lambda v: isinstance(v, str) and v in parts
     if origin in (types.UnionType, typing.Union):

@@ -53,7 +53,10 @@ class FakeEnv:
 
     def observe(self, mask=None, *, image=False):
         mask = self.active.copy() if mask is None else mask
-        return Observation(torch.zeros(self.worlds, 64), None, mask, self.task, self.spec.gym_id, self.spec.instruction)
+        picture = torch.zeros(self.worlds, 48, 64, 3, dtype=torch.uint8) if image else None
+        return Observation(
+            torch.zeros(self.worlds, 64), picture, mask, self.task, self.spec.gym_id, self.spec.instruction
+        )
 
     def step(self, action, worlds=None):
         if pause := float(os.environ.get("FAKE_TICK_S", "0")):

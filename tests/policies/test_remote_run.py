@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from arena_newton import policies, trackers
+<<<<<<< HEAD
 from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
+=======
+from arena_newton.env import STAND_ACTION, ArenaEnv
+>>>>>>> 9e1156bff375f84a83cb2cb70a44ba7e8ebe204e
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
@@ -24,7 +28,7 @@ class Undeclared(Handler):
 
     def do_POST(self):  # noqa: N802 (the name that http.server calls)
         self.rfile.read(int(self.headers["Content-Length"]))
-        reply = json.dumps({"ok": True, "action_chunk": [STAND_ACTION.tolist()] * 50}).encode()
+        reply = json.dumps({"ok": True, "action_chunk": [[float(v) for v in STAND_ACTION]] * 50}).encode()
         self.send_response(200)
         self.send_header("Content-Length", str(len(reply)))
         self.end_headers()

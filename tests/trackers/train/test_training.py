@@ -32,6 +32,7 @@ from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.tracker_env import TrackerEnv
+from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
 TWIST2 = interface.get("twist2")
@@ -243,7 +244,7 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
     runner.learn(1)
     for symmetric in (True, False):
         out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
-        tracker = twist2.Twist2Tracker.from_weights(out)
+        tracker = Twist2Tracker.from_weights(out)
         mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
         seen = env.get_observations()["actor"]
         with torch.no_grad():
