@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 
 from arena_newton import policies, trackers
-<<<<<<< HEAD
 from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
-=======
-from arena_newton.env import STAND_ACTION, ArenaEnv
->>>>>>> 9e1156bff375f84a83cb2cb70a44ba7e8ebe204e
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
