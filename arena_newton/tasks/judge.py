@@ -17,6 +17,7 @@ from arena_newton.interfaces import Predicate
 from arena_newton.kernels import predicates as kinds
 from arena_newton.kernels import reset
 from arena_newton.kernels.boxes import Boxes
+from arena_newton.kernels.launching import Recorded, record
 from arena_newton.tasks.base import IDENTITY, SUCCESS
 
 if TYPE_CHECKING:
@@ -136,6 +137,8 @@ class Judge:
         self.counters: list[wp.array] = [self.predicates[:, k] for k in range(len(names))]
         """int32 arrays [worlds] that a reset clears."""
         self._upload(list(conditions.values()))
+        self._recorded: Recorded | None = None
+        self._physics: Physics | None = None
 
     def _upload(self, predicates: Sequence[Sequence[Condition]]) -> None:
         """Copy the conditions' table to the device."""
@@ -175,11 +178,20 @@ class Judge:
         """Tell the physics what it must measure; called once before the first tick."""
 
     def decide(self, physics: Physics) -> None:
-        """Fill `success`, `margin` and `event` for the state after this tick; a subclass says how."""
+        """Launch what fills `success`, `margin` and `event` for the state after this tick.
+
+        A subclass says how. It is called once per physics, recorded and repeated every tick: the same kernels with the
+        same arrays and numbers.
+        """
         raise NotImplementedError
 
     def evaluate(self, physics: Physics) -> None:
         """Fill `success`, `margin`, `event` and `predicates` for the state after this tick."""
+        if self._recorded is None or self._physics is not physics:
+            self._recorded, self._physics = record(self._launch, physics), physics
+        self._recorded()
+
+    def _launch(self, physics: Physics) -> None:
         self.decide(physics)
         kinds.launch_predicates(
             physics.xpos,
