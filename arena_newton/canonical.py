@@ -24,11 +24,7 @@ __all__ = [
     "validate_action",
 ]
 
-STATE: dict[str, slice] = {
-    "root_rot6d": slice(0, 6),
-    "joint_pos": slice(6, 35),
-    "joint_vel": slice(35, 64),
-}
+STATE: dict[str, slice] = {"root_rot6d": slice(0, 6), "joint_pos": slice(6, 35), "joint_vel": slice(35, 64)}
 """State: root orientation without the episode's initial heading, joint positions [rad], joint velocities [rad/s]."""
 STATE_WIDTH = 64
 

@@ -33,12 +33,7 @@ from arena_newton.usd_scenes.shapes import check_buildable, open_stage
 if TYPE_CHECKING:
     from arena_newton.rules import RuleSet
 
-__all__ = [
-    "SCENES",
-    "Scene",
-    "load_scene",
-    "scene_path",
-]
+__all__ = ["SCENES", "Scene", "load_scene", "scene_path"]
 
 ROBOT = "/World/Robot"
 LATCH = "arena:latch"

@@ -83,20 +83,11 @@ def launch_reset(
         mocap_quat: Written, shape [worlds, nmocap, 4], or None.
     """
     worlds = mask.shape[0]
-    launch(
-        reset_state_kernel,
-        dim=(worlds, max(qpos.shape[1], qvel.shape[1], ctrl.shape[1])),
-        inputs=[mask, qpos0, qvel0, ctrl0],
-        outputs=[qpos, qvel, ctrl],
-        device=mask.device,
-    )
+    columns = max(qpos.shape[1], qvel.shape[1], ctrl.shape[1])
+    launch(reset_state_kernel, (worlds, columns), [mask, qpos0, qvel0, ctrl0], [qpos, qvel, ctrl])
     if mocap_pos is not None and mocap_pos.shape[1] > 0:
         launch(
-            reset_mocap_kernel,
-            dim=(worlds, mocap_pos.shape[1]),
-            inputs=[mask, mocap_pos0, mocap_quat0],
-            outputs=[mocap_pos, mocap_quat],
-            device=mask.device,
+            reset_mocap_kernel, (worlds, mocap_pos.shape[1]), [mask, mocap_pos0, mocap_quat0], [mocap_pos, mocap_quat]
         )
 
 
@@ -115,7 +106,7 @@ def launch_clear(mask: wp.array, counter: wp.array) -> None:
         mask: 1 = clear, int32, shape [worlds].
         counter: Streak or counter, int32, shape [worlds].
     """
-    launch(clear_kernel, dim=mask.shape[0], inputs=[mask], outputs=[counter], device=mask.device)
+    launch(clear_kernel, mask.shape[0], [mask], [counter])
 
 
 @wp.kernel
@@ -140,4 +131,4 @@ def launch_nonfinite(qpos: wp.array, qvel: wp.array, bad: wp.array) -> None:
         qvel: Velocities, shape [worlds, nv].
         bad: Output, 1 = broken, int32, shape [worlds].
     """
-    launch(nonfinite_kernel, dim=bad.shape[0], inputs=[qpos, qvel], outputs=[bad], device=bad.device)
+    launch(nonfinite_kernel, bad.shape[0], [qpos, qvel], [bad])

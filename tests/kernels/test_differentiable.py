@@ -121,14 +121,14 @@ def test_reference_step_gradients_have_the_known_ones(device, twin):
 
 
 def _box(twin, device, body, half, quat=(0.9, 0.05, -0.1, 0.3)):
-    return success.Boxes.from_boxes([twin.Marker(body, (0.05, -0.02, 0.04), quat, half)], device)
+    return success.upload_boxes([twin.Marker(body, (0.05, -0.02, 0.04), quat, half)], device)
 
 
 def _cases(twin, device):
     """Each predicate: launch, fixed arguments, names of its float arrays."""
     ids = [wp.array(v, dtype=wp.int32, device=device) for v in ([1, 2], [2, 6, 1], [1, 2, 6, 5])]
     offsets = wp.array([(0.1, 0.02, 0.0), (0.05, 0.0, 0.03)], dtype=wp.vec3, device=device)
-    decks = success.Boxes.from_boxes(
+    decks = success.upload_boxes(
         [twin.Marker(3, (0, 0, z), (0.95, 0.02, 0.03, 0.2), (0.5, 0.4, 0.05)) for z in (-0.4, 0.0, 0.4)], device
     )
     free = {"latched": wp.zeros(WORLDS, dtype=wp.int32, device=device)}
