@@ -260,7 +260,10 @@ class Physics(Protocol):
 
     @property
     def external_force(self) -> wp.array:
-        """Force [N] and torque [N·m] on each body, world frame, shape [worlds, nbody, 6]; stays until changed."""
+        """Force [N] and torque [N·m] on each body, world frame, float32, shape [worlds, nbody, 6].
+
+        Acts at the body's centre of mass and stays until it is changed or the world is reset.
+        """
 
     def add_velocity(self, change: np.ndarray, mask: np.ndarray | None = None) -> None:
         """Add to the robot root's velocity: linear [m/s], world frame; angular [rad/s], body frame; [worlds, 6]."""

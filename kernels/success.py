@@ -19,8 +19,7 @@ Arguments that mean the same in every launch:
 
 from arena_newton.kernels.boxes import Boxes, upload_boxes
 from arena_newton.kernels.success_hoi import (
-    launch_double_desk_paper,
-    launch_double_desk_released,
+    launch_double_desk,
     launch_football,
     launch_pp_box_paper,
     launch_pp_box_released,
@@ -37,8 +36,7 @@ from arena_newton.kernels.success_hsi import (
 __all__ = [
     "Boxes",
     "launch_boxing",
-    "launch_double_desk_paper",
-    "launch_double_desk_released",
+    "launch_double_desk",
     "launch_football",
     "launch_open_door_paper",
     "launch_open_door_released",

@@ -1,4 +1,7 @@
-"""Success predicates of the tasks that move an object: Football, DoubleDesk, P&PBox. Arguments that `success` describes are not repeated."""
+"""Success predicates of the tasks that move an object: Football, DoubleDesk, P&PBox.
+
+Arguments that `success` describes are not repeated.
+"""
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
 
@@ -19,8 +22,7 @@ from arena_newton.kernels.launching import launch
 from arena_newton.kernels.rotations import load_vec3
 
 __all__ = [
-    "launch_double_desk_paper",
-    "launch_double_desk_released",
+    "launch_double_desk",
     "launch_football",
     "launch_pp_box_paper",
     "launch_pp_box_released",
@@ -118,41 +120,27 @@ def double_desk_kernel(
     success[w] = holds(m)
 
 
-def launch_double_desk_paper(
+def launch_double_desk(
     xpos: wp.array,
     xquat: wp.array,
     xipos: wp.array,
     *,
     hammer_body: int,
     inside: Boxes,
+    min_z: float | None = None,
     success: wp.array,
     margin: wp.array,
 ) -> None:
-    """DoubleDesk, `paper`: the hammer's centre of mass inside the crate's box in the crate's own frame.
+    """DoubleDesk: the hammer's centre of mass inside the crate's box.
 
     Args:
         hammer_body: The hammer.
         inside: One box, the crate's.
+        min_z: None: the box is in the crate's own frame (`paper`). Otherwise it is the world-axis box around the
+            crate's, cut at this height [m] (`released`).
     """
-    launch(double_desk_kernel, success.shape[0], [xpos, xquat, xipos, hammer_body, inside, 0, 0.0], [success, margin])
-
-
-def launch_double_desk_released(
-    xpos: wp.array,
-    xquat: wp.array,
-    xipos: wp.array,
-    *,
-    hammer_body: int,
-    inside: Boxes,
-    min_z: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
-    """DoubleDesk, `released`: the hammer's centre of mass inside the crate's world-axis box and not below `min_z` [m].
-
-    Other arguments as `launch_double_desk_paper`.
-    """
-    launch(double_desk_kernel, success.shape[0], [xpos, xquat, xipos, hammer_body, inside, 1, min_z], [success, margin])
+    floor = (0, 0.0) if min_z is None else (1, min_z)
+    launch(double_desk_kernel, success.shape[0], [xpos, xquat, xipos, hammer_body, inside, *floor], [success, margin])
 
 
 @wp.func

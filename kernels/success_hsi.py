@@ -1,4 +1,7 @@
-"""Success predicates of the tasks between robot and scene: OpenDoor, SitSofa, Boxing, VisNavi. Arguments that `success` describes are not repeated."""
+"""Success predicates of the tasks between robot and scene: OpenDoor, SitSofa, Boxing, VisNavi.
+
+Arguments that `success` describes are not repeated.
+"""
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
 

@@ -148,8 +148,8 @@ def _cases(twin, device):
     return {
         "football paper": (success.launch_football, football | {"rear_bound": True}, poses),
         "football released": (success.launch_football, football | {"rear_bound": False}, poses),
-        "double_desk paper": (success.launch_double_desk_paper, desk, (*poses, "xipos")),
-        "double_desk released": (success.launch_double_desk_released, desk | {"min_z": -0.2}, (*poses, "xipos")),
+        "double_desk paper": (success.launch_double_desk, desk, (*poses, "xipos")),
+        "double_desk released": (success.launch_double_desk, desk | {"min_z": -0.2}, (*poses, "xipos")),
         "pp_box paper": (success.launch_pp_box_paper, box | paper_box, (*poses, "qvel")),
         "pp_box released": (success.launch_pp_box_released, box | {"deck": 1, "plane_below": 0.15}, poses),
         "open_door paper": (success.launch_open_door_paper, door | root | STAND, (*poses, "qpos")),
