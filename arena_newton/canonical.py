@@ -3,7 +3,6 @@
 State and action hold their joints in canonical order, the mimic command in MuJoCo (TWIST2) order.
 """
 
-from typing import Any
 
 import numpy as np
 
@@ -73,7 +72,7 @@ def element_name(index: int) -> str:
     raise IndexError(f"action index {index} is outside 0..{ACTION_WIDTH - 1}")
 
 
-def validate_action(action: Any, where: str) -> np.ndarray:
+def validate_action(action: object, where: str) -> np.ndarray:
     """Checks canonical actions and returns them as float32.
 
     Args:

@@ -131,7 +131,7 @@ def reference_step(
     return mimic, ReferenceState(position, quat, joints, prev_yaw, prev_z, state.heading, steps, joint_vel)
 
 
-def success_margin(launch: Callable[..., None], **arguments: Any) -> torch.Tensor:
+def success_margin(launch: Callable[..., None], **arguments: object) -> torch.Tensor:
     """The margin of a success predicate, differentiable in every floating-point tensor among the arguments.
 
     Args:

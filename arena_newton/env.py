@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -162,7 +162,7 @@ class ArenaEnv:
 
         self._rule = record(launch_rules)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """What ran, for results to record: engine, physics rate, drive, start-up and tracker."""
         return {
             "engine": self.engine,
