@@ -3,7 +3,6 @@
 State and action hold their joints in canonical order, the mimic command in MuJoCo (TWIST2) order.
 """
 
-
 import numpy as np
 
 from arena_newton import robot

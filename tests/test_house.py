@@ -41,9 +41,7 @@ ANY = {
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/registry.py": "what a maker takes is its own business",
     "policies/base.py": "what a maker takes is its own business, and JSON",
-    "policies/experts/base.py": "JSON",
     "policies/remote.py": "options of the command line and JSON",
-    "policies/replay.py": "JSON",
 }
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
 MOST_LINES = 600
