@@ -5,6 +5,7 @@ Lengths [m], masses [kg], quaternions wxyz. Every function returns the prim it w
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
@@ -122,7 +123,23 @@ def fixture(stage: Usd.Stage, path: str, position: Vec = (0, 0, 0), quat: Vec = 
     return frame
 
 
-def _finish(prim: Usd.Prim, collide: bool, visual: bool, look: Usd.Prim | None, surface: Usd.Prim | None) -> Usd.Prim:
+class Finish(TypedDict, total=False):
+    """What a geom is to touch and to the eye; by default it collides, is drawn, and has no material."""
+
+    collide: bool
+    visual: bool
+    look: Usd.Prim
+    surface: Usd.Prim
+
+
+def _finish(
+    prim: Usd.Prim,
+    *,
+    collide: bool = True,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
     if collide:
         UsdPhysics.CollisionAPI.Apply(prim)
     if not visual:
@@ -140,17 +157,12 @@ def box(
     half: Vec,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A box with half sizes `half` [m]."""
     geom = UsdGeom.Cube.Define(stage, path)
     geom.CreateSizeAttr(2.0)
-    _pose(geom.GetPrim(), position, quat, half)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat, half), **finish)
 
 
 def sphere(
@@ -159,17 +171,12 @@ def sphere(
     radius: float,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A sphere of `radius` [m]."""
     geom = UsdGeom.Sphere.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
-    _pose(geom.GetPrim(), position, quat)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat), **finish)
 
 
 def capsule(
@@ -180,19 +187,10 @@ def capsule(
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     axis: str = "Z",
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A capsule of `radius` [m] and cylinder `length` [m] (caps come on top) along local `axis`."""
-    geom = UsdGeom.Capsule.Define(stage, path)
-    geom.CreateRadiusAttr(float(radius))
-    geom.CreateHeightAttr(float(length))
-    geom.CreateAxisAttr(axis)
-    _pose(geom.GetPrim(), position, quat)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _round_bar(UsdGeom.Capsule.Define(stage, path), radius, length, position, quat, axis, finish)
 
 
 def cylinder(
@@ -203,19 +201,25 @@ def cylinder(
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     axis: str = "Z",
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A cylinder of `radius` [m] and `length` [m] along local `axis`."""
-    geom = UsdGeom.Cylinder.Define(stage, path)
+    return _round_bar(UsdGeom.Cylinder.Define(stage, path), radius, length, position, quat, axis, finish)
+
+
+def _round_bar(
+    geom: UsdGeom.Capsule | UsdGeom.Cylinder,
+    radius: float,
+    length: float,
+    position: Vec,
+    quat: Vec,
+    axis: str,
+    finish: Finish,
+) -> Usd.Prim:
     geom.CreateRadiusAttr(float(radius))
     geom.CreateHeightAttr(float(length))
     geom.CreateAxisAttr(axis)
-    _pose(geom.GetPrim(), position, quat)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat), **finish)
 
 
 def mesh(
@@ -227,12 +231,9 @@ def mesh(
     quat: Vec = IDENTITY,
     *,
     uv: np.ndarray | Sequence[Vec] | None = None,
-    collide: bool = False,
-    visual: bool = True,
     look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
 ) -> Usd.Prim:
-    """A triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
+    """A visual triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
     geom = UsdGeom.Mesh.Define(stage, path)
     faces = np.asarray(faces, dtype=np.int32)
     geom.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(points, dtype=np.float32)))
@@ -244,10 +245,7 @@ def mesh(
             "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
         )
         primvar.Set(Vt.Vec2fArray.FromNumpy(np.asarray(uv, dtype=np.float32)))
-    _pose(geom.GetPrim(), position, quat)
-    if collide:
-        UsdPhysics.MeshCollisionAPI.Apply(geom.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat), collide=False, look=look)
 
 
 def quad(

@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.g1.links import LINKS, PALM_OFFSET, Link
-from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Bar, Loft, Rod, grid, merge
+from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Block, Loft, Rod, grid, merge
 
 __all__ = ["PATH", "build", "fuse", "zero_poses"]
 
@@ -229,7 +229,7 @@ def _attribute(prim: Usd.Prim, name: str, value: object, kind: Sdf.ValueTypeName
     prim.CreateAttribute(name, kind, False).Set(value)
 
 
-def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Bar | Rod], looks: dict[str, Usd.Prim]) -> None:
+def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Block | Rod], looks: dict[str, Usd.Prim]) -> None:
     for k, shape in enumerate(shapes):
         path = f"{parent}/visual_{k}"
         if isinstance(shape, Rod):
