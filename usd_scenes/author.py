@@ -10,30 +10,6 @@ from typing import TypedDict, Unpack
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
-__all__ = [
-    "Vec",
-    "anchor",
-    "attribute",
-    "bind",
-    "bind_physics",
-    "box",
-    "camera",
-    "capsule",
-    "cylinder",
-    "distant_light",
-    "dome_light",
-    "fixture",
-    "marker",
-    "material",
-    "mesh",
-    "new_stage",
-    "physics_material",
-    "quad",
-    "rigid_body",
-    "sphere",
-    "xform",
-]
-
 Vec = Sequence[float] | np.ndarray
 """A vector or quaternion, of Python or NumPy numbers."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -90,11 +66,15 @@ def rigid_body(
     mass: float,
     inertia: Vec,
     com: Vec = (0, 0, 0),
-    principal: Vec = IDENTITY,
 ) -> Usd.Prim:
-    """A body with its mass [kg], diagonal inertia [kg·m²], centre of mass [m] and principal axes all authored."""
+    """A body whose principal axes are its own; mass [kg], diagonal inertia [kg·m²] and centre of mass [m] authored."""
     prim = xform(stage, path, position, quat)
     UsdPhysics.RigidBodyAPI.Apply(prim)
+    return massive(prim, mass, inertia, com)
+
+
+def massive(prim: Usd.Prim, mass: float, inertia: Vec, com: Vec, principal: Vec = IDENTITY) -> Usd.Prim:
+    """Author mass [kg], diagonal inertia [kg·m²], centre of mass [m] and principal axes."""
     api = UsdPhysics.MassAPI.Apply(prim)
     api.CreateMassAttr(float(mass))
     api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, com)))
@@ -107,6 +87,23 @@ def anchor(stage: Usd.Stage, path: str, body: str, position: Vec = (0, 0, 0), qu
     """A fixed joint from the world to `body`."""
     joint = UsdPhysics.FixedJoint.Define(stage, path)
     joint.CreateBody1Rel().SetTargets([body])
+    return _joint_frames(joint, position, quat)
+
+
+def hinge(
+    stage: Usd.Stage, path: str, parent: str, child: str, axis: str, limits: Vec, position: Vec, quat: Vec = IDENTITY
+) -> Usd.Prim:
+    """A revolute joint about an `axis` of the child's own frame, which is posed in the parent's; limits [deg]."""
+    joint = UsdPhysics.RevoluteJoint.Define(stage, path)
+    joint.CreateBody0Rel().SetTargets([parent])
+    joint.CreateBody1Rel().SetTargets([child])
+    joint.CreateAxisAttr(axis)
+    joint.CreateLowerLimitAttr(float(limits[0]))
+    joint.CreateUpperLimitAttr(float(limits[1]))
+    return _joint_frames(joint, position, quat)
+
+
+def _joint_frames(joint: UsdPhysics.Joint, position: Vec, quat: Vec) -> Usd.Prim:
     joint.CreateLocalPos0Attr(Gf.Vec3f(*map(float, position)))
     joint.CreateLocalRot0Attr(Gf.Quatf(*map(float, quat)))
     joint.CreateLocalPos1Attr(Gf.Vec3f(0, 0, 0))
@@ -190,7 +187,11 @@ def capsule(
     **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A capsule of `radius` [m] and cylinder `length` [m] (caps come on top) along local `axis`."""
-    return _round_bar(UsdGeom.Capsule.Define(stage, path), radius, length, position, quat, axis, finish)
+    geom = UsdGeom.Capsule.Define(stage, path)
+    geom.CreateRadiusAttr(float(radius))
+    geom.CreateHeightAttr(float(length))
+    geom.CreateAxisAttr(axis)
+    return _finish(_pose(geom.GetPrim(), position, quat), **finish)
 
 
 def cylinder(
@@ -204,18 +205,7 @@ def cylinder(
     **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A cylinder of `radius` [m] and `length` [m] along local `axis`."""
-    return _round_bar(UsdGeom.Cylinder.Define(stage, path), radius, length, position, quat, axis, finish)
-
-
-def _round_bar(
-    geom: UsdGeom.Capsule | UsdGeom.Cylinder,
-    radius: float,
-    length: float,
-    position: Vec,
-    quat: Vec,
-    axis: str,
-    finish: Finish,
-) -> Usd.Prim:
+    geom = UsdGeom.Cylinder.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
     geom.CreateHeightAttr(float(length))
     geom.CreateAxisAttr(axis)
@@ -241,9 +231,8 @@ def mesh(
     geom.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
     geom.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     if uv is not None:
-        primvar = UsdGeom.PrimvarsAPI(geom).CreatePrimvar(
-            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
-        )
+        kind = Sdf.ValueTypeNames.TexCoord2fArray
+        primvar = UsdGeom.PrimvarsAPI(geom).CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
         primvar.Set(Vt.Vec2fArray.FromNumpy(np.asarray(uv, dtype=np.float32)))
     return _finish(_pose(geom.GetPrim(), position, quat), collide=False, look=look)
 
@@ -313,23 +302,20 @@ def bind(prim: Usd.Prim, look: Usd.Prim) -> Usd.Prim:
     return prim
 
 
-def physics_material(
-    stage: Usd.Stage, path: str, *, static: float = 1.0, dynamic: float = 1.0, restitution: float = 0.0
-) -> Usd.Prim:
-    """A physics material (friction coefficients, restitution)."""
+def physics_material(stage: Usd.Stage, path: str, *, friction: float = 1.0, restitution: float = 0.0) -> Usd.Prim:
+    """A physics material; friction 1 is the original's scene-wide value."""
     prim = UsdShade.Material.Define(stage, path).GetPrim()
     api = UsdPhysics.MaterialAPI.Apply(prim)
-    api.CreateStaticFrictionAttr(float(static))
-    api.CreateDynamicFrictionAttr(float(dynamic))
+    api.CreateStaticFrictionAttr(friction)
+    api.CreateDynamicFrictionAttr(friction)
     api.CreateRestitutionAttr(float(restitution))
     return prim
 
 
 def bind_physics(prim: Usd.Prim, surface: Usd.Prim) -> Usd.Prim:
     """Bind a physics material to a collision geom."""
-    UsdShade.MaterialBindingAPI.Apply(prim).Bind(
-        UsdShade.Material(surface), UsdShade.Tokens.weakerThanDescendants, "physics"
-    )
+    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(UsdShade.Material(surface), UsdShade.Tokens.weakerThanDescendants, "physics")
     return prim
 
 

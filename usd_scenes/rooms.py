@@ -8,6 +8,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.errors import InputError
+from arena_newton.tasks import TaskSpec
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
@@ -21,18 +22,23 @@ BENCH_TOP = 0.745
 """Upper surface of the benches [m] (measured in the original's clips; both desk scenes use the same bench)."""
 
 
-def task_stage(path: Path, *, spawn: Vec, facing: Vec, eye: Vec, gaze: Vec, variants: Sequence[str]) -> Usd.Stage:
-    """A scene layer with physics, the robot at `spawn` (quaternion `facing`), world camera, dome light and variants.
+def task_stage(folder: Path, task: TaskSpec, *, eye: Vec, gaze: Vec) -> Usd.Stage:
+    """The scene of a task with the looks `base` and `semantic`; see `scene_stage`."""
+    return scene_stage(folder, task.spawn_position, task.spawn_quat, eye=eye, gaze=gaze, variants=("base", "semantic"))
+
+
+def scene_stage(folder: Path, spawn: Vec, facing: Vec, *, eye: Vec, gaze: Vec, variants: Sequence[str]) -> Usd.Stage:
+    """A layer `scene.usda` with physics, robot, world camera, dome light and variants.
 
     Args:
-        path: The layer to write, `<scenes>/<task>/scene.usda`.
+        folder: Where it is written.
         spawn: Robot position [m].
         facing: Robot orientation, wxyz.
         eye: Position of the world camera [m].
         gaze: Orientation of the world camera, wxyz, looking along its −z.
         variants: Names of the variants of `semantics`; the first is selected.
     """
-    stage = author.new_stage(path)
+    stage = author.new_stage(folder / "scene.usda")
     robot = author.xform(stage, "/World/Robot", spawn, facing)
     robot.GetReferences().AddReference("../g1/g1.usda")
     # 1920×1080, focal 12, aperture 27: horizontal field of view 96.7° (the original's world camera).
@@ -126,7 +132,7 @@ def floor(stage: Usd.Stage, half: Vec, centre: Vec, *, tile: float) -> Usd.Prim:
 
     The original's scene-wide friction is 1.0 with the maximum of both sides taken, hence 1.0 here.
     """
-    surface = author.physics_material(stage, "/World/Looks/GroundSurface", static=1.0, dynamic=1.0)
+    surface = author.physics_material(stage, "/World/Looks/GroundSurface")
     plane = UsdGeom.Plane.Define(stage, "/World/Ground")
     plane.CreateAxisAttr("Z")
     plane.CreateVisibilityAttr(UsdGeom.Tokens.invisible)

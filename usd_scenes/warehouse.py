@@ -14,39 +14,19 @@ from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
 
-__all__ = [
-    "FLOOR_X",
-    "FLOOR_Y",
-    "boxes",
-    "room",
-    "room_looks",
-    "rounded_box",
-    "surface",
-]
+__all__ = ["FLOOR_X", "FLOOR_Y", "boxes", "room", "room_looks", "rounded_box"]
 
 FLOOR_X, FLOOR_Y = zip(*ROOM, strict=True)
 """Extent of the room along x and y [m]."""
 _HEIGHT = 3.3
 _SKIRTING = 0.09
 
-_FACES = (
-    # (normal axis, sign, u axis, v axis)
-    (0, 1, 1, 2),
-    (0, -1, 1, 2),
-    (1, 1, 0, 2),
-    (1, -1, 0, 2),
-    (2, 1, 0, 1),
-    (2, -1, 0, 1),
-)
+_FACES = [(axis, sign, u, v) for axis, u, v in ((0, 1, 2), (1, 0, 2), (2, 0, 1)) for sign in (1, -1)]
+"""Faces of a box: axis and sign of the normal, axes of the texture."""
 
 
 def boxes(
-    stage: Usd.Stage,
-    path: str,
-    parts: Iterable[tuple[Vec, Vec]],
-    *,
-    look: Usd.Prim | None = None,
-    tile: float = 1.0,
+    stage: Usd.Stage, path: str, parts: Iterable[tuple[Vec, Vec]], *, look: Usd.Prim | None = None, tile: float = 1.0
 ) -> Usd.Prim:
     """One visual mesh made of several axis-aligned boxes `(half sizes, centre)`; its texture repeats every `tile` m."""
     shell = Solids()
@@ -89,12 +69,8 @@ def rounded_box(
         outward = sign > 0 if axis != 1 else sign < 0
         for j in range(n - 1):
             for i in range(n - 1):
-                a, b, c, d = (
-                    first + j * n + i,
-                    first + j * n + i + 1,
-                    first + (j + 1) * n + i + 1,
-                    first + (j + 1) * n + i,
-                )
+                a = first + j * n + i
+                b, c, d = a + 1, a + n + 1, a + n
                 faces.extend([[a, b, c], [a, c, d]] if outward else [[a, c, b], [a, d, c]])
     return author.mesh(stage, path, np.round(points, 5), faces, position, uv=np.round(uv, 4), look=look)
 
@@ -107,11 +83,6 @@ def _plane(stage: Usd.Stage, path: str, position: Vec, quat: Vec, surface: Usd.P
     plane.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
     UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
     return author.bind_physics(plane.GetPrim(), surface)
-
-
-def surface(stage: Usd.Stage, name: str = "Rough", *, friction: float = 1.0) -> Usd.Prim:
-    """The scene's physics material; friction 1 is the original's scene-wide value."""
-    return author.physics_material(stage, f"/World/Looks/{name}", static=friction, dynamic=friction)
 
 
 def room_looks(
