@@ -24,20 +24,8 @@ from arena_newton import limits, probe
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
-__all__ = [
-    "IMAGES",
-    "LAYERS",
-    "PACKAGE",
-    "Location",
-    "Problem",
-    "Dependencies",
-    "check_files",
-    "layers",
-    "probe_layers",
-    "reason",
-    "search_context",
-    "collect",
-]
+__all__ = ["LAYERS", "PACKAGE", "Dependencies", "Problem", "check_files", "collect", "layers", "probe_layers", "reason"]
+__all__ += ["search_context"]
 
 LAYERS = (".usda", ".usd", ".usdc", ".usdz")
 """What a sublayer, reference or payload may be."""
@@ -116,7 +104,8 @@ def layers(path: str | Path) -> list[Path]:
         InputError: A file that the scene needs is missing, no regular file or unreadable, or a number is not finite.
     """
     found = collect(Path(path))
-    _raise_fatal(found)
+    if found.fatal:
+        raise InputError(str(found.problems[0]))
     return found.files
 
 
@@ -126,12 +115,7 @@ def check_files(path: str | Path) -> None:
     Raises:
         InputError: One line that names the file and its first fault.
     """
-    _raise_fatal(collect(Path(path)))
-
-
-def _raise_fatal(found: Dependencies) -> None:
-    if found.fatal:
-        raise InputError(str(found.problems[0]))
+    layers(path)
 
 
 def collect(path: Path) -> Dependencies:
@@ -409,9 +393,8 @@ def _contents(layer: Sdf.Layer) -> tuple[Contents, list[tuple[str, str]]]:
             if where.count("/") > limits.NESTING:
                 deep[:] = [path]
             for arcs in (spec.referenceList, spec.payloadList):
-                contents.arcs += [
-                    Arc(where, item.assetPath, str(item.primPath)) for item in arcs.GetAddedOrExplicitItems()
-                ]
+                found = arcs.GetAddedOrExplicitItems()
+                contents.arcs += [Arc(where, item.assetPath, str(item.primPath)) for item in found]
             for paths in (spec.inheritPathList, spec.specializesList):
                 for target in paths.GetAddedOrExplicitItems():
                     contents.arcs.append(Arc(where, "", str(target), of_class=True))
@@ -468,7 +451,6 @@ def _not_finite(value: object) -> float | None:
 
 
 def _assets_in(value: object) -> Iterator[str]:
-
     if isinstance(value, Sdf.AssetPath):
         yield value.path
     elif isinstance(value, Sdf.AssetPathArray):

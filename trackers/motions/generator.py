@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -90,12 +90,7 @@ class ReferenceGenerator:
     """References for a batch of worlds, one tick at a time."""
 
     def __init__(self, worlds: int, device: torch.device | str = "cpu"):
-        """Stands in the robot's default pose at the origin.
-
-        Args:
-            worlds: Number of worlds.
-            device: Torch device.
-        """
+        """Stands in the robot's default pose at the origin."""
         self.worlds, self.device = worlds, torch.device(device)
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())
@@ -424,8 +419,9 @@ class ReferenceGenerator:
             dims = (slice(None), *([None] * (xy.ndim - 2)))
             return centre[dims] + rotate_xy(turn[dims], xy - centre[dims])
 
-        self._move_odometry(about)
-        s = self._s
+        found = {name: getattr(s, name) for name in ("body", "feet", "lift_off", "landing", "previous_root")}
+        moves = {name: torch.cat([about(v[..., :2]), v[..., 2:]], dim=-1) for name, v in found.items()}
+        s = self._s = dataclasses.replace(s, **moves)
         for name in ("body", "lift_off", "landing"):
             value = getattr(s, name)
             setattr(s, name, torch.cat([value[:, :2], value[:, 2:] + turn[:, None]], dim=1))
@@ -434,20 +430,3 @@ class ReferenceGenerator:
         s.euler = torch.cat([s.euler[:, :1] + turn[:, None], s.euler[:, 1:]], dim=1)
         self._com[:, :2] = about(self._com[:, :2])
         self._publish()
-
-    def rebase(self, xy: Tensor) -> None:
-        """Moves the odometry so that the pelvis is at `xy` [m], shape [worlds, 2]; displacements stay."""
-        by = xy.to(self.device) - self._s.root[:, :2]
-        self._move_odometry(lambda old: old + by.reshape(-1, *([1] * (old.ndim - 2)), 2))
-        self._s.root = torch.cat([self._s.root[:, :2] + by, self._s.root[:, 2:]], dim=1)
-        self._pelvis += by
-        self._com[:, :2] += by
-        self._publish()
-
-    def _move_odometry(self, moved: Callable[[Tensor], Tensor]) -> None:
-        """Maps the planar positions of the state except the pelvis', shape [worlds, ..., 2]."""
-        s = self._s
-        names = ("body", "feet", "lift_off", "landing", "previous_root")
-        found = {name: getattr(s, name) for name in names}
-        moves = {name: torch.cat([moved(v[..., :2]), v[..., 2:]], dim=-1) for name, v in found.items()}
-        self._s = dataclasses.replace(s, **moves)

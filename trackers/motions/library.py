@@ -24,15 +24,7 @@ from arena_newton.trackers.motions.frames import frame_mimic
 from arena_newton.trackers.motions.load import Clip, resample
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = [
-    "FORMAT",
-    "MIRROR_JOINTS",
-    "MIRROR_SIGNS",
-    "SUPPORTS",
-    "FIXTURES",
-    "DeviceLibrary",
-    "MotionLibrary",
-]
+__all__ = ["FIXTURES", "FORMAT", "MIRROR_JOINTS", "MIRROR_SIGNS", "SUPPORTS", "DeviceLibrary", "MotionLibrary"]
 
 FORMAT = "arena-newton-motions-1"
 """What the array `format` of a library file holds."""
@@ -170,10 +162,6 @@ class MotionLibrary:
         """Length of each clip [s], shape [clips]."""
         return (self.clip_length - 1) * TICK
 
-    def __len__(self) -> int:
-        """Number of clips."""
-        return self.clips
-
     def rows(self, clip: int) -> slice:
         """The frames of a clip."""
         start = int(self.clip_start[clip])
@@ -225,10 +213,9 @@ class MotionLibrary:
         even = [resample(clip, FPS) for clip in clips]
         kinds = list(dict.fromkeys(families))
         lengths = np.array([len(clip.root_pos) for clip in even], dtype=np.int64)
+        poses = ("root_pos", "root_quat", "joint_pos")
         return cls(
-            root_pos=np.concatenate([clip.root_pos for clip in even]),
-            root_quat=np.concatenate([clip.root_quat for clip in even]),
-            joint_pos=np.concatenate([clip.joint_pos for clip in even]),
+            **{name: np.concatenate([getattr(clip, name) for clip in even]) for name in poses},
             hands=np.concatenate([_hands(clip) for clip in even]),
             clip_start=np.cumsum(lengths) - lengths,
             clip_length=lengths,
@@ -242,17 +229,8 @@ class MotionLibrary:
         )
 
     @classmethod
-    def from_random(
-        cls, generated: Mapping[str, Any], *, licence: str = "Apache-2.0", source: str = "generated"
-    ) -> MotionLibrary:
-        """Make a library of what `programs.random_clips` returns.
-
-        Args:
-            generated: Arrays or tensors root_pos [clips, ticks, 3], root_quat, joint_pos, hands, family [clips],
-                family_names, support_kind [clips], support_box [clips, 7].
-            licence: Licence of the clips.
-            source: Origin of the clips.
-        """
+    def from_random(cls, generated: Mapping[str, Any], *, source: str = "generated") -> MotionLibrary:
+        """Make a library of what `programs.random_clips` returns, whose origin is `source`."""
         arrays = {name: _host(generated[name]) for name in (*_PER_FRAME, "family", "support_kind", "support_box")}
         clips, ticks = arrays["root_pos"].shape[:2]
         names = np.array([str(name) for name in generated["family_names"]])
@@ -261,16 +239,13 @@ class MotionLibrary:
             of_kind = arrays["family"] == kind
             numbers[of_kind] = np.arange(of_kind.sum())
         return cls(
-            **{
-                name: arrays[name].reshape(clips * ticks, -1)
-                for name in ("root_pos", "root_quat", "joint_pos", "hands")
-            },
+            **{name: arrays[name].reshape(clips * ticks, -1) for name in _PER_FRAME},
             clip_start=np.arange(clips) * ticks,
             clip_length=np.full(clips, ticks),
             family=arrays["family"].astype(np.int64),
             family_names=names,
             clip_names=np.array([f"{names[k]}-{i:04d}" for k, i in zip(arrays["family"], numbers, strict=True)]),
-            licence=np.full(clips, licence),
+            licence=np.full(clips, "Apache-2.0"),
             source=np.full(clips, source),
             support_kind=arrays["support_kind"].astype(np.int64),
             support_box=arrays["support_box"],
@@ -375,14 +350,14 @@ class MotionLibrary:
 
 @dataclass(frozen=True, eq=False)
 class DeviceLibrary:
-    """A library's frames on a device. Velocities are backward differences, zero on a clip's first frame."""
+    """A library's frames on a device; fields without a text are those of `MotionLibrary`.
+
+    Velocities are backward differences, zero on a clip's first frame.
+    """
 
     root_pos: Tensor
-    """Root position [m], float32, shape [frames, 3]."""
     root_quat: Tensor
-    """Root orientation, wxyz, float32, shape [frames, 4]."""
     joint_pos: Tensor
-    """Joint positions [rad], MuJoCo order, float32, shape [frames, 29]."""
     joint_vel: Tensor
     """Joint velocities [rad/s], MuJoCo order, float32, shape [frames, 29]."""
     lin_vel: Tensor
@@ -392,23 +367,15 @@ class DeviceLibrary:
     mimic: Tensor
     """Mimic command (canonical.MIMIC), float32, shape [frames, 35]."""
     hands: Tensor
-    """Left and right hand, 1 closed, 0 open, float32, shape [frames, 2]."""
     frame_clip: Tensor
     """Clip of each frame, int64, shape [frames]."""
     clip_start: Tensor
-    """First frame of each clip, int64, shape [clips]."""
     clip_length: Tensor
-    """Frames of each clip, int64, shape [clips]."""
     family: Tensor
-    """Index into `family_names` of each clip, int64, shape [clips]."""
     support_kind: Tensor
-    """Index into `SUPPORTS` of each clip, int64, shape [clips]."""
     support_box: Tensor
-    """Support of each clip (`MotionLibrary.support_box`), float32, shape [clips, 7]."""
     family_names: tuple[str, ...]
-    """What kinds of motion there are."""
     clip_names: tuple[str, ...]
-    """Name of each clip."""
 
     @classmethod
     def build(cls, library: MotionLibrary, device: str | torch.device) -> DeviceLibrary:
@@ -432,15 +399,11 @@ class DeviceLibrary:
             lin_vel=((pos64 - pos64[previous]) / TICK).float(),
             ang_vel=(rotation_vector(turned) / TICK).float(),
             mimic=mimic.float(),
-            hands=up(library.hands),
             frame_clip=up(clip),
-            clip_start=up(library.clip_start),
-            clip_length=up(library.clip_length),
-            family=up(library.family),
-            support_kind=up(library.support_kind),
-            support_box=up(library.support_box),
-            family_names=tuple(str(name) for name in library.family_names),
-            clip_names=tuple(str(name) for name in library.clip_names),
+            family_names=tuple(map(str, library.family_names)),
+            clip_names=tuple(map(str, library.clip_names)),
+            **{name: up(getattr(library, name)) for name in ("hands", "clip_start", "clip_length", "family")},
+            **{name: up(getattr(library, name)) for name in ("support_kind", "support_box")},
         )
 
     @property
