@@ -180,10 +180,6 @@ class MotionCommand:
             packed.append(value.reshape(worlds, -1).to(self.height.dtype))
         return torch.cat(packed, dim=1)
 
-    def replace(self, **channels: Tensor) -> MotionCommand:
-        """The same command with other channels."""
-        return dataclasses.replace(self, **channels)
-
 
 def _read_channels(command: type[MotionCommand]) -> dict[str, Channel]:
     """Channels of a command by name, checked.

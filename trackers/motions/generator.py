@@ -137,7 +137,7 @@ class ReferenceGenerator:
 
     def _standing(self, root: Tensor, yaw: Tensor) -> GaitState:
         """The default pose at rest with the pelvis at x, y [m], shape [worlds, 2], and a heading [rad]."""
-        zero, no, none = self._zeros(), self._zeros(dtype=torch.bool), self._zeros(dtype=torch.int64)
+        zero = self._zeros()
         ankles = self._zeros(2, 2)
         ankles[:, :, 0] = self._stance.ankle
         ankles[:, :, 1] = 0.5 * self._stance.width * self._sides
@@ -152,21 +152,10 @@ class ReferenceGenerator:
             feet=feet,
             lift_off=feet[:, 0, [0, 1, 3]],
             landing=feet[:, 0, [0, 1, 3]],
-            stepping=no,
-            side=none,
-            phase=zero,
-            first=no,
-            final=no,
-            gait=self._zeros(2),
-            ground=zero,
-            floor=self._zeros(2),
-            lift_off_floor=zero,
-            base=self._zeros(2),
-            kick_side=none,
-            kick_pending=none,
-            kick_command=none,
-            kick_time=zero,
-            kick_weight=zero,
+            **dict.fromkeys(("stepping", "first", "final"), self._zeros(dtype=torch.bool)),
+            **dict.fromkeys(("side", "kick_side", "kick_pending", "kick_command"), self._zeros(dtype=torch.int64)),
+            **dict.fromkeys(("phase", "ground", "lift_off_floor", "kick_time", "kick_weight"), zero),
+            **dict.fromkeys(("gait", "floor", "base", "hands"), self._zeros(2)),
             kick_length=torch.ones_like(yaw),
             kick_swing=torch.ones_like(yaw),
             support=~self._zeros(2, dtype=torch.bool),
@@ -174,7 +163,6 @@ class ReferenceGenerator:
             root=pelvis,
             previous_root=pelvis,
             start_yaw=yaw,
-            hands=self._zeros(2),
         )
 
     def reset(self, mask: Tensor | None = None, *, root_xy: Tensor | None = None, yaw: Tensor | None = None) -> None:

@@ -15,7 +15,7 @@ from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = ["ClipMeasures", "grounded", "joint_limits", "measure_clips", "measures_summary", "measures_table"]
+__all__ = ["ClipMeasures", "grounded", "measure_clips", "measures_summary", "measures_table"]
 
 JUMP_SPEED = 4.0
 """Root speed [m/s] that no motion of the robot reaches within a tick."""
@@ -65,13 +65,6 @@ class ClipMeasures:
     """Its origin."""
 
 
-def joint_limits() -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper angles [rad] of the 29 joints, MuJoCo order."""
-    ranges = {link.hinge.name: link.hinge.limits for link in LINKS if link.hinge is not None}
-    low, high = np.array([ranges[name] for name in MUJOCO_JOINTS]).T
-    return low, high
-
-
 def _soles(library: MotionLibrary) -> np.ndarray:
     """Middles of both soles [m], shape [frames, 2, 3]."""
     feet = [kinematics.link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]
@@ -93,7 +86,8 @@ def _floor(soles: np.ndarray) -> float:
 
 def measure_clips(library: MotionLibrary) -> list[ClipMeasures]:
     """Measure every clip."""
-    low, high = joint_limits()
+    ranges = {link.hinge.name: link.hinge.limits for link in LINKS if link.hinge is not None}
+    low, high = np.array([ranges[name] for name in MUJOCO_JOINTS]).T
     soles = _soles(library)
     measures = []
     for clip in range(library.clips):

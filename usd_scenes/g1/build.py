@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
+from arena_newton.rotations import matrix_from_quat_np
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.g1.links import LINKS, PALM_OFFSET, Link
 from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Block, Loft, Rod, grid, merge
@@ -73,7 +74,7 @@ def zero_poses() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             poses[link.name] = (np.zeros(3), quat)
             continue
         position, parent = poses[link.parent]
-        poses[link.name] = (position + _matrix(parent) @ np.asarray(link.offset), _multiply(parent, quat))
+        poses[link.name] = (position + matrix_from_quat_np(parent) @ np.asarray(link.offset), _multiply(parent, quat))
     return poses
 
 
@@ -87,9 +88,9 @@ def fuse(links: Sequence[Link]) -> tuple[float, np.ndarray, np.ndarray, np.ndarr
     parts = []
     for link in links:
         position, quat = poses[link.name]
-        rotation = _matrix(base).T @ _matrix(quat)
-        axes = rotation @ _matrix(_unit(link.principal))
-        center = _matrix(base).T @ (position - origin) + rotation @ np.asarray(link.com)
+        rotation = matrix_from_quat_np(base).T @ matrix_from_quat_np(quat)
+        axes = rotation @ matrix_from_quat_np(_unit(link.principal))
+        center = matrix_from_quat_np(base).T @ (position - origin) + rotation @ np.asarray(link.com)
         parts.append((link.mass, center, axes @ np.diag(link.inertia) @ axes.T))
     mass = sum(m for m, _, _ in parts)
     center = sum(m * c for m, c, _ in parts) / mass
@@ -176,7 +177,7 @@ def _fixed(stage: Usd.Stage, fingers: Sequence[Link], poses: dict, looks: dict[s
             position, quat = poses[link.name]
             if not np.allclose(base, quat):
                 raise ValueError(f"{link.name}: the open hand's links are expected to be parallel to the wrist")
-            offset = _matrix(base).T @ (position - origin)
+            offset = matrix_from_quat_np(base).T @ (position - origin)
             parts += [(points + offset, normals, faces) for points, normals, faces in map(grid, HAND_SHAPES[link.name])]
             finger = link.name.removesuffix("_link").split("_", 2)[2]
             if finger in HAND_BOXES:
@@ -300,17 +301,6 @@ def _unit(quat: author.Vec) -> np.ndarray:
 def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
     return np.concatenate([[w], v])
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _z_to(direction: np.ndarray) -> np.ndarray:
