@@ -15,7 +15,7 @@ Vec = Sequence[float] | np.ndarray
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
-def new_stage(path: Path, default_prim: str = "/World", *, gravity: float = 9.81, scene: bool = True) -> Usd.Stage:
+def new_stage(path: Path, default_prim: str = "/World", *, scene: bool = True) -> Usd.Stage:
     """Start a layer at `path` with metres, kilograms and z up, and a physics scene under the default prim."""
     path.parent.mkdir(parents=True, exist_ok=True)
     layer = Sdf.Layer.FindOrOpen(str(path)) if path.exists() else None
@@ -30,7 +30,7 @@ def new_stage(path: Path, default_prim: str = "/World", *, gravity: float = 9.81
     if scene:
         physics = UsdPhysics.Scene.Define(stage, f"{default_prim}/physicsScene")
         physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
-        physics.CreateGravityMagnitudeAttr(gravity)
+        physics.CreateGravityMagnitudeAttr(9.81)
     return stage
 
 
@@ -83,11 +83,11 @@ def massive(prim: Usd.Prim, mass: float, inertia: Vec, com: Vec, principal: Vec 
     return prim
 
 
-def anchor(stage: Usd.Stage, path: str, body: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+def anchor(stage: Usd.Stage, path: str, body: str, position: Vec) -> Usd.Prim:
     """A fixed joint from the world to `body`."""
     joint = UsdPhysics.FixedJoint.Define(stage, path)
     joint.CreateBody1Rel().SetTargets([body])
-    return _joint_frames(joint, position, quat)
+    return _joint_frames(joint, position, IDENTITY)
 
 
 def hinge(
@@ -111,12 +111,12 @@ def _joint_frames(joint: UsdPhysics.Joint, position: Vec, quat: Vec) -> Usd.Prim
     return joint.GetPrim()
 
 
-def fixture(stage: Usd.Stage, path: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+def fixture(stage: Usd.Stage, path: str, position: Vec) -> Usd.Prim:
     """An immovable body posed once an episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
     root = xform(stage, path)
     UsdPhysics.ArticulationRootAPI.Apply(root)
-    frame = rigid_body(stage, f"{path}/Frame", position, quat, mass=1.0, inertia=(0.1, 0.1, 0.1))
-    anchor(stage, f"{path}/anchor", f"{path}/Frame", position, quat)
+    frame = rigid_body(stage, f"{path}/Frame", position, mass=1.0, inertia=(0.1, 0.1, 0.1))
+    anchor(stage, f"{path}/anchor", f"{path}/Frame", position)
     return frame
 
 
@@ -162,18 +162,11 @@ def box(
     return _finish(_pose(geom.GetPrim(), position, quat, half), **finish)
 
 
-def sphere(
-    stage: Usd.Stage,
-    path: str,
-    radius: float,
-    position: Vec = (0, 0, 0),
-    quat: Vec = IDENTITY,
-    **finish: Unpack[Finish],
-) -> Usd.Prim:
+def sphere(stage: Usd.Stage, path: str, radius: float, **finish: Unpack[Finish]) -> Usd.Prim:
     """A sphere of `radius` [m]."""
     geom = UsdGeom.Sphere.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
-    return _finish(_pose(geom.GetPrim(), position, quat), **finish)
+    return _finish(_pose(geom.GetPrim(), (0, 0, 0), IDENTITY), **finish)
 
 
 def capsule(
@@ -242,8 +235,7 @@ def quad(
     path: str,
     half_x: float,
     half_y: float,
-    position: Vec = (0, 0, 0),
-    quat: Vec = IDENTITY,
+    position: Vec,
     *,
     repeat: Vec = (1, 1),
     look: Usd.Prim | None = None,
@@ -251,12 +243,12 @@ def quad(
     """A visual rectangle in the local xy plane facing +z, its texture repeated `repeat` times."""
     points = [(-half_x, -half_y, 0), (half_x, -half_y, 0), (half_x, half_y, 0), (-half_x, half_y, 0)]
     uv = [(0, 0), (repeat[0], 0), (repeat[0], repeat[1]), (0, repeat[1])]
-    return mesh(stage, path, points, [(0, 1, 2), (0, 2, 3)], position, quat, uv=uv, look=look)
+    return mesh(stage, path, points, [(0, 1, 2), (0, 2, 3)], position, uv=uv, look=look)
 
 
-def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0)) -> Usd.Prim:
     """A named oriented box (full extents `size` [m]) that rules read; never drawn, never touched."""
-    prim = xform(stage, path, position, quat)
+    prim = xform(stage, path, position)
     attribute(prim, "arena:size", Gf.Vec3f(*map(float, size)), Sdf.ValueTypeNames.Float3)
     return prim
 
@@ -333,27 +325,9 @@ def camera(
     return prim
 
 
-def dome_light(
-    stage: Usd.Stage, path: str = "/World/Light", *, intensity: float = 3000.0, color: Vec = (0.75, 0.75, 0.75)
-) -> Usd.Prim:
-    """A uniform dome."""
-    light = UsdLux.DomeLight.Define(stage, path)
-    light.CreateIntensityAttr(float(intensity))
-    light.CreateColorAttr(Gf.Vec3f(*map(float, color)))
+def dome_light(stage: Usd.Stage) -> Usd.Prim:
+    """The uniform dome of every scene."""
+    light = UsdLux.DomeLight.Define(stage, "/World/Light")
+    light.CreateIntensityAttr(3000.0)
+    light.CreateColorAttr(Gf.Vec3f(0.75, 0.75, 0.75))
     return light.GetPrim()
-
-
-def distant_light(
-    stage: Usd.Stage,
-    path: str = "/World/Light",
-    *,
-    intensity: float = 5000.0,
-    color: Vec = (0.75, 0.75, 0.75),
-    quat: Vec = IDENTITY,
-) -> Usd.Prim:
-    """A distant light shining along its local −z."""
-    light = UsdLux.DistantLight.Define(stage, path)
-    light.CreateIntensityAttr(float(intensity))
-    light.CreateAngleAttr(15.0)
-    light.CreateColorAttr(Gf.Vec3f(*map(float, color)))
-    return _pose(light.GetPrim(), (-4, -1, 18), quat)

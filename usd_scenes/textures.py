@@ -20,12 +20,12 @@ def _rng(name: str) -> np.random.Generator:
     return np.random.default_rng(list(name.encode()))
 
 
-def _noise(rng: np.random.Generator, cells_y: int, cells_x: int, side: int = SIDE) -> np.ndarray:
-    """Smooth periodic value noise in [0, 1], shape [side, side]."""
+def _noise(rng: np.random.Generator, cells_y: int, cells_x: int) -> np.ndarray:
+    """Smooth periodic value noise in [0, 1], shape [SIDE, SIDE]."""
     lattice = rng.random((cells_y, cells_x))
 
     def axis(cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        at = np.arange(side) * cells / side
+        at = np.arange(SIDE) * cells / SIDE
         low = at.astype(int)
         t = at - low
         return low % cells, (low + 1) % cells, t * t * (3 - 2 * t)

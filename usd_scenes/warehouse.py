@@ -42,7 +42,6 @@ def rounded_box(
     position: Vec = (0, 0, 0),
     *,
     radius: float = 0.05,
-    steps: int = 2,
     look: Usd.Prim | None = None,
 ) -> Usd.Prim:
     """A visual box with rounded edges, for cushions; `half` sizes include the rounding."""
@@ -51,10 +50,9 @@ def rounded_box(
     inner = extent - radius
     points, faces, uv = [], [], []
     # Each face: corner fan, flat middle, corner fan.
-    angles = np.linspace(0.0, np.pi / 4, steps + 1)
+    angles = np.linspace(0.0, np.pi / 4, 3)
     ramp = np.concatenate([-np.tan(angles[::-1]), np.tan(angles)])
-    side = np.concatenate([-np.ones(steps + 1), np.ones(steps + 1)])
-    n = len(ramp)
+    side, n = np.repeat([-1.0, 1.0], 3), 6
     for axis, sign, u, v in _FACES:
         first = len(points)
         for j in range(n):
@@ -95,8 +93,9 @@ def room_looks(
     author.material(stage, "/World/Looks/Skirting", skirting)
 
 
-def room(stage: Usd.Stage, rough: Usd.Prim, *, tile: float = 2.0) -> None:
+def room(stage: Usd.Stage, rough: Usd.Prim) -> None:
     """Floor, walls, skirting line and wall sockets; floor and walls also stop bodies (planes)."""
+    tile = 2.0
     looks = {n: stage.GetPrimAtPath(f"/World/Looks/{n}") for n in ("Floor", "Wall", "Skirting")}
     (x0, x1), (y0, y1), h = FLOOR_X, FLOOR_Y, _HEIGHT
     cx, cy, lx, ly = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0

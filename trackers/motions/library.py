@@ -7,7 +7,7 @@ evaluation read: torch tensors with velocities and mimic commands for every fram
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -50,56 +50,43 @@ MIRROR_JOINTS: tuple[int, ...] = tuple(MUJOCO_JOINTS.index(_mirrored_joint(name)
 MIRROR_SIGNS: tuple[float, ...] = tuple(1.0 if _HINGE_AXIS[name] == "Y" else -1.0 for name in MUJOCO_JOINTS)
 """The mirror keeps rotations about the sideways axis and reverses those about the other two."""
 
-# Array → (type, shape after the first axis, what the first axis counts).
-_ARRAYS: dict[str, tuple[Any, tuple[int, ...], str]] = {
-    "root_pos": (np.float32, (3,), "frames"),
-    "root_quat": (np.float32, (4,), "frames"),
-    "joint_pos": (np.float32, (29,), "frames"),
-    "hands": (np.float32, (2,), "frames"),
-    "clip_start": (np.int64, (), "clips"),
-    "clip_length": (np.int64, (), "clips"),
-    "family": (np.int64, (), "clips"),
-    "clip_names": (np.str_, (), "clips"),
-    "licence": (np.str_, (), "clips"),
-    "source": (np.str_, (), "clips"),
-    "support_kind": (np.int64, (), "clips"),
-    "support_box": (np.float32, (7,), "clips"),
-    "family_names": (np.str_, (), "families"),
-}
-_PER_FRAME = tuple(name for name, (_, _, axis) in _ARRAYS.items() if axis == "frames")
+
+def _array(kind: Any, axis: str, *tail: int) -> Any:
+    """A field of `MotionLibrary` that is an array: its type, what its first axis counts, and the other axes."""
+    return field(metadata={"array": (kind, tail, axis)})
 
 
 @dataclass(frozen=True, eq=False)
 class MotionLibrary:
     """Clips at 50 Hz. Arrays are checked when the library is made."""
 
-    root_pos: np.ndarray
+    root_pos: np.ndarray = _array(np.float32, "frames", 3)
     """Root position [m], world of the clip, float32, shape [frames, 3]."""
-    root_quat: np.ndarray
+    root_quat: np.ndarray = _array(np.float32, "frames", 4)
     """Root orientation, wxyz, float32, shape [frames, 4]."""
-    joint_pos: np.ndarray
+    joint_pos: np.ndarray = _array(np.float32, "frames", 29)
     """Joint positions [rad], MuJoCo order, float32, shape [frames, 29]."""
-    hands: np.ndarray
+    hands: np.ndarray = _array(np.float32, "frames", 2)
     """Left and right hand, 1 closed, 0 open, float32, shape [frames, 2]."""
-    clip_start: np.ndarray
+    clip_start: np.ndarray = _array(np.int64, "clips")
     """First frame of each clip, int64, shape [clips]."""
-    clip_length: np.ndarray
+    clip_length: np.ndarray = _array(np.int64, "clips")
     """Frames of each clip, 2 or more, int64, shape [clips]."""
-    family: np.ndarray
+    family: np.ndarray = _array(np.int64, "clips")
     """Index into `family_names` of each clip, int64, shape [clips]."""
-    family_names: np.ndarray
-    """What kinds of motion there are, str, shape [families]."""
-    clip_names: np.ndarray
+    clip_names: np.ndarray = _array(np.str_, "clips")
     """Name of each clip, str, shape [clips]."""
-    licence: np.ndarray
+    licence: np.ndarray = _array(np.str_, "clips")
     """Licence of each clip, str, shape [clips]."""
-    source: np.ndarray
+    source: np.ndarray = _array(np.str_, "clips")
     """Where each clip is from, str, shape [clips]."""
-    support_kind: np.ndarray
+    support_kind: np.ndarray = _array(np.int64, "clips")
     """Index into `SUPPORTS` of what the clip stands or sits on in addition to the floor, int64, shape [clips]."""
-    support_box: np.ndarray
+    support_box: np.ndarray = _array(np.float32, "clips", 7)
     """That support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
     top above the floor [m]; float32, shape [clips, 7]."""
+    family_names: np.ndarray = _array(np.str_, "families")
+    """What kinds of motion there are, str, shape [families]."""
 
     def __post_init__(self) -> None:
         """Bring the arrays to their types.
@@ -346,6 +333,11 @@ class MotionLibrary:
     def to(self, device: str | torch.device = "cpu") -> DeviceLibrary:
         """The frames as tensors, with velocities and mimic commands."""
         return DeviceLibrary.build(self, device)
+
+
+# Array → type, shape after the first axis, what the first axis counts; in the order of the file.
+_ARRAYS: dict[str, tuple[Any, tuple[int, ...], str]] = {f.name: f.metadata["array"] for f in fields(MotionLibrary)}
+_PER_FRAME = tuple(name for name, (_, _, axis) in _ARRAYS.items() if axis == "frames")
 
 
 @dataclass(frozen=True, eq=False)

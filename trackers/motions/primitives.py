@@ -265,13 +265,11 @@ def crouch_reach(
     pitch: float = 0.35,
     down: float = 1.5,
     hold: float = 1.5,
-    arms: Sequence[float] = DEFAULT_ARMS,
 ) -> Script:
     """Squat, reach to a point of the pelvis' heading frame [m], return, and rise."""
     low = {"height": height, "pitch": pitch}
-    lower = script(Segment(down, {**low, "arms": arms}, ramp=True))
-    rising = script(Segment(down, {"arms": arms}, ramp=True), (0.5, {}))
-    return lower + reach(side, point, hold=hold, arms=arms).over(**low) + rising
+    lower, up = script(Segment(down, low, ramp=True)), script(Segment(down, {}, ramp=True), (0.5, {}))
+    return lower + reach(side, point, hold=hold).over(**low) + up
 
 
 def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
