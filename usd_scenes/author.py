@@ -112,7 +112,7 @@ def _joint_frames(joint: UsdPhysics.Joint, position: Vec, quat: Vec) -> Usd.Prim
 
 
 def fixture(stage: Usd.Stage, path: str, position: Vec) -> Usd.Prim:
-    """An immovable body posed once an episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
+    """An immovable body posed once per episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
     root = xform(stage, path)
     UsdPhysics.ArticulationRootAPI.Apply(root)
     frame = rigid_body(stage, f"{path}/Frame", position, mass=1.0, inertia=(0.1, 0.1, 0.1))
@@ -314,7 +314,7 @@ def bind_physics(prim: Usd.Prim, surface: Usd.Prim) -> Usd.Prim:
 def camera(
     stage: Usd.Stage, path: str, position: Vec, quat: Vec, *, focal: float, aperture: float, size: Vec = (640, 480)
 ) -> Usd.Prim:
-    """A pinhole camera looking along local −z with +y up; `focal` and horizontal `aperture` share a unit."""
+    """A pinhole camera looking along local −z with +y up; `focal` and horizontal `aperture` have one unit."""
     cam = UsdGeom.Camera.Define(stage, path)
     cam.CreateFocalLengthAttr(float(focal))
     cam.CreateHorizontalApertureAttr(float(aperture))

@@ -32,7 +32,7 @@ LAYERS = (".usda", ".usd", ".usdc", ".usdz")
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """What an asset attribute (a texture) may name; Newton reads textures with Pillow."""
 PACKAGE = "arena_newton/usd_scenes/"
-"""What an asset path begins with that names a scene of this package, wherever the naming file lies."""
+"""What an asset path begins with that names a scene of this package, wherever the naming file is stored."""
 _ROOT = Path(arena_newton.__file__).resolve().parent.parent
 """Folder in which `PACKAGE` is searched: the checkout, or an installation's `site-packages`."""
 _CRATE = b"PXR-USDC"
@@ -246,7 +246,7 @@ def _probe(locations: list[Location]) -> None:
 
 
 def probe_layers(paths: Sequence[Path]) -> None:
-    """Open many binary layers in one process of their own at once; a search through each then asks no more."""
+    """Try many binary layers in one process of their own; `collect` then reuses what it found."""
     _probe([Location(Path(os.path.abspath(path))) for path in paths])
 
 
@@ -433,7 +433,7 @@ def _names_file(spec: Sdf.AttributeSpec) -> bool:
 
 
 def _not_finite(value: object) -> float | None:
-    """The first component that is no finite single-precision number; `None` if all are, or it is not about numbers."""
+    """The first component that is not a finite single-precision number; None if all are or there is none."""
     if isinstance(value, Gf.Quatf | Gf.Quatd | Gf.Quath):
         value = (value.real, *value.imaginary)
     elif isinstance(value, Sdf.TimeCode):
@@ -458,7 +458,7 @@ def _assets_in(value: object) -> Iterator[str]:
 
 
 def _units(layer: Sdf.Layer, shown: str) -> Iterator[Problem]:
-    """A layer that is built on must not speak other units: USD does not convert them."""
+    """A layer that is built on must not have other units: USD does not convert them."""
     info = layer.pseudoRoot
     for key, wanted in (("metersPerUnit", 1.0), ("upAxis", "Z"), ("kilogramsPerUnit", 1.0)):
         if info.HasInfo(key) and info.GetInfo(key) != wanted:
@@ -470,7 +470,7 @@ def reason(error: Exception) -> str:
     try:
         text = str(error)
     except UnicodeDecodeError as bytes_error:
-        # The complaint quotes the file, which is no UTF-8.
+        # The complaint quotes the file, which is not UTF-8.
         text = bytes_error.object.decode("utf-8", "backslashreplace")
     inner = _ERROR_AT.search(text)
     text = _RULE.sub("not understood: ", inner.group(1) if inner else text)

@@ -27,7 +27,7 @@ _SKIPPED = ("arena:resolution",)
 _TARGETS = ("physics:", "collection:colliders:")
 """Relationships of these namespaces count as well; those of a joint's bodies are reported under their short names."""
 _FIRST = ("scene:", "gravity:", "collisions:")
-"""Beginnings of the sentences that come first, since they concern everything."""
+"""Sentences that begin so come first, since they concern everything."""
 _CLOSE = 1e-6
 """Relative difference of numbers that are the same."""
 
@@ -54,7 +54,7 @@ def differences(path: str | Path, task: str) -> list[str]:
         task: The task that it is a variant of.
 
     Returns:
-        One sentence a change, such as `gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81`.
+        One sentence per change, such as `gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81`.
 
     Raises:
         InputError: The layer cannot be composed or built, or there is no such task.

@@ -46,7 +46,7 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
         The path of the PNG.
 
     Raises:
-        InputError: Unknown mode, size, or a target that is no scene.
+        InputError: Unknown mode, size, or a target that is not a scene.
     """
     if mode != "all" and mode not in MODES:
         raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")

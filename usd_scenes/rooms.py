@@ -1,4 +1,4 @@
-"""What several scenes share: the stage with robot, camera and light, the floor, the workshop room and its benches."""
+"""Common to several scenes: stage with robot, camera and light, floor, workshop room and its benches."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -128,7 +128,7 @@ def contact(
 
 
 def floor(stage: Usd.Stage, half: Vec, centre: Vec, *, tile: float) -> Usd.Prim:
-    """The ground: an unseen collision plane at z = 0 and a textured rectangle on it; returns the rectangle.
+    """The ground: an invisible collision plane at z = 0 and a textured rectangle on it; returns the rectangle.
 
     The original's scene-wide friction is 1.0 with the maximum of both sides taken, hence 1.0 here.
     """
@@ -165,7 +165,7 @@ def workshop(
         "+y": (((x1 - x0) / 2, thick, top / 2), ((x0 + x1) / 2, y1 + thick, top / 2)),
     }
     author.xform(stage, "/World/Room")
-    # Seen only: no task comes within a metre of a wall, and every collider costs contact search.
+    # Visual only: no task comes within a metre of a wall, and every collider costs contact search.
     shell = Solids()
     for half, centre in walls.values():
         shell.box(half, centre, tile=1.6)
@@ -175,7 +175,7 @@ def workshop(
         axis = 1 if wall[1] == "x" else 0
         plane, inward = {"-x": (x0, 1), "+x": (x1, -1), "-y": (y0, 1), "+y": (y1, -1)}[wall]
 
-        def place(
+        def at_wall(
             along: float, height: float, out: float, axis: int = axis, plane: float = plane, inward: int = inward
         ) -> np.ndarray:
             off = plane + inward * out
@@ -187,10 +187,10 @@ def workshop(
         head = 3.3
         middle, half_height = (head + sill) / 2, (head - sill) / 2
         for along in (at - width / 2, at, at + width / 2):
-            frames.box(bar(0.04, half_height, 0.05), place(along, middle, 0.05))
+            frames.box(bar(0.04, half_height, 0.05), at_wall(along, middle, 0.05))
         for height in (sill, sill + (head - sill) * 0.36, head):
-            frames.box(bar(width / 2 + 0.04, 0.04, 0.05), place(at, height, 0.05))
-        panes.box(bar(width / 2, half_height, 0.01), place(at, middle, 0.02))
+            frames.box(bar(width / 2 + 0.04, 0.04, 0.05), at_wall(at, height, 0.05))
+        panes.box(bar(width / 2, half_height, 0.01), at_wall(at, middle, 0.02))
     black = author.material(stage, "/World/Looks/black", (0.01, 0.01, 0.01))
     frames.write(stage, "/World/Room/WindowFrames", look=black)
     panes.write(stage, "/World/Room/Panes")
@@ -230,7 +230,7 @@ def bench(stage: Usd.Stage, path: str, low: Vec, high: Vec, *, solref: Vec | Non
             look=black,
         )
     author.box(stage, f"{path}/Shelf", (hx - 0.04, hy - 0.05, 0.015), (0, 0, 0.18), look=black)
-    # Apron under the top and back panel: seen, not touched (the top's edge is what a hand meets).
+    # Apron under the top and back panel: visual only (the top's edge is what a hand meets).
     trim = Solids()
     for sy in (-1, 1):
         trim.box((hx - 0.04, 0.012, 0.05), (0, sy * (hy - 0.05), BENCH_TOP - top - 0.05))

@@ -1,4 +1,4 @@
-"""Faults of a composed scene's geometry: what would crash or exhaust the importer, and what is no geometry at all."""
+"""Faults of a composed scene's geometry: what would crash or exhaust the importer, and what is not geometry at all."""
 
 import itertools
 import math
@@ -25,7 +25,7 @@ _LENGTHS = {
     "Plane": ("width", "length"),
 }
 _FLAT = 1e-5
-"""A collision mesh is flat if it is thinner than this part of its length; its hull has no inside."""
+"""A collision mesh is flat if it is thinner than this fraction of its length; its hull has no inside."""
 _ROUNDING = 1e-3
 """Relative error of a stored inertia."""
 _MASSES = (1e-5, 1e4)
@@ -35,7 +35,7 @@ _GRAVITY = 100.0
 
 
 def open_stage(path: str | Path, *, checked: bool = True) -> Usd.Stage:
-    """Open a stage of the project or a foreign one.
+    """Open a stage, the project's or a user's.
 
     Args:
         path: A USD layer.
@@ -187,7 +187,7 @@ def shape_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
 def _size_fault(prim: Usd.Prim) -> str | None:
     for name in _LENGTHS.get(prim.GetTypeName(), ()):
         value = prim.GetAttribute(name).Get()
-        # A plane of width 0 has no end.
+        # A plane of width 0 is infinite.
         least = 0.0 if prim.GetTypeName() == "Plane" else math.ulp(0.0)
         if value is None or not least <= value <= 2 * limits.FARTHEST:
             return f"{name} is {value}: expected more than 0 and at most {2 * limits.FARTHEST:g} m"

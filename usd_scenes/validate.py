@@ -48,7 +48,7 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
         task: Task name; by default the task whose folder the layer, or a layer it builds on, is stored in.
 
     Raises:
-        InputError: `task` is no task.
+        InputError: `task` is not a task.
     """
     if task is not None and task not in tasks.names():
         raise InputError(f"unknown task {task!r}; tasks are {', '.join(tasks.names())}")

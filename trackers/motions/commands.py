@@ -1,7 +1,7 @@
 """Commands of a reference generator: a set of channels, each with a neutral value, for a batch of worlds.
 
 Channels may jump and may be combined freely; the generator limits their rates. A field of `MotionCommand` is one
-channel, and the only place that names its width, neutral value, range and rate: columns, checks and limits follow.
+channel, and the only one that names its width, neutral value, range and rate: columns, checks and limits follow.
 """
 
 from __future__ import annotations

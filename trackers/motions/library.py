@@ -94,9 +94,7 @@ class MotionLibrary:
         Raises:
             InputError: An array is of the wrong shape, not finite, or contradicts another.
         """
-        self._coerce("motion library")
-
-    def _coerce(self, where: str) -> None:
+        where = "motion library"
         count: dict[str, int] = {}
         for name, (kind, tail, axis) in _ARRAYS.items():
             array = np.asarray(getattr(self, name))

@@ -117,7 +117,7 @@ def _admitted() -> dict[tuple[str, str], Any]:
 
 
 class _JoblibArray:
-    """Stands for joblib's `NumpyArrayWrapper`, which says what array follows in the file."""
+    """Replaces joblib's `NumpyArrayWrapper`, which says what array follows in the file."""
 
     shape: Any
     dtype: Any

@@ -171,7 +171,7 @@ def _limits(m: ClipMeasures) -> str:
     )
 
 
-# Title, alignment, text of a clip.
+# Title, alignment, and the text for one clip.
 _COLUMNS: tuple[tuple[str, Callable[[str, int], str], Callable[[ClipMeasures], str]], ...] = (
     ("clip", str.ljust, lambda m: m.name),
     ("family", str.ljust, lambda m: m.family),

@@ -510,7 +510,7 @@ def random_clips(
     A family draws scripts of primitives, joined until the clip is full, as the docstring of its maker (`_stand` to
     `_platform`) says; on about half the clips every segment has random arms, waist and hands.
 
-    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support in the way of a foot is drawn
+    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support in the path of a foot is drawn
     again.
 
     Args:

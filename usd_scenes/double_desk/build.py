@@ -42,7 +42,7 @@ def hammer_inertia() -> tuple[np.ndarray, np.ndarray]:
 
 
 def hammer(stage: Usd.Stage) -> None:
-    """The hammer: origin in the middle of the handle, handle along y, head at +y; lies along world x by default."""
+    """The hammer: origin in the middle of the handle, handle along y, head at +y; along world x by default."""
     com, inertia = hammer_inertia()
     author.rigid_body(
         stage,

@@ -26,7 +26,7 @@ NET_SPACING, CORD = 0.13, 0.02
 
 
 def ball(stage: Usd.Stage, path: str, position: author.Vec, radius: float, mass: float, look: Usd.Prim) -> Usd.Prim:
-    """A rolling ball: unseen sphere that touches, textured sphere that is seen.
+    """A rolling ball: invisible collision sphere, textured visual sphere.
 
     A solid sphere's inertia, as PhysX gives a sphere collider (a rolling ball then keeps 5/7 of a kick's peak speed).
     Contact: condim 3 and no damping, so rolling costs no speed; priority 1, so that the ball's own friction and
@@ -42,7 +42,7 @@ def ball(stage: Usd.Stage, path: str, position: author.Vec, radius: float, mass:
 
 
 def pitch(stage: Usd.Stage) -> None:
-    """Grass slab, centre circle, goal line, four grey backdrop walls (seen only) and the `Pitch` marker inside them."""
+    """Grass, centre circle, goal line, four grey backdrop walls (visual only) and the `Pitch` marker inside them."""
     white = author.material(stage, "/World/Looks/white", (0.85, 0.85, 0.85))
     grey = author.material(stage, "/World/Looks/grey", (0.35, 0.35, 0.35))
     grass = author.material(stage, "/World/Looks/grass", texture="../textures/grass.png")
@@ -60,7 +60,7 @@ def pitch(stage: Usd.Stage) -> None:
 
 
 def goal(stage: Usd.Stage) -> None:
-    """Posts and crossbar that touch, frame and net that are seen, and the `Volume` in which a goal counts."""
+    """Posts and crossbar for collision, frame and net for the eye, and the `Volume` in which a goal counts."""
     author.xform(stage, "/World/Goal")
     surface = author.physics_material(stage, "/World/Looks/GoalSurface", friction=0.5, restitution=0.1)
     half = (BAR + POST) / 2
