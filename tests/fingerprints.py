@@ -92,12 +92,10 @@ class Fingerprints:
 
     def families(self, clips: int) -> list[str]:
         """Flags for some clips of every family that the checkout's generator knows."""
-        found = "from arena_newton.trackers.motions.library import FAMILIES; print(*FAMILIES)"
+        found = "from arena_newton.trackers.motions.programs import FAMILIES; print(*FAMILIES)"
         environment = os.environ | {"PYTHONPATH": str(self.root)}
-        done = subprocess.run(
-            [sys.executable, "-c", found], cwd=self.work, env=environment, capture_output=True, text=True
-        )
-        return [flag for name in done.stdout.split() for flag in ("--family", f"{name}={clips}")]
+        names = subprocess.check_output([sys.executable, "-c", found], cwd=self.work, env=environment, text=True)
+        return [flag for name in names.split() for flag in ("--family", f"{name}={clips}")]
 
     def evaluations(self) -> Iterator[tuple[str, str]]:
         """Journals, tables and actions of `RUNS`."""

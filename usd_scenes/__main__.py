@@ -1,15 +1,17 @@
-"""`python -m arena_newton.usd_scenes {new,build,validate,list,preview}`."""
+"""`python -m arena_newton.usd_scenes {new,build,validate,list,preview}`.
+
+Argparse, not tyro: `--spawn`, `--no-spawn` and neither are three cases, for which tyro would ask `--spawn True`, and it
+draws its complaints as a box.
+"""
 
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-
-if TYPE_CHECKING:
-    from arena_newton.usd_scenes.dependencies import Problem
+from arena_newton.quiet import quiet_warp
 
 MODES = ("base", "semantic", "visual", "all")
 
@@ -21,14 +23,17 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
 
     new = commands.add_parser("new", help="write the skeleton of a variant of a task's scene")
+    new.set_defaults(run=_new)
     new.add_argument("task", metavar="TASK", help="the task")
     new.add_argument("file", type=Path, metavar="FILE", help="the .usda file to write, anywhere")
 
     build = commands.add_parser("build", help="write textures, robot and scenes from their authors")
+    build.set_defaults(run=_build)
     build.add_argument("names", nargs="*", metavar="NAME", help="textures, g1 or a task; all by default")
     build.add_argument("--out", type=Path, default=None, help="folder to build into (default: the project's own)")
 
     validate = commands.add_parser("validate", help="name everything wrong with scene or variant files")
+    validate.set_defaults(run=_validate)
     validate.add_argument("files", nargs="*", metavar="FILE", help="USD layers or task names; all scenes by default")
     validate.add_argument("--task", default=None, help="judge the files as this task's (default: from their folders)")
     validate.add_argument(
@@ -38,9 +43,10 @@ def _parser() -> argparse.ArgumentParser:
         help="reset an episode of each mode and name what starts inside something else (default: for files of yours)",
     )
 
-    commands.add_parser("list", help="tasks, their scene files and variants")
+    commands.add_parser("list", help="tasks, their scene files and variants").set_defaults(run=_list)
 
     preview = commands.add_parser("preview", help="render a contact sheet (world and ego camera)")
+    preview.set_defaults(run=_preview)
     preview.add_argument("targets", nargs="*", metavar="TARGET", help="task names or USD layers; all tasks by default")
     preview.add_argument("--out", type=Path, default=Path("preview.png"), help="PNG to write")
     preview.add_argument("--size", type=int, default=320, help="width of one picture [px]")
@@ -48,19 +54,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _build(args: argparse.Namespace) -> int:
+def _build(args: argparse.Namespace) -> None:
     from arena_newton.usd_scenes.build import FOLDER, build_all
 
-    for path in build_all(args.out or FOLDER, args.names):
-        print(path)
-    return 0
+    try:
+        paths = build_all(args.out or FOLDER, args.names)
+    except OSError as error:
+        raise InputError(f"--out {args.out or FOLDER}: cannot be written ({error.strerror})") from error
+    print(*paths, sep="\n")
 
 
-def _new(args: argparse.Namespace) -> int:
+def _new(args: argparse.Namespace) -> None:
     from arena_newton.usd_scenes.skeleton import write
 
     print(write(args.task, args.file))
-    return 0
 
 
 def _validate(args: argparse.Namespace) -> int:
@@ -80,7 +87,10 @@ def _validate(args: argparse.Namespace) -> int:
             if not own:
                 notes = [f"{path}: changed: {sentence}" for sentence in differences(path, task)]
             if args.spawn or (args.spawn is None and not own):
-                problems, known = _penetrations(path, task)
+                quiet_warp()
+                from arena_newton.usd_scenes.spawn import penetrations
+
+                problems, known = penetrations(path, task)
                 notes += [f"{problem} (in the task's own scene too)" for problem in known]
         wrong += len(problems)
         for line in (*problems, *notes):
@@ -90,15 +100,7 @@ def _validate(args: argparse.Namespace) -> int:
     return 2 if wrong else 0
 
 
-def _penetrations(path: Path, task: str) -> tuple[list["Problem"], list["Problem"]]:
-    from arena_newton.quiet import quiet_warp
-    from arena_newton.usd_scenes.spawn import penetrations
-
-    quiet_warp()
-    return penetrations(path, task)
-
-
-def _list(args: argparse.Namespace) -> int:
+def _list(args: argparse.Namespace) -> None:
     from arena_newton import tasks
 
     for name in tasks.names():
@@ -106,12 +108,10 @@ def _list(args: argparse.Namespace) -> int:
         variants = sorted(p.stem for p in (path.parent / "variants").glob("*.usda"))
         state = path if path.is_file() else "not built"
         print(f"{name:12} {', '.join(['base', *variants]):36} {state}")
-    return 0
 
 
-def _preview(args: argparse.Namespace) -> int:
-    if args.size < 16:
-        raise InputError(f"--size {args.size}: expected at least 16 pixels")
+def _preview(args: argparse.Namespace) -> None:
+    quiet_warp()
     from arena_newton import tasks
     from arena_newton.usd_scenes.dependencies import check_files
     from arena_newton.usd_scenes.preview import preview
@@ -120,22 +120,12 @@ def _preview(args: argparse.Namespace) -> int:
         if target not in tasks.names():
             check_files(target)
     print(preview(args.targets or list(tasks.names()), args.out, args.size, args.mode))
-    return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; 0 when all is well, 2 for bad input."""
+    """Run one command; 0 when all is well, 2 for bad input, 130 interrupted."""
     args = _parser().parse_args(argv)
-    commands = {"new": _new, "build": _build, "validate": _validate, "list": _list, "preview": _preview}
-    try:
-        if args.command == "preview":
-            from arena_newton.quiet import quiet_warp
-
-            quiet_warp()
-        return commands[args.command](args)
-    except (InputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return exit_code(lambda: args.run(args))
 
 
 if __name__ == "__main__":

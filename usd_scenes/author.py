@@ -5,40 +5,17 @@ Lengths [m], masses [kg], quaternions wxyz. Every function returns the prim it w
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
-
-__all__ = [
-    "Vec",
-    "anchor",
-    "attribute",
-    "bind",
-    "bind_physics",
-    "box",
-    "camera",
-    "capsule",
-    "cylinder",
-    "distant_light",
-    "dome_light",
-    "fixture",
-    "marker",
-    "material",
-    "mesh",
-    "new_stage",
-    "physics_material",
-    "quad",
-    "rigid_body",
-    "sphere",
-    "xform",
-]
 
 Vec = Sequence[float] | np.ndarray
 """A vector or quaternion, of Python or NumPy numbers."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
-def new_stage(path: Path, default_prim: str = "/World", *, gravity: float = 9.81, scene: bool = True) -> Usd.Stage:
+def new_stage(path: Path, default_prim: str = "/World", *, scene: bool = True) -> Usd.Stage:
     """Start a layer at `path` with metres, kilograms and z up, and a physics scene under the default prim."""
     path.parent.mkdir(parents=True, exist_ok=True)
     layer = Sdf.Layer.FindOrOpen(str(path)) if path.exists() else None
@@ -53,7 +30,7 @@ def new_stage(path: Path, default_prim: str = "/World", *, gravity: float = 9.81
     if scene:
         physics = UsdPhysics.Scene.Define(stage, f"{default_prim}/physicsScene")
         physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
-        physics.CreateGravityMagnitudeAttr(gravity)
+        physics.CreateGravityMagnitudeAttr(9.81)
     return stage
 
 
@@ -89,11 +66,15 @@ def rigid_body(
     mass: float,
     inertia: Vec,
     com: Vec = (0, 0, 0),
-    principal: Vec = IDENTITY,
 ) -> Usd.Prim:
-    """A body with its mass [kg], diagonal inertia [kg·m²], centre of mass [m] and principal axes all authored."""
+    """A body whose principal axes are its own; mass [kg], diagonal inertia [kg·m²] and centre of mass [m] authored."""
     prim = xform(stage, path, position, quat)
     UsdPhysics.RigidBodyAPI.Apply(prim)
+    return massive(prim, mass, inertia, com)
+
+
+def massive(prim: Usd.Prim, mass: float, inertia: Vec, com: Vec, principal: Vec = IDENTITY) -> Usd.Prim:
+    """Author mass [kg], diagonal inertia [kg·m²], centre of mass [m] and principal axes."""
     api = UsdPhysics.MassAPI.Apply(prim)
     api.CreateMassAttr(float(mass))
     api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, com)))
@@ -102,10 +83,27 @@ def rigid_body(
     return prim
 
 
-def anchor(stage: Usd.Stage, path: str, body: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+def anchor(stage: Usd.Stage, path: str, body: str, position: Vec) -> Usd.Prim:
     """A fixed joint from the world to `body`."""
     joint = UsdPhysics.FixedJoint.Define(stage, path)
     joint.CreateBody1Rel().SetTargets([body])
+    return _joint_frames(joint, position, IDENTITY)
+
+
+def hinge(
+    stage: Usd.Stage, path: str, parent: str, child: str, axis: str, limits: Vec, position: Vec, quat: Vec = IDENTITY
+) -> Usd.Prim:
+    """A revolute joint about an `axis` of the child's own frame, which is posed in the parent's; limits [deg]."""
+    joint = UsdPhysics.RevoluteJoint.Define(stage, path)
+    joint.CreateBody0Rel().SetTargets([parent])
+    joint.CreateBody1Rel().SetTargets([child])
+    joint.CreateAxisAttr(axis)
+    joint.CreateLowerLimitAttr(float(limits[0]))
+    joint.CreateUpperLimitAttr(float(limits[1]))
+    return _joint_frames(joint, position, quat)
+
+
+def _joint_frames(joint: UsdPhysics.Joint, position: Vec, quat: Vec) -> Usd.Prim:
     joint.CreateLocalPos0Attr(Gf.Vec3f(*map(float, position)))
     joint.CreateLocalRot0Attr(Gf.Quatf(*map(float, quat)))
     joint.CreateLocalPos1Attr(Gf.Vec3f(0, 0, 0))
@@ -113,16 +111,32 @@ def anchor(stage: Usd.Stage, path: str, body: str, position: Vec = (0, 0, 0), qu
     return joint.GetPrim()
 
 
-def fixture(stage: Usd.Stage, path: str, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
-    """An immovable body posed once an episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
+def fixture(stage: Usd.Stage, path: str, position: Vec) -> Usd.Prim:
+    """An immovable body posed once per episode: articulation root, `Frame` body and its anchor; returns `Frame`."""
     root = xform(stage, path)
     UsdPhysics.ArticulationRootAPI.Apply(root)
-    frame = rigid_body(stage, f"{path}/Frame", position, quat, mass=1.0, inertia=(0.1, 0.1, 0.1))
-    anchor(stage, f"{path}/anchor", f"{path}/Frame", position, quat)
+    frame = rigid_body(stage, f"{path}/Frame", position, mass=1.0, inertia=(0.1, 0.1, 0.1))
+    anchor(stage, f"{path}/anchor", f"{path}/Frame", position)
     return frame
 
 
-def _finish(prim: Usd.Prim, collide: bool, visual: bool, look: Usd.Prim | None, surface: Usd.Prim | None) -> Usd.Prim:
+class Finish(TypedDict, total=False):
+    """What a geom is to touch and to the eye; by default it collides, is drawn, and has no material."""
+
+    collide: bool
+    visual: bool
+    look: Usd.Prim
+    surface: Usd.Prim
+
+
+def _finish(
+    prim: Usd.Prim,
+    *,
+    collide: bool = True,
+    visual: bool = True,
+    look: Usd.Prim | None = None,
+    surface: Usd.Prim | None = None,
+) -> Usd.Prim:
     if collide:
         UsdPhysics.CollisionAPI.Apply(prim)
     if not visual:
@@ -140,36 +154,19 @@ def box(
     half: Vec,
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A box with half sizes `half` [m]."""
     geom = UsdGeom.Cube.Define(stage, path)
     geom.CreateSizeAttr(2.0)
-    _pose(geom.GetPrim(), position, quat, half)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat, half), **finish)
 
 
-def sphere(
-    stage: Usd.Stage,
-    path: str,
-    radius: float,
-    position: Vec = (0, 0, 0),
-    quat: Vec = IDENTITY,
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
-) -> Usd.Prim:
+def sphere(stage: Usd.Stage, path: str, radius: float, **finish: Unpack[Finish]) -> Usd.Prim:
     """A sphere of `radius` [m]."""
     geom = UsdGeom.Sphere.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
-    _pose(geom.GetPrim(), position, quat)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), (0, 0, 0), IDENTITY), **finish)
 
 
 def capsule(
@@ -180,19 +177,14 @@ def capsule(
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     axis: str = "Z",
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A capsule of `radius` [m] and cylinder `length` [m] (caps come on top) along local `axis`."""
     geom = UsdGeom.Capsule.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
     geom.CreateHeightAttr(float(length))
     geom.CreateAxisAttr(axis)
-    _pose(geom.GetPrim(), position, quat)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat), **finish)
 
 
 def cylinder(
@@ -203,19 +195,14 @@ def cylinder(
     position: Vec = (0, 0, 0),
     quat: Vec = IDENTITY,
     axis: str = "Z",
-    *,
-    collide: bool = True,
-    visual: bool = True,
-    look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
+    **finish: Unpack[Finish],
 ) -> Usd.Prim:
     """A cylinder of `radius` [m] and `length` [m] along local `axis`."""
     geom = UsdGeom.Cylinder.Define(stage, path)
     geom.CreateRadiusAttr(float(radius))
     geom.CreateHeightAttr(float(length))
     geom.CreateAxisAttr(axis)
-    _pose(geom.GetPrim(), position, quat)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat), **finish)
 
 
 def mesh(
@@ -227,12 +214,9 @@ def mesh(
     quat: Vec = IDENTITY,
     *,
     uv: np.ndarray | Sequence[Vec] | None = None,
-    collide: bool = False,
-    visual: bool = True,
     look: Usd.Prim | None = None,
-    surface: Usd.Prim | None = None,
 ) -> Usd.Prim:
-    """A triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
+    """A visual triangle mesh; `points` [n,3] m, `faces` [m,3], `uv` [n,2] per vertex."""
     geom = UsdGeom.Mesh.Define(stage, path)
     faces = np.asarray(faces, dtype=np.int32)
     geom.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(points, dtype=np.float32)))
@@ -240,14 +224,10 @@ def mesh(
     geom.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
     geom.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     if uv is not None:
-        primvar = UsdGeom.PrimvarsAPI(geom).CreatePrimvar(
-            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
-        )
+        kind = Sdf.ValueTypeNames.TexCoord2fArray
+        primvar = UsdGeom.PrimvarsAPI(geom).CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
         primvar.Set(Vt.Vec2fArray.FromNumpy(np.asarray(uv, dtype=np.float32)))
-    _pose(geom.GetPrim(), position, quat)
-    if collide:
-        UsdPhysics.MeshCollisionAPI.Apply(geom.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
-    return _finish(geom.GetPrim(), collide, visual, look, surface)
+    return _finish(_pose(geom.GetPrim(), position, quat), collide=False, look=look)
 
 
 def quad(
@@ -255,8 +235,7 @@ def quad(
     path: str,
     half_x: float,
     half_y: float,
-    position: Vec = (0, 0, 0),
-    quat: Vec = IDENTITY,
+    position: Vec,
     *,
     repeat: Vec = (1, 1),
     look: Usd.Prim | None = None,
@@ -264,12 +243,12 @@ def quad(
     """A visual rectangle in the local xy plane facing +z, its texture repeated `repeat` times."""
     points = [(-half_x, -half_y, 0), (half_x, -half_y, 0), (half_x, half_y, 0), (-half_x, half_y, 0)]
     uv = [(0, 0), (repeat[0], 0), (repeat[0], repeat[1]), (0, repeat[1])]
-    return mesh(stage, path, points, [(0, 1, 2), (0, 2, 3)], position, quat, uv=uv, look=look)
+    return mesh(stage, path, points, [(0, 1, 2), (0, 2, 3)], position, uv=uv, look=look)
 
 
-def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0), quat: Vec = IDENTITY) -> Usd.Prim:
+def marker(stage: Usd.Stage, path: str, size: Vec, position: Vec = (0, 0, 0)) -> Usd.Prim:
     """A named oriented box (full extents `size` [m]) that rules read; never drawn, never touched."""
-    prim = xform(stage, path, position, quat)
+    prim = xform(stage, path, position)
     attribute(prim, "arena:size", Gf.Vec3f(*map(float, size)), Sdf.ValueTypeNames.Float3)
     return prim
 
@@ -315,30 +294,27 @@ def bind(prim: Usd.Prim, look: Usd.Prim) -> Usd.Prim:
     return prim
 
 
-def physics_material(
-    stage: Usd.Stage, path: str, *, static: float = 1.0, dynamic: float = 1.0, restitution: float = 0.0
-) -> Usd.Prim:
-    """A physics material (friction coefficients, restitution)."""
+def physics_material(stage: Usd.Stage, path: str, *, friction: float = 1.0, restitution: float = 0.0) -> Usd.Prim:
+    """A physics material; friction 1 is the original's scene-wide value."""
     prim = UsdShade.Material.Define(stage, path).GetPrim()
     api = UsdPhysics.MaterialAPI.Apply(prim)
-    api.CreateStaticFrictionAttr(float(static))
-    api.CreateDynamicFrictionAttr(float(dynamic))
+    api.CreateStaticFrictionAttr(friction)
+    api.CreateDynamicFrictionAttr(friction)
     api.CreateRestitutionAttr(float(restitution))
     return prim
 
 
 def bind_physics(prim: Usd.Prim, surface: Usd.Prim) -> Usd.Prim:
     """Bind a physics material to a collision geom."""
-    UsdShade.MaterialBindingAPI.Apply(prim).Bind(
-        UsdShade.Material(surface), UsdShade.Tokens.weakerThanDescendants, "physics"
-    )
+    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(UsdShade.Material(surface), UsdShade.Tokens.weakerThanDescendants, "physics")
     return prim
 
 
 def camera(
     stage: Usd.Stage, path: str, position: Vec, quat: Vec, *, focal: float, aperture: float, size: Vec = (640, 480)
 ) -> Usd.Prim:
-    """A pinhole camera looking along local −z with +y up; `focal` and horizontal `aperture` share a unit."""
+    """A pinhole camera looking along local −z with +y up; `focal` and horizontal `aperture` have one unit."""
     cam = UsdGeom.Camera.Define(stage, path)
     cam.CreateFocalLengthAttr(float(focal))
     cam.CreateHorizontalApertureAttr(float(aperture))
@@ -349,27 +325,9 @@ def camera(
     return prim
 
 
-def dome_light(
-    stage: Usd.Stage, path: str = "/World/Light", *, intensity: float = 3000.0, color: Vec = (0.75, 0.75, 0.75)
-) -> Usd.Prim:
-    """A uniform dome."""
-    light = UsdLux.DomeLight.Define(stage, path)
-    light.CreateIntensityAttr(float(intensity))
-    light.CreateColorAttr(Gf.Vec3f(*map(float, color)))
+def dome_light(stage: Usd.Stage) -> Usd.Prim:
+    """The uniform dome of every scene."""
+    light = UsdLux.DomeLight.Define(stage, "/World/Light")
+    light.CreateIntensityAttr(3000.0)
+    light.CreateColorAttr(Gf.Vec3f(0.75, 0.75, 0.75))
     return light.GetPrim()
-
-
-def distant_light(
-    stage: Usd.Stage,
-    path: str = "/World/Light",
-    *,
-    intensity: float = 5000.0,
-    color: Vec = (0.75, 0.75, 0.75),
-    quat: Vec = IDENTITY,
-) -> Usd.Prim:
-    """A distant light shining along its local −z."""
-    light = UsdLux.DistantLight.Define(stage, path)
-    light.CreateIntensityAttr(float(intensity))
-    light.CreateAngleAttr(15.0)
-    light.CreateColorAttr(Gf.Vec3f(*map(float, color)))
-    return _pose(light.GetPrim(), (-4, -1, 18), quat)

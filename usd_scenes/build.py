@@ -15,7 +15,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def parts() -> tuple[str, ...]:
-    """What can be built, in order; a task that brings its own layer is not among them."""
+    """What can be built, in order; without tasks that bring their own layer."""
     return ("textures", "g1", *(name for name in tasks.names() if tasks.get(name).scene is None), "lab")
 
 
@@ -25,7 +25,7 @@ def build_all(folder: Path = FOLDER, names: Sequence[str] = ()) -> list[Path]:
     Layers refer to each other by relative paths, so a build elsewhere must hold the robot and the textures too.
 
     Raises:
-        InputError: A name is no part.
+        InputError: A name is not a part.
     """
     for name in names:
         if name not in parts():

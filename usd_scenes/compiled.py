@@ -32,26 +32,9 @@ _CLOSE = 1e-4
 _MOST_OF_A_THING = 4
 """Sentences about the bodies, joints or colliders of one thing; more are summed up."""
 _OPTIONS = (
-    "wind",
-    "magnetic",
-    "density",
-    "viscosity",
-    "timestep",
-    "integrator",
-    "cone",
-    "jacobian",
-    "solver",
-    "iterations",
-    "ls_iterations",
-    "noslip_iterations",
-    "tolerance",
-    "impratio",
-    "disableactuator",
-    "o_margin",
-    "o_solref",
-    "o_solimp",
-    "o_friction",
-)
+    "wind magnetic density viscosity timestep integrator cone jacobian solver iterations ls_iterations "
+    "noslip_iterations tolerance impratio disableactuator o_margin o_solref o_solimp o_friction"
+).split()
 _BODY = {
     "mass": ("body_mass", ("physics:mass", "physics:density")),
     "inertia": ("body_inertia", ("physics:mass", "physics:density", "physics:diagonalInertia")),
@@ -60,18 +43,7 @@ _BODY = {
     "gravity compensation": ("body_gravcomp", ("gravcomp",)),
 }
 """Field of the model, and words by which a sentence already mentions it."""
-_SIZE = (
-    "radius",
-    "size",
-    "height",
-    "width",
-    "length",
-    "axis",
-    "points",
-    "faceVertexIndices",
-    "scaled",
-    "approximation",
-)
+_SIZE = tuple("radius size height width length axis points faceVertexIndices scaled approximation".split())
 _GEOM = {
     "type": ("geom_type", _SIZE),
     "size": ("geom_size", _SIZE),
@@ -165,11 +137,8 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
 
     quiet_warp()
     # The importer repeats its remarks when the scene is built to be run.
-    with (
-        warnings.catch_warnings(),
-        contextlib.redirect_stdout(io.StringIO()),
-        contextlib.redirect_stderr(io.StringIO()),
-    ):
+    dropped = io.StringIO()
+    with warnings.catch_warnings(), contextlib.redirect_stdout(dropped), contextlib.redirect_stderr(dropped):
         warnings.simplefilter("ignore")
         scene = load_scene(path, worlds=1, device="cpu", native=True, variant=variant)
     m = scene.mj_model
@@ -257,18 +226,16 @@ def _meets(scene: Scene) -> frozenset[tuple[str, str]]:
     if m.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
         pairs[:] = False
     excluded = {(int(row) >> 16, int(row) & 0xFFFF) for row in m.exclude_signature}
-    found = {
-        (min(a, b), max(a, b))
+    filtered = [
+        (i, j)
         for i, j in zip(*np.nonzero(np.triu(pairs, 1)), strict=True)
         if (body[i], body[j]) not in excluded and (body[j], body[i]) not in excluded
-        if (a := scene.geom_labels[i]) and (b := scene.geom_labels[j])
-    }
-    found |= {
+    ]
+    return frozenset(
         (min(a, b), max(a, b))
-        for i, j in zip(m.pair_geom1, m.pair_geom2, strict=True)
+        for i, j in (*filtered, *zip(m.pair_geom1, m.pair_geom2, strict=True))
         if (a := scene.geom_labels[i]) and (b := scene.geom_labels[j])
-    }
-    return frozenset(found)
+    )
 
 
 def compiled_changes(theirs: Compiled, ours: Compiled, reported: Reported, needed: Iterable[str] = ()) -> Iterator[str]:
@@ -376,9 +343,7 @@ def lost_contacts(theirs: Compiled, ours: Compiled, needed: Iterable[str]) -> It
             # A robot before what it meets, and the ground last.
             first, second = sorted((a, b), key=lambda name: (name in grounds, name != _ROBOT, name))
             before.setdefault((first, second), set()).add(pair)
-    for (a, b), pairs in sorted(
-        before.items(), key=lambda item: (item[0][0] != _ROBOT, item[0][1] not in grounds, item)
-    ):
+    for (a, b), pairs in sorted(before.items(), key=lambda kv: (kv[0][0] != _ROBOT, kv[0][1] not in grounds, kv)):
         gone = pairs - theirs.meets
         if gone == pairs:
             yield a, f"no longer meets {b}: expected collisions as in the task's scene"

@@ -36,7 +36,7 @@ class Contents:
     default_prim: str
     """Name of its default prim."""
     prims: list[str] = field(default_factory=list)
-    """Path of every prim that it says something about, of all variants."""
+    """Path of every prim that it has opinions about, of all variants."""
     arcs: list[Arc] = field(default_factory=list)
     """References, payloads, inherits and specializes."""
     sublayers: list[Arc] = field(default_factory=list)
@@ -50,7 +50,7 @@ class _TooMany(Exception):
 def count_prims(graph: Mapping[Key, Contents], start: Key) -> tuple[str, str] | None:
     """What is wrong with the number of prims, as (prim path, message); None if nothing is.
 
-    The count is at least that of the composed prims: a prim counts once for every layer that says something about it,
+    The count is at least that of the composed prims: a prim counts once for every layer with an opinion about it,
     and every variant counts.
 
     Args:

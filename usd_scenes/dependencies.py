@@ -24,27 +24,15 @@ from arena_newton import limits, probe
 from arena_newton.errors import InputError
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
-__all__ = [
-    "IMAGES",
-    "LAYERS",
-    "PACKAGE",
-    "Location",
-    "Problem",
-    "Dependencies",
-    "check_files",
-    "layers",
-    "probe_layers",
-    "reason",
-    "search_context",
-    "collect",
-]
+__all__ = ["LAYERS", "PACKAGE", "Dependencies", "Problem", "check_files", "collect", "layers", "probe_layers", "reason"]
+__all__ += ["search_context"]
 
 LAYERS = (".usda", ".usd", ".usdc", ".usdz")
 """What a sublayer, reference or payload may be."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """What an asset attribute (a texture) may name; Newton reads textures with Pillow."""
 PACKAGE = "arena_newton/usd_scenes/"
-"""What an asset path begins with that names a scene of this package, wherever the naming file lies."""
+"""What an asset path begins with that names a scene of this package, wherever the naming file is stored."""
 _ROOT = Path(arena_newton.__file__).resolve().parent.parent
 """Folder in which `PACKAGE` is searched: the checkout, or an installation's `site-packages`."""
 _CRATE = b"PXR-USDC"
@@ -116,7 +104,8 @@ def layers(path: str | Path) -> list[Path]:
         InputError: A file that the scene needs is missing, no regular file or unreadable, or a number is not finite.
     """
     found = collect(Path(path))
-    _raise_fatal(found)
+    if found.fatal:
+        raise InputError(str(found.problems[0]))
     return found.files
 
 
@@ -126,12 +115,7 @@ def check_files(path: str | Path) -> None:
     Raises:
         InputError: One line that names the file and its first fault.
     """
-    _raise_fatal(collect(Path(path)))
-
-
-def _raise_fatal(found: Dependencies) -> None:
-    if found.fatal:
-        raise InputError(str(found.problems[0]))
+    layers(path)
 
 
 def collect(path: Path) -> Dependencies:
@@ -262,7 +246,7 @@ def _probe(locations: list[Location]) -> None:
 
 
 def probe_layers(paths: Sequence[Path]) -> None:
-    """Open many binary layers in one process of their own at once; a search through each then asks no more."""
+    """Try many binary layers in one process of their own; `collect` then reuses what it found."""
     _probe([Location(Path(os.path.abspath(path))) for path in paths])
 
 
@@ -409,9 +393,8 @@ def _contents(layer: Sdf.Layer) -> tuple[Contents, list[tuple[str, str]]]:
             if where.count("/") > limits.NESTING:
                 deep[:] = [path]
             for arcs in (spec.referenceList, spec.payloadList):
-                contents.arcs += [
-                    Arc(where, item.assetPath, str(item.primPath)) for item in arcs.GetAddedOrExplicitItems()
-                ]
+                found = arcs.GetAddedOrExplicitItems()
+                contents.arcs += [Arc(where, item.assetPath, str(item.primPath)) for item in found]
             for paths in (spec.inheritPathList, spec.specializesList):
                 for target in paths.GetAddedOrExplicitItems():
                     contents.arcs.append(Arc(where, "", str(target), of_class=True))
@@ -450,7 +433,7 @@ def _names_file(spec: Sdf.AttributeSpec) -> bool:
 
 
 def _not_finite(value: object) -> float | None:
-    """The first component that is no finite single-precision number; `None` if all are, or it is not about numbers."""
+    """The first component that is not a finite single-precision number; None if all are or there is none."""
     if isinstance(value, Gf.Quatf | Gf.Quatd | Gf.Quath):
         value = (value.real, *value.imaginary)
     elif isinstance(value, Sdf.TimeCode):
@@ -468,7 +451,6 @@ def _not_finite(value: object) -> float | None:
 
 
 def _assets_in(value: object) -> Iterator[str]:
-
     if isinstance(value, Sdf.AssetPath):
         yield value.path
     elif isinstance(value, Sdf.AssetPathArray):
@@ -476,7 +458,7 @@ def _assets_in(value: object) -> Iterator[str]:
 
 
 def _units(layer: Sdf.Layer, shown: str) -> Iterator[Problem]:
-    """A layer that is built on must not speak other units: USD does not convert them."""
+    """A layer that is built on must not have other units: USD does not convert them."""
     info = layer.pseudoRoot
     for key, wanted in (("metersPerUnit", 1.0), ("upAxis", "Z"), ("kilogramsPerUnit", 1.0)):
         if info.HasInfo(key) and info.GetInfo(key) != wanted:
@@ -488,7 +470,7 @@ def reason(error: Exception) -> str:
     try:
         text = str(error)
     except UnicodeDecodeError as bytes_error:
-        # The complaint quotes the file, which is no UTF-8.
+        # The complaint quotes the file, which is not UTF-8.
         text = bytes_error.object.decode("utf-8", "backslashreplace")
     inner = _ERROR_AT.search(text)
     text = _RULE.sub("not understood: ", inner.group(1) if inner else text)

@@ -27,7 +27,7 @@ _SKIPPED = ("arena:resolution",)
 _TARGETS = ("physics:", "collection:colliders:")
 """Relationships of these namespaces count as well; those of a joint's bodies are reported under their short names."""
 _FIRST = ("scene:", "gravity:", "collisions:")
-"""Beginnings of the sentences that come first, since they concern everything."""
+"""Sentences that begin so come first, since they concern everything."""
 _CLOSE = 1e-6
 """Relative difference of numbers that are the same."""
 
@@ -54,7 +54,7 @@ def differences(path: str | Path, task: str) -> list[str]:
         task: The task that it is a variant of.
 
     Returns:
-        One sentence a change, such as `gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81`.
+        One sentence per change, such as `gravity: /World/physicsScene: physics:gravityMagnitude is 0, not 9.81`.
 
     Raises:
         InputError: The layer cannot be composed or built, or there is no such task.
@@ -118,7 +118,6 @@ def _selection(stage: Usd.Stage) -> str:
 
 
 def _select(stage: Usd.Stage, variant: str) -> None:
-
     world = stage.GetPrimAtPath("/World")
     if world and variant in world.GetVariantSet("semantics").GetVariantNames():
         with Usd.EditContext(stage, stage.GetSessionLayer()):
@@ -159,21 +158,15 @@ def _parts(stage: Usd.Stage) -> dict[str, _Part]:
         if joint:
             for name in ("body0", "body1"):
                 values[name] = [str(target) for target in prim.GetRelationship(f"physics:{name}").GetTargets()]
-        if prim.IsA(UsdPhysics.Scene):
-            kind = "gravity"
-        elif group:
-            kind = "collisions"
-        elif robot:
-            kind = "robot"
-        elif marker:
-            kind = "rule"
-        elif joint:
-            kind = "joint"
-        elif prim.HasAPI(UsdPhysics.MaterialAPI):
-            kind = "surface"
-        else:
-            kind = "object"
-        parts[path] = _Part(kind, values)
+        kinds = {
+            "gravity": prim.IsA(UsdPhysics.Scene),
+            "collisions": group,
+            "robot": robot,
+            "rule": marker,
+            "joint": joint,
+            "surface": prim.HasAPI(UsdPhysics.MaterialAPI),
+        }
+        parts[path] = _Part(next((kind for kind, fits in kinds.items() if fits), "object"), values)
     return parts
 
 
@@ -237,10 +230,9 @@ def _numbers(value: Any) -> np.ndarray | None:
     if value is None or isinstance(value, str | bool):
         return None
     try:
-        array = np.asarray(value, dtype=np.float64)
+        return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         return None
-    return array
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -46,23 +46,18 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
         The path of the PNG.
 
     Raises:
-        InputError: Unknown mode, size, or a target that is no scene.
+        InputError: Unknown mode, size, or a target that is not a scene.
     """
     if mode != "all" and mode not in MODES:
         raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
     if size < 16:
-        raise InputError(f"--size {size}: must be at least 16 px")
-    if not targets:
-        raise InputError("preview: name at least one task or scene file")
+        raise InputError(f"--size {size}: expected at least 16 pixels")
     height = round(size / _VIEWS[0][1])
-    rows = []
-    for target in targets:
-        for name in MODES if mode == "all" else (mode,):
-            rows.append((f"{target} | {name}", _views(target, height, name)))
+    modes = MODES if mode == "all" else (mode,)
+    rows = [(f"{target} | {name}", _views(target, height, name)) for target in targets for name in modes]
     widths = [round(height * aspect) for _, aspect in _VIEWS]
-    sheet = Image.new(
-        "RGB", (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows)), (24, 24, 24)
-    )
+    area = (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows))
+    sheet = Image.new("RGB", area, (24, 24, 24))
     text = ImageDraw.Draw(sheet)
     for row, (label, pictures) in enumerate(rows):
         y, x = row * (height + _LABEL + _GAP), _GAP
@@ -97,14 +92,9 @@ def _variant(target: str, mode: str) -> str:
     """The variant of `semantics` to load: the one that the scene selects by itself, unless asked for semantic."""
     if mode == "semantic":
         return "semantic"
-    return _selected(target) or "base"
-
-
-def _selected(target: str) -> str | None:
-    """The variant that a scene selects by itself; None without one."""
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
-    return (world.GetVariantSet("semantics").GetVariantSelection() or None) if world else None
+    return (world.GetVariantSet("semantics").GetVariantSelection() if world else "") or "base"
 
 
 def _settled(scene: Scene) -> newton.State:
@@ -114,8 +104,7 @@ def _settled(scene: Scene) -> newton.State:
     handles = scene.robot
     data.qpos[handles.joint_qpos] = g1.DEFAULT_POSE
     data.ctrl[handles.joint_ctrl] = g1.DEFAULT_POSE
-    links = set(handles.bodies)
-    own_q, own_v = _robot_coordinates(m, links)
+    own_q, own_v = _robot_coordinates(m, set(handles.bodies))
     spawn = data.qpos[own_q].copy()
     saved_step, m.opt.timestep = m.opt.timestep, _STEP
     for _ in range(round(_SETTLE / _STEP)):

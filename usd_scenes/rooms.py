@@ -1,4 +1,4 @@
-"""What several scenes share: the stage with robot, camera and light, the floor, the workshop room and its benches."""
+"""Common to several scenes: stage with robot, camera and light, floor, workshop room and its benches."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -8,6 +8,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.errors import InputError
+from arena_newton.tasks import TaskSpec
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
@@ -21,18 +22,23 @@ BENCH_TOP = 0.745
 """Upper surface of the benches [m] (measured in the original's clips; both desk scenes use the same bench)."""
 
 
-def task_stage(path: Path, *, spawn: Vec, facing: Vec, eye: Vec, gaze: Vec, variants: Sequence[str]) -> Usd.Stage:
-    """A scene layer with physics, the robot at `spawn` (quaternion `facing`), world camera, dome light and variants.
+def task_stage(folder: Path, task: TaskSpec, *, eye: Vec, gaze: Vec) -> Usd.Stage:
+    """The scene of a task with the looks `base` and `semantic`; see `scene_stage`."""
+    return scene_stage(folder, task.spawn_position, task.spawn_quat, eye=eye, gaze=gaze, variants=("base", "semantic"))
+
+
+def scene_stage(folder: Path, spawn: Vec, facing: Vec, *, eye: Vec, gaze: Vec, variants: Sequence[str]) -> Usd.Stage:
+    """A layer `scene.usda` with physics, robot, world camera, dome light and variants.
 
     Args:
-        path: The layer to write, `<scenes>/<task>/scene.usda`.
+        folder: Where it is written.
         spawn: Robot position [m].
         facing: Robot orientation, wxyz.
         eye: Position of the world camera [m].
         gaze: Orientation of the world camera, wxyz, looking along its −z.
         variants: Names of the variants of `semantics`; the first is selected.
     """
-    stage = author.new_stage(path)
+    stage = author.new_stage(folder / "scene.usda")
     robot = author.xform(stage, "/World/Robot", spawn, facing)
     robot.GetReferences().AddReference("../g1/g1.usda")
     # 1920×1080, focal 12, aperture 27: horizontal field of view 96.7° (the original's world camera).
@@ -122,11 +128,11 @@ def contact(
 
 
 def floor(stage: Usd.Stage, half: Vec, centre: Vec, *, tile: float) -> Usd.Prim:
-    """The ground: an unseen collision plane at z = 0 and a textured rectangle on it; returns the rectangle.
+    """The ground: an invisible collision plane at z = 0 and a textured rectangle on it; returns the rectangle.
 
     The original's scene-wide friction is 1.0 with the maximum of both sides taken, hence 1.0 here.
     """
-    surface = author.physics_material(stage, "/World/Looks/GroundSurface", static=1.0, dynamic=1.0)
+    surface = author.physics_material(stage, "/World/Looks/GroundSurface")
     plane = UsdGeom.Plane.Define(stage, "/World/Ground")
     plane.CreateAxisAttr("Z")
     plane.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
@@ -159,7 +165,7 @@ def workshop(
         "+y": (((x1 - x0) / 2, thick, top / 2), ((x0 + x1) / 2, y1 + thick, top / 2)),
     }
     author.xform(stage, "/World/Room")
-    # Seen only: no task comes within a metre of a wall, and every collider costs contact search.
+    # Visual only: no task comes within a metre of a wall, and every collider costs contact search.
     shell = Solids()
     for half, centre in walls.values():
         shell.box(half, centre, tile=1.6)
@@ -169,7 +175,7 @@ def workshop(
         axis = 1 if wall[1] == "x" else 0
         plane, inward = {"-x": (x0, 1), "+x": (x1, -1), "-y": (y0, 1), "+y": (y1, -1)}[wall]
 
-        def place(
+        def at_wall(
             along: float, height: float, out: float, axis: int = axis, plane: float = plane, inward: int = inward
         ) -> np.ndarray:
             off = plane + inward * out
@@ -181,10 +187,10 @@ def workshop(
         head = 3.3
         middle, half_height = (head + sill) / 2, (head - sill) / 2
         for along in (at - width / 2, at, at + width / 2):
-            frames.box(bar(0.04, half_height, 0.05), place(along, middle, 0.05))
+            frames.box(bar(0.04, half_height, 0.05), at_wall(along, middle, 0.05))
         for height in (sill, sill + (head - sill) * 0.36, head):
-            frames.box(bar(width / 2 + 0.04, 0.04, 0.05), place(at, height, 0.05))
-        panes.box(bar(width / 2, half_height, 0.01), place(at, middle, 0.02))
+            frames.box(bar(width / 2 + 0.04, 0.04, 0.05), at_wall(at, height, 0.05))
+        panes.box(bar(width / 2, half_height, 0.01), at_wall(at, middle, 0.02))
     black = author.material(stage, "/World/Looks/black", (0.01, 0.01, 0.01))
     frames.write(stage, "/World/Room/WindowFrames", look=black)
     panes.write(stage, "/World/Room/Panes")
@@ -224,7 +230,7 @@ def bench(stage: Usd.Stage, path: str, low: Vec, high: Vec, *, solref: Vec | Non
             look=black,
         )
     author.box(stage, f"{path}/Shelf", (hx - 0.04, hy - 0.05, 0.015), (0, 0, 0.18), look=black)
-    # Apron under the top and back panel: seen, not touched (the top's edge is what a hand meets).
+    # Apron under the top and back panel: visual only (the top's edge is what a hand meets).
     trim = Solids()
     for sy in (-1, 1):
         trim.box((hx - 0.04, 0.012, 0.05), (0, sy * (hy - 0.05), BENCH_TOP - top - 0.05))

@@ -1,4 +1,4 @@
-"""Faults of a composed scene's geometry: what would crash or exhaust the importer, and what is no geometry at all."""
+"""Faults of a composed scene's geometry: what would crash or exhaust the importer, and what is not geometry at all."""
 
 import itertools
 import math
@@ -25,7 +25,7 @@ _LENGTHS = {
     "Plane": ("width", "length"),
 }
 _FLAT = 1e-5
-"""A collision mesh is flat if it is thinner than this part of its length; its hull has no inside."""
+"""A collision mesh is flat if it is thinner than this fraction of its length; its hull has no inside."""
 _ROUNDING = 1e-3
 """Relative error of a stored inertia."""
 _MASSES = (1e-5, 1e4)
@@ -35,7 +35,7 @@ _GRAVITY = 100.0
 
 
 def open_stage(path: str | Path, *, checked: bool = True) -> Usd.Stage:
-    """Open a stage of the project or a foreign one.
+    """Open a stage, the project's or a user's.
 
     Args:
         path: A USD layer.
@@ -114,16 +114,14 @@ def mesh_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
 
 def _mesh_fault(mesh: Usd.Typed) -> tuple[str | None, int]:
     """What is wrong with a mesh, and how many points it has."""
-    points, counts, indices = (
-        attribute.Get()
-        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
-    )
-    for name, value in (("points", points), ("faceVertexCounts", counts), ("faceVertexIndices", indices)):
+    names = ("points", "faceVertexCounts", "faceVertexIndices")
+    points, counts, indices = values = [mesh.GetPrim().GetAttribute(name).Get() for name in names]
+    for name, value in zip(names, values, strict=True):
         if value is None:
             return f"{name} is missing: expected a value without time", 0
     many, corners = len(points), len(indices)
-    if max(many, corners, len(counts)) > limits.MESH_POINTS:
-        most = max(many, corners, len(counts))
+    most = max(many, corners, len(counts))
+    if most > limits.MESH_POINTS:
         return f"has {most} points or corners, expected at most {limits.MESH_POINTS} for a mesh", many
     sides, at = np.asarray(counts, dtype=np.int64), np.asarray(indices, dtype=np.int64)
     if not many or not len(sides):
@@ -189,7 +187,7 @@ def shape_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
 def _size_fault(prim: Usd.Prim) -> str | None:
     for name in _LENGTHS.get(prim.GetTypeName(), ()):
         value = prim.GetAttribute(name).Get()
-        # A plane of width 0 has no end.
+        # A plane of width 0 is infinite.
         least = 0.0 if prim.GetTypeName() == "Plane" else math.ulp(0.0)
         if value is None or not least <= value <= 2 * limits.FARTHEST:
             return f"{name} is {value}: expected more than 0 and at most {2 * limits.FARTHEST:g} m"
@@ -197,7 +195,6 @@ def _size_fault(prim: Usd.Prim) -> str | None:
 
 
 def _pose_fault(prim: Usd.Prim, poses: object) -> str | None:
-
     for operation in UsdGeom.Xformable(prim).GetOrderedXformOps():
         value = operation.Get()
         if operation.GetOpType() == UsdGeom.XformOp.TypeOrient and value is not None and value.GetLength() < 1e-6:
@@ -229,7 +226,6 @@ def _flat_fault(prim: Usd.Prim) -> str | None:
 
 
 def _light_fault(prim: Usd.Prim) -> str | None:
-
     light = UsdLux.LightAPI(prim)
     intensity, color = light.GetIntensityAttr().Get(), light.GetColorAttr().Get()
     if intensity is None or not 0.0 <= intensity <= 1e9:
@@ -238,7 +234,6 @@ def _light_fault(prim: Usd.Prim) -> str | None:
 
 
 def _joint_fault(prim: Usd.Prim) -> str | None:
-
     joint = UsdPhysics.Joint(prim)
     for attribute in (joint.GetLocalRot0Attr(), joint.GetLocalRot1Attr()):
         turn = attribute.Get()

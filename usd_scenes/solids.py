@@ -101,8 +101,9 @@ class Solids:
             self.cord(p[0] + t * (p[3] - p[0]), p[1] + t * (p[2] - p[1]), width, normal)
         return self
 
-    def ring(self, inner: float, outer: float, centre: Vec, *, sides: int = 64) -> "Solids":
+    def ring(self, inner: float, outer: float, centre: Vec) -> "Solids":
         """A flat ring in the xy plane facing +z, radii [m]."""
+        sides = 64
         angle = np.linspace(0, 2 * np.pi, sides + 1)
         rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         points = np.concatenate([inner * rim, outer * rim]) + np.asarray(centre, dtype=float)
@@ -111,8 +112,9 @@ class Solids:
         self._add(points, points[:, :2], faces)
         return self
 
-    def ball(self, radius: float, centre: Vec = (0, 0, 0), *, rings: int = 20) -> "Solids":
+    def ball(self, radius: float) -> "Solids":
         """A sphere of `radius` [m] whose texture is an equirectangular map with its north pole in the first row."""
+        rings = 20
         polar = np.linspace(0, np.pi, rings + 1)
         around = np.linspace(0, 2 * np.pi, 2 * rings + 1)
         theta, phi = (g.reshape(-1) for g in np.meshgrid(polar, around, indexing="ij"))
@@ -123,7 +125,7 @@ class Solids:
         a, b = i * row + j, (i + 1) * row + j
         lower = np.stack([a, b, b + 1], 1)[i < rings - 1]
         upper = np.stack([a, b + 1, a + 1], 1)[i > 0]
-        self._add(radius * unit + np.asarray(centre, dtype=float), uv, np.concatenate([lower, upper]))
+        self._add(radius * unit + 0.0, uv, np.concatenate([lower, upper]))
         return self
 
     def write(self, stage: Usd.Stage, path: str, *, look: Usd.Prim | None = None) -> Usd.Prim:

@@ -13,7 +13,6 @@ from PIL import Image
 __all__ = ["TEXTURES", "write_all"]
 
 SIDE = 128
-FOLDER = Path(__file__).parent / "textures"
 
 
 def _rng(name: str) -> np.random.Generator:
@@ -21,12 +20,12 @@ def _rng(name: str) -> np.random.Generator:
     return np.random.default_rng(list(name.encode()))
 
 
-def _noise(rng: np.random.Generator, cells_y: int, cells_x: int, side: int = SIDE) -> np.ndarray:
-    """Smooth periodic value noise in [0, 1], shape [side, side]."""
+def _noise(rng: np.random.Generator, cells_y: int, cells_x: int) -> np.ndarray:
+    """Smooth periodic value noise in [0, 1], shape [SIDE, SIDE]."""
     lattice = rng.random((cells_y, cells_x))
 
     def axis(cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        at = np.arange(side) * cells / side
+        at = np.arange(SIDE) * cells / SIDE
         low = at.astype(int)
         t = at - low
         return low % cells, (low + 1) % cells, t * t * (3 - 2 * t)
@@ -42,10 +41,6 @@ def _blend(low: tuple[int, int, int], high: tuple[int, int, int], amount: np.nda
     """Mix two colours by `amount` in [0, 1]; few levels keep the files small."""
     amount = np.round(np.clip(amount, 0, 1) * (levels - 1))[..., None] / (levels - 1)
     return np.round(np.asarray(low) * (1 - amount) + np.asarray(high) * amount).astype(np.uint8)
-
-
-def _line(image: np.ndarray, colour: tuple[int, int, int], rows: slice | int, columns: slice | int) -> None:
-    image[rows, columns] = colour
 
 
 def grass() -> np.ndarray:
@@ -70,7 +65,7 @@ def wood() -> np.ndarray:
     image[:: SIDE // 4] = (84, 54, 32)
     for plank in range(4):
         column = int(rng.integers(0, SIDE))
-        _line(image, (84, 54, 32), slice(plank * SIDE // 4, (plank + 1) * SIDE // 4), column)
+        image[plank * SIDE // 4 : (plank + 1) * SIDE // 4, column] = (84, 54, 32)
     return image
 
 
@@ -113,14 +108,8 @@ def _directions(height: int, width: int) -> np.ndarray:
     """Unit vectors of an equirectangular map's texel centres, shape [height, width, 3]."""
     polar = (np.arange(height) + 0.5) / height * np.pi
     around = (np.arange(width) + 0.5) / width * 2 * np.pi
-    return np.stack(
-        [
-            np.sin(polar)[:, None] * np.cos(around),
-            np.sin(polar)[:, None] * np.sin(around),
-            np.repeat(np.cos(polar)[:, None], width, axis=1),
-        ],
-        axis=-1,
-    )
+    sine, height_of = np.sin(polar)[:, None], np.repeat(np.cos(polar)[:, None], width, axis=1)
+    return np.stack([sine * np.cos(around), sine * np.sin(around), height_of], axis=-1)
 
 
 def football() -> np.ndarray:
@@ -199,26 +188,12 @@ def brick() -> np.ndarray:
     return image
 
 
-TEXTURES: dict[str, Callable[[], np.ndarray]] = {
-    "grass": grass,
-    "carpet": carpet,
-    "wood": wood,
-    "tiles": tiles,
-    "concrete": concrete,
-    "hazard": hazard,
-    "cardboard": cardboard,
-    "football": football,
-    "basketball": basketball,
-    "net": net,
-    "steel": steel,
-    "fabric": fabric,
-    "wall": wall,
-    "brick": brick,
-}
+_ALL = (grass, carpet, wood, tiles, concrete, hazard, cardboard, football, basketball, net, steel, fabric, wall, brick)
+TEXTURES: dict[str, Callable[[], np.ndarray]] = {draw.__name__: draw for draw in _ALL}
 """Every texture by name; the file is `textures/<name>.png`."""
 
 
-def write_all(folder: Path = FOLDER) -> list[Path]:
+def write_all(folder: Path) -> list[Path]:
     """Write every texture as `<folder>/<name>.png`; the bytes are the same on every run."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []

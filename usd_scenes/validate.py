@@ -15,6 +15,7 @@ from arena_newton.errors import InputError
 from arena_newton.tasks import Required
 from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
 from arena_newton.usd_scenes.dependencies import (
+    LAYERS,
     Dependencies,
     Problem,
     check_files,
@@ -26,16 +27,7 @@ from arena_newton.usd_scenes.dependencies import (
 from arena_newton.usd_scenes.differences import differences
 from arena_newton.usd_scenes.shapes import mesh_faults, shape_faults, type_faults
 
-__all__ = [
-    "Problem",
-    "check",
-    "check_files",
-    "differences",
-    "layers",
-    "task_of",
-    "validate",
-]
-
+__all__ = ["Problem", "check", "check_files", "differences", "layers", "task_of", "validate"]
 
 _FOLDER = Path(__file__).resolve().parent
 
@@ -56,7 +48,7 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
         task: Task name; by default the task whose folder the layer, or a layer it builds on, is stored in.
 
     Raises:
-        InputError: `task` is no task.
+        InputError: `task` is not a task.
     """
     if task is not None and task not in tasks.names():
         raise InputError(f"unknown task {task!r}; tasks are {', '.join(tasks.names())}")
@@ -88,7 +80,6 @@ def task_of(path: str | Path) -> str | None:
 
 
 def _validate(file: Path, task: str | None) -> list[Problem]:
-
     found = collect(file)
     if found.fatal:
         return found.problems
@@ -145,9 +136,8 @@ def _contacts(stage: Usd.Stage, file: Path, found: Dependencies, task: str) -> I
 
 
 def _speaks_of_collisions(stage: Usd.Stage, found: Dependencies) -> bool:
-
     layers = {layer.identifier: layer for layer in stage.GetUsedLayers() if not layer.anonymous}
-    files = (path for path in found.files if path.suffix in (".usda", ".usd", ".usdc", ".usdz"))
+    files = (path for path in found.files if path.suffix in LAYERS)
     layers |= {layer.identifier: layer for path in files if (layer := Sdf.Layer.FindOrOpen(str(path)))}
     names: list[str] = []
 
@@ -250,7 +240,6 @@ _KIND_WORDS = {
 
 
 def _collides(prim: Usd.Prim) -> bool:
-
     return any(
         p.HasAPI(UsdPhysics.CollisionAPI) and UsdPhysics.CollisionAPI(p).GetCollisionEnabledAttr().Get()
         for p in Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
@@ -258,7 +247,6 @@ def _collides(prim: Usd.Prim) -> bool:
 
 
 def _body_fault(prim: Usd.Prim) -> str | None:
-
     if not prim.HasAPI(UsdPhysics.RigidBodyAPI):
         return "is not a rigid body"
     return _held_fault(prim) or (None if _collides(prim) else "has no collision geom")
@@ -273,7 +261,6 @@ def _held_fault(prim: Usd.Prim) -> str | None:
 
 
 def _target_fault(prim: Usd.Prim) -> str | None:
-
     frame, joint = prim.GetChild("Frame"), prim.GetChild("anchor")
     if not prim.HasAPI(UsdPhysics.ArticulationRootAPI):
         return "is not an articulation root"
@@ -290,7 +277,6 @@ def _fixture_fault(prim: Usd.Prim) -> str | None:
 
 
 def _hinge_fault(prim: Usd.Prim) -> str | None:
-
     if not prim.IsA(UsdPhysics.RevoluteJoint):
         return "is not a revolute joint"
     joint = UsdPhysics.Joint(prim)
@@ -317,29 +303,16 @@ def _marker_fault(prim: Usd.Prim) -> str | None:
 
 
 def _collider_fault(prim: Usd.Prim) -> str | None:
-
     if prim.HasAPI(UsdPhysics.RigidBodyAPI):
         return "is a rigid body"
     return None if _collides(prim) else "has no collision geom"
 
 
-def _camera_fault(prim: Usd.Prim) -> str | None:
-
-    return None if prim.IsA(UsdGeom.Camera) else f"is a {prim.GetTypeName() or 'typeless prim'}"
-
-
-def _light_fault(prim: Usd.Prim) -> str | None:
-
-    return None if prim.HasAPI(UsdLux.LightAPI) else f"is a {prim.GetTypeName() or 'typeless prim'}"
-
-
-def _physics_fault(prim: Usd.Prim) -> str | None:
-
-    return None if prim.IsA(UsdPhysics.Scene) else f"is a {prim.GetTypeName() or 'typeless prim'}"
+def _kind_fault(fits: bool, prim: Usd.Prim) -> str | None:
+    return None if fits else f"is a {prim.GetTypeName() or 'typeless prim'}"
 
 
 def _robot_fault(prim: Usd.Prim) -> str | None:
-
     bodies = [p for p in Usd.PrimRange(prim) if p.HasAPI(UsdPhysics.RigidBodyAPI)]
     if all(p.GetName() != "pelvis" for p in bodies):
         return "has no rigid body pelvis"
@@ -354,9 +327,9 @@ _KIND_TESTS = {
     "latch": _latch_fault,
     "marker": _marker_fault,
     "collider": _collider_fault,
-    "camera": _camera_fault,
-    "light": _light_fault,
-    "physics": _physics_fault,
+    "camera": lambda prim: _kind_fault(prim.IsA(UsdGeom.Camera), prim),
+    "light": lambda prim: _kind_fault(prim.HasAPI(UsdLux.LightAPI), prim),
+    "physics": lambda prim: _kind_fault(prim.IsA(UsdPhysics.Scene), prim),
     "robot": _robot_fault,
 }
 
@@ -392,7 +365,6 @@ def _masses(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
 
 
 def _units(stage: Usd.Stage, file: Path) -> Iterator[Problem]:
-
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         yield Problem(str(file), "", "metersPerUnit is missing (USD then means 0.01): expected 1")
     elif UsdGeom.GetStageMetersPerUnit(stage) != 1.0:

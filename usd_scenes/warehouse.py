@@ -14,39 +14,19 @@ from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.author import Vec
 from arena_newton.usd_scenes.solids import Solids
 
-__all__ = [
-    "FLOOR_X",
-    "FLOOR_Y",
-    "boxes",
-    "room",
-    "room_looks",
-    "rounded_box",
-    "surface",
-]
+__all__ = ["FLOOR_X", "FLOOR_Y", "boxes", "room", "room_looks", "rounded_box"]
 
 FLOOR_X, FLOOR_Y = zip(*ROOM, strict=True)
 """Extent of the room along x and y [m]."""
 _HEIGHT = 3.3
 _SKIRTING = 0.09
 
-_FACES = (
-    # (normal axis, sign, u axis, v axis)
-    (0, 1, 1, 2),
-    (0, -1, 1, 2),
-    (1, 1, 0, 2),
-    (1, -1, 0, 2),
-    (2, 1, 0, 1),
-    (2, -1, 0, 1),
-)
+_FACES = [(axis, sign, u, v) for axis, u, v in ((0, 1, 2), (1, 0, 2), (2, 0, 1)) for sign in (1, -1)]
+"""Faces of a box: axis and sign of the normal, axes of the texture."""
 
 
 def boxes(
-    stage: Usd.Stage,
-    path: str,
-    parts: Iterable[tuple[Vec, Vec]],
-    *,
-    look: Usd.Prim | None = None,
-    tile: float = 1.0,
+    stage: Usd.Stage, path: str, parts: Iterable[tuple[Vec, Vec]], *, look: Usd.Prim | None = None, tile: float = 1.0
 ) -> Usd.Prim:
     """One visual mesh made of several axis-aligned boxes `(half sizes, centre)`; its texture repeats every `tile` m."""
     shell = Solids()
@@ -62,7 +42,6 @@ def rounded_box(
     position: Vec = (0, 0, 0),
     *,
     radius: float = 0.05,
-    steps: int = 2,
     look: Usd.Prim | None = None,
 ) -> Usd.Prim:
     """A visual box with rounded edges, for cushions; `half` sizes include the rounding."""
@@ -71,10 +50,9 @@ def rounded_box(
     inner = extent - radius
     points, faces, uv = [], [], []
     # Each face: corner fan, flat middle, corner fan.
-    angles = np.linspace(0.0, np.pi / 4, steps + 1)
+    angles = np.linspace(0.0, np.pi / 4, 3)
     ramp = np.concatenate([-np.tan(angles[::-1]), np.tan(angles)])
-    side = np.concatenate([-np.ones(steps + 1), np.ones(steps + 1)])
-    n = len(ramp)
+    side, n = np.repeat([-1.0, 1.0], 3), 6
     for axis, sign, u, v in _FACES:
         first = len(points)
         for j in range(n):
@@ -89,12 +67,8 @@ def rounded_box(
         outward = sign > 0 if axis != 1 else sign < 0
         for j in range(n - 1):
             for i in range(n - 1):
-                a, b, c, d = (
-                    first + j * n + i,
-                    first + j * n + i + 1,
-                    first + (j + 1) * n + i + 1,
-                    first + (j + 1) * n + i,
-                )
+                a = first + j * n + i
+                b, c, d = a + 1, a + n + 1, a + n
                 faces.extend([[a, b, c], [a, c, d]] if outward else [[a, c, b], [a, d, c]])
     return author.mesh(stage, path, np.round(points, 5), faces, position, uv=np.round(uv, 4), look=look)
 
@@ -109,11 +83,6 @@ def _plane(stage: Usd.Stage, path: str, position: Vec, quat: Vec, surface: Usd.P
     return author.bind_physics(plane.GetPrim(), surface)
 
 
-def surface(stage: Usd.Stage, name: str = "Rough", *, friction: float = 1.0) -> Usd.Prim:
-    """The scene's physics material; friction 1 is the original's scene-wide value."""
-    return author.physics_material(stage, f"/World/Looks/{name}", static=friction, dynamic=friction)
-
-
 def room_looks(
     stage: Usd.Stage, *, floor: str = "concrete", wall: str | None = None, skirting: Sequence[float] = (0.9, 0.9, 0.88)
 ) -> None:
@@ -124,8 +93,9 @@ def room_looks(
     author.material(stage, "/World/Looks/Skirting", skirting)
 
 
-def room(stage: Usd.Stage, rough: Usd.Prim, *, tile: float = 2.0) -> None:
+def room(stage: Usd.Stage, rough: Usd.Prim) -> None:
     """Floor, walls, skirting line and wall sockets; floor and walls also stop bodies (planes)."""
+    tile = 2.0
     looks = {n: stage.GetPrimAtPath(f"/World/Looks/{n}") for n in ("Floor", "Wall", "Skirting")}
     (x0, x1), (y0, y1), h = FLOOR_X, FLOOR_Y, _HEIGHT
     cx, cy, lx, ly = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0

@@ -238,14 +238,7 @@ def test_layers_are_what_their_authors_write(tmp_path):
 
 def test_a_forgotten_or_misspelled_look_is_refused(tmp_path):
     """A scene with a variant that nobody authored is not written, and an edit names the variants that there are."""
-    stage = rooms.task_stage(
-        tmp_path / "scene.usda",
-        spawn=(0, 0, 0.8),
-        facing=(1, 0, 0, 0),
-        eye=(0, 0, 1),
-        gaze=(1, 0, 0, 0),
-        variants=("base", "semantic"),
-    )
+    stage = rooms.task_stage(tmp_path, tasks.get("pp_box"), eye=(0, 0, 1), gaze=(1, 0, 0, 0))
     with rooms.edit(stage, "base"):
         author.xform(stage, "/World/Chair")
     with pytest.raises(InputError, match="variant semantic is empty"):

@@ -1,4 +1,7 @@
-"""`python -m arena_newton.trackers.motions {convert,inspect,render,generate}`."""
+"""`python -m arena_newton.trackers.motions {convert,inspect,render,generate}`.
+
+Argparse, not tyro: files and `--out` are required, and only argparse says in one line which of them is missing.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +62,8 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--ground", action="store_true", help="shift each clip so that its soles are on the floor")
     convert.add_argument("--mirror", action="store_true", help="add every clip with left and right exchanged")
 
-    inspect = commands.add_parser(
-        "inspect", parents=[reading], help="print speed, heights, limits, jumps, slip per clip"
-    )
+    measured = "print speed, heights, limits, jumps, slip per clip"
+    inspect = commands.add_parser("inspect", parents=[reading], help=measured)
     inspect.add_argument("--all", action="store_true", help=f"list every clip, not the first {ROWS}")
     inspect.add_argument("--json", action="store_true", help="print the numbers as JSON")
 
@@ -115,13 +117,8 @@ def _convert(args: argparse.Namespace) -> None:
     from arena_newton.trackers.motions.library import UNKNOWN, MotionLibrary
 
     _check_out(args.out, ".npz")
-    library, reports = read_library(
-        args.files,
-        _options(args),
-        family=args.family,
-        licence=args.licence or UNKNOWN,
-        source=args.source or UNKNOWN,
-    )
+    given = {"family": args.family, "licence": args.licence or UNKNOWN, "source": args.source or UNKNOWN}
+    library, reports = read_library(args.files, _options(args), **given)
     for report in reports:
         print(report.line())
     if any(report.kind != "motion library" for report in reports) and not (args.licence and args.source):
@@ -211,11 +208,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             quiet_warp()
         _COMMANDS[args.command](args)
 
-    try:
-        return exit_code(work)
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
+    return exit_code(work)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Commands of a reference generator: a set of channels, each with a neutral value, for a batch of worlds.
 
 Channels may jump and may be combined freely; the generator limits their rates. A field of `MotionCommand` is one
-channel, and the only place that names its width, neutral value, range and rate: columns, checks and limits follow.
+channel, and the only one that names its width, neutral value, range and rate: columns, checks and limits follow.
 """
 
 from __future__ import annotations
@@ -179,10 +179,6 @@ class MotionCommand:
                 raise InputError(f"motion command: {name} has shape {list(value.shape)}, expected {expected}")
             packed.append(value.reshape(worlds, -1).to(self.height.dtype))
         return torch.cat(packed, dim=1)
-
-    def replace(self, **channels: Tensor) -> MotionCommand:
-        """The same command with other channels."""
-        return dataclasses.replace(self, **channels)
 
 
 def _read_channels(command: type[MotionCommand]) -> dict[str, Channel]:

@@ -48,25 +48,13 @@ def film(
     start: float = 0.0,
     end: float | None = None,
 ) -> Path:
-    """Write a PNG with one strip of pictures per clip.
+    """Write a PNG with one strip of pictures per clip, from `start` to `end` [s] (by default the clip's end).
 
-    Args:
-        library: The clips.
-        clips: Which of them.
-        out: The PNG.
-        pictures: Pictures per clip.
-        width: Width of a picture [px]; its height is a third more.
-        start: Time of the first picture [s].
-        end: Time of the last [s]; the clip's end by default.
-
-    Returns:
-        The path.
+    A picture is `width` [px] wide and a third more high.
 
     Raises:
-        InputError: No clips, no time, or the file cannot be written.
+        InputError: No such time, or the file cannot be written.
     """
-    if not clips:
-        raise InputError("render: name at least one clip")
     picked = [picked_frames(library, clip, pictures, start, end) for clip in clips]
     renderer = ClipRenderer(library, width=width, height=width * 4 // 3)
     high, row = renderer.height, renderer.height + LABEL_HEIGHT + GAP
@@ -75,8 +63,8 @@ def film(
     text = ImageDraw.Draw(sheet)
     for line, (clip, frames) in enumerate(zip(clips, picked, strict=True)):
         y = line * row
-        name = f"{library.clip_names[clip]} ({library.family_names[library.family[clip]]})"
-        text.text((GAP, y + 3), name, fill="black")
+        family = library.family_names[library.family[clip]]
+        text.text((GAP, y + 3), f"{library.clip_names[clip]} ({family})", fill="black")
         for column, picture in enumerate(renderer.pictures(clip, frames)):
             x = GAP + column * (width + GAP)
             sheet.paste(Image.fromarray(picture), (x, y + LABEL_HEIGHT))
@@ -102,10 +90,8 @@ def movie(
     """Write an MP4 of clips one after the other, at 25 frames per second; arguments as of `film`.
 
     Raises:
-        InputError: No clips, no time, or the file cannot be written.
+        InputError: No such time, or the file cannot be written.
     """
-    if not clips:
-        raise InputError("render: name at least one clip")
     picked = []
     for clip in clips:
         first, last = picked_frames(library, clip, 2, start, end)[[0, -1]]

@@ -23,6 +23,7 @@ from arena_newton import limits
 from arena_newton.errors import InputError
 from arena_newton.foreign import numbers, read_arrays, read_bytes
 from arena_newton.robot import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
+from arena_newton.text import counted
 from arena_newton.trackers.motions.frames import actions_to_motion
 from arena_newton.trackers.motions.kinematics import forward
 from arena_newton.trackers.motions.library import FORMAT, UNKNOWN, MotionLibrary
@@ -82,8 +83,8 @@ class FileReport:
 
     def line(self) -> str:
         """The report in one line."""
-        found = f"{self.path}: {self.kind}, {_count(self.clips, 'clip')}, {self.seconds:.1f} s"
-        cut = [f"{_count(self.trimmed, 'frame')} of a jump cut off the start"] if self.trimmed else []
+        found = f"{self.path}: {self.kind}, {counted(self.clips, 'clip')}, {self.seconds:.1f} s"
+        cut = [f"{counted(self.trimmed, 'frame')} of a jump cut off the start"] if self.trimmed else []
         return ", ".join([found, *cut, *self.notes])
 
 
@@ -126,7 +127,7 @@ def read_library(
         try:
             reading = read_file(path, options)
         except InputError as error:
-            others = f"; nothing is made of the other {_count(len(paths) - 1, 'file')}" if len(paths) > 1 else ""
+            others = f"; nothing is made of the other {counted(len(paths) - 1, 'file')}" if len(paths) > 1 else ""
             raise InputError(f"{error}{others}") from error
         reports.append(reading.report)
         if reading.library is not None:
@@ -168,19 +169,9 @@ def read_file(path: str | Path, options: ReadOptions | None = None) -> Reading:
     raise InputError(f"{path}: unknown kind of motion file, expected .pkl, .csv or .npz")
 
 
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
 def _reading(path: Path, kind: str, clips: dict[str, Clip], notes: Sequence[str] = ()) -> Reading:
-    report = FileReport(
-        path,
-        kind,
-        len(clips),
-        sum(clip.duration for clip in clips.values()),
-        sum(clip.trimmed for clip in clips.values()),
-        tuple(notes),
-    )
+    seconds, trimmed = sum(clip.duration for clip in clips.values()), sum(clip.trimmed for clip in clips.values())
+    report = FileReport(path, kind, len(clips), seconds, trimmed, tuple(notes))
     return Reading(report, tuple(clips), tuple(clips.values()))
 
 
@@ -192,12 +183,9 @@ def _pickle(path: Path, options: ReadOptions) -> Reading:
         clips[name or path.stem] = clip_from_fields(fields, where, trim=options.trim)
         kinds.add("ASAP pickle" if "root_trans_offset" in fields else "TWIST2/GMR pickle")
         widths.add(np.asarray(fields.get("dof_pos", fields.get("dof"))).shape[1])
-    return _reading(path, " and ".join(sorted(kinds)), _short(clips, path), _padding(widths))
-
-
-def _short(clips: dict[str, Clip], path: Path) -> dict[str, Clip]:
-    """A single clip is named after its file."""
-    return {path.stem: next(iter(clips.values()))} if len(clips) == 1 else clips
+    if len(clips) == 1:  # is named after its file
+        clips = {path.stem: clips.popitem()[1]}
+    return _reading(path, " and ".join(sorted(kinds)), clips, _padding(widths))
 
 
 def _padding(widths: set[int]) -> list[str]:
@@ -233,9 +221,8 @@ def _table(path: Path, options: ReadOptions) -> Reading:
     table, width = np.array(rows), len(rows[0])
     order = options.quat_order if options.quat_order != "auto" else _quat_order(table[:, 3:7], path)
     fps = CSV_FPS if options.fps is None else options.fps
-    clip = checked_clip(
-        fps, table[:, :3], table[:, 3:7], table[:, 7:], str(path), xyzw=order == "xyzw", trim=options.trim
-    )
+    motion = table[:, :3], table[:, 3:7], table[:, 7:]
+    clip = checked_clip(fps, *motion, str(path), xyzw=order == "xyzw", trim=options.trim)
     notes = [f"{fps:g} frames per second", f"quaternions {order}", *_padding({width - 7})]
     return _reading(path, "table", {path.stem: clip}, notes)
 

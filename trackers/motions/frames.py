@@ -27,14 +27,7 @@ from arena_newton.rotations import (
     wrap_angle,
 )
 
-__all__ = [
-    "MotionClip",
-    "actions_to_motion",
-    "frame_action",
-    "frame_mimic",
-    "motion_actions",
-    "motion_mimic",
-]
+__all__ = ["MotionClip", "actions_to_motion", "frame_action", "frame_mimic", "motion_actions", "motion_mimic"]
 
 _LEVEL_FLOOR = 1e-6
 """Below this |R22| height does not determine the displacement along the root's z axis (`kernels.canonical`)."""
@@ -89,17 +82,9 @@ def frame_action(
 def frame_mimic(
     previous_pos: Tensor, previous_quat: Tensor, root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor
 ) -> Tensor:
-    """Mimic command of one frame: what `kernels.canonical` makes of the frame's action.
+    """Mimic command of one frame, shape [..., 35]: what `kernels.canonical` makes of the frame's action.
 
-    Args:
-        previous_pos: Root position one tick earlier [m], shape [..., 3].
-        previous_quat: Root orientation one tick earlier, wxyz, shape [..., 4].
-        root_pos: Root position [m], shape [..., 3].
-        root_quat: Root orientation, wxyz, shape [..., 4].
-        joint_pos: Joint positions [rad], MuJoCo order, shape [..., 29].
-
-    Returns:
-        Shape [..., 35].
+    The frame is that of `frame_action`; `previous_quat`, wxyz, shape [..., 4], is the root one tick earlier.
     """
     mimic = torch.empty(*joint_pos.shape[:-1], MIMIC_WIDTH, dtype=joint_pos.dtype, device=joint_pos.device)
     moved = quat_apply(quat_conjugate(root_quat), root_pos - previous_pos)
@@ -117,16 +102,9 @@ def _delayed(values: Tensor) -> Tensor:
 
 
 def motion_actions(root_pos: Tensor, root_quat: Tensor, joint_pos: Tensor, hands: Tensor | None = None) -> Tensor:
-    """Canonical actions of a motion, without its first heading; the first action holds no displacement.
+    """Canonical actions of a motion (`MotionClip`), without its first heading, shape [..., ticks, 40].
 
-    Args:
-        root_pos: Root position [m], shape [..., ticks, 3].
-        root_quat: Root orientation, wxyz, shape [..., ticks, 4].
-        joint_pos: Joint positions [rad], MuJoCo order, shape [..., ticks, 29].
-        hands: Hands, shape [..., ticks, 2]; open by default.
-
-    Returns:
-        Shape [..., ticks, 40].
+    The first action holds no displacement; hands are open by default.
     """
     hands = joint_pos.new_zeros(*joint_pos.shape[:-1], 2) if hands is None else hands
     start = heading(root_quat[..., :1, :]).expand(joint_pos.shape[:-1])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -90,12 +90,7 @@ class ReferenceGenerator:
     """References for a batch of worlds, one tick at a time."""
 
     def __init__(self, worlds: int, device: torch.device | str = "cpu"):
-        """Stands in the robot's default pose at the origin.
-
-        Args:
-            worlds: Number of worlds.
-            device: Torch device.
-        """
+        """Stands in the robot's default pose at the origin."""
         self.worlds, self.device = worlds, torch.device(device)
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())
@@ -142,7 +137,7 @@ class ReferenceGenerator:
 
     def _standing(self, root: Tensor, yaw: Tensor) -> GaitState:
         """The default pose at rest with the pelvis at x, y [m], shape [worlds, 2], and a heading [rad]."""
-        zero, no, none = self._zeros(), self._zeros(dtype=torch.bool), self._zeros(dtype=torch.int64)
+        zero = self._zeros()
         ankles = self._zeros(2, 2)
         ankles[:, :, 0] = self._stance.ankle
         ankles[:, :, 1] = 0.5 * self._stance.width * self._sides
@@ -157,21 +152,10 @@ class ReferenceGenerator:
             feet=feet,
             lift_off=feet[:, 0, [0, 1, 3]],
             landing=feet[:, 0, [0, 1, 3]],
-            stepping=no,
-            side=none,
-            phase=zero,
-            first=no,
-            final=no,
-            gait=self._zeros(2),
-            ground=zero,
-            floor=self._zeros(2),
-            lift_off_floor=zero,
-            base=self._zeros(2),
-            kick_side=none,
-            kick_pending=none,
-            kick_command=none,
-            kick_time=zero,
-            kick_weight=zero,
+            **dict.fromkeys(("stepping", "first", "final"), self._zeros(dtype=torch.bool)),
+            **dict.fromkeys(("side", "kick_side", "kick_pending", "kick_command"), self._zeros(dtype=torch.int64)),
+            **dict.fromkeys(("phase", "ground", "lift_off_floor", "kick_time", "kick_weight"), zero),
+            **dict.fromkeys(("gait", "floor", "base", "hands"), self._zeros(2)),
             kick_length=torch.ones_like(yaw),
             kick_swing=torch.ones_like(yaw),
             support=~self._zeros(2, dtype=torch.bool),
@@ -179,7 +163,6 @@ class ReferenceGenerator:
             root=pelvis,
             previous_root=pelvis,
             start_yaw=yaw,
-            hands=self._zeros(2),
         )
 
     def reset(self, mask: Tensor | None = None, *, root_xy: Tensor | None = None, yaw: Tensor | None = None) -> None:
@@ -424,8 +407,9 @@ class ReferenceGenerator:
             dims = (slice(None), *([None] * (xy.ndim - 2)))
             return centre[dims] + rotate_xy(turn[dims], xy - centre[dims])
 
-        self._move_odometry(about)
-        s = self._s
+        found = {name: getattr(s, name) for name in ("body", "feet", "lift_off", "landing", "previous_root")}
+        moves = {name: torch.cat([about(v[..., :2]), v[..., 2:]], dim=-1) for name, v in found.items()}
+        s = self._s = dataclasses.replace(s, **moves)
         for name in ("body", "lift_off", "landing"):
             value = getattr(s, name)
             setattr(s, name, torch.cat([value[:, :2], value[:, 2:] + turn[:, None]], dim=1))
@@ -434,20 +418,3 @@ class ReferenceGenerator:
         s.euler = torch.cat([s.euler[:, :1] + turn[:, None], s.euler[:, 1:]], dim=1)
         self._com[:, :2] = about(self._com[:, :2])
         self._publish()
-
-    def rebase(self, xy: Tensor) -> None:
-        """Moves the odometry so that the pelvis is at `xy` [m], shape [worlds, 2]; displacements stay."""
-        by = xy.to(self.device) - self._s.root[:, :2]
-        self._move_odometry(lambda old: old + by.reshape(-1, *([1] * (old.ndim - 2)), 2))
-        self._s.root = torch.cat([self._s.root[:, :2] + by, self._s.root[:, 2:]], dim=1)
-        self._pelvis += by
-        self._com[:, :2] += by
-        self._publish()
-
-    def _move_odometry(self, moved: Callable[[Tensor], Tensor]) -> None:
-        """Maps the planar positions of the state except the pelvis', shape [worlds, ..., 2]."""
-        s = self._s
-        names = ("body", "feet", "lift_off", "landing", "previous_root")
-        found = {name: getattr(s, name) for name in names}
-        moves = {name: torch.cat([moved(v[..., :2]), v[..., 2:]], dim=-1) for name, v in found.items()}
-        self._s = dataclasses.replace(s, **moves)

@@ -15,19 +15,8 @@ from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS
 from arena_newton.rotations import matrix_from_quat_np, quat_apply, quat_multiply
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = [
-    "HAND_POINT",
-    "LINK_NAMES",
-    "SOLE_CENTRE",
-    "SOLE_HEIGHT",
-    "Chain",
-    "Poses",
-    "Stance",
-    "chain",
-    "forward",
-    "link_index",
-    "neutral_stance",
-]
+__all__ = ["HAND_POINT", "LINK_NAMES", "SOLE_CENTRE", "SOLE_HEIGHT", "Chain", "Poses", "Stance", "chain", "forward"]
+__all__ += ["link_index", "neutral_stance"]
 
 SOLE_HEIGHT = 0.035
 """Height of the ankle roll frame above the ground with a flat foot [m]: contact spheres at -0.03, radius 0.005."""

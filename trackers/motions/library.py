@@ -7,7 +7,7 @@ evaluation read: torch tensors with velocities and mimic commands for every fram
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,7 @@ from arena_newton.trackers.motions.frames import frame_mimic
 from arena_newton.trackers.motions.load import Clip, resample
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = [
-    "FORMAT",
-    "MIRROR_JOINTS",
-    "MIRROR_SIGNS",
-    "SUPPORTS",
-    "FIXTURES",
-    "DeviceLibrary",
-    "MotionLibrary",
-]
+__all__ = ["FIXTURES", "FORMAT", "MIRROR_JOINTS", "MIRROR_SIGNS", "SUPPORTS", "DeviceLibrary", "MotionLibrary"]
 
 FORMAT = "arena-newton-motions-1"
 """What the array `format` of a library file holds."""
@@ -58,56 +50,43 @@ MIRROR_JOINTS: tuple[int, ...] = tuple(MUJOCO_JOINTS.index(_mirrored_joint(name)
 MIRROR_SIGNS: tuple[float, ...] = tuple(1.0 if _HINGE_AXIS[name] == "Y" else -1.0 for name in MUJOCO_JOINTS)
 """The mirror keeps rotations about the sideways axis and reverses those about the other two."""
 
-# Array → (type, shape after the first axis, what the first axis counts).
-_ARRAYS: dict[str, tuple[Any, tuple[int, ...], str]] = {
-    "root_pos": (np.float32, (3,), "frames"),
-    "root_quat": (np.float32, (4,), "frames"),
-    "joint_pos": (np.float32, (29,), "frames"),
-    "hands": (np.float32, (2,), "frames"),
-    "clip_start": (np.int64, (), "clips"),
-    "clip_length": (np.int64, (), "clips"),
-    "family": (np.int64, (), "clips"),
-    "clip_names": (np.str_, (), "clips"),
-    "licence": (np.str_, (), "clips"),
-    "source": (np.str_, (), "clips"),
-    "support_kind": (np.int64, (), "clips"),
-    "support_box": (np.float32, (7,), "clips"),
-    "family_names": (np.str_, (), "families"),
-}
-_PER_FRAME = tuple(name for name, (_, _, axis) in _ARRAYS.items() if axis == "frames")
+
+def _array(kind: Any, axis: str, *tail: int) -> Any:
+    """A field of `MotionLibrary` that is an array: its type, what its first axis counts, and the other axes."""
+    return field(metadata={"array": (kind, tail, axis)})
 
 
 @dataclass(frozen=True, eq=False)
 class MotionLibrary:
     """Clips at 50 Hz. Arrays are checked when the library is made."""
 
-    root_pos: np.ndarray
+    root_pos: np.ndarray = _array(np.float32, "frames", 3)
     """Root position [m], world of the clip, float32, shape [frames, 3]."""
-    root_quat: np.ndarray
+    root_quat: np.ndarray = _array(np.float32, "frames", 4)
     """Root orientation, wxyz, float32, shape [frames, 4]."""
-    joint_pos: np.ndarray
+    joint_pos: np.ndarray = _array(np.float32, "frames", 29)
     """Joint positions [rad], MuJoCo order, float32, shape [frames, 29]."""
-    hands: np.ndarray
+    hands: np.ndarray = _array(np.float32, "frames", 2)
     """Left and right hand, 1 closed, 0 open, float32, shape [frames, 2]."""
-    clip_start: np.ndarray
+    clip_start: np.ndarray = _array(np.int64, "clips")
     """First frame of each clip, int64, shape [clips]."""
-    clip_length: np.ndarray
+    clip_length: np.ndarray = _array(np.int64, "clips")
     """Frames of each clip, 2 or more, int64, shape [clips]."""
-    family: np.ndarray
+    family: np.ndarray = _array(np.int64, "clips")
     """Index into `family_names` of each clip, int64, shape [clips]."""
-    family_names: np.ndarray
-    """What kinds of motion there are, str, shape [families]."""
-    clip_names: np.ndarray
+    clip_names: np.ndarray = _array(np.str_, "clips")
     """Name of each clip, str, shape [clips]."""
-    licence: np.ndarray
+    licence: np.ndarray = _array(np.str_, "clips")
     """Licence of each clip, str, shape [clips]."""
-    source: np.ndarray
+    source: np.ndarray = _array(np.str_, "clips")
     """Where each clip is from, str, shape [clips]."""
-    support_kind: np.ndarray
+    support_kind: np.ndarray = _array(np.int64, "clips")
     """Index into `SUPPORTS` of what the clip stands or sits on in addition to the floor, int64, shape [clips]."""
-    support_box: np.ndarray
+    support_box: np.ndarray = _array(np.float32, "clips", 7)
     """That support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
     top above the floor [m]; float32, shape [clips, 7]."""
+    family_names: np.ndarray = _array(np.str_, "families")
+    """What kinds of motion there are, str, shape [families]."""
 
     def __post_init__(self) -> None:
         """Bring the arrays to their types.
@@ -115,9 +94,7 @@ class MotionLibrary:
         Raises:
             InputError: An array is of the wrong shape, not finite, or contradicts another.
         """
-        self._coerce("motion library")
-
-    def _coerce(self, where: str) -> None:
+        where = "motion library"
         count: dict[str, int] = {}
         for name, (kind, tail, axis) in _ARRAYS.items():
             array = np.asarray(getattr(self, name))
@@ -170,10 +147,6 @@ class MotionLibrary:
         """Length of each clip [s], shape [clips]."""
         return (self.clip_length - 1) * TICK
 
-    def __len__(self) -> int:
-        """Number of clips."""
-        return self.clips
-
     def rows(self, clip: int) -> slice:
         """The frames of a clip."""
         start = int(self.clip_start[clip])
@@ -225,10 +198,9 @@ class MotionLibrary:
         even = [resample(clip, FPS) for clip in clips]
         kinds = list(dict.fromkeys(families))
         lengths = np.array([len(clip.root_pos) for clip in even], dtype=np.int64)
+        poses = ("root_pos", "root_quat", "joint_pos")
         return cls(
-            root_pos=np.concatenate([clip.root_pos for clip in even]),
-            root_quat=np.concatenate([clip.root_quat for clip in even]),
-            joint_pos=np.concatenate([clip.joint_pos for clip in even]),
+            **{name: np.concatenate([getattr(clip, name) for clip in even]) for name in poses},
             hands=np.concatenate([_hands(clip) for clip in even]),
             clip_start=np.cumsum(lengths) - lengths,
             clip_length=lengths,
@@ -242,17 +214,8 @@ class MotionLibrary:
         )
 
     @classmethod
-    def from_random(
-        cls, generated: Mapping[str, Any], *, licence: str = "Apache-2.0", source: str = "generated"
-    ) -> MotionLibrary:
-        """Make a library of what `programs.random_clips` returns.
-
-        Args:
-            generated: Arrays or tensors root_pos [clips, ticks, 3], root_quat, joint_pos, hands, family [clips],
-                family_names, support_kind [clips], support_box [clips, 7].
-            licence: Licence of the clips.
-            source: Origin of the clips.
-        """
+    def from_random(cls, generated: Mapping[str, Any], *, source: str = "generated") -> MotionLibrary:
+        """Make a library of what `programs.random_clips` returns, whose origin is `source`."""
         arrays = {name: _host(generated[name]) for name in (*_PER_FRAME, "family", "support_kind", "support_box")}
         clips, ticks = arrays["root_pos"].shape[:2]
         names = np.array([str(name) for name in generated["family_names"]])
@@ -261,16 +224,13 @@ class MotionLibrary:
             of_kind = arrays["family"] == kind
             numbers[of_kind] = np.arange(of_kind.sum())
         return cls(
-            **{
-                name: arrays[name].reshape(clips * ticks, -1)
-                for name in ("root_pos", "root_quat", "joint_pos", "hands")
-            },
+            **{name: arrays[name].reshape(clips * ticks, -1) for name in _PER_FRAME},
             clip_start=np.arange(clips) * ticks,
             clip_length=np.full(clips, ticks),
             family=arrays["family"].astype(np.int64),
             family_names=names,
             clip_names=np.array([f"{names[k]}-{i:04d}" for k, i in zip(arrays["family"], numbers, strict=True)]),
-            licence=np.full(clips, licence),
+            licence=np.full(clips, "Apache-2.0"),
             source=np.full(clips, source),
             support_kind=arrays["support_kind"].astype(np.int64),
             support_box=arrays["support_box"],
@@ -373,16 +333,21 @@ class MotionLibrary:
         return DeviceLibrary.build(self, device)
 
 
+# Array → type, shape after the first axis, what the first axis counts; in the order of the file.
+_ARRAYS: dict[str, tuple[Any, tuple[int, ...], str]] = {f.name: f.metadata["array"] for f in fields(MotionLibrary)}
+_PER_FRAME = tuple(name for name, (_, _, axis) in _ARRAYS.items() if axis == "frames")
+
+
 @dataclass(frozen=True, eq=False)
 class DeviceLibrary:
-    """A library's frames on a device. Velocities are backward differences, zero on a clip's first frame."""
+    """A library's frames on a device; fields without a text are those of `MotionLibrary`.
+
+    Velocities are backward differences, zero on a clip's first frame.
+    """
 
     root_pos: Tensor
-    """Root position [m], float32, shape [frames, 3]."""
     root_quat: Tensor
-    """Root orientation, wxyz, float32, shape [frames, 4]."""
     joint_pos: Tensor
-    """Joint positions [rad], MuJoCo order, float32, shape [frames, 29]."""
     joint_vel: Tensor
     """Joint velocities [rad/s], MuJoCo order, float32, shape [frames, 29]."""
     lin_vel: Tensor
@@ -392,23 +357,15 @@ class DeviceLibrary:
     mimic: Tensor
     """Mimic command (canonical.MIMIC), float32, shape [frames, 35]."""
     hands: Tensor
-    """Left and right hand, 1 closed, 0 open, float32, shape [frames, 2]."""
     frame_clip: Tensor
     """Clip of each frame, int64, shape [frames]."""
     clip_start: Tensor
-    """First frame of each clip, int64, shape [clips]."""
     clip_length: Tensor
-    """Frames of each clip, int64, shape [clips]."""
     family: Tensor
-    """Index into `family_names` of each clip, int64, shape [clips]."""
     support_kind: Tensor
-    """Index into `SUPPORTS` of each clip, int64, shape [clips]."""
     support_box: Tensor
-    """Support of each clip (`MotionLibrary.support_box`), float32, shape [clips, 7]."""
     family_names: tuple[str, ...]
-    """What kinds of motion there are."""
     clip_names: tuple[str, ...]
-    """Name of each clip."""
 
     @classmethod
     def build(cls, library: MotionLibrary, device: str | torch.device) -> DeviceLibrary:
@@ -432,15 +389,11 @@ class DeviceLibrary:
             lin_vel=((pos64 - pos64[previous]) / TICK).float(),
             ang_vel=(rotation_vector(turned) / TICK).float(),
             mimic=mimic.float(),
-            hands=up(library.hands),
             frame_clip=up(clip),
-            clip_start=up(library.clip_start),
-            clip_length=up(library.clip_length),
-            family=up(library.family),
-            support_kind=up(library.support_kind),
-            support_box=up(library.support_box),
-            family_names=tuple(str(name) for name in library.family_names),
-            clip_names=tuple(str(name) for name in library.clip_names),
+            family_names=tuple(map(str, library.family_names)),
+            clip_names=tuple(map(str, library.clip_names)),
+            **{name: up(getattr(library, name)) for name in ("hands", "clip_start", "clip_length", "family")},
+            **{name: up(getattr(library, name)) for name in ("support_kind", "support_box")},
         )
 
     @property

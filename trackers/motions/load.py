@@ -21,19 +21,8 @@ from arena_newton.canonical import ACTION_WIDTH, validate_action
 from arena_newton.errors import InputError
 from arena_newton.foreign import numbers, read_arrays, read_bytes
 
-__all__ = [
-    "JOINTS_23",
-    "Clip",
-    "checked_clip",
-    "clip_from_fields",
-    "load_actions",
-    "load_clip",
-    "load_plain_pickle",
-    "motions_of",
-    "pad_joints",
-    "resample",
-    "trim_start",
-]
+__all__ = ["JOINTS_23", "Clip", "checked_clip", "clip_from_fields", "load_actions", "load_clip", "load_plain_pickle"]
+__all__ += ["motions_of", "resample"]
 
 JOINTS = 29
 JOINTS_23: tuple[int, ...] = (*range(19), *range(22, 26))
@@ -128,7 +117,7 @@ def _admitted() -> dict[tuple[str, str], Any]:
 
 
 class _JoblibArray:
-    """Stands for joblib's `NumpyArrayWrapper`, which says what array follows in the file."""
+    """Replaces joblib's `NumpyArrayWrapper`, which says what array follows in the file."""
 
     shape: Any
     dtype: Any
@@ -256,23 +245,20 @@ def _check_size(content: Any) -> None:
     measured(content, 0)
 
 
-def load_clip(path: str | Path, *, flag: str = "--policy replay:", trim: bool = True) -> Clip:
+def load_clip(path: str | Path, *, trim: bool = True) -> Clip:
     """Read a pickled clip: fields `fps`, `root_pos`, `root_rot` (xyzw) and `dof_pos` (MuJoCo order; TWIST2, GMR, GMT).
 
-    29 joints, or the 23 without wrists, which are then zero. ASAP's names of the fields do as well.
-
-    Args:
-        path: The `.pkl` file.
-        flag: What errors name in front of the path.
-        trim: Cut a motion capture jump off the start.
+    29 joints, or the 23 without wrists, which are then zero. ASAP's names of the fields do as well. `trim` cuts a
+    motion capture jump off the start.
 
     Raises:
         InputError: A field is missing, of the wrong shape, or not finite; or the file holds several clips.
     """
-    motions = motions_of(load_plain_pickle(path, flag=flag), f"{flag}{path}")
+    where = f"--policy replay:{path}"
+    motions = motions_of(load_plain_pickle(path), where)
     if len(motions) != 1:
-        raise InputError(f"{flag}{path}: holds {len(motions)} clips, expected one; `motions convert` reads them all")
-    return clip_from_fields(next(iter(motions.values())), f"{flag}{path}", trim=trim)
+        raise InputError(f"{where}: holds {len(motions)} clips, expected one; `motions convert` reads them all")
+    return clip_from_fields(next(iter(motions.values())), where, trim=trim)
 
 
 def motions_of(content: Any, where: str) -> dict[str, Mapping[str, Any]]:
@@ -308,15 +294,8 @@ def clip_from_fields(content: Mapping[str, Any], where: str, *, trim: bool = Tru
             raise InputError(f"{where}: field {name} holds NaN or infinity")
     if arrays["fps"].size != 1:
         raise InputError(f"{where}: field fps must be one number from 1 to 1000")
-    return checked_clip(
-        float(arrays["fps"].reshape(())),
-        arrays["root_pos"],
-        arrays["root_rot"],
-        arrays["dof_pos"],
-        where,
-        xyzw=True,
-        trim=trim,
-    )
+    fps = float(arrays["fps"].reshape(()))
+    return checked_clip(fps, arrays["root_pos"], arrays["root_rot"], arrays["dof_pos"], where, xyzw=True, trim=trim)
 
 
 def checked_clip(
@@ -329,13 +308,9 @@ def checked_clip(
     xyzw: bool = False,
     trim: bool = True,
 ) -> Clip:
-    """A clip of finite arrays.
+    """A clip of finite arrays: root [m] and quaternions, and joints [rad], MuJoCo order, 29 or the 23 without wrists.
 
     Args:
-        fps: Frames per second.
-        root_pos: Root position [m].
-        root_rot: Root orientation.
-        dof_pos: Joint positions [rad], MuJoCo order, 29 or the 23 without wrists.
         where: What errors name.
         xyzw: The quaternions' scalar comes last.
         trim: Cut a motion capture jump off the start.
@@ -347,7 +322,9 @@ def checked_clip(
     if not 1.0 <= fps <= 1000.0:
         raise InputError(f"{where}: field fps must be one number from 1 to 1000")
     if dof_pos.ndim == 2 and dof_pos.shape[1] == len(JOINTS_23):
-        dof_pos = pad_joints(dof_pos)
+        padded = np.zeros((len(dof_pos), JOINTS), dtype=dof_pos.dtype)
+        padded[:, JOINTS_23] = dof_pos
+        dof_pos = padded
     if dof_pos.ndim == 2 and dof_pos.shape[1] != JOINTS:
         raise InputError(f"{where}: dof_pos has {dof_pos.shape[1]} joints, expected {JOINTS} or {len(JOINTS_23)}")
     frames = root_pos.shape[0] if root_pos.ndim == 2 else 0
@@ -363,17 +340,10 @@ def checked_clip(
         raise InputError(f"{where}: root_rot holds a quaternion that is not of length 1")
     quat = root_rot / norm
     clip = Clip(fps, root_pos, quat[:, [3, 0, 1, 2]] if xyzw else quat, dof_pos)
-    return trim_start(clip, where) if trim else clip
+    return _trim_start(clip, where) if trim else clip
 
 
-def pad_joints(joint_pos: np.ndarray) -> np.ndarray:
-    """Joints of a 23-DoF clip with wrists at zero; shape [frames, 23] becomes [frames, 29]."""
-    padded = np.zeros((len(joint_pos), JOINTS), dtype=joint_pos.dtype)
-    padded[:, JOINTS_23] = joint_pos
-    return padded
-
-
-def trim_start(clip: Clip, where: str) -> Clip:
+def _trim_start(clip: Clip, where: str) -> Clip:
     """The clip without a motion capture jump at its start; `trimmed` counts the frames.
 
     Raises:
@@ -384,9 +354,8 @@ def trim_start(clip: Clip, where: str) -> Clip:
         raise InputError(f"{where}: nothing is left after the jump at its start")
     if not start:
         return clip
-    hands = None if clip.hands is None else clip.hands[start:]
     arrays = {name: getattr(clip, name)[start:] for name in ("root_pos", "root_quat", "joint_pos")}
-    return replace(clip, **arrays, hands=hands, trimmed=clip.trimmed + start)
+    return replace(clip, **arrays, trimmed=start)
 
 
 def _start(root_pos: np.ndarray, joint_pos: np.ndarray, fps: float) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = ["ClipMeasures", "grounded", "joint_limits", "measure_clips", "measures_summary", "measures_table"]
+__all__ = ["ClipMeasures", "grounded", "measure_clips", "measures_summary", "measures_table"]
 
 JUMP_SPEED = 4.0
 """Root speed [m/s] that no motion of the robot reaches within a tick."""
@@ -64,13 +65,6 @@ class ClipMeasures:
     """Its origin."""
 
 
-def joint_limits() -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper angles [rad] of the 29 joints, MuJoCo order."""
-    ranges = {link.hinge.name: link.hinge.limits for link in LINKS if link.hinge is not None}
-    low, high = np.array([ranges[name] for name in MUJOCO_JOINTS]).T
-    return low, high
-
-
 def _soles(library: MotionLibrary) -> np.ndarray:
     """Middles of both soles [m], shape [frames, 2, 3]."""
     feet = [kinematics.link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]
@@ -92,7 +86,8 @@ def _floor(soles: np.ndarray) -> float:
 
 def measure_clips(library: MotionLibrary) -> list[ClipMeasures]:
     """Measure every clip."""
-    low, high = joint_limits()
+    ranges = {link.hinge.name: link.hinge.limits for link in LINKS if link.hinge is not None}
+    low, high = np.array([ranges[name] for name in MUJOCO_JOINTS]).T
     soles = _soles(library)
     measures = []
     for clip in range(library.clips):
@@ -170,48 +165,36 @@ def measures_summary(measures: list[ClipMeasures]) -> dict[str, Any]:
     }
 
 
-_COLUMNS = (
-    ("clip", str.ljust),
-    ("family", str.ljust),
-    ("s", str.rjust),
-    ("m/s", str.rjust),
-    ("p95", str.rjust),
-    ("low m", str.rjust),
-    ("limits", str.ljust),
-    ("jumps", str.rjust),
-    ("slip mm/s", str.rjust),
-    ("floor cm", str.rjust),
-    ("support", str.ljust),
-    ("licence", str.ljust),
-)
-
-
-def _cells(m: ClipMeasures) -> tuple[str, ...]:
-    limits = f"{np.degrees(m.beyond_limits):.1f}° {m.beyond_limits_joint.removesuffix('_joint')}"
+def _limits(m: ClipMeasures) -> str:
     return (
-        m.name,
-        m.family,
-        f"{m.seconds:.1f}",
-        f"{m.speed:.2f}",
-        f"{m.top_speed:.2f}",
-        f"{m.lowest:.2f}",
-        limits if m.beyond_limits else "-",
-        str(m.jumps or "-"),
-        f"{1e3 * m.slip:.0f}",
-        f"{round(100 * m.floor, 1) + 0.0:+.1f}",
-        m.support if m.support != "none" else "-",
-        m.licence,
+        f"{np.degrees(m.beyond_limits):.1f}° {m.beyond_limits_joint.removesuffix('_joint')}" if m.beyond_limits else "-"
     )
+
+
+# Title, alignment, and the text for one clip.
+_COLUMNS: tuple[tuple[str, Callable[[str, int], str], Callable[[ClipMeasures], str]], ...] = (
+    ("clip", str.ljust, lambda m: m.name),
+    ("family", str.ljust, lambda m: m.family),
+    ("s", str.rjust, lambda m: f"{m.seconds:.1f}"),
+    ("m/s", str.rjust, lambda m: f"{m.speed:.2f}"),
+    ("p95", str.rjust, lambda m: f"{m.top_speed:.2f}"),
+    ("low m", str.rjust, lambda m: f"{m.lowest:.2f}"),
+    ("limits", str.ljust, _limits),
+    ("jumps", str.rjust, lambda m: str(m.jumps or "-")),
+    ("slip mm/s", str.rjust, lambda m: f"{1e3 * m.slip:.0f}"),
+    ("floor cm", str.rjust, lambda m: f"{round(100 * m.floor, 1) + 0.0:+.1f}"),
+    ("support", str.ljust, lambda m: m.support if m.support != "none" else "-"),
+    ("licence", str.ljust, lambda m: m.licence),
+)
 
 
 def measures_table(measures: list[ClipMeasures], rows: int | None = None) -> str:
     """A table of the first `rows` clips (all by default), with totals by family below."""
-    lines = [tuple(name for name, _ in _COLUMNS), *map(_cells, measures[:rows])]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = []
-    for line in lines:
-        cells = (align(cell, width) for cell, (_, align), width in zip(line, _COLUMNS, widths, strict=True))
-        text.append("  ".join(cells).rstrip())
+    columns = []
+    for title, align, cell in _COLUMNS:
+        cells = [title, *map(cell, measures[:rows])]
+        columns.append([align(text, max(map(len, cells))) for text in cells])
+    text = ["  ".join(line).rstrip() for line in zip(*columns, strict=True)]
     if rows is not None and len(measures) > rows:
         text.append(f"... and {len(measures) - rows} more (--all shows them)")
     total = measures_summary(measures)

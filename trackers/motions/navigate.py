@@ -13,7 +13,7 @@ from torch import Tensor
 
 from arena_newton.rotations import rotate_xy, wrap_angle
 
-__all__ = ["Command", "NavigationLimits", "Navigator", "steer"]
+__all__ = ["NavigationCommand", "NavigationLimits", "Navigator", "steer"]
 
 TURN_FIRST, TURN_BLEND = 1.3, 0.7
 """Far from the goal, a heading error of `TURN_FIRST` stops the walk; this much less leaves it at full speed [rad]."""
@@ -63,7 +63,7 @@ class NavigationLimits:
 
 
 @dataclass
-class Command:
+class NavigationCommand:
     """What the controller asks for; rows are worlds."""
 
     velocity: Tensor
@@ -122,33 +122,25 @@ class Navigator:
         self.holding = torch.zeros(worlds, dtype=torch.bool, device=device)
         """Worlds that have arrived and hold their position."""
         self._smooth = torch.zeros(worlds, 2, device=device)
-        self._fresh = torch.ones(worlds, dtype=torch.bool, device=device)
+        self._first_tick = torch.ones(worlds, dtype=torch.bool, device=device)
         self._travelled = torch.zeros(worlds, device=device)
         self._bias = torch.zeros(worlds, 3, device=device)
 
     def reset(self, mask: Tensor | None = None) -> None:
-        """Forget the past of some worlds (all without a mask): a new episode.
-
-        Args:
-            mask: bool, shape [worlds].
-        """
-        every = torch.ones_like(self._fresh) if mask is None else mask
+        """Forget the past of the worlds of `mask`, bool, shape [worlds] (all without one): a new episode."""
+        every = torch.ones_like(self._first_tick) if mask is None else mask
         self.retarget(every)
         self._bias = self._bias.masked_fill(every[:, None], 0.0)
 
     def retarget(self, mask: Tensor) -> None:
-        """Some worlds get another goal or route; what was learned about their stops is kept.
-
-        Args:
-            mask: bool, shape [worlds].
-        """
+        """Worlds of `mask`, bool, shape [worlds], get another goal or route; what their stops taught is kept."""
         self.holding = self.holding & ~mask
-        self._fresh = self._fresh | mask
+        self._first_tick = self._first_tick | mask
         self._travelled = self._travelled.masked_fill(mask, 0.0)
 
     def command(
         self, pose: Tensor, goal: Tensor, dt: float, *, route: Tensor | None = None, mask: Tensor | None = None
-    ) -> Command:
+    ) -> NavigationCommand:
         """One step of the loop.
 
         Args:
@@ -163,12 +155,12 @@ class Navigator:
             The command of every world.
         """
         k = self.limits
-        every = torch.ones_like(self._fresh) if mask is None else mask
+        every = torch.ones_like(self._first_tick) if mask is None else mask
         here, yaw = pose[:, :2], pose[:, 2]
         blend = dt / (k.smoothing + dt)
-        smooth = torch.where(self._fresh[:, None], here, self._smooth + blend * (here - self._smooth))
+        smooth = torch.where(self._first_tick[:, None], here, self._smooth + blend * (here - self._smooth))
         self._smooth = torch.where(every[:, None], smooth, self._smooth)
-        self._fresh = self._fresh & ~every
+        self._first_tick = self._first_tick & ~every
 
         aim, left = goal[:, :2], torch.linalg.vector_norm(goal[:, :2] - here, dim=1)
         stray = torch.zeros_like(left)
@@ -194,7 +186,7 @@ class Navigator:
         near = (left < k.lookahead)[:, None]
         left = torch.where(near[:, 0], torch.linalg.vector_norm(goal[:, :2] + shift - here, dim=1), left)
         velocity = steer(pose, aim + near * shift, turned, left, k) * (~holding)[:, None]
-        return Command(velocity=velocity, arrived=holding, distance=left, heading_error=error, stray=stray)
+        return NavigationCommand(velocity=velocity, arrived=holding, distance=left, heading_error=error, stray=stray)
 
 
 def follow(

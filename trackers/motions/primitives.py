@@ -34,6 +34,7 @@ __all__ = [
     "push",
     "reach",
     "rise",
+    "script",
     "shift",
     "sit",
     "squat",
@@ -161,7 +162,8 @@ class Program:
         return MotionCommand.unpack(previous + fraction * (row - previous))
 
 
-def _script(*segments: tuple[float, dict[str, Any]] | Segment) -> Script:
+def script(*segments: tuple[float, dict[str, Any]] | Segment) -> Script:
+    """A script of segments, each given whole or as its time [s] and channels."""
     return Script(tuple(s if isinstance(s, Segment) else Segment(*s) for s in segments))
 
 
@@ -173,24 +175,24 @@ def _sided(side: str) -> int:
 
 def stand(seconds: float = 2.0, **channels: Any) -> Script:
     """Stand for a while, with any other channels."""
-    return _script((seconds, channels))
+    return script((seconds, channels))
 
 
 def shift(forward: float = 0.0, left: float = 0.05, hold: float = 1.5) -> Script:
     """Move the centre of mass over fixed feet [m], hold, and come back."""
-    return _script((hold + 0.8, {"shift": (forward, left)}), (1.0, {}))
+    return script((hold + 0.8, {"shift": (forward, left)}), (1.0, {}))
 
 
 def step(seconds: float = 3.0, *, pause: float = 1.0) -> Script:
     """Step in place."""
-    return _script((seconds, {"step_in_place": 1.0}), (pause, {}))
+    return script((seconds, {"step_in_place": 1.0}), (pause, {}))
 
 
 def walk(
     forward: float = 0.3, left: float = 0.0, turn: float = 0.0, seconds: float = 4.0, *, pause: float = 1.5
 ) -> Script:
     """Walk at a velocity [m/s, m/s, rad/s] of the heading frame and stop."""
-    return _script((seconds, {"velocity": (forward, left, turn)}), *([(pause, {})] if pause > 0.0 else []))
+    return script((seconds, {"velocity": (forward, left, turn)}), *([(pause, {})] if pause > 0.0 else []))
 
 
 def step_over(
@@ -207,7 +209,7 @@ def step_over(
     high = {"swing_height": swing_height, "step_time": step_time, "height": 0.74}
     speed = 0.5 * stride / step_time
     stepping = {"velocity": (speed, 0.0, 0.0), "stagger": 0.5 * stride, **high}
-    return _script((0.5, high), (seconds, stepping), (1.5, high), (0.5, {}))
+    return script((0.5, high), (seconds, stepping), (1.5, high), (0.5, {}))
 
 
 def step_up(
@@ -234,16 +236,16 @@ def step_up(
     high = {"swing_height": swing_height, "step_time": step_time, "height": 0.73}
     stepping = {"velocity": (0.5 * stride / step_time, 0.0, 0.0), "stagger": 0.5 * stride, **high}
     seconds = 2.0 * step_time * pairs
-    parts = _script((0.5, high), (ahead, stepping), (seconds, {**stepping, "ground": height}))
+    parts = script((0.5, high), (ahead, stepping), (seconds, {**stepping, "ground": height}))
     if down:
-        return parts + _script((4.0 * step_time, stepping), (1.5, high), (0.5, {}))
-    return parts + _script((1.5, {**high, "ground": height}), (0.5, {"ground": height}))
+        return parts + script((4.0 * step_time, stepping), (1.5, high), (0.5, {}))
+    return parts + script((1.5, {**high, "ground": height}), (0.5, {"ground": height}))
 
 
 def squat(height: float = 0.45, *, pitch: float = 0.3, down: float = 1.5, hold: float = 1.0) -> Script:
     """Lower the pelvis [m] over fixed feet, hold, and rise; `down` is the time of going down, and of going up [s]."""
     low = {"height": height, "pitch": pitch}
-    return _script(Segment(down, low, ramp=True), (hold + 0.3, low), Segment(down, {}, ramp=True), (0.5, {}))
+    return script(Segment(down, low, ramp=True), (hold + 0.3, low), Segment(down, {}, ramp=True), (0.5, {}))
 
 
 def reach(side: str, point: Sequence[float], *, hold: float = 1.5, arms: Sequence[float] = DEFAULT_ARMS) -> Script:
@@ -252,7 +254,7 @@ def reach(side: str, point: Sequence[float], *, hold: float = 1.5, arms: Sequenc
     points, weights = np.array(neutral_row()[COLUMNS["hand_point"]]).reshape(2, 3), [0.0, 0.0]
     points[k], weights[k] = point, 1.0
     out = {"hand_point": points, "reach": weights, "arms": arms}
-    return _script((hold + 1.2, out), (1.2, {"arms": arms}))
+    return script((hold + 1.2, out), (1.2, {"arms": arms}))
 
 
 def crouch_reach(
@@ -263,22 +265,17 @@ def crouch_reach(
     pitch: float = 0.35,
     down: float = 1.5,
     hold: float = 1.5,
-    arms: Sequence[float] = DEFAULT_ARMS,
 ) -> Script:
     """Squat, reach to a point of the pelvis' heading frame [m], return, and rise."""
     low = {"height": height, "pitch": pitch}
-    up = _script(Segment(down, {"arms": arms}, ramp=True), (0.5, {}))
-    return (
-        _script(Segment(down, {**low, "arms": arms}, ramp=True))
-        + reach(side, point, hold=hold, arms=arms).over(**low)
-        + up
-    )
+    lower, up = script(Segment(down, low, ramp=True)), script(Segment(down, {}, ramp=True), (0.5, {}))
+    return lower + reach(side, point, hold=hold).over(**low) + up
 
 
 def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
     """Shift to the other foot, wind up, swing at a foot speed [m/s], and recover."""
     foot = _sided(side) + 1
-    return _script((kick_seconds(speed), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
+    return script((kick_seconds(speed), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
 
 
 def punch(side: str = "right", *, height: float | None = None, speed: float = 10.0, times: int = 1) -> Script:
@@ -289,7 +286,7 @@ def punch(side: str = "right", *, height: float | None = None, speed: float = 10
     both = {"hands": (1.0, 1.0), **({} if height is None else {"height": height, "pitch": 0.15})}
     guard = {"arms": GUARD_ARMS, "arm_speed": 3.0, **both}
     hit = ((0.35, {**guard, "arms": out.ravel(), "arm_speed": speed}), (0.7, {**guard, "arm_speed": 6.0}))
-    return _script((1.2, guard), *(hit * times), (1.2, {"arms": DEFAULT_ARMS}))
+    return script((1.2, guard), *(hit * times), (1.2, {"arms": DEFAULT_ARMS}))
 
 
 def sit(seat: float = 0.42, *, hold: float = 3.0, depth: float = SEAT_DEPTH[0], press: float = SEAT_DEPTH[1]) -> Script:
@@ -305,7 +302,7 @@ def sit(seat: float = 0.42, *, hold: float = 3.0, depth: float = SEAT_DEPTH[0], 
     back, above = min(SEAT_APPROACH[0], depth), SEAT_APPROACH[1]
     lean = {"pitch": 0.21, "waist": (0.0, 0.0, 0.14), **arms}
     middle = 0.5 * (0.78 + seat + above)
-    return _script(
+    return script(
         Segment(1.1, {"height": middle, "pelvis_back": 0.5 * back, **lean}, ramp=True),
         Segment(1.1, {"height": seat + above, "pelvis_back": back, "pitch": 0.12, **arms}, ramp=True),
         Segment(1.0, {"height": seat + press, "pelvis_back": depth, "pitch": 0.05, **arms}, ramp=True),
@@ -318,7 +315,7 @@ def rise(seat: float = 0.42, *, depth: float = SEAT_DEPTH[0], press: float = SEA
     arms = {"arms": FORWARD_ARMS}
     lean = {"pitch": 0.45, "waist": (0.0, 0.0, 0.35), **arms}
     # The weight comes over the feet while the seat still bears it; leaving it earlier, the robot falls back.
-    return _script(
+    return script(
         Segment(0.8, {"height": seat + press, "pelvis_back": depth, **lean}, ramp=True),
         Segment(0.4 + 4.0 * depth, {"height": seat + SEAT_CLEAR, "pelvis_back": 0.0, **lean}, ramp=True),
         (0.2, {"height": seat + SEAT_CLEAR, **lean}),
@@ -333,7 +330,7 @@ def carry(
     """Walk with both palms at the sides of a box of a width [m] in front of the belly."""
     points = ((0.30, 0.5 * width, 0.10), (0.30, -0.5 * width, 0.10))
     held = {"hand_point": points, "reach": (1.0, 1.0), "arms": CARRY_ARMS}
-    return _script((1.5, held), (seconds, {**held, "velocity": (forward, left, turn)}), (1.0, held), (1.5, {}))
+    return script((1.5, held), (seconds, {**held, "velocity": (forward, left, turn)}), (1.0, held), (1.5, {}))
 
 
 def push(
@@ -345,4 +342,4 @@ def push(
 ) -> Script:
     """Walk against a resistance: palms forward, feet set behind the pelvis [m]."""
     held = {"hand_point": hands, "reach": (1.0, 1.0), "arms": CARRY_ARMS, "foot_offset": foot_offset}
-    return _script((1.2, held), (seconds, {**held, "velocity": (forward, 0.0, 0.0)}), (1.0, held), (1.5, {}))
+    return script((1.2, held), (seconds, {**held, "velocity": (forward, 0.0, 0.0)}), (1.0, held), (1.5, {}))

@@ -81,10 +81,10 @@ class _Draw:
         limbs = [tuple(self(low, high) for low, high in ARM_RANGES) for _ in range(2)]
         return (*limbs[0], *p.mirrored_arms(limbs[1])[7:])
 
-    def hand(self, side: str) -> tuple[float, float, float]:
-        """A random hand point of a side [m]."""
-        y = self(-0.08, 0.45)
-        return self(0.12, 0.5), y if side == "left" else -y, self(-0.25, 0.6)
+    def hand(self) -> tuple[str, tuple[float, float, float]]:
+        """A random side and a point for its hand [m]."""
+        side, y = self.side(), self(-0.08, 0.45)
+        return side, (self(0.12, 0.5), y if side == "left" else -y, self(-0.25, 0.6))
 
     def gait(self) -> dict[str, float]:
         """Random shape of steps."""
@@ -163,8 +163,7 @@ def _squat(d: _Draw, seconds: float) -> _Plan:
     """Down to 0.42-0.72 m, repeated."""
     parts = p.stand(d(0.3, 1.0))
     while parts.seconds < seconds:
-        height = d(0.42, 0.72)
-        parts = parts + p.squat(height, pitch=d(0.0, 0.5), down=d(0.9, 2.2), hold=d(0.2, 2.0))
+        parts = parts + p.squat(d(0.42, 0.72), pitch=d(0.0, 0.5), down=d(0.9, 2.2), hold=d(0.2, 2.0))
     return _Plan(d.upper(parts))
 
 
@@ -216,8 +215,7 @@ def _reach(d: _Draw, seconds: float) -> _Plan:
     """Either palm to random points."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
-        side = d.side()
-        one = p.reach(side, d.hand(side), hold=d(0.3, 1.5)).over(
+        one = p.reach(*d.hand(), hold=d(0.3, 1.5)).over(
             height=d(0.68, 0.779), pitch=d(-0.05, 0.3), arm_speed=d(1.0, 4.0), shift=(d(-0.01, 0.03), d(-0.03, 0.03))
         )
         if d.chance(0.3):
@@ -231,10 +229,7 @@ def _crouch_reach(d: _Draw, seconds: float) -> _Plan:
     """The same in a squat."""
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
-        side = d.side()
-        parts = parts + p.crouch_reach(
-            side, d.hand(side), d(0.42, 0.68), pitch=d(0.1, 0.55), down=d(1.0, 2.0), hold=d(0.3, 1.5)
-        )
+        parts = parts + p.crouch_reach(*d.hand(), d(0.42, 0.68), pitch=d(0.1, 0.55), down=d(1.0, 2.0), hold=d(0.3, 1.5))
     return _Plan(parts)
 
 
@@ -295,7 +290,7 @@ def _sit_air(d: _Draw, seconds: float) -> _Plan:
     parts = p.stand(d(0.2, 0.8))
     while parts.seconds < seconds:
         low = {"height": d(0.5, 0.6), "pitch": d(0.2, 0.45), "arms": p.FORWARD_ARMS}
-        parts = parts + p._script(
+        parts = parts + p.script(
             p.Segment(d(1.5, 2.5), low, ramp=True), (d(0.5, 1.5), low), p.Segment(d(1.5, 2.5), {}, ramp=True), (0.6, {})
         )
     return _Plan(parts)
@@ -340,23 +335,17 @@ def _sill(d: _Draw, seconds: float) -> _Plan:
 @_family(160)
 def _mixed(d: _Draw, seconds: float) -> _Plan:
     """Walk, reach, crouch, kick, punch, squat in any order."""
+    pieces = (
+        lambda: p.walk(*d.velocity(), d(1.5, 3.0), pause=d(0.0, 1.0)).over(**d.gait()),
+        lambda: p.crouch_reach(*d.hand(), d(0.45, 0.7), down=1.2, hold=d(0.3, 1.0)),
+        lambda: p.reach(*d.hand(), hold=d(0.3, 1.0)),
+        lambda: p.kick(d.side(), d(1.5, 3.2), pause=0.3),
+        lambda: p.punch(d.side(), height=d(0.6, 0.77)),
+        lambda: p.squat(d(0.45, 0.7), down=d(1.0, 1.6), hold=d(0.2, 1.0)),
+    )
     parts = p.stand(d(0.1, 0.6))
     while parts.seconds < seconds:
-        kind = int(d.rng.integers(6))
-        if kind == 0:
-            parts = parts + p.walk(*d.velocity(), d(1.5, 3.0), pause=d(0.0, 1.0)).over(**d.gait())
-        elif kind == 1:
-            side = d.side()
-            parts = parts + p.crouch_reach(side, d.hand(side), d(0.45, 0.7), down=1.2, hold=d(0.3, 1.0))
-        elif kind == 2:
-            side = d.side()
-            parts = parts + p.reach(side, d.hand(side), hold=d(0.3, 1.0))
-        elif kind == 3:
-            parts = parts + p.kick(d.side(), d(1.5, 3.2), pause=0.3)
-        elif kind == 4:
-            parts = parts + p.punch(d.side(), height=d(0.6, 0.77))
-        else:
-            parts = parts + p.squat(d(0.45, 0.7), down=d(1.0, 1.6), hold=d(0.2, 1.0))
+        parts = parts + pieces[d.rng.integers(6)]()
     return _Plan(parts)
 
 
@@ -364,15 +353,9 @@ def _mixed(d: _Draw, seconds: float) -> _Plan:
 def _platform(d: _Draw, seconds: float) -> _Plan:
     """A walk onto a platform, half of them over it and down again; `place_platform` finds where it fits."""
     height, down = d(*PLATFORM_HEIGHTS), d.chance(0.5)
-    over = p.step_up(
-        height,
-        d(0.38, 0.42),
-        3 if down else 2,
-        ahead=d(1.0, 2.0),
-        down=down,
-        swing_height=d(0.14, 0.18),
-        step_time=d(0.5, 0.6),
-    )
+    stride, ahead, swing_height, step_time = d(0.38, 0.42), d(1.0, 2.0), d(0.14, 0.18), d(0.5, 0.6)
+    high = {"swing_height": swing_height, "step_time": step_time}
+    over = p.step_up(height, stride, 3 if down else 2, ahead=ahead, down=down, **high)
     return _Plan(d.upper(p.stand(d(0.1, 0.5)) + over, 0.3), "platform", height=height)
 
 
@@ -400,6 +383,12 @@ def _play(plans: list[_Plan], ticks: int, device: torch.device | str) -> dict[st
     return out
 
 
+def _box(centre: torch.Tensor, top: torch.Tensor, yaw: torch.Tensor, size: tuple[float, float]) -> torch.Tensor:
+    """Rows of `MotionLibrary.support_box` of boxes of one length and width, shape [clips, 7]."""
+    sizes = torch.tensor(size, device=top.device).expand(len(top), 2)
+    return torch.cat([centre, top[:, None], yaw[:, None], sizes, top[:, None]], dim=1)
+
+
 def _place_seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Boxes behind the standing pelvis, and which stay clear of the feet and of the walk to them."""
     root = out["root_pos"]
@@ -410,8 +399,7 @@ def _place_seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
     height = torch.tensor([plan.height for plan in plans], device=root.device)
     ahead = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
     centre = position[:, :2] - ahead * (edge + 0.5 * SEAT_SIZE[0])[:, None]
-    size = torch.tensor(SEAT_SIZE, device=root.device).expand(len(plans), 2)
-    box = torch.cat([centre, height[:, None], yaw[:, None], size, height[:, None]], dim=1)
+    box = _box(centre, height, yaw, SEAT_SIZE)
 
     def local(xy: torch.Tensor) -> torch.Tensor:
         return rotate_xy(-yaw[:, None], xy - centre[:, None]).abs()
@@ -427,13 +415,9 @@ def _place_seat(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
 def _along(root_xy: torch.Tensor, feet: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """The line of a walk from its start to its end, and where the feet are on it.
 
-    Args:
-        root_xy: Pelvis [m], shape [clips, ticks, 2].
-        feet: Ankles [m], shape [clips, ticks, 2, 2 or more].
-
-    Returns:
-        Start [m] and direction, shape [clips, 2], length [m], shape [clips], and the position of each foot along it
-        [m], shape [clips, ticks, 2].
+    Pelvis [m], shape [clips, ticks, 2], and ankles [m], shape [clips, ticks, 2, 2 or more], give the start [m] and the
+    direction, shape [clips, 2], the length [m], shape [clips], and each foot's position along it [m], shape [clips,
+    ticks, 2].
     """
     start, path = root_xy[:, 0], root_xy[:, -1] - root_xy[:, 0]
     length = path.square().sum(1).sqrt().clamp(min=1e-3)
@@ -463,9 +447,7 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
     top = torch.minimum(best - SILL_CLEARANCE, wanted)
     yaw = torch.atan2(ahead[:, 1], ahead[:, 0])
     centre = start + ahead * where[:, None]
-    size = torch.tensor(SILL_SIZE, device=root.device).expand(len(top), 2)
-    box = torch.cat([centre, top[:, None], yaw[:, None], size, top[:, None]], dim=1)
-    return box, top >= SILL_HEIGHTS[0]
+    return _box(centre, top, yaw, SILL_SIZE), top >= SILL_HEIGHTS[0]
 
 
 def place_platform(
@@ -507,9 +489,7 @@ def _place_platform_box(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tup
     root = out["root_pos"]
     height = torch.tensor([plan.height for plan in plans], device=root.device)
     pose, room = place_platform(root[..., :2], out["feet"], height)
-    size = torch.tensor(PLATFORM_SIZE, device=root.device).expand(len(plans), 2)
-    box = torch.cat([pose[:, :2], height[:, None], pose[:, 2:], size, height[:, None]], dim=1)
-    return box, room >= 0.0
+    return _box(pose[:, :2], height, pose[:, 2], PLATFORM_SIZE), room >= 0.0
 
 
 _PLACE = {"seat": _place_seat, "sill": _place_sill, "platform": _place_platform_box}
@@ -527,13 +507,10 @@ def random_clips(
 ) -> dict[str, Any]:
     """Random clips of the named families, all of the same length.
 
-    A family is a way to draw scripts of primitives (`primitives`), joined until the clip is full; gait shape (step
-    0.38-0.52 s, width 0.19-0.27 m, swing 6-10 cm, pelvis 0.70-0.78 m) is drawn once per clip, and on about half the
-    clips every segment has random arms, waist and hands.
+    A family draws scripts of primitives, joined until the clip is full, as the docstring of its maker (`_stand` to
+    `_platform`) says; on about half the clips every segment has random arms, waist and hands.
 
-    The docstring of each maker (`_stand` to `_platform`) says what it draws.
-
-    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support in the way of a foot is drawn
+    A clip with more than 2 cm of IK error, a joint faster than 25 rad/s, or a support in the path of a foot is drawn
     again.
 
     Args:
@@ -584,10 +561,8 @@ def random_clips(
             result[name][to] = values[sound]
         missing = missing[~good]
     if len(missing):
-        bad = sorted({names[family[i]] for i in missing})
-        why = "IK error, joint speed or support"
-        raise InputError(
-            f"could not generate {len(missing)} clips of {', '.join(bad)}: {ROUNDS} attempts failed ({why})"
-        )
+        bad = ", ".join(sorted({names[family[i]] for i in missing}))
+        why = f"{ROUNDS} attempts failed (IK error, joint speed or support)"
+        raise InputError(f"could not generate {len(missing)} clips of {bad}: {why}")
     del result["feet"]
     return {**result, "family": torch.tensor(family, device=device), "family_names": names}

@@ -34,12 +34,7 @@ class ClipRenderer:
     """Poses the robot as a library's frames say and takes pictures that follow it."""
 
     def __init__(self, library: MotionLibrary, *, width: int = 240, height: int = 320):
-        """Build the scene.
-
-        Args:
-            library: The clips.
-            width: Width of a picture [px].
-            height: Height of a picture [px].
+        """Build the scene for pictures of `width` by `height` [px].
 
         Raises:
             InputError: A size below 16 px.
@@ -55,21 +50,15 @@ class ClipRenderer:
         self._lights.set(0, LightDraw(LIGHT_DIRECTION, LIGHT_INTENSITY, (1.0, 1.0, 1.0)))
 
     def pictures(self, clip: int, frames: np.ndarray) -> Iterator[np.ndarray]:
-        """Pictures of a clip, one at a time.
+        """Pictures of a clip, uint8 [height, width, 3], of frames counted from its start.
 
         The clip is turned to start towards +x, and its path centred on the floor.
-
-        Args:
-            clip: Index of the clip.
-            frames: Frames of the clip, counted from its start.
-
-        Yields:
-            uint8 [height, width, 3].
         """
         rows = self.library.rows(clip)
         pos, quat = (getattr(self.library, name)[rows].astype(np.float64) for name in ("root_pos", "root_quat"))
         turn = quat_from_yaw_np(-heading_np(quat[0]))
-        matrix = self._rotation(turn)
+        matrix = np.zeros((3, 3))
+        mujoco.mju_quat2Mat(matrix.reshape(9), turn)
         pos = pos @ matrix.T
         middle = (pos[:, :2].min(axis=0) + pos[:, :2].max(axis=0)) / 2
         pos[:, :2] -= middle
@@ -80,11 +69,6 @@ class ClipRenderer:
             mujoco.mju_mulQuat(root, turn, quat[frame])
             self._pose(pos[frame], root, joints[frame], hands[frame])
             yield self._camera(pos[frame]).render(self._state)[0].cpu().numpy().copy()
-
-    def _rotation(self, quat: np.ndarray) -> np.ndarray:
-        matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, quat)
-        return matrix.reshape(3, 3)
 
     def _place_support(self, clip: int, turn: np.ndarray, matrix: np.ndarray, middle: np.ndarray) -> None:
         self._data.mocap_pos[:] = self._parked

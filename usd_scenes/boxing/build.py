@@ -64,14 +64,9 @@ def _bag(stage: Usd.Stage, name: str, centre: author.Vec, skin: Usd.Prim, metal:
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=TASK.spawn_quat,
-        eye=(-4.39689, -2.7965, 2.15956),
-        gaze=(0.62349, 0.41055, -0.34404, -0.56951),
-        variants=("base", "semantic"),
+        folder, TASK, eye=(-4.39689, -2.7965, 2.15956), gaze=(0.62349, 0.41055, -0.34404, -0.56951)
     )
-    rough = warehouse.surface(stage)
+    rough = author.physics_material(stage, "/World/Looks/Rough")
     warehouse.room_looks(stage)
     warehouse.room(stage, rough)
     metal = author.material(stage, "/World/Looks/Metal", (0.05, 0.05, 0.055), roughness=0.4, metallic=0.6)

@@ -42,7 +42,7 @@ def hammer_inertia() -> tuple[np.ndarray, np.ndarray]:
 
 
 def hammer(stage: Usd.Stage) -> None:
-    """The hammer: origin in the middle of the handle, handle along y, head at +y; lies along world x by default."""
+    """The hammer: origin in the middle of the handle, handle along y, head at +y; along world x by default."""
     com, inertia = hammer_inertia()
     author.rigid_body(
         stage,
@@ -54,26 +54,13 @@ def hammer(stage: Usd.Stage) -> None:
         inertia=inertia,
         com=com,
     )
-    surface = author.physics_material(stage, "/World/Looks/HammerSurface", static=1.0, dynamic=1.0)
+    surface = author.physics_material(stage, "/World/Looks/HammerSurface")
     yellow = author.material(stage, "/World/Looks/handle", (0.62, 0.38, 0.10))
     iron = author.material(stage, "/World/Looks/iron", (0.10, 0.10, 0.11), metallic=0.8, roughness=0.4)
-    handle = author.capsule(
-        stage,
-        "/World/Hammer/Handle",
-        HANDLE_RADIUS,
-        HANDLE_LENGTH - 2 * HANDLE_RADIUS,
-        axis="Y",
-        look=yellow,
-        surface=surface,
-    )
-    head = author.box(
-        stage,
-        "/World/Hammer/Head",
-        HEAD_HALF,
-        (0, HANDLE_LENGTH / 2 - HEAD_HALF[1], 0),
-        look=iron,
-        surface=surface,
-    )
+    straight, end = HANDLE_LENGTH - 2 * HANDLE_RADIUS, (0, HANDLE_LENGTH / 2 - HEAD_HALF[1], 0)
+    path = "/World/Hammer"
+    handle = author.capsule(stage, f"{path}/Handle", HANDLE_RADIUS, straight, axis="Y", look=yellow, surface=surface)
+    head = author.box(stage, f"{path}/Head", HEAD_HALF, end, look=iron, surface=surface)
     for geom in (handle, head):
         rooms.contact(geom, solref=STIFF, condim=3)
 
@@ -103,14 +90,7 @@ def crate(stage: Usd.Stage) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
-    stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=TASK.spawn_quat,
-        eye=(-0.55955, -2.63763, 2.16241),
-        gaze=(0.70287, 0.42371, 0.29498, 0.48932),
-        variants=("base", "semantic"),
-    )
+    stage = rooms.task_stage(folder, TASK, eye=(-0.55955, -2.63763, 2.16241), gaze=(0.70287, 0.42371, 0.29498, 0.48932))
     looks = rooms.workshop(stage, low=(-5.6, -6.0), high=(2.0, 2.4), windows=[("+y", -3.4, 1.6, 0.3)])
     rooms.bench(stage, "/World/RightDesk", (-3.8, -3.68), (-1.35, -2.93), solref=STIFF)
     rooms.bench(stage, "/World/LeftDesk", (-3.9, -0.40), (-1.41, 0.33), solref=STIFF)

@@ -26,7 +26,7 @@ NET_SPACING, CORD = 0.13, 0.02
 
 
 def ball(stage: Usd.Stage, path: str, position: author.Vec, radius: float, mass: float, look: Usd.Prim) -> Usd.Prim:
-    """A rolling ball: unseen sphere that touches, textured sphere that is seen.
+    """A rolling ball: invisible collision sphere, textured visual sphere.
 
     A solid sphere's inertia, as PhysX gives a sphere collider (a rolling ball then keeps 5/7 of a kick's peak speed).
     Contact: condim 3 and no damping, so rolling costs no speed; priority 1, so that the ball's own friction and
@@ -34,7 +34,7 @@ def ball(stage: Usd.Stage, path: str, position: author.Vec, radius: float, mass:
     sets it when the scene is loaded.
     """
     body = author.rigid_body(stage, path, position, mass=mass, inertia=[0.4 * mass * radius**2] * 3)
-    surface = author.physics_material(stage, f"{path}/Surface", static=0.7, dynamic=0.7, restitution=0.1)
+    surface = author.physics_material(stage, f"{path}/Surface", friction=0.7, restitution=0.1)
     geom = author.sphere(stage, f"{path}/Collider", radius, visual=False, surface=surface)
     rooms.contact(geom, condim=3, priority=1)
     Solids().ball(radius).write(stage, f"{path}/Look", look=look)
@@ -42,7 +42,7 @@ def ball(stage: Usd.Stage, path: str, position: author.Vec, radius: float, mass:
 
 
 def pitch(stage: Usd.Stage) -> None:
-    """Grass slab, centre circle, goal line, four grey backdrop walls (seen only) and the `Pitch` marker inside them."""
+    """Grass, centre circle, goal line, four grey backdrop walls (visual only) and the `Pitch` marker inside them."""
     white = author.material(stage, "/World/Looks/white", (0.85, 0.85, 0.85))
     grey = author.material(stage, "/World/Looks/grey", (0.35, 0.35, 0.35))
     grass = author.material(stage, "/World/Looks/grass", texture="../textures/grass.png")
@@ -60,9 +60,9 @@ def pitch(stage: Usd.Stage) -> None:
 
 
 def goal(stage: Usd.Stage) -> None:
-    """Posts and crossbar that touch, frame and net that are seen, and the `Volume` in which a goal counts."""
+    """Posts and crossbar for collision, frame and net for the eye, and the `Volume` in which a goal counts."""
     author.xform(stage, "/World/Goal")
-    surface = author.physics_material(stage, "/World/Looks/GoalSurface", static=0.5, dynamic=0.5, restitution=0.1)
+    surface = author.physics_material(stage, "/World/Looks/GoalSurface", friction=0.5, restitution=0.1)
     half = (BAR + POST) / 2
     middle, width = (LEFT + RIGHT) / 2, RIGHT - LEFT
     for name, x in (("LeftPost", LEFT), ("RightPost", RIGHT)):
@@ -85,26 +85,17 @@ def goal(stage: Usd.Stage) -> None:
     frame.write(stage, "/World/Goal/FrameLook")
     front, rear = LINE + 0.45, BAR - 0.06
     net = Solids()
-    net.net(
+    # Its top from the crossbar over the stays to the rear posts, its back, and both sides.
+    nets = [
         [(LEFT, LINE, BAR), (RIGHT, LINE, BAR), (RIGHT, front, rear), (LEFT, front, rear)],
-        spacing=NET_SPACING,
-        width=CORD,
-    )
-    net.net(
         [(LEFT, front, rear), (RIGHT, front, rear), (RIGHT, BACK, BACK_HEIGHT), (LEFT, BACK, BACK_HEIGHT)],
-        spacing=NET_SPACING,
-        width=CORD,
-    )
-    net.net(
         [(LEFT, BACK, 0), (RIGHT, BACK, 0), (RIGHT, BACK, BACK_HEIGHT), (LEFT, BACK, BACK_HEIGHT)],
-        spacing=NET_SPACING,
-        width=CORD,
-    )
+    ]
     for x in (LEFT, RIGHT):
-        net.net([(x, LINE, 0), (x, front, 0), (x, front, rear), (x, LINE, BAR)], spacing=NET_SPACING, width=CORD)
-        net.net(
-            [(x, front, 0), (x, BACK, 0), (x, BACK, BACK_HEIGHT), (x, front, rear)], spacing=NET_SPACING, width=CORD
-        )
+        nets.append([(x, LINE, 0), (x, front, 0), (x, front, rear), (x, LINE, BAR)])
+        nets.append([(x, front, 0), (x, BACK, 0), (x, BACK, BACK_HEIGHT), (x, front, rear)])
+    for corners in nets:
+        net.net(corners, spacing=NET_SPACING, width=CORD)
     net.write(stage, "/World/Goal/Net")
     # Centre of the ball, rule set `paper`: −2.5 < x < 2.6, 3.03 < y < 5.03, 0 < z < 1.85.
     author.marker(stage, "/World/Goal/Volume", (5.1, 2.0, 1.85), (0.05, 4.03, 0.925))
@@ -113,10 +104,10 @@ def goal(stage: Usd.Stage) -> None:
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
     variants = ("base", "semantic", "semantic_released")
-    stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=tuple(round(value, 7) for value in TASK.spawn_quat),  # as the layer has always been written
+    stage = rooms.scene_stage(
+        folder,
+        TASK.spawn_position,
+        tuple(round(value, 7) for value in TASK.spawn_quat),  # as the layer has always been written
         eye=(3.00604, -1.18692, 1.99495),
         gaze=(0.70141, 0.51577, 0.29143, 0.39632),
         variants=variants,

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
+from arena_newton.rotations import matrix_from_quat_np
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.g1.links import LINKS, PALM_OFFSET, Link
-from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Bar, Loft, Rod, grid, merge
+from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Block, Loft, Rod, grid, merge
 
 __all__ = ["PATH", "build", "fuse", "zero_poses"]
 
@@ -21,8 +22,6 @@ PATH = Path(__file__).with_name("g1.usda")
 """The committed layer."""
 
 ROOT = "/G1"
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
 HEAD_CAMERA = ((0.0576235, 0.01753, 0.42987), 0.8307767239493009)
 """`d435_link` on `torso_link`: offset [m], pitch down [rad]; Unitree's public G1 model."""
 
@@ -75,7 +74,7 @@ def zero_poses() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             poses[link.name] = (np.zeros(3), quat)
             continue
         position, parent = poses[link.parent]
-        poses[link.name] = (position + _matrix(parent) @ np.asarray(link.offset), _multiply(parent, quat))
+        poses[link.name] = (position + matrix_from_quat_np(parent) @ np.asarray(link.offset), _multiply(parent, quat))
     return poses
 
 
@@ -89,9 +88,9 @@ def fuse(links: Sequence[Link]) -> tuple[float, np.ndarray, np.ndarray, np.ndarr
     parts = []
     for link in links:
         position, quat = poses[link.name]
-        rotation = _matrix(base).T @ _matrix(quat)
-        axes = rotation @ _matrix(_unit(link.principal))
-        center = _matrix(base).T @ (position - origin) + rotation @ np.asarray(link.com)
+        rotation = matrix_from_quat_np(base).T @ matrix_from_quat_np(quat)
+        axes = rotation @ matrix_from_quat_np(_unit(link.principal))
+        center = matrix_from_quat_np(base).T @ (position - origin) + rotation @ np.asarray(link.com)
         parts.append((link.mass, center, axes @ np.diag(link.inertia) @ axes.T))
     mass = sum(m for m, _, _ in parts)
     center = sum(m * c for m, c, _ in parts) / mass
@@ -151,7 +150,8 @@ def _dex3(stage: Usd.Stage, fingers: Sequence[Link], poses: dict, looks: dict[st
     """Moving fingers."""
     for side in ("left", "right"):
         wrist = next(link for link in LINKS if link.name == f"{side}_wrist_yaw_link")
-        _mass(stage.GetPrimAtPath(f"{ROOT}/{wrist.name}"), wrist.mass, wrist.com, wrist.inertia, wrist.principal)
+        prim = stage.GetPrimAtPath(f"{ROOT}/{wrist.name}")
+        author.massive(prim, wrist.mass, wrist.inertia, wrist.com, _unit(wrist.principal))
         _hand_box(stage, f"{ROOT}/{wrist.name}/palm_collision", PALM_BOX, side, grip)
     for link in fingers:
         _link(stage, link, poses)
@@ -168,7 +168,8 @@ def _fixed(stage: Usd.Stage, fingers: Sequence[Link], poses: dict, looks: dict[s
     for side in ("left", "right"):
         wrist = next(link for link in LINKS if link.name == f"{side}_wrist_yaw_link")
         own = [link for link in fingers if link.name.startswith(side)]
-        _mass(stage.GetPrimAtPath(f"{ROOT}/{wrist.name}"), *fuse([wrist, *own]))
+        mass, com, inertia, principal = fuse([wrist, *own])
+        author.massive(stage.GetPrimAtPath(f"{ROOT}/{wrist.name}"), mass, inertia, com, _unit(principal))
         _hand_box(stage, f"{ROOT}/{wrist.name}/palm_collision", PALM_BOX, side, grip)
         origin, base = poses[wrist.name]
         parts = []
@@ -176,7 +177,7 @@ def _fixed(stage: Usd.Stage, fingers: Sequence[Link], poses: dict, looks: dict[s
             position, quat = poses[link.name]
             if not np.allclose(base, quat):
                 raise ValueError(f"{link.name}: the open hand's links are expected to be parallel to the wrist")
-            offset = _matrix(base).T @ (position - origin)
+            offset = matrix_from_quat_np(base).T @ (position - origin)
             parts += [(points + offset, normals, faces) for points, normals, faces in map(grid, HAND_SHAPES[link.name])]
             finger = link.name.removesuffix("_link").split("_", 2)[2]
             if finger in HAND_BOXES:
@@ -190,15 +191,7 @@ def _link(stage: Usd.Stage, link: Link, poses: dict) -> None:
     prim = author.xform(stage, f"{ROOT}/{link.name}", position, quat)
     UsdPhysics.RigidBodyAPI.Apply(prim)
     if not link.name.endswith("_wrist_yaw_link"):  # the wrist's mass depends on the hands variant
-        _mass(prim, link.mass, link.com, link.inertia, link.principal)
-
-
-def _mass(prim: Usd.Prim, mass: float, com: author.Vec, inertia: author.Vec, principal: author.Vec) -> None:
-    api = UsdPhysics.MassAPI.Apply(prim)
-    api.CreateMassAttr(float(mass))
-    api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, com)))
-    api.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, inertia)))
-    api.CreatePrincipalAxesAttr(Gf.Quatf(*map(float, _unit(principal))))
+        author.massive(prim, link.mass, link.inertia, link.com, _unit(link.principal))
 
 
 def _joint(stage: Usd.Stage, link: Link) -> None:
@@ -206,17 +199,9 @@ def _joint(stage: Usd.Stage, link: Link) -> None:
     hinge = link.hinge
     if hinge is None:
         return
-    joint = UsdPhysics.RevoluteJoint.Define(stage, f"{ROOT}/joints/{hinge.name}")
-    joint.CreateBody0Rel().SetTargets([f"{ROOT}/{link.parent}"])
-    joint.CreateBody1Rel().SetTargets([f"{ROOT}/{link.name}"])
-    joint.CreateAxisAttr(hinge.axis)
-    joint.CreateLocalPos0Attr(Gf.Vec3f(*map(float, link.offset)))
-    joint.CreateLocalRot0Attr(Gf.Quatf(*map(float, _unit(link.quat))))
-    joint.CreateLocalPos1Attr(Gf.Vec3f(0, 0, 0))
-    joint.CreateLocalRot1Attr(Gf.Quatf(1, 0, 0, 0))
-    joint.CreateLowerLimitAttr(float(np.rad2deg(hinge.limits[0])))
-    joint.CreateUpperLimitAttr(float(np.rad2deg(hinge.limits[1])))
-    prim = joint.GetPrim()
+    path, parent, child = f"{ROOT}/joints/{hinge.name}", f"{ROOT}/{link.parent}", f"{ROOT}/{link.name}"
+    limits = np.rad2deg(hinge.limits)
+    prim = author.hinge(stage, path, parent, child, hinge.axis, limits, link.offset, _unit(link.quat))
     prim.AddAppliedSchema("NewtonJointAPI")
     prim.AddAppliedSchema("MjcJointAPI")
     _attribute(prim, "newton:armature", hinge.armature, Sdf.ValueTypeNames.Float)
@@ -229,20 +214,12 @@ def _attribute(prim: Usd.Prim, name: str, value: object, kind: Sdf.ValueTypeName
     prim.CreateAttribute(name, kind, False).Set(value)
 
 
-def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Bar | Rod], looks: dict[str, Usd.Prim]) -> None:
+def _shapes(stage: Usd.Stage, parent: str, shapes: Sequence[Loft | Block | Rod], looks: dict[str, Usd.Prim]) -> None:
     for k, shape in enumerate(shapes):
         path = f"{parent}/visual_{k}"
         if isinstance(shape, Rod):
-            author.cylinder(
-                stage,
-                path,
-                shape.radius,
-                shape.length,
-                shape.center,
-                axis=shape.axis,
-                collide=False,
-                look=looks[shape.look],
-            )
+            size, look = (shape.radius, shape.length), looks[shape.look]
+            author.cylinder(stage, path, *size, shape.center, axis=shape.axis, collide=False, look=look)
         else:
             _mesh(stage, path, *grid(shape), looks[shape.look])
 
@@ -262,7 +239,7 @@ def _mesh(
 
 def _body_collisions(stage: Usd.Stage, skin: Usd.Prim) -> None:
     """Invisible collision shapes of everything but the hands."""
-    hidden = {"collide": True, "visual": False, "surface": skin}
+    hidden: author.Finish = {"visual": False, "surface": skin}
     author.box(stage, f"{ROOT}/pelvis/collision", (0.060, 0.075, 0.055), (0.0, 0.0, -0.085), **hidden)
     torso = f"{ROOT}/torso_link"
     author.box(stage, f"{torso}/collision", (0.072, 0.095, 0.115), (0.006, 0.0, 0.165), **hidden)
@@ -324,17 +301,6 @@ def _unit(quat: author.Vec) -> np.ndarray:
 def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
     return np.concatenate([[w], v])
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _z_to(direction: np.ndarray) -> np.ndarray:

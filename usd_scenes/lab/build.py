@@ -40,10 +40,10 @@ def _support(stage: Usd.Stage, name: str, size: Sequence[float], surface: Usd.Pr
 
 def build(folder: Path) -> None:
     """Write `scene.usda` into `folder`."""
-    stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=(0.0, 0.0, SPAWN_HEIGHT),
-        facing=(1.0, 0.0, 0.0, 0.0),
+    stage = rooms.scene_stage(
+        folder,
+        (0.0, 0.0, SPAWN_HEIGHT),
+        (1.0, 0.0, 0.0, 0.0),
         # From the robot's right, looking across its path at the height of its waist.
         eye=(1.0, -3.4, 1.3),
         gaze=(0.7644, 0.64208, 0.03764, 0.04481),
@@ -51,7 +51,7 @@ def build(folder: Path) -> None:
     )
     concrete = author.material(stage, "/World/Looks/concrete", texture="../textures/concrete.png")
     author.bind(rooms.floor(stage, (20.0, 20.0), (0.0, 0.0), tile=2.0), concrete)
-    surface = author.physics_material(stage, "/World/Looks/SupportSurface", static=1.0, dynamic=1.0)
+    surface = author.physics_material(stage, "/World/Looks/SupportSurface")
     wood = author.material(stage, "/World/Looks/wood", texture="../textures/wood.png")
     for name, size in SUPPORTS.items():
         _support(stage, name, size, surface, wood)

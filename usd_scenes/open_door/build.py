@@ -48,21 +48,13 @@ DOORWAY = (1.10, 0.04, 2.15)
 
 
 def _hinge(
-    stage: Usd.Stage, path: str, parent: str, child: str, axis: str, at_parent: author.Vec, limits: author.Vec
+    stage: Usd.Stage, name: str, parent: str, child: str, axis: str, at_parent: author.Vec, limits: author.Vec
 ) -> Usd.Prim:
-    joint = UsdPhysics.RevoluteJoint.Define(stage, path)
-    joint.CreateAxisAttr(axis)
-    joint.CreateBody0Rel().SetTargets([parent])
-    joint.CreateBody1Rel().SetTargets([child])
-    joint.CreateLocalPos0Attr(Gf.Vec3f(*map(float, at_parent)))
-    joint.CreateLocalRot0Attr(Gf.Quatf(1, 0, 0, 0))
-    joint.CreateLocalPos1Attr(Gf.Vec3f(0, 0, 0))
-    joint.CreateLocalRot1Attr(Gf.Quatf(1, 0, 0, 0))
-    joint.CreateLowerLimitAttr(float(limits[0]))
-    joint.CreateUpperLimitAttr(float(limits[1]))
+    bodies = f"/World/Door/{parent}", f"/World/Door/{child}"
+    joint = author.hinge(stage, f"/World/Door/{name}", *bodies, axis, limits, at_parent)
     # MuJoCo's own default stop; the importer's would let the leaf bounce between its limits.
-    author.attribute(joint.GetPrim(), "mjc:solreflimit", Gf.Vec2d(0.02, 1.0), Sdf.ValueTypeNames.Double2)
-    return joint.GetPrim()
+    author.attribute(joint, "mjc:solreflimit", Gf.Vec2d(0.02, 1.0), Sdf.ValueTypeNames.Double2)
+    return joint
 
 
 def _partition(stage: Usd.Stage, frame: str, rough: Usd.Prim) -> None:
@@ -155,16 +147,12 @@ def _chain(stage: Usd.Stage, rough: Usd.Prim) -> None:
     pivot_in_leaf = np.asarray(HANDLE_PIVOT) - hinge_in_frame
     _leaf(stage, "/World/Door/Leaf", tuple(p + hinge_in_frame), rough)
     _handle(stage, "/World/Door/Handle", tuple(p + HANDLE_PIVOT), rough)
-    leaf = _hinge(
-        stage, "/World/Door/LeafHinge", "/World/Door/Frame", "/World/Door/Leaf", "Z", hinge_in_frame, LEAF_LIMITS
-    )
+    leaf = _hinge(stage, "LeafHinge", "Frame", "Leaf", "Z", hinge_in_frame, LEAF_LIMITS)
     author.attribute(leaf, "arena:latch", True, Sdf.ValueTypeNames.Bool)
     # USD angles are degrees: damping and stiffness of a hinge are per degree, friction is a torque.
     author.attribute(leaf, "newton:damping", float(np.deg2rad(LEAF_DAMPING)), Sdf.ValueTypeNames.Float)
     author.attribute(leaf, "newton:friction", LEAF_FRICTION, Sdf.ValueTypeNames.Float)
-    handle = _hinge(
-        stage, "/World/Door/HandleHinge", "/World/Door/Leaf", "/World/Door/Handle", "Y", pivot_in_leaf, HANDLE_LIMITS
-    )
+    handle = _hinge(stage, "HandleHinge", "Leaf", "Handle", "Y", pivot_in_leaf, HANDLE_LIMITS)
     author.attribute(handle, "newton:damping", float(np.deg2rad(HANDLE_DAMPING)), Sdf.ValueTypeNames.Float)
     author.attribute(handle, "newton:armature", 0.001, Sdf.ValueTypeNames.Float)
     drive = UsdPhysics.DriveAPI.Apply(handle, "angular")
@@ -188,15 +176,8 @@ def _back_room(stage: Usd.Stage) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
-    stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=TASK.spawn_quat,
-        eye=(0.26556, 1.33827, 3.77471),
-        gaze=(0.6811, 0.21343, 0.20944, 0.66834),
-        variants=("base", "semantic"),
-    )
-    rough = warehouse.surface(stage)
+    stage = rooms.task_stage(folder, TASK, eye=(0.26556, 1.33827, 3.77471), gaze=(0.6811, 0.21343, 0.20944, 0.66834))
+    rough = author.physics_material(stage, "/World/Looks/Rough")
     warehouse.room_looks(stage)
     warehouse.room(stage, rough)
     _back_room(stage)

@@ -51,7 +51,7 @@ def carton_box(stage: Usd.Stage, cardboard: Usd.Prim) -> None:
         inertia=[m * BOX_SIDE**2 / 6] * 3,
         com=(0, 0, half),
     )
-    surface = author.physics_material(stage, "/World/Looks/BoxSurface", static=1.0, dynamic=1.0)
+    surface = author.physics_material(stage, "/World/Looks/BoxSurface")
     geom = author.box(stage, "/World/Box/Collider", (half, half, half), (0, 0, half), visual=False, surface=surface)
     rooms.contact(geom, condim=3)
     Solids().box((half, half, half), (0, 0, half)).write(stage, "/World/Box/Look", look=cardboard)
@@ -118,14 +118,7 @@ def clutter(stage: Usd.Stage) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
-    stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=TASK.spawn_quat,
-        eye=(0.08792, -4.59362, 2.05127),
-        gaze=(0.63441, 0.29145, 0.29887, 0.65058),
-        variants=("base", "semantic"),
-    )
+    stage = rooms.task_stage(folder, TASK, eye=(0.08792, -4.59362, 2.05127), gaze=(0.63441, 0.29145, 0.29887, 0.65058))
     looks = rooms.workshop(
         stage, low=(-5.6, -8.0), high=(2.0, 2.4), windows=[("-x", -4.2, 2.0, 1.1), ("+y", -3.6, 2.0, 0.3)]
     )

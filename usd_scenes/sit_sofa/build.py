@@ -111,14 +111,9 @@ def _look(stage: Usd.Stage, name: str, color: author.Vec, texture: str | None = 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=TASK.spawn_quat,
-        eye=(-5.00612, 1.22158, 2.27319),
-        gaze=(-0.43051, -0.25339, 0.43941, 0.74657),
-        variants=("base", "semantic"),
+        folder, TASK, eye=(-5.00612, 1.22158, 2.27319), gaze=(-0.43051, -0.25339, 0.43941, 0.74657)
     )
-    rough = warehouse.surface(stage)
+    rough = author.physics_material(stage, "/World/Looks/Rough")
     with rooms.edit(stage, "base"):
         warehouse.room_looks(stage)
         _look(stage, "Carpet", (0.30, 0.30, 0.31))

@@ -63,15 +63,8 @@ def _folding_sign(stage: Usd.Stage, parent: str) -> None:
     y, lean = OUTLINE_CENTRE[1] + OUTLINE / 2 - 0.02, np.deg2rad(9.0)
     for name, side in (("PanelFront", -1), ("PanelBack", 1)):
         quat = (float(np.cos(lean / 2)), side * float(np.sin(lean / 2)), 0.0, 0.0)
-        author.box(
-            stage,
-            f"{parent}/{name}",
-            (0.15, 0.008, 0.31),
-            (-0.05, y + side * 0.05, 0.306),
-            quat,
-            collide=False,
-            look=yellow,
-        )
+        half, centre = (0.15, 0.008, 0.31), (-0.05, y + side * 0.05, 0.306)
+        author.box(stage, f"{parent}/{name}", half, centre, quat, collide=False, look=yellow)
     # Triangle and bar on the front panel, lifted 1 mm off it.
     q = (float(np.cos(lean / 2)), -float(np.sin(lean / 2)), 0.0, 0.0)
     author.mesh(
@@ -115,15 +108,8 @@ def _ring_sign(stage: Usd.Stage, parent: str) -> None:
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
-    stage = rooms.task_stage(
-        folder / "scene.usda",
-        spawn=TASK.spawn_position,
-        facing=TASK.spawn_quat,
-        eye=(0.45796, -1.01443, 2.42268),
-        gaze=(0.50211, 0.27898, 0.39756, 0.71555),
-        variants=("base", "semantic"),
-    )
-    rough = warehouse.surface(stage)
+    stage = rooms.task_stage(folder, TASK, eye=(0.45796, -1.01443, 2.42268), gaze=(0.50211, 0.27898, 0.39756, 0.71555))
+    rough = author.physics_material(stage, "/World/Looks/Rough")
     warehouse.room_looks(stage)
     warehouse.room(stage, rough)
     pink = author.material(stage, "/World/Looks/Pink", PINK)

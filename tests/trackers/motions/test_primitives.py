@@ -1,5 +1,7 @@
 """Primitives, their programs, and random clips."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -111,7 +113,7 @@ def test_wrong_commands_are_named():
     with pytest.raises(InputError, match="no side 'up'"):
         primitives.kick("up")
     with pytest.raises(InputError, match="velocity has shape"):
-        MotionCommand.neutral(2).replace(velocity=torch.zeros(2)).pack()
+        dataclasses.replace(MotionCommand.neutral(2), velocity=torch.zeros(2)).pack()
     with pytest.raises(InputError, match="no family 'dance'"):
         programs.random_clips({"dance": 1})
 
