@@ -88,11 +88,7 @@ class Tracker:
 
     def describe(self) -> dict[str, Any]:
         """What a result must record to name this tracker exactly; drive and physics rate are the environment's."""
-        return {
-            "name": self.name,
-            "checkpoint_hash": self.checkpoint_hash,
-            "ignores": list(self.ignores),
-        }
+        return {"name": self.name, "checkpoint_hash": self.checkpoint_hash, "ignores": list(self.ignores)}
 
 
 _TRACKERS: Registry[Tracker] = Registry(

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["JOINTS", "MODULES", "ActionForm", "Interface", "get", "names", "residual_form", "slices"]
 
-MODULES: dict[str, str] = {
-    "sonic": "arena_newton.trackers.sonic",
-    "twist2": "arena_newton.trackers.twist2",
-}
+MODULES: dict[str, str] = {"sonic": "arena_newton.trackers.sonic", "twist2": "arena_newton.trackers.twist2"}
 """Interface → module with its `INTERFACE`, and with `from_checkpoint`, which makes the tracker."""
 
 JOINTS = len(MUJOCO_JOINTS)

@@ -123,10 +123,7 @@ class SonicNet(TrackerNetwork):
     """Indices of the encoder inputs that the encoder reads, shape [646]."""
 
     def __init__(
-        self,
-        encoder: Sequence[int] = (512, 256),
-        decoder: Sequence[int] = (512, 512, 256),
-        latent: int = LATENT,
+        self, encoder: Sequence[int] = (512, 256), decoder: Sequence[int] = (512, 512, 256), latent: int = LATENT
     ):
         """Make the layers.
 

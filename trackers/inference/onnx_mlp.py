@@ -272,11 +272,7 @@ class _Graph:
         return _Call(lambda v, w, b: functional.layer_norm(v, w.shape, w, b, epsilon), {1: weight, 2: bias}), (x,)
 
     def _convolution(
-        self,
-        inputs: list[str],
-        static: dict[int, torch.Tensor],
-        attributes: dict[str, Any],
-        shape: tuple[int, ...],
+        self, inputs: list[str], static: dict[int, torch.Tensor], attributes: dict[str, Any], shape: tuple[int, ...]
     ) -> torch.nn.Module:
         in_shape = tuple(self.probe[inputs[0]].shape)[1:]
         size = math.prod(in_shape)

@@ -64,11 +64,7 @@ class DeviceLogger(Logger):
         return []
 
     def process_env_step(
-        self,
-        rewards: torch.Tensor,
-        dones: torch.Tensor,
-        extras: dict,
-        intrinsic_rewards: torch.Tensor | None = None,
+        self, rewards: torch.Tensor, dones: torch.Tensor, extras: dict, intrinsic_rewards: torch.Tensor | None = None
     ) -> None:
         """Count one tick."""
         if self.disable_logs:

@@ -17,15 +17,7 @@ import tyro
 from arena_newton.errors import InputError
 from arena_newton.trackers.interface import names
 
-__all__ = [
-    "FAMILY_WEIGHTS",
-    "CurveOptions",
-    "ExportCommand",
-    "ExportOptions",
-    "TrainOptions",
-    "check",
-    "runner_config",
-]
+__all__ = ["FAMILY_WEIGHTS", "CurveOptions", "ExportCommand", "ExportOptions", "TrainOptions", "check", "runner_config"]
 
 if TYPE_CHECKING:
     TrackerName = str
