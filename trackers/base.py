@@ -76,23 +76,12 @@ class Tracker:
         """Fill the observation history of the masked worlds with the current frame."""
 
     def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; valid until the next call.
-
-        Args:
-            command: Reference of the tick.
-            state: Measured state.
-            mask: Worlds that advance, bool, shape [worlds]; all without one. The histories of the others keep every
-                bit, and their rows of the result mean nothing.
-        """
+        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; see `interfaces.Tracker`."""
         raise TypeError(f"tracker {self.name!r} defines no step()")
 
     def describe(self) -> dict[str, Any]:
         """What a result must record to name this tracker exactly; drive and physics rate are the environment's."""
-        return {
-            "name": self.name,
-            "checkpoint_hash": self.checkpoint_hash,
-            "ignores": list(self.ignores),
-        }
+        return {"name": self.name, "checkpoint_hash": self.checkpoint_hash, "ignores": list(self.ignores)}
 
 
 _TRACKERS: Registry[Tracker] = Registry(

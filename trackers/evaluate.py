@@ -13,6 +13,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -30,14 +31,13 @@ ROLLOUTS = {"full": 64, "quick": 8}
 """Rollouts per cell, unless --rollouts says otherwise."""
 
 
+@dataclass
 class Entry:
     """A tracker on the command line: its name, checkpoint and label."""
 
-    def __init__(self, name: str):
-        """With its default weights, called by its name."""
-        self.name = name
-        self.checkpoint: str | None = None
-        self.given_label: str | None = None
+    name: str
+    checkpoint: str | None = None
+    given_label: str | None = None
 
     @property
     def label(self) -> str:
@@ -65,16 +65,12 @@ class Entry:
 
 
 class _AddTracker(argparse.Action):
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
-    ) -> None:
+    def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
         namespace.trackers = [*(namespace.trackers or []), Entry(values)]
 
 
 class _OfLastTracker(argparse.Action):
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
-    ) -> None:
+    def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
         if not namespace.trackers:
             raise InputError(f"{option} {values}: name its --tracker first")
         setattr(namespace.trackers[-1], "checkpoint" if option == "--checkpoint" else "given_label", values)
@@ -88,13 +84,8 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog=PROG, description="Measure trackers on one suite of references.")
     add = parser.add_argument
-    add(
-        "--tracker",
-        dest="trackers",
-        action=_AddTracker,
-        metavar="NAME",
-        help="registered tracker, or module:factory of one that is not; repeat to compare several",
-    )
+    name = "registered tracker, or module:factory of one that is not; repeat to compare several"
+    add("--tracker", dest="trackers", action=_AddTracker, metavar="NAME", help=name)
     add("--checkpoint", action=_OfLastTracker, metavar="PATH", help="weights of the --tracker before it")
     add("--label", action=_OfLastTracker, metavar="TEXT", help="what tables call the --tracker before it")
     add("--suite", choices=tuple(ROLLOUTS), default="full", help="full: every cell; quick: a few")
@@ -135,12 +126,10 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
 
 
 def _check(args: argparse.Namespace) -> int:
-    for name in ("rollouts", "goals", "threads"):
+    for name, least in {"rollouts": 1, "goals": 0, "threads": 1, "seed": 0}.items():
         value = getattr(args, name)
-        if value is not None and value < (0 if name == "goals" else 1):
-            raise InputError(f"--{name} {value}: must be at least {0 if name == 'goals' else 1}")
-    if args.seed < 0:
-        raise InputError(f"--seed {args.seed}: must be at least 0")
+        if value is not None and value < least:
+            raise InputError(f"--{name} {value}: must be at least {least}")
     if args.film and args.out is None:
         raise InputError("--film: name a folder with --out")
     return args.rollouts or ROLLOUTS[args.suite]
@@ -214,12 +203,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = _parser().parse_args(argv)
         quiet_warp()
         return _evaluate(args)
-    except (InputError, OSError) as error:
+    except (ArenaError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except ArenaError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+        return getattr(error, "exit_code", 2)
 
 
 if __name__ == "__main__":

@@ -190,14 +190,7 @@ class NetworkTracker(Tracker):
         checkpoint: str | None = None,
         checkpoint_hash: str = "none",
     ):
-        """Join the two.
-
-        Args:
-            front_end: Makes observations and targets.
-            network: Maps [rows, obs_width] to [rows, action_width], each row by itself; `bind` moves it to the device.
-            checkpoint: File the weights came from.
-            checkpoint_hash: First 12 hexadecimal digits of its SHA-256.
-        """
+        """Join a front end and a network, which maps [rows, obs_width] to [rows, action_width], each row by itself."""
         self.front_end = front_end
         self.network = network
         self.checkpoint, self.checkpoint_hash = checkpoint, checkpoint_hash
@@ -269,14 +262,7 @@ class NetworkTracker(Tracker):
 
     @torch.inference_mode()
     def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; the buffer is reused by the next call.
-
-        Args:
-            command: Reference of the tick.
-            state: Measured state.
-            mask: Worlds that advance, bool, shape [worlds]; all without one. The histories of the others keep every
-                bit, and their rows of the result mean nothing.
-        """
+        """See `interfaces.Tracker`; the buffer is reused by the next call."""
         if mask is not None and mask.device.type == "cpu" and bool(mask.all()):
             mask = None
         return (self._graph or self._tick)(command, state, mask)
@@ -293,13 +279,7 @@ class _TickGraph:
     """A tick held in a CUDA graph: some sixty small launches become one; ticks with a mask have a second graph."""
 
     def __init__(self, tick: Tick, worlds: int, device: torch.device):
-        """Allocate the inputs that the graphs read.
-
-        Args:
-            tick: What to hold; it always writes the same result buffer.
-            worlds: Number of worlds.
-            device: A CUDA device.
-        """
+        """Allocate the inputs that the graphs read; `tick` must always write the same result buffer."""
         self._tick = tick
 
         def row(width: int) -> torch.Tensor:

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["JOINTS", "MODULES", "ActionForm", "Interface", "get", "names", "residual_form", "slices"]
 
-MODULES: dict[str, str] = {
-    "sonic": "arena_newton.trackers.sonic",
-    "twist2": "arena_newton.trackers.twist2",
-}
+MODULES: dict[str, str] = {"sonic": "arena_newton.trackers.sonic", "twist2": "arena_newton.trackers.twist2"}
 """Interface → module with its `INTERFACE`, and with `from_checkpoint`, which makes the tracker."""
 
 JOINTS = len(MUJOCO_JOINTS)
@@ -52,14 +49,13 @@ class ActionForm:
             raise InputError(f"action form {self.kind!r}: needs {JOINTS} scales and a clip of at least 0")
 
 
-def residual_form(drive: DriveGains, clip: float = 6.0) -> ActionForm:
-    """Residual action: one unit commands a quarter of a joint's torque limit through its position gain.
+def residual_form(drive: DriveGains) -> ActionForm:
+    """Residual action: one unit commands a quarter of a joint's torque limit through its position gain; up to 6 count.
 
     Args:
         drive: The drive that executes the targets.
-        clip: Largest magnitude of the raw output that counts.
     """
-    return ActionForm("residual", tuple(0.25 * e / k for e, k in zip(drive.effort, drive.kp, strict=True)), clip)
+    return ActionForm("residual", tuple(0.25 * e / k for e, k in zip(drive.effort, drive.kp, strict=True)), clip=6.0)
 
 
 def slices(layout: Mapping[str, int]) -> dict[str, slice]:

@@ -123,18 +123,9 @@ class SonicNet(TrackerNetwork):
     """Indices of the encoder inputs that the encoder reads, shape [646]."""
 
     def __init__(
-        self,
-        encoder: Sequence[int] = (512, 256),
-        decoder: Sequence[int] = (512, 512, 256),
-        latent: int = LATENT,
+        self, encoder: Sequence[int] = (512, 256), decoder: Sequence[int] = (512, 512, 256), latent: int = LATENT
     ):
-        """Make the layers.
-
-        Args:
-            encoder: Widths of the encoder's hidden layers.
-            decoder: Widths of the decoder's hidden layers.
-            latent: Width of the latent.
-        """
+        """Make layers with these hidden widths."""
         super().__init__()
         self.widths = tuple(encoder), tuple(decoder), latent
         used = torch.cat([torch.arange(AT[name].start, AT[name].stop) for name in ENCODED])
@@ -346,10 +337,7 @@ class SonicTracker(NetworkTracker):
 
     @classmethod
     def official(cls, checkpoint: str | Path) -> Self:
-        """The tracker of the official networks.
-
-        Args:
-            checkpoint: What `official_pair` takes.
+        """The tracker of the official networks, which `official_pair` finds.
 
         Raises:
             InputError: A file is absent or not a network of SONIC's widths.

@@ -55,11 +55,7 @@ class Twist2Net(TrackerNetwork):
     obs_width = OBSERVATION
 
     def __init__(self, hidden: Sequence[int] = (512, 512, 256)):
-        """Make the layers.
-
-        Args:
-            hidden: Widths of the hidden layers.
-        """
+        """Make layers with these hidden widths."""
         super().__init__()
         self.hidden = tuple(hidden)
         self.norm = InputNorm(self.obs_width)

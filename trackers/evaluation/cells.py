@@ -22,16 +22,7 @@ RIGHT_FOOT = -0.11
 """To the left of the robot's middle [m]: in front of the right foot."""
 SEAT_DEPTH, SEAT_GAP = 0.5, 0.05
 """Depth of the seat, and its front edge behind the standing pelvis [m] (measured: at 18 cm the robot misses it)."""
-QUICK = (
-    "stand",
-    "walk 0.3",
-    "walk 0.6",
-    "turn 0.5",
-    "squat 0.45",
-    "kick 2.5",
-    "sit 0.42",
-    "push 40 N·s, walk 0.3",
-)
+QUICK = ("stand", "walk 0.3", "walk 0.6", "turn 0.5", "squat 0.45", "kick 2.5", "sit 0.42", "push 40 N·s, walk 0.3")
 """Cells of the quick suite, besides a few goals."""
 CARRY_WALK = 1.5
 """Time at which a carrying robot starts to walk [s]."""

@@ -36,10 +36,6 @@ def chart(results: Sequence[Result], out: Path) -> Path:
     A bar's length is the figure's number over its limit, or the limit over the number where more is better; its colour
     is the verdict, which may ask for more than the number (no fall). Figures without a limit show their value alone.
 
-    Args:
-        results: Trackers on the same plan.
-        out: Picture, such as `evaluation.png`.
-
     Raises:
         InputError: matplotlib is not installed.
     """
@@ -73,8 +69,6 @@ def chart(results: Sequence[Result], out: Path) -> Path:
 
 
 def _row(axis: Axes, row: int, figure: Figure | None) -> None:
-    value = "–" if figure is None else figure.value
-    ratio = None if figure is None else figure.ratio
-    if figure is not None and ratio is not None:
-        axis.barh(row, min(max(ratio, _NARROWEST), _WIDEST), height=0.72, color=_COLOURS[figure.verdict])
-    axis.text(0.02, row, value, va="center", fontsize=6.5)
+    if figure is not None and figure.ratio is not None:
+        axis.barh(row, min(max(figure.ratio, _NARROWEST), _WIDEST), height=0.72, color=_COLOURS[figure.verdict])
+    axis.text(0.02, row, "–" if figure is None else figure.value, va="center", fontsize=6.5)

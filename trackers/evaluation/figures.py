@@ -152,9 +152,8 @@ class Bar:
         numbers = self.reduce(sample)
         number, limit = next(iter(numbers.values())), self.limit
         if self.key:
-            limit = (
-                interface.get(result.interface).bars.get(self.key) if result.interface in interface.names() else None
-            )
+            known = result.interface in interface.names()
+            limit = interface.get(result.interface).bars.get(self.key) if known else None
         met, bar = None, ""
         if limit is not None:
             met = (number >= limit if self.at_least else number <= limit) and not (self.no_fall and sample.fell.any())
@@ -204,8 +203,7 @@ def _ball(sample: Sample) -> Numbers:
 
 
 def _standing_ball(sample: Sample) -> Numbers:
-    numbers = _ball(sample)
-    return {"hit": numbers.pop("hit")} | numbers
+    return {"hit": 0.0} | _ball(sample)  # the hits are judged: they come first
 
 
 _BALL = "median {median:.1f} m/s (rolls {rolls:.1f}), {percent:.0f} % ≥ 1.5 m/s, falls {fell}/{count}"
@@ -255,12 +253,7 @@ BARS: tuple[Bar, ...] = (
 
 
 def figures(result: Result, others: Sequence[Result] = ()) -> list[Figure]:
-    """Every figure that the suite's cells allow.
-
-    Args:
-        result: The tracker to judge.
-        others: All results of the same plan, for comparisons.
-    """
+    """Every figure that the suite's cells allow; `others` are all results of the plan, for comparisons."""
     rows = [bar.figure(result) for bar in BARS]
     rows.insert(1, _against_official(result, others))
     return [row for row in rows if row is not None] + _inference(result)

@@ -18,11 +18,7 @@ WARM_UP, CALLS = 30, 200
 
 
 def inference(make: Callable[[], Tracker]) -> dict[str, float]:
-    """Median time of a tick [ms]: `cpu` for one world and, where there is a GPU, `cuda` for `GPU_WORLDS`.
-
-    Args:
-        make: Returns a tracker that is not bound yet.
-    """
+    """Median time of a tick [ms]: `cpu` for one world and, where there is a GPU, `cuda` for `GPU_WORLDS`."""
     out = {"cpu": _median(make(), 1, torch.device("cpu"))}
     if torch.cuda.is_available():
         out["cuda"] = _median(make(), GPU_WORLDS, torch.device("cuda"))
@@ -39,15 +35,12 @@ def _median(tracker: Tracker, worlds: int, device: torch.device) -> float:
     state = RobotState(quat=quat, ang_vel_body=zero[:, :3], joint_pos=joints, joint_vel=zero)
     tracker.bind(worlds, device)
     tracker.prefill(command, state)
-    cuda = torch.cuda.is_available() and worlds > 1
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
     times = []
-    for call in range(WARM_UP + CALLS):
-        if cuda:
-            torch.cuda.synchronize()
+    for _ in range(WARM_UP + CALLS):
+        wait()
         began = time.perf_counter()
         tracker.step(command, state)
-        if cuda:
-            torch.cuda.synchronize()
-        if call >= WARM_UP:
-            times.append(time.perf_counter() - began)
-    return 1000.0 * sorted(times)[len(times) // 2]
+        wait()
+        times.append(time.perf_counter() - began)
+    return 1000.0 * sorted(times[WARM_UP:])[CALLS // 2]

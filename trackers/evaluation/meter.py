@@ -103,14 +103,12 @@ class Meter:
     def anchor(self, targets: torch.Tensor, reference: torch.Tensor) -> None:
         """Store the state before the first tick: root, feet, targets and the reference's root [worlds, 3]."""
         position, quat = self._root()
-        self._last = {
-            "position": position.clone(),
-            "yaw": heading(quat),
-            "ref_position": reference.clone(),
-            "ref_yaw": heading(quat),
-            "feet": self.lab.xpos[:, self._feet].clone(),
-            "targets": targets.clone(),
-        }
+        yaw, feet = heading(quat), self.lab.xpos[:, self._feet]
+        self._remember(position=position, yaw=yaw, ref_position=reference, ref_yaw=yaw, feet=feet, targets=targets)
+
+    def _remember(self, **state: torch.Tensor) -> None:
+        """Keep the state of this tick for the differences of the next."""
+        self._last = {name: value.clone() for name, value in state.items()}
 
     def update(self, tick: int, reference: TickReference, targets: torch.Tensor) -> torch.Tensor:
         """Take one tick into account; returns the worlds that still run, bool [worlds].
@@ -132,7 +130,7 @@ class Meter:
         live = running & standing
         if tick >= 0:
             self._posture(live, tick, reference, targets, position, quat, up)
-            self._events(live, position)
+            self._events(live)
         return live
 
     def _posture(
@@ -195,16 +193,11 @@ class Meter:
         self._lowest_ref = torch.where(
             live, torch.minimum(self._lowest_ref, reference.position[:, 2]), self._lowest_ref
         )
-        self._last = {
-            "position": position.clone(),
-            "yaw": yaw,
-            "ref_position": reference.position.clone(),
-            "ref_yaw": ref_yaw,
-            "feet": feet,
-            "targets": targets.clone(),
-        }
+        self._remember(
+            position=position, yaw=yaw, ref_position=reference.position, ref_yaw=ref_yaw, feet=feet, targets=targets
+        )
 
-    def _events(self, live: torch.Tensor, position: torch.Tensor) -> None:
+    def _events(self, live: torch.Tensor) -> None:
         lab = self.lab
         ball = torch.linalg.vector_norm(lab.qvel[:, lab.ball_v : lab.ball_v + 2], dim=1)
         self._ball_peak = torch.where(live, torch.maximum(self._ball_peak, ball), self._ball_peak)
@@ -235,7 +228,6 @@ class Meter:
         windowed = host(self._window_sum) / np.maximum(host(self._window_count), 1.0)[:, None]
         seconds = count * g1.TICK
         offset = np.linalg.norm(host(self._end_offset), axis=1)
-        root = host(self._end_root)
         out = {
             "fell": host(self.fallen) > 0.5,
             "fall_time": np.where(host(self.fall_tick) != -1, host(self.fall_tick) * g1.TICK, np.nan),
@@ -261,9 +253,6 @@ class Meter:
             "touch": host(self._touch),
             "lowest": host(self._lowest),
             "lowest_ref": host(self._lowest_ref),
-            "end_x": root[:, 0],
-            "end_y": root[:, 1],
-            "end_z": root[:, 2],
-            "end_yaw": root[:, 3],
         }
+        out |= dict(zip(("end_x", "end_y", "end_z", "end_yaw"), host(self._end_root).T, strict=True))
         return out | dict(zip(_WINDOW, windowed.T, strict=True))

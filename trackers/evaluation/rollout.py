@@ -6,6 +6,7 @@ import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
 from arena_newton.trackers.motions.programs import SILL_SIZE, place_platform
 from arena_newton.tracking import TrackerLoop
 
-__all__ = ["Outcome", "Plan", "SuiteRollout", "find_sill", "make_plan", "play"]
+__all__ = ["Outcome", "Plan", "Settings", "SuiteRollout", "find_sill", "make_plan", "play"]
 
 BALL_RADIUS = 0.11
 """[m]"""
@@ -40,6 +41,17 @@ VELOCITY_KICK, TURN_KICK = 0.1, 0.1
 TOE, HEEL = 0.12, 0.05
 """Ends of the sole in front of and behind the ankle frame [m]: the foot itself. `motions.programs` adds one or two
 centimetres (`SOLE_FRONT`, `SOLE_BACK`) where it draws clips for training, which must leave room for errors."""
+
+
+class Settings(TypedDict, total=False):
+    """Where a plan is played."""
+
+    engine: str
+    """`auto` (the default), `mujoco` or `warp`."""
+    device: str | None
+    """Warp device."""
+    threads: int | None
+    """CPU threads of engine `mujoco`; all by default."""
 
 
 @dataclass
@@ -80,13 +92,7 @@ class Outcome:
 
 
 def make_plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
-    """Worlds for cells; a cell's draws depend on the seed and its name alone.
-
-    Args:
-        cells: The suite.
-        rollouts: Worlds per cell, where the cell does not say.
-        seed: Seed of all draws.
-    """
+    """Worlds for cells, `rollouts` for each that does not say; a cell's draws depend on the seed and its name alone."""
     index = np.concatenate([np.full(c.rollouts or rollouts, i) for i, c in enumerate(cells)])
     noise: dict[str, list[np.ndarray]] = {}
     for c in cells:
@@ -231,27 +237,16 @@ class _Goals:
 class SuiteRollout:
     """A plan under one tracker: `prepare` once, `tick` from `-startup_ticks` to `ticks - 1`, then `outcome`."""
 
-    def __init__(
-        self,
-        tracker: Tracker,
-        plan: Plan,
-        *,
-        engine: str = "auto",
-        device: str | None = None,
-        fast_physics: bool = False,
-        threads: int | None = None,
-        startup_ticks: int | None = None,
-    ):
+    def __init__(self, tracker: Tracker, plan: Plan, *, fast_physics: bool = False, **settings: Unpack[Settings]):
         """Build worlds and references; see `play`."""
         began = time.perf_counter()
         self.plan, self.rate = plan, tracker.rate(fast=fast_physics)
-        self.startup_ticks = rule_sets.get("paper").startup.ticks if startup_ticks is None else startup_ticks
+        self.startup_ticks = rule_sets.get("paper").startup.ticks
+        """Standing before the references start [ticks], as in an episode of the rule set `paper`."""
         cells, cell = plan.cells, plan.cell
         kinds = [WorldKind(cells[i].friction, cells[i].payload) for i in cell]
         watched = np.array([cells[i].support is not None for i in cell])
-        self.lab = Lab(
-            kinds, watched, drive=tracker.drive, rate=self.rate, engine=engine, device=device, threads=threads
-        )
+        self.lab = Lab(kinds, watched, drive=tracker.drive, rate=self.rate, **settings)
         self.tables = plan.tables(self.lab.device)
         self.start = _start(plan, self.tables)
         end = np.array([c.ticks for c in cells])[cell]
@@ -330,35 +325,20 @@ def play(
     tracker: Tracker,
     plan: Plan,
     *,
-    engine: str = "auto",
-    device: str | None = None,
     fast_physics: bool = False,
-    threads: int | None = None,
-    startup_ticks: int | None = None,
     observer: Callable[[Lab, int], None] | None = None,
+    **settings: Unpack[Settings],
 ) -> Outcome:
     """Play a plan.
 
     Args:
         tracker: A tracker, not bound yet.
         plan: Cells and draws.
-        engine: `auto`, `mujoco` or `warp`.
-        device: Warp device.
         fast_physics: Use the tracker's fast physics rate.
-        threads: CPU threads of engine `mujoco`.
-        startup_ticks: Standing before the references start [ticks]; as in an episode of the rule set `paper` by
-            default.
         observer: Called as observer(lab, tick) after every tick, for films.
+        settings: See `Settings`.
     """
-    rollout = SuiteRollout(
-        tracker,
-        plan,
-        engine=engine,
-        device=device,
-        fast_physics=fast_physics,
-        threads=threads,
-        startup_ticks=startup_ticks,
-    )
+    rollout = SuiteRollout(tracker, plan, fast_physics=fast_physics, **settings)
     rollout.prepare()
     for tick in range(-rollout.startup_ticks, rollout.ticks):
         rollout.tick(tick)

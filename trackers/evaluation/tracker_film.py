@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from arena_newton.pictures.video import film_strip
 from arena_newton.robot import TICK
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.lab import Lab
-from arena_newton.trackers.evaluation.rollout import make_plan, play
+from arena_newton.trackers.evaluation.rollout import Settings, make_plan, play
 
 __all__ = ["FILMED", "film"]
 
@@ -23,12 +24,7 @@ PICTURES = 10
 WIDTH, HEIGHT = 256, 256
 SHOWN = {"walk 0.6": (0.0, 5.0), "ball, standing kick": (0.5, 4.0), "squat 0.45": (0.0, 7.0), "sit 0.42": (0.0, 12.0)}
 """Part of each rollout that is shown [s]."""
-VIEWS = {
-    "walk 0.6": (1.2, 4.6),
-    "ball, standing kick": (0.4, 2.6),
-    "squat 0.45": (0.1, 2.6),
-    "sit 0.42": (-0.1, 2.6),
-}
+VIEWS = {"walk 0.6": (1.2, 4.6), "ball, standing kick": (0.4, 2.6), "squat 0.45": (0.1, 2.6), "sit 0.42": (-0.1, 2.6)}
 """Middle of the picture along the robot's path and distance of the camera to its right [m]."""
 EYE, GAZE = 1.05, 0.72
 """Heights of the camera and of its target [m]."""
@@ -89,28 +85,18 @@ def film(
     out: Path,
     *,
     seed: int = 0,
-    engine: str = "auto",
-    device: str | None = None,
     fast_physics: bool = False,
-    threads: int | None = None,
+    **settings: Unpack[Settings],
 ) -> list[Path]:
-    """Play the filmed cells once and write one strip per cell; returns the files.
+    """Play the filmed cells once and write one strip per cell into a folder; returns the files.
 
-    Args:
-        tracker: A tracker, not bound yet.
-        label: Its name in file names and in the line above a strip.
-        out: Folder.
-        seed: Seed of the plan.
-        engine: As in `rollout.play`, like the rest.
-        device: Warp device.
-        fast_physics: Use the tracker's fast physics rate.
-        threads: CPU threads of engine `mujoco`.
+    The tracker is not bound yet; file names and the line above a strip name it `label`. The rest is `rollout.play`'s.
     """
     cells = [cell for cell in suite("full") if cell.name in FILMED]
     names = [cell.name for cell in cells]
     camera = _StripCamera(names)
     plan = make_plan(cells, 1, seed)
-    play(tracker, plan, engine=engine, device=device, fast_physics=fast_physics, threads=threads, observer=camera)
+    play(tracker, plan, fast_physics=fast_physics, observer=camera, **settings)
     safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in label)
     written = []
     for name, frames in zip(names, camera.frames, strict=True):

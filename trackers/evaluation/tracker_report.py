@@ -32,13 +32,9 @@ COLUMNS: dict[str, tuple[str, str]] = {
 
 
 def _means(result: Result, rows: np.ndarray) -> dict[str, float | None]:
-    out: dict[str, float | None] = {}
-    for name, values in result.outcome.measures.items():
-        kept = values[rows].astype(float)
-        kept = kept[np.isfinite(kept)]
-        if name != "fell":
-            out[name] = float(kept.mean()) if len(kept) else None
-    return out
+    measured = {name: values[rows].astype(float) for name, values in result.outcome.measures.items() if name != "fell"}
+    finite = {name: values[np.isfinite(values)] for name, values in measured.items()}
+    return {name: float(values.mean()) if len(values) else None for name, values in finite.items()}
 
 
 def _entry(result: Result, name: str, group: str, rows: np.ndarray) -> dict[str, Any]:

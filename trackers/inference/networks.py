@@ -134,10 +134,7 @@ class Symmetric(nn.Module):
     action_sign: torch.Tensor
 
     def __init__(
-        self,
-        network: nn.Module,
-        obs: tuple[torch.Tensor, torch.Tensor],
-        action: tuple[torch.Tensor, torch.Tensor],
+        self, network: nn.Module, obs: tuple[torch.Tensor, torch.Tensor], action: tuple[torch.Tensor, torch.Tensor]
     ):
         """Join network and mirrors.
 

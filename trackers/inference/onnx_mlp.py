@@ -64,31 +64,6 @@ class _Unfit(Exception):
     """The graph holds something that this reader does not know."""
 
 
-class _Linear(torch.nn.Module):
-    weight: torch.Tensor
-    bias: torch.Tensor | None
-
-    def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None):
-        super().__init__()
-        self.register_buffer("weight", weight.contiguous())
-        self.register_buffer("bias", bias)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return functional.linear(x, self.weight, self.bias)
-
-
-class _Convolution(torch.nn.Module):
-    """A convolution on a fixed length as one matrix product."""
-
-    def __init__(self, matrix: torch.Tensor, bias: torch.Tensor | None, shape: tuple[int, ...]):
-        super().__init__()
-        self.linear = _Linear(matrix.t(), bias)
-        self.shape = shape
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.linear(x.flatten(1)).reshape(-1, *self.shape)
-
-
 class _Call(torch.nn.Module):
     """A function with some arguments that are constant."""
 
@@ -98,15 +73,17 @@ class _Call(torch.nn.Module):
         constants = constants or {}
         self.positions = tuple(sorted(constants))
         for position in self.positions:
-            self.register_buffer(f"constant_{position}", constants[position])
+            self.register_buffer(f"constant_{position}", constants[position].contiguous())
 
     def forward(self, *dynamic: torch.Tensor) -> torch.Tensor:
-        if not self.positions:
-            return self.function(*dynamic)
         arguments = list(dynamic)
         for position in self.positions:
             arguments.insert(position, getattr(self, f"constant_{position}"))
         return self.function(*arguments)
+
+
+def _linear(weight: torch.Tensor, bias: torch.Tensor | None) -> _Call:
+    return _Call(functional.linear, {1: weight} | ({} if bias is None else {2: bias}))
 
 
 class OnnxNetwork(torch.nn.Module):
@@ -211,9 +188,9 @@ class _Graph:
         if op == "Gemm" and len(dynamic) == 1 and inputs[0] in self.dynamic and not attributes.get("transA", 0):
             weight = static[1] if attributes.get("transB", 0) else static[1].t()
             bias = static[2] * attributes.get("beta", 1.0) if 2 in static else None
-            module = _Linear(weight * attributes.get("alpha", 1.0), bias)
+            module = _linear(weight * attributes.get("alpha", 1.0), bias)
         elif op == "MatMul" and 1 in static and static[1].dim() == 2:
-            module = _Linear(static[1].t(), None)
+            module = _linear(static[1].t(), None)
         elif op == "Conv" and self._fuse and len(dynamic) == 1 and inputs[0] in self.dynamic:
             module = self._convolution(inputs, static, attributes, shape)
         elif op in ("Reshape", "Flatten") or (op in ("Squeeze", "Unsqueeze") and shape[0] == _PROBE_ROWS):
@@ -272,11 +249,7 @@ class _Graph:
         return _Call(lambda v, w, b: functional.layer_norm(v, w.shape, w, b, epsilon), {1: weight, 2: bias}), (x,)
 
     def _convolution(
-        self,
-        inputs: list[str],
-        static: dict[int, torch.Tensor],
-        attributes: dict[str, Any],
-        shape: tuple[int, ...],
+        self, inputs: list[str], static: dict[int, torch.Tensor], attributes: dict[str, Any], shape: tuple[int, ...]
     ) -> torch.nn.Module:
         in_shape = tuple(self.probe[inputs[0]].shape)[1:]
         size = math.prod(in_shape)
@@ -285,7 +258,7 @@ class _Graph:
         basis = torch.eye(size).reshape(size, *in_shape)
         matrix = _evaluate("Conv", [basis, static[1], None], attributes).flatten(1)
         bias = static[2].repeat_interleave(math.prod(shape[2:])) if 2 in static else None
-        return _Convolution(matrix, bias, shape[1:])
+        return torch.nn.Sequential(torch.nn.Flatten(), _linear(matrix.t(), bias), torch.nn.Unflatten(1, shape[1:]))
 
     def _live(self, steps: list[Step]) -> list[Step]:
         needed, live = {self.output}, []
@@ -414,12 +387,7 @@ def _evaluate(op: str, x: list[Any], attributes: dict[str, Any]) -> torch.Tensor
 
 
 def read(path: str | Path, *, in_width: int, flag: str = "--checkpoint") -> tuple[onnx.ModelProto, bytes]:
-    """The graph of an ONNX file that holds all of its weights, and the file's content.
-
-    Args:
-        path: The file.
-        in_width: Observation width that the caller needs.
-        flag: Command-line flag that errors name.
+    """The graph of an ONNX file that holds all of its weights, and the file's content; errors name the `flag`.
 
     Raises:
         InputError: The file is absent, not an ONNX network, keeps weights in another file, or has another input width.
@@ -450,14 +418,9 @@ def _reason(error: Exception) -> str:
 def load(
     path: str | Path, *, in_width: int, out_width: int, flag: str = "--checkpoint", fuse: bool = True
 ) -> OnnxNetwork:
-    """Read a feed-forward network from an ONNX file.
+    """Read a feed-forward network of these widths from an ONNX file; errors name the `flag`.
 
-    Args:
-        path: The file.
-        in_width: Observation width that the caller needs.
-        out_width: Output width that the caller needs.
-        flag: Command-line flag that errors name.
-        fuse: Whether `x * sigmoid(x)`, layer normalisation and convolutions become one call each.
+    With `fuse`, `x * sigmoid(x)`, layer normalisation and convolutions become one call each.
 
     Raises:
         InputError: The file is absent, not an ONNX network, holds an unknown operator, or has other widths.

@@ -31,13 +31,7 @@ class OnnxSession(torch.nn.Module):
     """The same network as torch modules, after `convert`."""
 
     def __init__(self, path: str | Path, *, in_width: int, out_width: int, flag: str = "--checkpoint"):
-        """Open the file.
-
-        Args:
-            path: The file.
-            in_width: Observation width that the caller needs.
-            out_width: Output width that the caller needs.
-            flag: Command-line flag that errors name.
+        """Open a file that must have these widths; errors name the command line's `flag`.
 
         Raises:
             InputError: ONNX Runtime cannot run the file, or it has other widths.
@@ -98,4 +92,4 @@ class OnnxSession(torch.nn.Module):
         """Outputs of all rows, shape [rows, out_width], on the device of `x`."""
         if self.twin is not None:
             return self.twin(x)
-        return torch.from_numpy(self._run(np.ascontiguousarray(x.cpu().numpy()))).to(x.device)
+        return torch.from_numpy(self._run(x.cpu().numpy())).to(x.device)

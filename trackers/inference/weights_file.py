@@ -29,7 +29,18 @@ from arena_newton.trackers import base, interface
 from arena_newton.trackers.inference.networks import TrackerNetwork
 from arena_newton.trackers.interface import JOINTS, ActionForm
 
-__all__ = ["FORMAT", "METADATA_KEY", "Weights", "default", "default_path", "load", "save"]
+__all__ = [
+    "FORMAT",
+    "METADATA_KEY",
+    "Weights",
+    "action_form",
+    "default",
+    "default_path",
+    "drive",
+    "load",
+    "physics",
+    "save",
+]
 
 FORMAT = "arena-newton-tracker-1"
 """Format that this module writes and reads."""
@@ -82,12 +93,8 @@ def default_path(name: str) -> Path:
 def default(name: str, otherwise: str) -> Path:
     """The weights that come with the package.
 
-    Args:
-        name: Name of the interface.
-        otherwise: What the user can pass instead, for the error.
-
     Raises:
-        InputError: There are none.
+        InputError: There are none; it says what to pass `otherwise`.
     """
     path = default_path(name)
     if not path.is_file():
@@ -99,11 +106,7 @@ def default(name: str, otherwise: str) -> Path:
 
 
 def save(path: str | Path, weights: Weights) -> None:
-    """Write a weights file; a reader never sees a part of it.
-
-    Args:
-        path: The file, `.safetensors`.
-        weights: What to write.
+    """Write a weights file, `.safetensors`; a reader never sees a part of it.
 
     Raises:
         InputError: The path cannot be written, or a number of the network is not finite.
@@ -157,9 +160,9 @@ def load(path: str | Path, wanted: str | None = None, *, flag: str = "--checkpoi
         weights = Weights(
             interface=meta["interface"],
             network=network,
-            action_form=_action_form(meta["action_form"]),
-            drive=_drive(meta["drive"]),
-            physics=_physics(meta["physics"]),
+            action_form=action_form(meta["action_form"]),
+            drive=drive(meta["drive"]),
+            physics=physics(meta["physics"]),
             symmetric=bool(meta.get("symmetric", False)),
             card=dict(meta.get("card") or {}),
             sha256=hashlib.sha256(data).hexdigest(),
@@ -203,39 +206,29 @@ def _check_tensors(expected: Mapping[str, torch.Tensor], tensors: Mapping[str, t
             raise InputError(f"{where}: {name} holds numbers that are not finite")
 
 
-def _action_form(value: Mapping[str, Any]) -> ActionForm:
+def action_form(value: Mapping[str, Any]) -> ActionForm:
+    """An action form from JSON; ValueError, KeyError or TypeError where it is unfit."""
     scale, clip = tuple(float(v) for v in value["scale"]), float(value["clip"])
     if not all(map(math.isfinite, (*scale, clip))):
         raise ValueError("action_form holds numbers that are not finite")
     return ActionForm(str(value["kind"]), scale, clip)
 
 
-def _drive(value: Mapping[str, Any]) -> DriveGains:
-    def vector(name: str) -> tuple[float, ...]:
-        numbers = tuple(float(v) for v in value[name])
+def drive(value: Mapping[str, Any]) -> DriveGains:
+    """A drive from JSON; errors as `action_form`."""
+    vectors = {name: tuple(float(v) for v in value[name]) for name in ("kp", "kd", "effort")}
+    fingers = {f"finger_{name}": float(value[f"finger_{name}"]) for name in ("kp", "kd", "effort", "armature")}
+    for name, numbers in vectors.items():
         if len(numbers) != JOINTS or not all(math.isfinite(v) and v >= 0.0 for v in numbers):
             raise ValueError(f"drive {name} needs {JOINTS} finite numbers of at least 0")
-        return numbers
-
-    def scalar(name: str) -> float:
-        number = float(value[name])
+    for name, number in fingers.items():
         if not (math.isfinite(number) and number >= 0.0):
             raise ValueError(f"drive {name} is {number}, expected a finite number of at least 0")
-        return number
-
-    return DriveGains(
-        name=str(value["name"]),
-        kp=vector("kp"),
-        kd=vector("kd"),
-        effort=vector("effort"),
-        finger_kp=scalar("finger_kp"),
-        finger_kd=scalar("finger_kd"),
-        finger_effort=scalar("finger_effort"),
-        finger_armature=scalar("finger_armature"),
-    )
+    return DriveGains(str(value["name"]), vectors["kp"], vectors["kd"], vectors["effort"], **fingers)
 
 
-def _physics(value: Mapping[str, Any]) -> PhysicsRate:
+def physics(value: Mapping[str, Any]) -> PhysicsRate:
+    """A physics rate from JSON; errors as `action_form`."""
     rate = PhysicsRate(float(value["dt"]), int(value["substeps"]))
     if not rate.dt > 0.0 or rate.substeps < 1 or not abs(rate.dt * rate.substeps - TICK) <= 1e-9:
         raise ValueError(f"physics {rate.dt} s x {rate.substeps} is not a tick of {TICK} s")

@@ -121,11 +121,7 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path: str | Path, device: str = "cpu") -> Checkpoint:
-        """Read a file: tensors and plain containers only.
-
-        Args:
-            path: The file.
-            device: Device of its tensors.
+        """Read a file, tensors and plain containers only, onto a device.
 
         Raises:
             InputError: The file is absent or not a checkpoint of this training.
@@ -145,15 +141,10 @@ class Checkpoint:
         return cls(**_known(cls, state) | {"card": Card(**_known(Card, state["card"]))})
 
     def check_same(self, tracker: str, kind: str, path: str | Path) -> None:
-        """Refuse to continue the training of another tracker or action form.
-
-        Args:
-            tracker: Interface of this training.
-            kind: Kind of this training's action form.
-            path: The checkpoint's file, for errors.
+        """Refuse to continue the training of another tracker or kind of action form.
 
         Raises:
-            InputError: They differ.
+            InputError: They differ; it names the checkpoint's file.
         """
         if self.card.tracker != tracker:
             raise InputError(f"{path}: a training of {self.card.tracker}, not of {tracker}")

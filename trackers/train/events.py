@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
 from arena_newton.robot import TICK
 
 if TYPE_CHECKING:
-    from arena_newton.trackers.train.references import ReferenceBank
-    from arena_newton.trackers.train.simulation import Simulation
+    from arena_newton.trackers.train.tracker_env import TrackerEnv
 
 __all__ = ["EVENTS", "OBSERVATION_NOISE", "START_NOISE", "Event", "apply", "uniform"]
 
@@ -42,23 +41,6 @@ _PAYLOAD_RADIUS = 0.05
 """Radius of gyration of a payload [m]."""
 
 
-class World(Protocol):
-    """What events act on."""
-
-    sim: Simulation
-    """The physics."""
-    privileged: dict[str, torch.Tensor]
-    """What the start events drew, by name, each of shape [worlds, n]."""
-    delay: torch.Tensor
-    """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
-    bank: ReferenceBank
-    """The references."""
-    frame: torch.Tensor
-    """Reference frame of each world, shape [worlds]."""
-    since_push: torch.Tensor
-    """Time since the last push of each world [s], shape [worlds]."""
-
-
 @dataclass(frozen=True)
 class Event:
     """One event and its settings."""
@@ -80,14 +62,14 @@ def _chance(like: torch.Tensor, probability: float, worlds: int) -> torch.Tensor
     return torch.rand(worlds, device=like.device) < probability
 
 
-def friction(env: World, mask: torch.Tensor, low: float, high: float) -> None:
+def friction(env: TrackerEnv, mask: torch.Tensor, low: float, high: float) -> None:
     """Sliding friction of every geom of a world: MuJoCo takes the larger of two geoms."""
     value = uniform(env.sim.qpos, low, high, env.sim.worlds)
     env.sim.geom_friction[:, :, 0] = value[:, None]
     env.privileged["friction"] = value[:, None] - 0.8
 
 
-def link_mass(env: World, mask: torch.Tensor, low: float, high: float) -> None:
+def link_mass(env: TrackerEnv, mask: torch.Tensor, low: float, high: float) -> None:
     """Mass and inertia of every link of the robot, by one factor per link."""
     sim = env.sim
     links = list(sim.bodies.values())
@@ -98,7 +80,7 @@ def link_mass(env: World, mask: torch.Tensor, low: float, high: float) -> None:
     env.privileged["trunk_mass"] = 10.0 * (factor[:, [sim.bodies["pelvis"], sim.bodies["torso_link"]]] - 1.0)
 
 
-def centre_of_mass(env: World, mask: torch.Tensor, reach: float) -> None:
+def centre_of_mass(env: TrackerEnv, mask: torch.Tensor, reach: float) -> None:
     """Centres of mass of pelvis and torso [m]."""
     sim = env.sim
     moved = []
@@ -109,7 +91,7 @@ def centre_of_mass(env: World, mask: torch.Tensor, reach: float) -> None:
     env.privileged["centre_of_mass"] = 50.0 * torch.cat(moved, 1)
 
 
-def payload(env: World, mask: torch.Tensor, fraction: float, mass: float) -> None:
+def payload(env: TrackerEnv, mask: torch.Tensor, fraction: float, mass: float) -> None:
     """Up to `mass` [kg] in either hand in a fraction of the worlds, each hand loaded with probability 2/3."""
     sim = env.sim
     loaded = _chance(sim.qpos, fraction, sim.worlds)
@@ -128,7 +110,7 @@ def payload(env: World, mask: torch.Tensor, fraction: float, mass: float) -> Non
     env.privileged["payload"] = torch.stack(carried, 1)
 
 
-def motor_strength(env: World, mask: torch.Tensor, low: float, high: float) -> None:
+def motor_strength(env: TrackerEnv, mask: torch.Tensor, low: float, high: float) -> None:
     """Stiffness, damping and torque limit of every joint, by one factor per joint."""
     sim = env.sim
     factor = uniform(sim.qpos, low, high, sim.worlds, 29)
@@ -138,19 +120,19 @@ def motor_strength(env: World, mask: torch.Tensor, low: float, high: float) -> N
     env.privileged["motor_strength"] = 10.0 * (factor - 1.0)
 
 
-def action_delay(env: World, mask: torch.Tensor, fraction: float) -> None:
+def action_delay(env: TrackerEnv, mask: torch.Tensor, fraction: float) -> None:
     """Targets arrive one tick late in a fraction of the episodes."""
     env.delay.copy_(torch.where(mask, _chance(env.sim.qpos, fraction, env.sim.worlds), env.delay))
 
 
-def hand_force(env: World, mask: torch.Tensor, fraction: float, force: float) -> None:
+def hand_force(env: TrackerEnv, mask: torch.Tensor, fraction: float, force: float) -> None:
     """A constant force of up to `force` [N] in a random direction on each hand, in a fraction of the episodes."""
     for name in HANDS:
         direction = torch.nn.functional.normalize(torch.randn(env.sim.worlds, 3, device=mask.device), dim=1)
         _write_force(env, mask, name, direction, fraction, force)
 
 
-def trunk_force(env: World, mask: torch.Tensor, fraction: float, force: float, resistance: float) -> None:
+def trunk_force(env: TrackerEnv, mask: torch.Tensor, fraction: float, force: float, resistance: float) -> None:
     """A constant horizontal force of up to `force` [N] on the torso, in a fraction of the episodes.
 
     References of the family `push` lean into something: nothing but a force against their heading makes them feasible,
@@ -169,7 +151,7 @@ def trunk_force(env: World, mask: torch.Tensor, fraction: float, force: float, r
 
 
 def _write_force(
-    env: World, mask: torch.Tensor, link: str, direction: torch.Tensor, fraction: float, force: float
+    env: TrackerEnv, mask: torch.Tensor, link: str, direction: torch.Tensor, fraction: float, force: float
 ) -> None:
     worlds = env.sim.worlds
     size = uniform(env.sim.qpos, 0.0, force, worlds) * _chance(mask, fraction, worlds)
@@ -177,11 +159,11 @@ def _write_force(
     applied.copy_(torch.where(mask[:, None], direction * size[:, None], applied))
 
 
-def push(env: World, mask: torch.Tensor, every: float, planar: float, vertical: float, turn: float) -> None:
+def push(env: TrackerEnv, mask: torch.Tensor, every: float, planar: float, vertical: float, turn: float) -> None:
     """A kick of the base, every `every` seconds on average: its velocity jumps.
 
     Args:
-        env: What is pushed.
+        env: The worlds.
         mask: Worlds that may be pushed.
         every: Mean time between two pushes of the same world [s].
         planar: Largest jump over the ground, in any direction [m/s].
@@ -212,7 +194,7 @@ EVENTS: dict[str, Event] = {
 }
 
 
-def apply(env: World, when: str, mask: torch.Tensor, events: Mapping[str, Event]) -> None:
+def apply(env: TrackerEnv, when: str, mask: torch.Tensor, events: Mapping[str, Event]) -> None:
     """Run the events of one kind on the worlds of a mask, in the table's order."""
     for event in events.values():
         if event.when == when:

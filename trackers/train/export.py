@@ -8,9 +8,8 @@ from typing import Any
 
 from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
-from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.trackers.inference import weights_file
-from arena_newton.trackers.interface import ActionForm, get
+from arena_newton.trackers.interface import get
 from arena_newton.trackers.train.checkpoint import Checkpoint
 from arena_newton.trackers.train.options import ExportOptions
 
@@ -18,14 +17,7 @@ __all__ = ["export", "write"]
 
 
 def export(checkpoint: Path, options: ExportOptions) -> Path:
-    """Write the weights of a checkpoint.
-
-    Args:
-        checkpoint: File of the training.
-        options: Where to and with what.
-
-    Returns:
-        The weights file.
+    """Write the weights of a training's checkpoint; returns the file.
 
     Raises:
         InputError: The checkpoint is unfit, or a file cannot be written.
@@ -53,18 +45,15 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
         "training": {k: round(v, 5) for k, v in state.last.items() if "/" in k},
     }
     form, drive, physics = card.pop("action_form"), card.pop("drive"), card.pop("physics")
-    if options.note:
-        card["note"] = options.note
-    if options.hardware:
-        card["hardware"] = options.hardware
+    card |= {name: text for name in ("note", "hardware") if (text := getattr(options, name))}
     if options.metrics is not None:
         card["metrics"] = _figures(options.metrics, card["tracker"])
     weights = weights_file.Weights(
         interface=card["tracker"],
         network=network,
-        action_form=ActionForm(form["kind"], tuple(form["scale"]), form["clip"]),
-        drive=_drive(drive),
-        physics=PhysicsRate(**physics),
+        action_form=weights_file.action_form(form),
+        drive=weights_file.drive(drive),
+        physics=weights_file.physics(physics),
         symmetric=options.symmetric,
         card=card | {"symmetric": options.symmetric},
     )
@@ -118,11 +107,6 @@ def _figures(path: Path, interface: str) -> dict[str, Any]:
         raise InputError(f"--metrics {path}: not an evaluation.json of trackers.evaluate") from None
     kept = ("suite", "rollouts", "seed", "engine", "device", "clips", "only")
     return {"figures": figures, "settings": {k: settings[k] for k in kept if settings.get(k) not in (None, "")}}
-
-
-def _drive(value: dict[str, Any]) -> DriveGains:
-    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in value.items()}
-    return DriveGains(**fields)
 
 
 def _markdown(card: dict[str, Any]) -> str:

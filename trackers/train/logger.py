@@ -29,11 +29,6 @@ class IterationTimes:
     samples: int
     """Samples of all processes."""
 
-    @property
-    def samples_per_s(self) -> int:
-        """Rounded."""
-        return round(self.samples / (self.collect + self.learn))
-
 
 class DeviceLogger(Logger):
     """rsl_rl's log, fetched from the device once per iteration."""
@@ -64,11 +59,7 @@ class DeviceLogger(Logger):
         return []
 
     def process_env_step(
-        self,
-        rewards: torch.Tensor,
-        dones: torch.Tensor,
-        extras: dict,
-        intrinsic_rewards: torch.Tensor | None = None,
+        self, rewards: torch.Tensor, dones: torch.Tensor, extras: dict, intrinsic_rewards: torch.Tensor | None = None
     ) -> None:
         """Count one tick."""
         if self.disable_logs:
@@ -108,7 +99,7 @@ class DeviceLogger(Logger):
             "iteration": progress["iteration"],
             "samples": progress["samples"],
             "seconds": round(progress["seconds"], 2),
-            "samples_per_s": times.samples_per_s,
+            "samples_per_s": round(times.samples / (times.collect + times.learn)),
             "collect_s": round(times.collect, 4),
             "learn_s": round(times.learn, 4),
             "learning_rate": progress["learning_rate"],

@@ -42,25 +42,14 @@ class TrackerActor(MLPModel):
         init_std: float,
         std_range: tuple[float, float] = (0.05, 2.0),
     ):
-        """Make the network and the action noise.
-
-        Args:
-            obs: An observation, for the widths.
-            obs_groups: Groups of observations by set.
-            obs_set: The set that this model reads.
-            output_dim: Width of the action.
-            interface: Name of the interface.
-            network: Widths (`Interface.make_network`).
-            init_std: Initial standard deviation of the action noise.
-            std_range: Bounds of the standard deviation.
-        """
+        """Make an interface's network of these widths and the action noise; the other arguments are rsl_rl's."""
         nn.Module.__init__(self)
         self.obs_groups, self.obs_dim = self._get_obs_dim(obs, obs_groups, obs_set)
         self.obs_normalization = True
         self.net = get(interface).make_network(network)
         if self.obs_dim != self.net.obs_width:
             raise ValueError(
-                f"interface {interface}: {self.obs_dim} observations, the network takes {self.net.obs_width}"
+                f"interface {interface}: {self.obs_dim} observations, its network takes {self.net.obs_width}"
             )
         self.distribution = UncheckedGaussian(output_dim, init_std=init_std, std_range=std_range, std_type="log")
 

@@ -17,15 +17,7 @@ import tyro
 from arena_newton.errors import InputError
 from arena_newton.trackers.interface import names
 
-__all__ = [
-    "FAMILY_WEIGHTS",
-    "CurveOptions",
-    "ExportCommand",
-    "ExportOptions",
-    "TrainOptions",
-    "check",
-    "runner_config",
-]
+__all__ = ["FAMILY_WEIGHTS", "CurveOptions", "ExportCommand", "ExportOptions", "TrainOptions", "check", "runner_config"]
 
 if TYPE_CHECKING:
     TrackerName = str
@@ -185,7 +177,9 @@ def check(options: TrainOptions) -> None:
     """
     for option in dataclasses.fields(options):
         if "bounds" in option.metadata:
-            _refuse_outside(_flag(option.name), getattr(options, option.name), *option.metadata["bounds"])
+            _refuse_outside(
+                "--" + option.name.replace("_", "-"), getattr(options, option.name), *option.metadata["bounds"]
+            )
     _refuse_outside("--minibatches", options.minibatches, 1, options.worlds * options.steps)
     if options.settle > 0.0 and options.minutes <= 0.0:
         raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")
@@ -198,10 +192,6 @@ def check(options: TrainOptions) -> None:
             raise InputError(f"{flag} {file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
 
 
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
 def _refuse_outside(flag: str, value: float | Mapping[str, float], low: float, high: float) -> None:
     if isinstance(value, Mapping):
         for name, number in value.items():
@@ -212,12 +202,7 @@ def _refuse_outside(flag: str, value: float | Mapping[str, float], low: float, h
 
 
 def runner_config(options: TrainOptions, network: dict[str, Any]) -> dict[str, Any]:
-    """rsl_rl's configuration.
-
-    Args:
-        options: The user's options.
-        network: Widths of the tracker's network.
-    """
+    """rsl_rl's configuration, for a tracker's network of these widths."""
     wandb = {"class_name": "WandbLogWriter", "project_name": "arena-newton-trackers"}
     return {
         "logger": wandb if options.logger == "wandb" else options.logger,

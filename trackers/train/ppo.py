@@ -44,16 +44,9 @@ class TrackerPPO(PPO):
     """Upper bound of the learning rate."""
 
     def __init__(self, *args: Any, mirror_loss: float, graph: bool, **kwargs: Any):
-        """Take rsl_rl's arguments and two of our own.
-
-        Args:
-            args: rsl_rl's.
-            mirror_loss: Weight of the squared difference between the action of a mirrored observation and the mirrored
-                action.
-            graph: Use CUDA graphs on a GPU.
-            kwargs: rsl_rl's; `schedule` is `adaptive` or `fixed`, `desired_kl` the target divergence.
-        """
+        """Take rsl_rl's arguments and two of our own; `graph` allows CUDA graphs on a GPU."""
         self.mirror_loss = mirror_loss
+        """Weight of the squared difference between the action of a mirrored observation and the mirrored action."""
         self.mirrors: tuple[Mirror, Mirror] | None = None
         """Mirror images of the actor's observation and of the action."""
         super().__init__(*args, **kwargs)
@@ -104,8 +97,7 @@ class TrackerPPO(PPO):
         losses = (totals / (self.num_learning_epochs * self.num_mini_batches)).tolist()
         self.last_kl = float(divergence)
         self._set_rate(self.last_kl)
-        named = dict(zip(("value", "surrogate", "entropy"), losses, strict=True))
-        return named | {"kl": self.last_kl}
+        return dict(zip(("value", "surrogate", "entropy", "kl"), (*losses, self.last_kl), strict=True))
 
     @contextlib.contextmanager
     def _own_stream(self) -> Iterator[None]:
@@ -202,13 +194,7 @@ class _Captured:
     """A minibatch's work in CUDA graphs, for one set of parameters that learn."""
 
     def __init__(self, ppo: TrackerPPO, batch: RolloutStorage.Batch, learning: list[bool]):
-        """Capture it.
-
-        Args:
-            ppo: Whose parameters learn; their gradients must be None, the graph allocates them.
-            batch: A minibatch, for the shapes.
-            learning: Which parameters learn.
-        """
+        """Capture it; gradients must be None before, for the graph allocates them."""
         self.learning = learning
         mine = RolloutStorage.Batch(
             batch.observations.clone(),

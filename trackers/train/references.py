@@ -69,12 +69,7 @@ class ReferenceBank:
     """Frames of all clips and what training derives from them."""
 
     def __init__(self, library: DeviceLibrary, device: str):
-        """Pack a library.
-
-        Args:
-            library: Frames and clips on any device.
-            device: Torch device.
-        """
+        """Pack a library, which may be on another device."""
         self.start = library.clip_start.to(device=device, dtype=torch.long)
         """First frame of each clip, shape [clips]."""
         self.length = library.clip_length.to(device=device, dtype=torch.long)

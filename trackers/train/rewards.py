@@ -165,11 +165,7 @@ REWARDS: dict[str, Term] = {
 
 
 def configured(weights: Mapping[str, float], scales: Mapping[str, float]) -> dict[str, Term]:
-    """`REWARDS` with other weights and scales.
-
-    Args:
-        weights: Weights by term.
-        scales: Scales by term.
+    """`REWARDS` with other weights and scales, by term.
 
     Raises:
         InputError: A term is unknown, or has no scale.

@@ -86,15 +86,7 @@ class TrackerRunner(OnPolicyRunner):
     def __init__(
         self, env: TrackerEnv, options: TrainOptions, network: dict[str, Any], card: Card, log_dir: Path | None = None
     ):
-        """Make networks, algorithm and log.
-
-        Args:
-            env: The worlds.
-            options: The user's options.
-            network: Widths of the tracker's network.
-            card: What the weights' card will say about this training.
-            log_dir: Folder of checkpoints and log; nothing is written without one.
-        """
+        """Make a network of these widths, algorithm and log; nothing is written without `log_dir`."""
         folder = None if log_dir is None else str(log_dir)
         super().__init__(env, runner_config(options, network), folder, env.device)
         self.options, self.card = options, card
@@ -110,6 +102,7 @@ class TrackerRunner(OnPolicyRunner):
             gpu_global_rank=self.gpu_global_rank,
             device=env.device,
         )
+        self.history = self.logger.history
         self.folder = Path(folder or ".")
         """Folder of checkpoints and log."""
         if self.alg.mirror_loss > 0.0:
@@ -123,11 +116,6 @@ class TrackerRunner(OnPolicyRunner):
         self._stop = False
         self._started = False
         self._resumed: Path | None = None
-
-    @property
-    def history(self) -> list[dict[str, float]]:
-        """What each iteration measured."""
-        return self.logger.history
 
     def _configure_multi_gpu(self) -> None:
         """As rsl_rl, which knows GPUs only; processes on the CPU talk through gloo."""
@@ -164,12 +152,9 @@ class TrackerRunner(OnPolicyRunner):
     # -- learning ---------------------------------------------------------------------------------------------------
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False, minutes: float = 0.0) -> None:
-        """Train.
+        """Train up to so many iterations or `minutes`, 0 = no limit; the last iteration is finished.
 
-        Args:
-            num_learning_iterations: Largest number of iterations.
-            init_at_random_ep_len: Unused; episodes start at random frames.
-            minutes: Time limit [min], 0 = none. The last iteration is finished.
+        `init_at_random_ep_len` is rsl_rl's and unused: episodes start at random frames.
         """
         main = threading.current_thread() is threading.main_thread()
         signals = (signal.SIGTERM, signal.SIGINT) if main else ()
@@ -200,6 +185,7 @@ class TrackerRunner(OnPolicyRunner):
         warm_up = CriticWarmUp(
             self.alg, self.critic_iterations if self._started else 0, first, self.options.learning_rate
         )
+        samples = self.options.steps * self.env.num_envs * self.gpu_world_size
         began = mark = time.monotonic()
         for it in range(first, first + iterations):
             warm_up.begin(it)
@@ -209,7 +195,7 @@ class TrackerRunner(OnPolicyRunner):
                 self.alg.compute_returns(obs)
             losses = self.alg.update()
             now = time.monotonic()
-            self._count(IterationTimes(collected - mark, now - collected, self._batch), losses, metrics, first)
+            self._count(IterationTimes(collected - mark, now - collected, samples), losses, metrics, first)
             mark = now
             stop, elapsed = self._agree((now - began) / (60.0 * minutes) if minutes > 0.0 else 0.0)
             if stop:
@@ -223,11 +209,6 @@ class TrackerRunner(OnPolicyRunner):
             self.logger.finish()
             self.save(str(self.folder / "model_last.pt"))
             self.save(str(self.folder / "model_slim.pt"), slim=True)
-
-    @property
-    def _batch(self) -> int:
-        """Samples per iteration of all processes."""
-        return self.options.steps * self.env.num_envs * self.gpu_world_size
 
     @torch.no_grad()
     def _roll_out(self, obs: TensorDict) -> tuple[TensorDict, dict[str, float]]:
@@ -304,11 +285,7 @@ class TrackerRunner(OnPolicyRunner):
         return stop > 0.0 or elapsed >= 1.0, elapsed
 
     def anneal(self, elapsed: float) -> None:
-        """Reduce target KL and entropy coefficient towards the end of a time limit.
-
-        Args:
-            elapsed: Fraction of the time limit that has passed.
-        """
+        """Reduce target KL and entropy coefficient towards the end of a time limit; see `annealed`."""
         left = annealed(elapsed, self.options.settle)
         self.alg.desired_kl = self.options.desired_kl * left
         self.alg.entropy_coef = self.options.entropy * left
@@ -316,12 +293,9 @@ class TrackerRunner(OnPolicyRunner):
     # -- checkpoints ------------------------------------------------------------------------------------------------
 
     def save(self, path: str, infos: dict[str, Any] | None = None, *, slim: bool = False) -> None:
-        """Write everything that a resumed training needs.
+        """Write everything that a resumed training needs; `load` returns `infos`.
 
-        Args:
-            path: The file.
-            infos: Anything the caller wants back from `load`.
-            slim: Leave out the optimiser's moments, two thirds of the file; a resumed training estimates them again.
+        A slim file lacks the optimiser's moments, two thirds of it; a resumed training estimates them again.
         """
         on_cuda = str(self.device).startswith("cuda")
         networks, actor = self.alg.save(), self.alg.actor
@@ -335,7 +309,7 @@ class TrackerRunner(OnPolicyRunner):
             samples=self.samples,
             seconds=self.seconds,
             started=self._started,
-            families=list(self.env.bank.family_names),
+            families=self.env.bank.family_names,
             critic_widths=self.env.critic_widths,
             sampler=self.env.sampler.state_dict(),
             rng=torch.get_rng_state(),
@@ -370,11 +344,7 @@ class TrackerRunner(OnPolicyRunner):
             return self.resume(Checkpoint.read(path, map_location or str(self.device)), path)
 
     def resume(self, checkpoint: Checkpoint, path: str | Path) -> dict[str, Any]:
-        """Continue the training of a checkpoint.
-
-        Args:
-            checkpoint: The checkpoint.
-            path: Its file, for errors.
+        """Continue the training of a checkpoint, whose file's path errors name.
 
         Raises:
             InputError: It is of another training.

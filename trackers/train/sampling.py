@@ -27,6 +27,7 @@ FORGET = 0.99
 """Fraction of the evidence that is kept per iteration."""
 CEILING = 5.0
 """Largest factor of a bin over the mean: clips that no tracker can follow must not take all the time."""
+_EVIDENCE = ("seconds", "failures", "cumulative")
 
 
 class ClipSampler:
@@ -107,18 +108,12 @@ class ClipSampler:
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed training needs."""
-        return {
-            "library": self.library,
-            "seconds": self.seconds,
-            "failures": self.failures,
-            "cumulative": self.cumulative,
-        }
+        return {"library": self.library} | {name: getattr(self, name) for name in _EVIDENCE}
 
     def load_state_dict(self, state: dict[str, Any]) -> bool:
         """Load the evidence of a checkpoint; False, and nothing is loaded, where it is of another library."""
         if state.get("library") != self.library:
             return False
-        self.seconds.copy_(state["seconds"])
-        self.failures.copy_(state["failures"])
-        self.cumulative.copy_(state["cumulative"])
+        for name in _EVIDENCE:
+            getattr(self, name).copy_(state[name])
         return True

@@ -8,6 +8,7 @@ import importlib.util
 import io
 import os
 import shlex
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -204,10 +205,9 @@ def build(options: TrainOptions) -> TrackerRunner:
 
 def _runner(env: TrackerEnv, options: TrainOptions, card: Card, checkpoint: Checkpoint | None) -> TrackerRunner:
     """The runner, at the state from which it is to go on."""
+    folder = None if options.bench else options.log_dir
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints both networks layer by layer
-        runner = TrackerRunner(
-            env, options, env.interface.make_network().config(), card, None if options.bench else options.log_dir
-        )
+        runner = TrackerRunner(env, options, env.interface.make_network().config(), card, folder)
     if checkpoint is not None:
         with naming("--resume"):
             runner.resume(checkpoint, str(options.resume))
@@ -246,12 +246,10 @@ def _bench_line(runner: TrackerRunner, options: TrainOptions) -> str:
     """Speed of a training, and the time of the physics in a tick."""
     # The first iterations warm up allocators and libraries.
     rows = runner.history[3:] or runner.history
-    total = sum(r["samples"] for r in rows[-1:]) - (rows[0]["samples"] if len(rows) > 1 else 0)
-    spent = rows[-1]["seconds"] - (rows[0]["seconds"] if len(rows) > 1 else 0.0)
-    collect = sum(r["collect_s"] for r in rows) / len(rows)
-    learn = sum(r["learn_s"] for r in rows) / len(rows)
-    ticks = 50 if runner.device != "cpu" else 5
-    wait = (lambda: torch.cuda.synchronize(runner.device)) if runner.device != "cpu" else (lambda: None)
+    collect, learn = (statistics.mean(row[name] for row in rows) for name in ("collect_s", "learn_s"))
+    rate = options.worlds * options.steps * runner.gpu_world_size / max(collect + learn, 1e-9)
+    on_cuda = runner.device != "cpu"
+    ticks, wait = (50, torch.cuda.synchronize) if on_cuda else (5, lambda: None)
     wait()
     began = time.perf_counter()
     for _ in range(ticks):
@@ -259,7 +257,7 @@ def _bench_line(runner: TrackerRunner, options: TrainOptions) -> str:
     wait()
     physics = (time.perf_counter() - began) / ticks
     return (
-        f"bench: {total / max(spent, 1e-9):.0f} samples/s, iteration {1e3 * (collect + learn):.1f} ms "
+        f"bench: {rate:.0f} samples/s, iteration {1e3 * (collect + learn):.1f} ms "
         f"(collect {1e3 * collect:.1f}, update {1e3 * learn:.1f}), tick {1e3 * collect / options.steps:.2f} ms "
         f"(physics {1e3 * physics:.2f}), {options.worlds} worlds x {options.steps} ticks, {options.tracker}"
     )

@@ -15,6 +15,7 @@ import warp as wp
 from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.scene import load_scene
 from arena_newton.trackers.motions.library import FIXTURES
+from arena_newton.trackers.train.options import TrainOptions
 from arena_newton.trackers.train.references import KEY_LINKS
 
 __all__ = ["Simulation", "share_stream"]
@@ -39,37 +40,17 @@ def _span(indices: Sequence[int] | np.ndarray) -> slice:
 class Simulation:
     """State and per-world model fields of the lab as torch views; rows are worlds, joints in MuJoCo order."""
 
-    def __init__(
-        self,
-        worlds: int,
-        device: str,
-        drive: DriveGains,
-        rate: PhysicsRate,
-        *,
-        contacts_per_world: int,
-        constraints_per_world: int,
-        graph: bool,
-    ):
-        """Build the lab.
-
-        Args:
-            worlds: Number of worlds.
-            device: `cpu` or `cuda:N`.
-            drive: Gains of the tracker.
-            rate: Physics rate of the tracker.
-            contacts_per_world: Contact buffer.
-            constraints_per_world: Constraint buffer.
-            graph: Capture the tick on CUDA.
-        """
-        self.worlds, self.device, self.rate = worlds, device, rate
+    def __init__(self, drive: DriveGains, rate: PhysicsRate, options: TrainOptions, device: str):
+        """Build the lab with a tracker's gains and physics rate on `cpu` or `cuda:N`."""
+        self.worlds, self.device, self.rate = options.worlds, device, rate
         self.scene = load_scene(
             "lab",
-            worlds=worlds,
+            worlds=options.worlds,
             device=device,
             hands="fixed",
             drive=drive,
-            contacts_per_world=contacts_per_world,
-            constraints_per_world=constraints_per_world,
+            contacts_per_world=options.contacts_per_world,
+            constraints_per_world=options.constraints_per_world,
         )
         self._m, self._d = self.scene.solver.mjw_model, self.scene.solver.mjw_data
         self._m.opt.timestep.fill_(rate.dt)
@@ -114,7 +95,7 @@ class Simulation:
         self._parked_pos = self.mocap_pos[:, self._fixtures].clone()
         self._parked_quat = self.mocap_quat[:, self._fixtures].clone()
         self._graph: wp.Graph | None = None
-        self._want_graph = graph and device.startswith("cuda")
+        self._want_graph = options.graph and device.startswith("cuda")
 
     def _launch(self) -> None:
         for _ in range(self.rate.substeps):

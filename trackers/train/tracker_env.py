@@ -48,17 +48,6 @@ NO_PUSH = 1e3
 class TrackerEnv(VecEnv):
     """References tracked in the lab by a front end's robot."""
 
-    front_end: FrontEnd
-    """Observation and action of the tracker."""
-    ahead: Frame
-    """The reference frame that is commanded next."""
-    delay: torch.Tensor
-    """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
-    default_pose: torch.Tensor
-    """The robot's default joint positions [rad], shape [29]."""
-    randomised: torch.Tensor
-    """What the start events drew, shape [worlds, n]."""
-
     def __init__(
         self,
         interface: Interface,
@@ -73,26 +62,14 @@ class TrackerEnv(VecEnv):
         critic_terms: Mapping[str, critic.CriticTerm] = critic.CRITIC,
         family_weights: Mapping[str, float] | None = None,
     ):
-        """Build the worlds.
-
-        Args:
-            interface: Front end, drive and physics rate of the tracker.
-            form: How raw actions become joint targets.
-            library: References on `device`.
-            options: Number of worlds, length of the episodes, buffers and switches.
-            device: `cpu` or `cuda:N`.
-            rewards: Reward terms by name.
-            terminations: Termination terms by name.
-            randomisation: Events by name.
-            critic_terms: The critic's observation by name.
-            family_weights: Weights of families in the sampling, 1 where not named.
-        """
+        """Build the worlds on a device, `cpu` or `cuda:N`; families without a weight have 1."""
         self.cfg = options
         self.num_envs = worlds = options.worlds
         self.device = device
         self.max_episode_length = round(options.episode_s / TICK)
         self.interface = interface
-        self.front_end = front_end = interface.front_end(form)
+        self.front_end: FrontEnd = interface.front_end(form)
+        front_end = self.front_end
         self.num_actions = front_end.action_width
         self.rewards, self.terminations = dict(rewards), dict(terminations)
         self.events = dict(randomisation) if options.randomise else {}
@@ -101,17 +78,10 @@ class TrackerEnv(VecEnv):
         """Width of each critic term."""
         self.bank = ReferenceBank(library, device)
         self.sampler = ClipSampler(self.bank, options.adaptive, dict(family_weights or {}))
-        self.sim = Simulation(
-            worlds,
-            device,
-            interface.drive,
-            interface.rate,
-            contacts_per_world=options.contacts_per_world,
-            constraints_per_world=options.constraints_per_world,
-            graph=options.graph,
-        )
+        self.sim = Simulation(interface.drive, interface.rate, options, device)
         self._every = torch.ones(worlds, dtype=torch.bool, device=device)
-        self.delay = torch.zeros(worlds, dtype=torch.bool, device=device)
+        self.delay: torch.Tensor = torch.zeros(worlds, dtype=torch.bool, device=device)
+        """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
         zero = torch.zeros(worlds, 1, device=device)
         self.privileged: dict[str, torch.Tensor] = {
             "friction": zero,
@@ -120,13 +90,15 @@ class TrackerEnv(VecEnv):
             "payload": zero.repeat(1, 2),
             "motor_strength": zero.repeat(1, 29),
         }
+        """What the start events drew, by name, each of shape [worlds, n]."""
         events.apply(self, "start", self._every, self.events)
-        self.randomised = torch.cat(list(self.privileged.values()), 1)
+        self.randomised: torch.Tensor = torch.cat(list(self.privileged.values()), 1)
         self.sim.finish()
         self.pushed_links = [self.sim.bodies[name] for name in (*events.HANDS, "torso_link")]
         """Bodies on which events apply forces."""
         self._foot_bodies = torch.tensor([self.sim.bodies[name] for name in KEY_LINKS[FEET]], device=device)
-        self.default_pose = torch.tensor(DEFAULT_POSE, device=device)
+        self.default_pose: torch.Tensor = torch.tensor(DEFAULT_POSE, device=device)
+        """The robot's default joint positions [rad], shape [29]."""
         self.families = torch.eye(len(self.bank.family_names), device=device)
         """One-hot rows of the families."""
         self.support_kinds = torch.arange(1, 4, device=device)
@@ -154,8 +126,10 @@ class TrackerEnv(VecEnv):
         self._targets = zeros(worlds, 29)
         self._feet, self._foot_vel = zeros(worlds, 2, 3), zeros(worlds, 2, 3)
         self._next_rows = zeros(worlds, self.bank.data.shape[1])
-        self.ahead = self.bank.split(self._next_rows)
+        self.ahead: Frame = self.bank.split(self._next_rows)
+        """The reference frame that is commanded next."""
         self.since_push = zeros(worlds)
+        """Time since the last push of each world [s], shape [worlds]."""
         self._reward, self._done = zeros(worlds), zeros(worlds, dtype=torch.long)
         self._time_out = zeros(worlds, dtype=torch.bool)
         self._critic_obs: torch.Tensor | None = None
@@ -177,11 +151,7 @@ class TrackerEnv(VecEnv):
         self.tally.clear()
 
     def _run(self, name: str, work: Callable[[], None]) -> None:
-        graph = self._graphs.get(name)
-        if graph is None:
-            work()
-        else:
-            graph.replay()
+        (self._graphs[name].replay if name in self._graphs else work)()
 
     # -- rsl_rl's interface -----------------------------------------------------------------------------------------
 
@@ -325,12 +295,8 @@ class TrackerEnv(VecEnv):
         self.episode_length_buf.masked_fill_(mask, 0)
         self.since_push.masked_fill_(mask, NO_PUSH)
         bank, clip = self.bank, self.clip()
-        sim.place_supports(
-            mask,
-            bank.support_kind.index_select(0, clip),
-            bank.support_pos.index_select(0, clip),
-            bank.support_quat.index_select(0, clip),
-        )
+        supports = (bank.support_kind, bank.support_pos, bank.support_quat)
+        sim.place_supports(mask, *(part.index_select(0, clip) for part in supports))
         events.apply(self, "reset", mask, self.events)
 
     def _observe(self, first: torch.Tensor) -> None:
