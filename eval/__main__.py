@@ -128,24 +128,35 @@ def _run(arguments: list[str], factories: Factories | None) -> int:
     options = _parse(RunOptions, arguments, "run")
     from arena_newton.eval.folder import results_folder
     from arena_newton.eval.options import is_quick
-    from arena_newton.eval.run import execute
 
     if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
-        return execute(options, factories)
+        return _execute(options, factories)
     folder = results_folder(options.out)
-    code = execute(dataclasses.replace(options, out=str(folder)), factories)
+    code = _execute(dataclasses.replace(options, out=str(folder)), factories)
     return code if code == INTERRUPTED else max(code, _show_expert(options, folder / "expert", factories))
+
+
+def _execute(options: RunOptions, factories: Factories | None) -> int:
+    """Run; what is wrong with flags or folder is found before the libraries of physics load, which takes seconds."""
+    from arena_newton.doctor import versions
+    from arena_newton.eval.config import resolve
+    from arena_newton.eval.folder import ResultsFolder, results_folder
+
+    config = resolve(options)
+    folder = ResultsFolder(results_folder(options.out), config, versions())
+    folder.check()
+    from arena_newton.eval.run import execute
+
+    return execute(folder, factories)
 
 
 def _show_expert(options: RunOptions, folder: Path, factories: Factories | None) -> int:
     """End the quick look with a policy that solves its task, and name a picture of it."""
-    from arena_newton.eval.run import execute
-
     print("\nAll of these stood still. One that solves its task:")
     one = dataclasses.replace(
         options, task=("vis_navi",), policy="expert", seeds=(0,), repeats=1, worlds=1, strip=True, out=str(folder)
     )
-    code = execute(one, factories)
+    code = _execute(one, factories)
     for strip in sorted((folder / "strips").glob("*__world.*")):
         print(f"see it: {strip}")
     return code
@@ -159,12 +170,11 @@ def _resume(arguments: list[str], factories: Factories | None) -> int:
         _parse(RunOptions, ["--help"], "resume <out>")
     folder = _folder(arguments, "resume")
     from arena_newton.eval.folder import stored_options
-    from arena_newton.eval.run import execute
 
     options = _parse(RunOptions, arguments, "resume", default=stored_options(folder))
     if options.out != str(folder):
         raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
-    return execute(options, factories)
+    return _execute(options, factories)
 
 
 def _report(arguments: list[str], factories: Factories | None) -> int:

@@ -1,4 +1,7 @@
-"""A run as it is executed: flags are checked and resolved once, and only go down from there."""
+"""A run as it is executed: flags are checked and resolved once, and only go down from there.
+
+No library of physics or pictures is loaded before all that needs none was checked.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
@@ -17,15 +21,14 @@ from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_MAX_STEPS, QUICK_REPEATS, QUICK_SEEDS, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
-from arena_newton.physics import resolve_engine
-from arena_newton.pictures.camera import CameraConfig
-from arena_newton.pictures.recorder import video_sizes
-from arena_newton.policies.base import Policy
 from arena_newton.quiet import quiet_warp
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
-from arena_newton.trackers.base import Tracker
-from arena_newton.usd_scenes import validate
+
+if TYPE_CHECKING:
+    from arena_newton.pictures.camera import CameraConfig
+    from arena_newton.policies.base import Policy
+    from arena_newton.trackers.base import Tracker
 
 __all__ = ["DRIVES", "RunConfig", "plain_facts", "resolve"]
 
@@ -125,6 +128,8 @@ class RunConfig:
 
     def with_parts(self, tracker: Tracker, policy: Policy) -> RunConfig:
         """The run with what tracker and policy say of themselves."""
+        from arena_newton.pictures.camera import CameraConfig
+
         return dataclasses.replace(
             self,
             camera=(policy.camera or CameraConfig()) if policy.needs_image else None,
@@ -193,11 +198,12 @@ def resolve(options: RunOptions) -> RunConfig:
         checkpoint_hash=checkpoint_hash,
         policy_hash=hash_path(policy_path) if policy_path else None,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
-        # A USD file counts with every layer and asset that it names; the validator walks them before USD composes any.
-        variant_hash=config_hash(sorted(map(hash_path, validate.layers(variant)))) if variant else None,
+        variant_hash=_variant_hash(variant) if variant else None,
         scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names()), hash_path),
         code_hash=code_hash(),
     )
+    from arena_newton.physics import resolve_engine
+
     quiet_warp()
     engine, device = resolve_engine(options.engine, options.device)
     flags = dataclasses.replace(flags, engine=engine, device=device)
@@ -262,7 +268,16 @@ def _size(given: str | None) -> tuple[int, int] | None:
     numbers = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", given)
     if not numbers:
         raise InputError(f"--video-size {given}: expected width x height, such as 960x540")
+    from arena_newton.pictures.recorder import video_sizes
+
     return video_sizes((int(numbers[1]), int(numbers[2])))["world"]
+
+
+def _variant_hash(variant: Path) -> str:
+    """A USD file counts with every layer and asset that it names; the validator walks them before USD composes any."""
+    from arena_newton.usd_scenes import validate
+
+    return config_hash(sorted(map(hash_path, validate.layers(variant))))
 
 
 def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:

@@ -21,7 +21,6 @@ from arena_newton.eval.options import RunOptions
 from arena_newton.eval.records import JsonObject, check_types
 from arena_newton.files import PARTIAL
 from arena_newton.text import plain_text
-from arena_newton.usd_scenes import validate
 
 __all__ = ["BREAK_FILE", "SUBFOLDERS", "ResultsFolder", "iso", "results_folder", "setting", "stored_options"]
 
@@ -168,6 +167,8 @@ class ResultsFolder:
             "environments": {},
         }
         if config.variant is not None:
+            from arena_newton.usd_scenes import validate
+
             document["variant_changes"] = validate.differences(config.variant, config.flags.task[0])
         return document
 

@@ -16,14 +16,12 @@ from pathlib import Path
 import warp as wp
 
 from arena_newton import policies, trackers
-from arena_newton.doctor import versions
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import console, report
-from arena_newton.eval.config import RunConfig, resolve
-from arena_newton.eval.folder import ResultsFolder, iso, results_folder
+from arena_newton.eval.config import RunConfig
+from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
-from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
@@ -62,8 +60,8 @@ class Factories:
     """Raises InputError for a file that is not a scene of the task."""
 
 
-def execute(options: RunOptions, factories: Factories | None = None) -> int:
-    """Run or continue the run that `options` describe.
+def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
+    """Run or continue the run of a folder that was checked.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -73,10 +71,7 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
         StorageError: The results folder cannot be written; finished episodes are kept.
         RunStopped: Simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
-    factories = factories or Factories()
-    config = resolve(options)
-    folder = ResultsFolder(results_folder(options.out), config, versions())
-    folder.check()
+    factories, config = factories or Factories(), folder.config
     try:
         config, policy = _check_parts(config, factories)
     except SystemExit as stop:

@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.registry import Registry
 
 if TYPE_CHECKING:
+    import torch
+
     from arena_newton.interfaces import World
     from arena_newton.pictures.camera import CameraConfig
 
@@ -31,7 +32,7 @@ __all__ = [
 
 Json = dict[str, Any]
 """A JSON object."""
-Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
+type Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
 """Worlds, bool, shape [worlds]; None: all."""
 
 
@@ -134,9 +135,8 @@ def world_mask(mask: Mask, worlds: int) -> np.ndarray:
     """A mask as bool array of shape [worlds]."""
     if mask is None:
         return np.ones(worlds, dtype=bool)
-    if isinstance(mask, torch.Tensor):
-        mask = mask.detach().cpu()
-    return np.asarray(mask).astype(bool).reshape(worlds)
+    values = mask if isinstance(mask, Sequence | np.ndarray) else mask.detach().cpu()
+    return np.asarray(values).astype(bool).reshape(worlds)
 
 
 def register(name: str, factory: Callable[..., Policy]) -> None:

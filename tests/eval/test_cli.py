@@ -212,6 +212,22 @@ def test_help_is_quick_and_imports_nothing_heavy(command):
     assert "usage" in done.stdout
 
 
+@pytest.mark.parametrize(
+    "flags", ["--task nosuch", "--drive stiff", "--worlds 0", "--policy nosuch", "--checkpoint absent.onnx"]
+)
+def test_refusals_import_nothing_heavy(flags):
+    """What is wrong without a look at the machine is said before any library of physics, networks or pictures loads."""
+    code = (
+        "import sys; from arena_newton.eval.__main__ import main\n"
+        "assert main(sys.argv[1:]) == 2\n"
+        "heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'cv2', 'av'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "run", *flags.split()], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert flags in done.stderr
+
+
 def test_doctor_names_what_is_missing(monkeypatch, capsys):
     """A missing required package is a problem with advice and code 1; a missing extra is a note."""
     from arena_newton import doctor
