@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from arena_newton import canonical, differentiable, policies, rule_sets, rules, tasks, trackers
     from arena_newton.env import ArenaEnv
-    from arena_newton.pictures.camera import Camera, CameraConfig
+    from arena_newton.pictures.camera import Camera
     from arena_newton.pictures.recorder import EpisodeRecorder
+    from arena_newton.pictures.settings import CameraConfig
     from arena_newton.rollout import Rollout
 
 __all__ = [
@@ -37,7 +38,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "ArenaEnv": "arena_newton.env",
     "Camera": "arena_newton.pictures.camera",
-    "CameraConfig": "arena_newton.pictures.camera",
+    "CameraConfig": "arena_newton.pictures.settings",
     "EpisodeRecorder": "arena_newton.pictures.recorder",
     "Rollout": "arena_newton.rollout",
 }

@@ -18,13 +18,15 @@ import warp as wp
 from arena_newton import robot as g1
 from arena_newton import rule_sets, tasks
 from arena_newton.canonical import STAND_ACTION, STATE_WIDTH
+from arena_newton.devices import resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeEvent, Observation, Spawn, Verdict
 from arena_newton.kernels import canonical, fall, reset
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
-from arena_newton.physics import make_physics, resolve_engine
-from arena_newton.pictures.camera import Camera, CameraConfig, WorldLights
+from arena_newton.physics import make_physics
+from arena_newton.pictures.camera import Camera, WorldLights
+from arena_newton.pictures.settings import CameraConfig
 from arena_newton.scene import load_scene
 from arena_newton.tracking import TrackerLoop, WorldMask
 

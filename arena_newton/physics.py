@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import mujoco
-import warp as wp
 
-from arena_newton.errors import InputError
+from arena_newton.devices import resolve_engine
 from arena_newton.physics_batch import Physics
 from arena_newton.physics_mujoco import MujocoPhysics
 from arena_newton.physics_warp import WarpPhysics
@@ -18,31 +17,6 @@ from arena_newton.robot import PhysicsRate
 from arena_newton.scene import Scene
 
 __all__ = ["MujocoPhysics", "Physics", "WarpPhysics", "make_physics", "resolve_engine"]
-
-
-def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
-    """Engine and device for `auto`, checked against what this machine has.
-
-    Raises:
-        InputError: Unknown engine, or a device that this machine does not have.
-    """
-    cuda = wp.is_cuda_available()
-    if engine not in {"auto", "mujoco", "warp"}:
-        raise InputError(f"--engine {engine}: unknown, choose auto, mujoco or warp")
-    if device is not None and device != "cpu":
-        if not device.startswith("cuda"):
-            raise InputError(f"--device {device}: unknown, choose cpu, cuda or cuda:N")
-        if not cuda:
-            raise InputError(f"--device {device}: no CUDA device on this machine, use --device cpu")
-        if device != "cuda" and device not in {d.alias for d in wp.get_cuda_devices()}:
-            raise InputError(f"--device {device}: no such device, this machine has {wp.get_cuda_device_count()}")
-    if engine == "auto":
-        engine = "warp" if cuda and device != "cpu" else "mujoco"
-    if engine == "mujoco":
-        if device not in (None, "cpu"):
-            raise InputError(f"--device {device}: engine mujoco runs on the CPU, use --engine warp for CUDA")
-        return "mujoco", "cpu"
-    return "warp", device or ("cuda:0" if cuda else "cpu")
 
 
 def make_physics(

@@ -29,6 +29,9 @@ UNLATCHED = wp.constant(5)
 """The door's latch is released."""
 MARGIN = wp.constant(6)
 """The success condition holds at this instant."""
+KINDS = {"near": NEAR, "clear": CLEAR, "angle": ANGLE, "toward": TOWARD, "away": AWAY, "unlatched": UNLATCHED}
+KINDS["margin"] = MARGIN
+"""Name of a condition's kind → its number."""
 
 TERM = ("kind", "horizontal", "address", "first_point", "end_point", "first_box", "end_box")
 """Columns of a condition: kind, whether heights are ignored, address in qpos or qvel, ranges of points and of boxes."""

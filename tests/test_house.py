@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from arena_newton import tasks
 from tests.import_graph import PACKAGE, Module, circles, imports, modules, statements, upward
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,6 +23,9 @@ HEAVY |= {"safetensors", "trimesh"}
 STARTS = ("__main__", "eval.__main__", "trackers.__main__", "trackers.evaluate", "trackers.train.__main__")
 STARTS += ("trackers.motions.__main__", "usd_scenes.__main__")
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
+PLANNING = ("eval.plan", "rule_sets", "devices", "pictures.settings", *(f"tasks.{name}" for name in tasks.names()))
+"""Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are
+imported by name."""
 LATE = {
     "arena_newton.doctor": "it reports libraries that do not import",
     "arena_newton.probe": "its other process imports only the library that it tries",
@@ -143,13 +147,13 @@ def test_signatures_say_types():
 
 
 def light() -> set[str]:
-    """The modules that a `--help` loads."""
+    """The modules that a `--help` or a plan loads."""
     following = collections.defaultdict(set)
     for edge in EDGES:
         if not edge.late:
             following[edge.source].add(edge.target)
     found: set[str] = set()
-    todo = [f"{PACKAGE}.{start}" for start in STARTS]
+    todo = [f"{PACKAGE}.{start}" for start in STARTS + PLANNING]
     while todo:
         name = todo.pop()
         if name not in found:
@@ -166,13 +170,15 @@ def tops(statement: ast.Import | ast.ImportFrom) -> set[str]:
 
 
 def test_heavy_imports_stand_at_the_top():
-    """Only what a `--help` loads imports heavy libraries late; it imports none at its top."""
+    """Only what a `--help` or a plan loads imports heavy libraries late; it imports none at its top."""
     found, lights = [], light()
     for module in KNOWN.values():
         for statement, late in statements(module.tree):
             for name in sorted(tops(statement) & HEAVY):
                 if not late and module.name in lights:
-                    found.append(f"{place(module, statement.lineno)}: {name} at the top of a module that --help loads")
+                    found.append(
+                        f"{place(module, statement.lineno)}: {name} at the top of a module that --help or a plan loads"
+                    )
                 if late and module.name not in lights | set(LATE) and name not in OPTIONAL:
                     found.append(f"{place(module, statement.lineno)}: {name} inside a function")
     report(found)

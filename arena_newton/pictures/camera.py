@@ -11,7 +11,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 import newton
 import numpy as np
@@ -25,6 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.kernels.lighting import launch_camera_poses, launch_shade
 from arena_newton.kernels.raster import launch_rasterize
 from arena_newton.kernels.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
+from arena_newton.pictures.settings import CameraConfig, Fit
 from arena_newton.pictures.triangles import srgb_to_linear, triangles
 
 if TYPE_CHECKING:
@@ -45,26 +46,8 @@ DOME_INTENSITY = 3000.0
 """Intensity of the original's dome light."""
 DOME_COLOR = (0.75, 0.75, 0.75)
 """Colour of the original's dome light, linear RGB."""
-Fit = Literal["native", "pad"]
 SHADOW_BYTES = 2 << 30
 """Memory of a camera's shadow maps; more worlds than fit are drawn in several parts [B]."""
-
-
-@dataclass(frozen=True)
-class CameraConfig:
-    """A camera for policies or videos."""
-
-    width: int = 224
-    """Image width [px]."""
-    height: int = 224
-    """Image height [px]."""
-    prim: str = "ego"
-    """`ego`, `left_wrist`, `right_wrist`, `world`, or the path of a camera prim."""
-    fit: Fit = "pad"
-    """`native`: the lens fills width × height with square pixels, horizontal view kept; `pad`: the sensor's own aspect
-    (4:3 for the robot's cameras) inside width × height, black around it, as the original prepares policy images."""
-    samples: int = 1
-    """Rays per pixel along each axis (2 is 4 rays per pixel: smooth edges for videos)."""
 
 
 class WorldLights:

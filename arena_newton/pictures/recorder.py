@@ -21,6 +21,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Recorder
 from arena_newton.pictures import follow as following
 from arena_newton.pictures.camera import Camera, WorldLights
+from arena_newton.pictures.settings import STRIP_SIZES, video_sizes
 from arena_newton.pictures.video import VideoWriter, caption, evenly, film_strip
 from arena_newton.robot import TICK
 
@@ -33,12 +34,6 @@ STRIP_FRAMES = 10
 """Frames of a film strip, as in the paper's rollout figures."""
 STRIP_POSES = 4 * STRIP_FRAMES
 """Most poses kept of an episode; beyond them every other one is dropped. Frames are then evenly spaced to 1 in 40."""
-STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
-"""Size of a strip's frames (width, height) [px]."""
-VIDEO_SIZE = (480, 270)
-"""Size of world videos (width, height) [px]."""
-SIZE_LIMITS = (32, 4096)
-"""Smallest and largest width and height of a video, the head camera's too [px]; H.264 encoders end at 4096."""
 VIEWS = 32
 """Worlds that are drawn at once: bounds the memory of the pictures."""
 HOLD_FRAMES = 25
@@ -59,29 +54,6 @@ class EpisodeKey(Protocol):
     repeat: int
     rank: int
     """Number within task and mode, in the order of the plan."""
-
-
-def video_sizes(size: tuple[int, int] | None) -> dict[str, tuple[int, int]]:
-    """Width and height of the videos of each camera [px].
-
-    Args:
-        size: Those of world videos; head camera videos are as high, 4:3. None for 480×270 and 320×240.
-
-    Raises:
-        InputError: A video would be smaller or larger than encoders take.
-    """
-    if size is None:
-        return {"ego": STRIP_SIZES["ego"], "world": VIDEO_SIZE}
-    low, high = SIZE_LIMITS
-    if not all(low <= n <= high for n in size):
-        raise InputError(f"--video-size {size[0]}x{size[1]}: expected {low} to {high} pixels each")
-    ego = (round(size[1] * 4 / 3), size[1])
-    if max(ego) > high:
-        raise InputError(
-            f"--video-size {size[0]}x{size[1]}: makes head camera videos of {ego[0]}x{ego[1]}, expected at most {high} "
-            f"pixels each: a height of at most {high * 3 // 4}"
-        )
-    return {"ego": ego, "world": size}
 
 
 @dataclass

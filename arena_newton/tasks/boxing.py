@@ -6,12 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import warp as wp
-
 from arena_newton import seeding
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
 from arena_newton.rules import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
     FACE_MINUS_Y,
@@ -66,12 +62,13 @@ class BoxingJudge(Judge):
             scene, PREDICATES, {"approach": [near(links(scene, "pelvis"), target, REACH, horizontal=True)]}
         )
         self.rule: BoxingRule = rules.task("boxing").success
-        self.palm_body: wp.array = wp.array([p.body_id for p in hands], dtype=wp.int32, device=self.device)
-        self.palm_offset: wp.array = wp.array([wp.vec3(*p.pos) for p in hands], dtype=wp.vec3, device=self.device)
-        self.target = Boxes.from_boxes([target], self.device)
+        self.palm_body, self.palm_offset = self.points(*hands)
+        self.target = self.boxes(target)
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         success.launch_boxing(
             physics.xpos,
             physics.xquat,

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 from arena_newton.errors import InputError
 from arena_newton.handles import BodyFrame
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.judge import Judge, above, bounding_box, links, near, palms, top
@@ -86,10 +84,12 @@ class DoubleDeskJudge(Judge):
                 "transport": [lifted, near([mass], inside, OVER_CRATE, horizontal=True)],
             },
         )
-        self.inside = Boxes.from_boxes([inside], self.device)
+        self.inside = self.boxes(inside)
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         state = (physics.xpos, physics.xquat, physics.xipos)
         common = {"hammer_body": self.hammer, "inside": self.inside, **self.outputs()}
         if self.rule.min_z is None:

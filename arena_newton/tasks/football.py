@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING
 
 from arena_newton.handles import BodyFrame
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
-from arena_newton.kernels.predicates import TOWARD
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near
@@ -90,14 +87,16 @@ class FootballJudge(Judge):
             {
                 "approach": [near(links(scene, "pelvis"), surface, REACH, horizontal=True)],
                 "contact": [near(toes, surface, KICK)],
-                "transport": [Condition(TOWARD, ROLLING, (ball,), (goal,), horizontal=True, address=speed)],
+                "transport": [Condition("toward", ROLLING, (ball,), (goal,), horizontal=True, address=speed)],
             },
         )
-        self.goal = Boxes.from_boxes([goal], self.device)
-        self.pitch = Boxes.from_boxes([scene.marker(PITCH)], self.device)
+        self.goal = self.boxes(goal)
+        self.pitch = self.boxes(scene.marker(PITCH))
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         success.launch_football(
             physics.xpos,
             physics.xquat,

@@ -1,26 +1,27 @@
-"""The judge of a task: binds prims of a built scene to a success kernel and to conditions of predicates."""
+"""The judge of a task: binds prims of a built scene to a success kernel and to conditions of predicates.
+
+A plan reads the task files too, and loads neither Warp nor MuJoCo: those are imported where a judge is built.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-import mujoco
 import numpy as np
-import warp as wp
 
 from arena_newton.errors import InputError
 from arena_newton.handles import BodyFrame, Marker
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import predicates as kinds
-from arena_newton.kernels import reset
-from arena_newton.kernels.boxes import Boxes
-from arena_newton.kernels.launching import Recorded, record
 from arena_newton.tasks.base import IDENTITY, SUCCESS
 
 if TYPE_CHECKING:
+    import warp as wp
+
+    from arena_newton.kernels.boxes import Boxes
+    from arena_newton.kernels.launching import Recorded
     from arena_newton.physics import Physics
     from arena_newton.scene import Scene
 
@@ -35,8 +36,8 @@ _ABOVE = 50.0
 class Condition:
     """One measured quantity against a limit; a predicate holds where all of its conditions do."""
 
-    kind: int
-    """One of the kinds of `kernels.predicates`."""
+    kind: Literal["near", "clear", "angle", "toward", "away", "unlatched", "margin"]
+    """What is measured; `kernels.predicates` says what each kind compares."""
     limit: float = 0.0
     """In the unit of the kind."""
     points: Sequence[BodyFrame] = ()
@@ -49,13 +50,13 @@ class Condition:
 
 def near(points: Iterable[BodyFrame], box: Marker, limit: float, *, horizontal: bool = False) -> Condition:
     """One of some points is within `limit` [m] of a box."""
-    return Condition(kinds.NEAR, limit, tuple(points), (box,), horizontal)
+    return Condition("near", limit, tuple(points), (box,), horizontal)
 
 
 def above(point: BodyFrame, height: float) -> Condition:
     """A point is higher than `height` [m]."""
     half = (_ABOVE, _ABOVE, _ABOVE)
-    return Condition(kinds.NEAR, 0.0, (point,), (Marker(0, (0.0, 0.0, height + _ABOVE), IDENTITY, half),))
+    return Condition("near", 0.0, (point,), (Marker(0, (0.0, 0.0, height + _ABOVE), IDENTITY, half),))
 
 
 def links(scene: Scene, *names: str) -> tuple[BodyFrame, ...]:
@@ -74,6 +75,8 @@ def bounding_box(scene: Scene, prim: str) -> Marker:
     Raises:
         InputError: The prim holds no collision geometry.
     """
+    import mujoco
+
     model, body = scene.mj_model, scene.body_ids.get(prim, 0)
     corners = []
     for geom in scene.geom_ids(prim):
@@ -119,6 +122,8 @@ class Judge:
         Raises:
             InputError: Conditions and predicates do not match.
         """
+        import warp as wp
+
         conditions = conditions or {}
         names = [predicate.name for predicate in predicates]
         if names[:-1] != list(conditions):
@@ -142,12 +147,16 @@ class Judge:
 
     def _upload(self, predicates: Sequence[Sequence[Condition]]) -> None:
         """Copy the conditions' table to the device."""
+        import warp as wp
+
+        from arena_newton.kernels.predicates import KINDS, TERM
+
         points: list[BodyFrame] = []
         boxes: list[Marker] = []
         rows = []
         for condition in itertools.chain.from_iterable(predicates):
             ranges = (len(points), len(points) + len(condition.points), len(boxes), len(boxes) + len(condition.boxes))
-            rows.append((condition.kind, int(condition.horizontal), condition.address, *ranges))
+            rows.append((KINDS[condition.kind], int(condition.horizontal), condition.address, *ranges))
             points += condition.points
             boxes += condition.boxes
         limits = [condition.limit for condition in itertools.chain.from_iterable(predicates)]
@@ -156,17 +165,31 @@ class Judge:
         def up(values: object, dtype: type) -> wp.array:
             return wp.array(values, dtype=dtype, device=self.device)
 
+        bodies, positions = self.points(*points)
         self._conditions = {
             "first": up(first, wp.int32),
-            "terms": up(np.array(rows, dtype=np.int32).reshape(-1, len(kinds.TERM)), wp.int32),
+            "terms": up(np.array(rows, dtype=np.int32).reshape(-1, len(TERM)), wp.int32),
             "limits": up(limits, wp.float32),
-            "point_body": up([point.body_id for point in points], wp.int32),
-            "point_pos": up([wp.vec3(*point.pos) for point in points], wp.vec3),
-            "boxes": Boxes.from_boxes(boxes, self.device),
+            "boxes": self.boxes(*boxes),
         }
+
+    def boxes(self, *markers: Marker) -> Boxes:
+        """Boxes on the device, for kernels."""
+        from arena_newton.kernels.boxes import Boxes
+
+        return Boxes.from_boxes(markers, self.device)
+
+    def points(self, *points: BodyFrame) -> tuple[wp.array, wp.array]:
+        """Bodies that carry some points, int32, and the points in their frames [m], vec3; both of shape [points]."""
+        import warp as wp
+
+        bodies = wp.array([point.body_id for point in points], dtype=wp.int32, device=self.device)
+        return bodies, wp.array([wp.vec3(*point.pos) for point in points], dtype=wp.vec3, device=self.device)
 
     def counter(self) -> wp.array:
         """A new counter of ticks, cleared at reset, int32, shape [worlds]."""
+        import warp as wp
+
         self.counters.append(wp.zeros(self.worlds, dtype=wp.int32, device=self.device))
         return self.counters[-1]
 
@@ -188,12 +211,16 @@ class Judge:
     def evaluate(self, physics: Physics) -> None:
         """Fill `success`, `margin`, `event` and `predicates` for the state after this tick."""
         if self._recorded is None or self._physics is not physics:
+            from arena_newton.kernels.launching import record
+
             self._recorded, self._physics = record(self._launch, physics), physics
         self._recorded()
 
     def _launch(self, physics: Physics) -> None:
+        from arena_newton.kernels.predicates import launch_predicates
+
         self.decide(physics)
-        kinds.launch_predicates(
+        launch_predicates(
             physics.xpos,
             physics.xquat,
             physics.qpos,
@@ -211,5 +238,7 @@ class Judge:
         Args:
             mask: 1 = reset, int32, shape [worlds].
         """
+        from arena_newton.kernels.reset import launch_clear
+
         for array in (*self.counters, self.success, self.event):
-            reset.launch_clear(mask, array)
+            launch_clear(mask, array)

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
-from arena_newton.kernels.predicates import ANGLE, UNLATCHED
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, palms
@@ -76,17 +73,19 @@ class OpenDoorJudge(Judge):
             {
                 "approach": [near(links(scene, "pelvis"), doorway, REACH, horizontal=True)],
                 "contact": [near(palms(scene), bounding_box(scene, HANDLE), TOUCH)],
-                "unlatch": [Condition(UNLATCHED)],
-                "open": [Condition(ANGLE, math.radians(OPEN_DEG), address=self.leaf)],
+                "unlatch": [Condition("unlatched")],
+                "open": [Condition("angle", math.radians(OPEN_DEG), address=self.leaf)],
             },
         )
         self.rule: DoorPassedRule | DoorOpenRule = rules.task("open_door").success
         self.standing = rules.standing
         self.root = scene.robot.root_qpos
-        self.doorway = Boxes.from_boxes([doorway], self.device)
+        self.doorway = self.boxes(doorway)
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         common = {
             "root_qpos_adr": self.root,
             "stand_height": self.standing.min_root_z,

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 
 from arena_newton.handles import BodyFrame, Marker
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
-from arena_newton.kernels.predicates import CLEAR, NEAR
 from arena_newton.robot import TICK
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
@@ -98,7 +95,7 @@ class PPBoxJudge(Judge):
         box, decks = bounding_box(scene, BOX), tuple(scene.marker(path) for path in DECKS)
         centre, half = BodyFrame(box.body_id, box.pos, IDENTITY), box.half[2]
         bottom = BodyFrame(box.body_id, (box.pos[0], box.pos[1], box.pos[2] - half), IDENTITY)
-        placed = Condition(NEAR, 0.0, (centre,), tuple(on_deck(deck, half) for deck in decks))
+        placed = Condition("near", 0.0, (centre,), tuple(on_deck(deck, half) for deck in decks))
         super().__init__(
             scene,
             PREDICATES,
@@ -108,16 +105,18 @@ class PPBoxJudge(Judge):
                 "lift": [above(bottom, top(scene, TABLE) + LIFT)],
                 "transport": [near([centre], decks[0], OVER_SHELF, horizontal=True)],
                 "place": [placed],
-                "release": [placed, Condition(CLEAR, TOUCH, palms(scene), (box,))],
+                "release": [placed, Condition("clear", TOUCH, palms(scene), (box,))],
             },
         )
-        self.box = Boxes.from_boxes([box], self.device)
+        self.box = self.boxes(box)
         self.box_qvel = scene.joint_qvel(BOX)
-        self.decks = Boxes.from_boxes(decks, self.device)
+        self.decks = self.boxes(*decks)
         self.slow = self.counter()
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         common = {"box": self.box, "decks": self.decks, **self.outputs()}
         if isinstance(self.rule, PPBoxAnyDeckRule):
             success.launch_pp_box_paper(

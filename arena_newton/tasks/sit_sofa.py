@@ -5,12 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import warp as wp
-
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
-from arena_newton.kernels.predicates import AWAY, MARGIN
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_MINUS_Y, REACH, ObjectSpec, Overlap, Required, TaskSpec, widened
 from arena_newton.tasks.judge import Condition, Judge, links, near
@@ -95,18 +90,17 @@ class SitSofaJudge(Judge):
             PREDICATES,
             {
                 "approach": [approached],
-                "turn": [approached, Condition(AWAY, TURNED, root, (seat,), horizontal=True)],
-                "contact": [Condition(MARGIN)],
+                "turn": [approached, Condition("away", TURNED, root, (seat,), horizontal=True)],
+                "contact": [Condition("margin")],
             },
         )
         self.rule: SeatPressedRule | SeatTouchedRule = rules.task("sit_sofa").success
         self.root = scene.robot.root_qpos
-        self.seat = Boxes.from_boxes([seat], self.device)
+        self.seat = self.boxes(seat)
         self.cushion_geoms = scene.geom_ids(CUSHION)
         pressing = {scene.link(name) for name in PRESSING_LINKS}
         self.pressing_geoms = [g for g, b in enumerate(scene.mj_model.geom_bodyid) if int(b) in pressing]
-        touching = [scene.link(name) for name in TOUCHING_LINKS]
-        self.touching: wp.array = wp.array(touching, dtype=wp.int32, device=self.device)
+        self.touching, _ = self.points(*links(scene, *TOUCHING_LINKS))
         self.seated = self.counter()
         self._bound: Physics | None = None
 
@@ -122,6 +116,8 @@ class SitSofaJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         self.bind(physics)
         if isinstance(self.rule, SeatPressedRule):
             success.launch_sit_sofa_paper(

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 
 from arena_newton import seeding
 from arena_newton.interfaces import Predicate
-from arena_newton.kernels import success
-from arena_newton.kernels.boxes import Boxes
 from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
     FACE_PLUS_Y,
@@ -76,12 +73,14 @@ class VisNaviJudge(Judge):
         )
         self.standing = rules.standing
         self.root = scene.robot.root_qpos
-        self.feet: wp.array = wp.array([foot.body_id for foot in feet], dtype=wp.int32, device=self.device)
-        self.zone = Boxes.from_boxes([zone], self.device)
+        self.feet, _ = self.points(*feet)
+        self.zone = self.boxes(zone)
         self.round = zone.round and rule.round_signs
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
+        from arena_newton.kernels import success
+
         success.launch_vis_navi(
             physics.xpos,
             physics.xquat,

@@ -1,0 +1,56 @@
+"""Sizes and lenses that a run asks for: checked while it is planned, so nothing heavy is imported here."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from arena_newton.errors import InputError
+
+__all__ = ["STRIP_SIZES", "CameraConfig", "Fit", "video_sizes"]
+
+Fit = Literal["native", "pad"]
+STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
+"""Size of a strip's frames (width, height) [px]."""
+VIDEO_SIZE = (480, 270)
+"""Size of world videos (width, height) [px]."""
+SIZE_LIMITS = (32, 4096)
+"""Smallest and largest width and height of a video, the head camera's too [px]; H.264 encoders end at 4096."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A camera for policies or videos."""
+
+    width: int = 224
+    """Image width [px]."""
+    height: int = 224
+    """Image height [px]."""
+    prim: str = "ego"
+    """`ego`, `left_wrist`, `right_wrist`, `world`, or the path of a camera prim."""
+    fit: Fit = "pad"
+    """`native`: the lens fills width × height with square pixels, horizontal view kept; `pad`: the sensor's own aspect
+    (4:3 for the robot's cameras) inside width × height, black around it, as the original prepares policy images."""
+    samples: int = 1
+    """Rays per pixel along each axis (2 is 4 rays per pixel: smooth edges for videos)."""
+
+
+def video_sizes(size: tuple[int, int] | None) -> dict[str, tuple[int, int]]:
+    """Width and height of the videos of each camera [px].
+
+    Args:
+        size: Those of world videos; head camera videos are as high, 4:3. None for 480×270 and 320×240.
+
+    Raises:
+        InputError: A video would be smaller or larger than encoders take.
+    """
+    if size is None:
+        return {"ego": STRIP_SIZES["ego"], "world": VIDEO_SIZE}
+    low, high = SIZE_LIMITS
+    if not all(low <= n <= high for n in size):
+        raise InputError(f"--video-size {size[0]}x{size[1]}: expected {low} to {high} pixels each")
+    ego = (round(size[1] * 4 / 3), size[1])
+    if max(ego) > high:
+        raise InputError(
+            f"--video-size {size[0]}x{size[1]}: makes head camera videos of {ego[0]}x{ego[1]}, expected at most {high} "
+            f"pixels each: a height of at most {high * 3 // 4}"
+        )
+    return {"ego": ego, "world": size}
