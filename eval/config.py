@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
+from arena_newton.devices import resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_MAX_STEPS, QUICK_REPEATS, QUICK_SEEDS, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
-from arena_newton.quiet import quiet_warp
+from arena_newton.pictures.settings import CameraConfig, video_sizes
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
 
 if TYPE_CHECKING:
-    from arena_newton.pictures.camera import CameraConfig
     from arena_newton.policies.base import Policy
     from arena_newton.trackers.base import Tracker
 
@@ -128,8 +128,6 @@ class RunConfig:
 
     def with_parts(self, tracker: Tracker, policy: Policy) -> RunConfig:
         """The run with what tracker and policy say of themselves."""
-        from arena_newton.pictures.camera import CameraConfig
-
         return dataclasses.replace(
             self,
             camera=(policy.camera or CameraConfig()) if policy.needs_image else None,
@@ -202,9 +200,6 @@ def resolve(options: RunOptions) -> RunConfig:
         scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names()), hash_path),
         code_hash=code_hash(),
     )
-    from arena_newton.physics import resolve_engine
-
-    quiet_warp()
     engine, device = resolve_engine(options.engine, options.device)
     flags = dataclasses.replace(flags, engine=engine, device=device)
     return dataclasses.replace(config, flags=flags, device=device, episodes=_episodes(flags, label, repeats))
@@ -268,8 +263,6 @@ def _size(given: str | None) -> tuple[int, int] | None:
     numbers = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", given)
     if not numbers:
         raise InputError(f"--video-size {given}: expected width x height, such as 960x540")
-    from arena_newton.pictures.recorder import video_sizes
-
     return video_sizes((int(numbers[1]), int(numbers[2])))["world"]
 
 

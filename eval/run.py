@@ -30,6 +30,7 @@ from arena_newton.eval.results import load_run
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.policies.base import Policy, PolicyUnavailable
+from arena_newton.quiet import quiet_warp
 from arena_newton.robot import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.text import counted, plain_text
@@ -71,6 +72,7 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
         StorageError: The results folder cannot be written; finished episodes are kept.
         RunStopped: Simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
+    quiet_warp()
     factories, config = factories or Factories(), folder.config
     try:
         config, policy = _check_parts(config, factories)
