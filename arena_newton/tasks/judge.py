@@ -170,6 +170,8 @@ class Judge:
             "first": up(first, wp.int32),
             "terms": up(np.array(rows, dtype=np.int32).reshape(-1, len(TERM)), wp.int32),
             "limits": up(limits, wp.float32),
+            "point_body": bodies,
+            "point_pos": positions,
             "boxes": self.boxes(*boxes),
         }
 
