@@ -6,19 +6,21 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import json
 import signal
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import tyro
+
 from arena_newton.command_line import INTERRUPTED, exit_code
 from arena_newton.errors import InputError
+from arena_newton.eval.options import BenchOptions, EngineOptions, ReportOptions, RunOptions, is_quick
 
 if TYPE_CHECKING:
-    from arena_newton.eval.options import RunOptions
     from arena_newton.eval.run import Factories
 
 __all__ = ["main"]
@@ -33,14 +35,6 @@ OVERVIEW = f"""commands:
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
 """
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """Write tables and reports of a results folder again from its journal."""
-
-    json: bool = False
-    """Print results.json instead of the table."""
 
 
 def main(argv: Sequence[str] | None = None, factories: Factories | None = None) -> int:
@@ -69,8 +63,6 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
 
 def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | None = None) -> T:
     """Parse flags with tyro; a complaint becomes one line of our own."""
-    import tyro
-
     prog = f"{PROG} {command}".rstrip()
     missing = tyro.MISSING_NONPROP if default is None else default
     try:
@@ -87,8 +79,6 @@ def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
 
     tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
     """
-    import tyro
-
     groups: list[list[str]] = []
     for argument in arguments:
         if not groups or argument[:1] == "-" and not argument[1:2].isdigit():
@@ -121,13 +111,10 @@ def _wants_help(arguments: Sequence[str]) -> bool:
 
 
 def _run(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.options import RunOptions
-
     if _wants_help(arguments):
         print(OVERVIEW)
     options = _parse(RunOptions, arguments, "run")
     from arena_newton.eval.folder import results_folder
-    from arena_newton.eval.options import is_quick
 
     if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
         return _execute(options, factories)
@@ -163,8 +150,6 @@ def _show_expert(options: RunOptions, folder: Path, factories: Factories | None)
 
 
 def _resume(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.options import RunOptions
-
     if _wants_help(arguments):
         print(f"usage: {PROG} resume <out> [flags]; flags that change the results are refused\n")
         _parse(RunOptions, ["--help"], "resume <out>")
@@ -182,8 +167,6 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
         _parse(ReportOptions, ["--help"], "report <out>")
     folder = _folder(arguments, "report")
     options = _parse(ReportOptions, arguments, "report")
-    import json
-
     from arena_newton.eval import report
     from arena_newton.eval.results import load_run
 
@@ -200,8 +183,6 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _list(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.options import RunOptions
-
     as_json = "--json" in arguments
     if _wants_help(arguments):
         print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
@@ -212,8 +193,6 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
     episodes = resolve(options).episodes
     if as_json:
-        import json
-
         from arena_newton.eval import plan
 
         rows = [json.dumps(row, allow_nan=False) for row in plan.to_list_json(episodes)]
@@ -229,15 +208,17 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _bench(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(BenchOptions, arguments, "bench")
     from arena_newton.eval import bench
 
-    return bench.run(_parse(bench.BenchOptions, arguments, "bench"))
+    return bench.run(options)
 
 
 def _engines(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(EngineOptions, arguments, "engines")
     from arena_newton.eval import engines
 
-    return engines.run(_parse(engines.EngineOptions, arguments, "engines"))
+    return engines.run(options)
 
 
 _COMMANDS = {

@@ -20,7 +20,7 @@ import jinja2
 from arena_newton.eval.document import Document
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.results import Results, RunRecord
-from arena_newton.eval.stats import Cell, ErrorReason
+from arena_newton.eval.stats import ErrorReason, ResultCell
 from arena_newton.eval.wording import (
     MEDIA,
     environment_facts,
@@ -190,17 +190,17 @@ def _per_cent(fraction: float | None) -> str:
     return f"{100 * (fraction or 0.0):.2f}%"
 
 
-def _bars(cells: Sequence[Cell]) -> list[dict[str, object]]:
+def _bars(cells: Sequence[ResultCell]) -> list[dict[str, object]]:
     """A bar of outcomes per cell; under it the success rate with its interval and the rates of the group seeds."""
 
-    def names(cell: Cell) -> tuple[str, str, str]:
+    def names(cell: ResultCell) -> tuple[str, str, str]:
         return plain(cell["tracker"]), plain(cell["policy"]), plain(cell["mode"])
 
     differing = [i for i in range(3) if len({names(cell)[i] for cell in cells}) > 1]
     return [_bar(" ".join([plain(cell["task"]), *(names(cell)[i] for i in differing)]), cell) for cell in cells]
 
 
-def _bar(title: str, cell: Cell) -> dict[str, object]:
+def _bar(title: str, cell: ResultCell) -> dict[str, object]:
     numbers = (cell["successes"], cell["timeouts"], cell["falls"], cell["errors"])
     counts = dict(zip(OUTCOMES, numbers, strict=True))
     parts, done = [], 0
