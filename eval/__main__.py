@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 PROG = "python -m arena_newton.eval"
-COMMANDS = ("run", "resume", "report", "bench", "engines", "list")
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
@@ -38,24 +37,20 @@ OVERVIEW = f"""commands:
 
 
 def main(argv: Sequence[str] | None = None, factories: Factories | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: arguments; those of the process by default.
-        factories: builders of the parts of a run; the real ones by default.
+    """Run the command line, with the arguments of the process and the real parts of a run by default.
 
     Returns:
         Exit code: 0 done, 1 episodes with errors or missing, 2 bad input, no room or a run that had to stop, 130
         interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    command = arguments.pop(0) if arguments and arguments[0] in COMMANDS else "run"
+    command = arguments.pop(0) if arguments and arguments[0] in _COMMANDS else "run"
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     def work() -> int:
         if command == "run" and arguments and not arguments[0].startswith("-"):
-            raise InputError(f"{arguments[0]}: unknown command, known are {' '.join(COMMANDS)}")
+            raise InputError(f"{arguments[0]}: unknown command, known are {' '.join(_COMMANDS)}")
         return _COMMANDS[command](arguments, factories)
 
     return exit_code(work)
@@ -221,14 +216,7 @@ def _engines(arguments: list[str], factories: Factories | None) -> int:
     return engines.run(options)
 
 
-_COMMANDS = {
-    "run": _run,
-    "resume": _resume,
-    "report": _report,
-    "list": _list,
-    "bench": _bench,
-    "engines": _engines,
-}
+_COMMANDS = {"run": _run, "resume": _resume, "report": _report, "bench": _bench, "engines": _engines, "list": _list}
 
 
 if __name__ == "__main__":

@@ -197,7 +197,7 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_hash=hash_path(policy_path) if policy_path else None,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
         variant_hash=_variant_hash(variant) if variant else None,
-        scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names()), hash_path),
+        scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
         code_hash=code_hash(),
     )
     engine, device = resolve_engine(options.engine, options.device)

@@ -49,19 +49,9 @@ TICKS = (0, 25, 50, 75, 100)
 """Marks of the axis of rates [%]."""
 SEED_SPACING = 9
 """Distance of the dots of group seeds with one rate [px]."""
-COLUMNS = (
-    ("task", "task"),
-    ("mode", "mode"),
-    ("seed", "seed"),
-    ("repeat", "repeat"),
-    ("outcome", "outcome"),
-    ("reason", None),
-    ("steps", "steps"),
-    ("margin", "margin"),
-    ("pictures", None),
-    ("play it again", None),
-)
-"""Columns of the list of episodes and the keys that they are sorted by."""
+SORTED = ("task", "mode", "seed", "repeat", "outcome", "steps", "margin")
+"""Columns of the list of episodes by which a reader can sort it."""
+COLUMNS = ("task", "mode", "seed", "repeat", "outcome", "reason", "steps", "margin", "pictures", "play it again")
 
 
 @functools.cache
@@ -109,13 +99,7 @@ def page(
 ) -> str:
     """The page as text, the same for the same content byte for byte.
 
-    Args:
-        run: What the results folder holds.
-        results: Content of results.json.
-        notes: What a reader must know besides the table.
-        head: Column names of the table.
-        rows: The table: a row per cell, then a row per suite.
-        reasons: Why episodes ended as errors.
+    `head` and `rows` are the table: a row per cell, then a row per suite; `notes` what a reader must know besides it.
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
@@ -140,7 +124,7 @@ def page(
         filters=[
             (name, _distinct(getattr(record, name) for record in records)) for name in ("outcome", "task", "mode")
         ],
-        columns=COLUMNS,
+        columns=[(name, name if name in SORTED else None) for name in COLUMNS],
         folds=_folds(document, records),
     )
 

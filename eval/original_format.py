@@ -23,29 +23,11 @@ from arena_newton.eval.stats import population_std, seed_rates
 
 __all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]
 
-SUMMARY_COLUMNS = (
-    "task",
-    "model_path",
-    "model_label",
-    "seed",
-    "repeat_idx",
-    "episode_seed",
-    "episode_index",
-    "episode_object_seed",
-    "episode_object_seed_source",
-    "success",
-    "failure_reason",
-    "episode_steps",
-    "max_steps",
-    "final_reward",
-    "final_reward_scaled",
-    "max_reward",
-    "max_reward_scaled",
-    "video_path",
-    "log_path",
-    "vla_trace_path",
-    "server_url",
-    "returncode",
+SUMMARY_COLUMNS = tuple(
+    """task model_path model_label seed repeat_idx episode_seed episode_index
+    episode_object_seed episode_object_seed_source success failure_reason episode_steps max_steps
+    final_reward final_reward_scaled max_reward max_reward_scaled
+    video_path log_path vla_trace_path server_url returncode""".split()
 )
 """Columns of `summary.csv` and keys of `summary.jsonl`, in the original's order."""
 

@@ -61,16 +61,8 @@ def expand(
 ) -> list[Episode]:
     """Episodes of a run: tasks × modes × group seeds × repeats, in this order.
 
-    Args:
-        task_names: Names of tasks, or `all` alone.
-        tracker: Name that results carry.
-        policy: Name that results carry.
-        modes: Test modes.
-        rules: Name of the rule set.
-        engine: Name of the physics engine.
-        seeds: Group seeds.
-        repeats: Episodes per group seed.
-        max_steps: Cap on the rule set's step budgets, or None.
+    `task_names` may be `all` alone; `repeats` are the episodes per group seed; `max_steps` caps the rule set's step
+    budgets; tracker, policy, rules and engine are the names that results carry.
 
     Raises:
         InputError: Unknown task, mode or rule set, something named twice, or nothing to run.

@@ -18,24 +18,8 @@ from arena_newton.text import counted
 
 __all__ = ["notes", "table", "write_reports"]
 
-_COLUMNS = (
-    "task",
-    "tracker",
-    "policy",
-    "mode",
-    "episodes",
-    "successes",
-    "falls",
-    "startup_falls",
-    "timeouts",
-    "errors",
-    "sr",
-    "sr_seed_std",
-    "ci95_low",
-    "ci95_high",
-    "afr",
-    "mean_steps",
-)
+_COLUMNS = """task tracker policy mode episodes successes falls startup_falls timeouts errors
+    sr sr_seed_std ci95_low ci95_high afr mean_steps""".split()
 
 
 def _percent(value: float | None) -> str:

@@ -62,10 +62,7 @@ def media_of(record: EpisodeRecord) -> dict[str, str]:
 def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: object = None) -> str:
     """The command line that plays an episode again, the last one of its seed's that it plays.
 
-    Args:
-        options: Flags of the run, as config.json has them.
-        record: The episode.
-        worlds: How many worlds asked at once, where the policy depends on it.
+    `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
     words: list[object] = ["python", "-m", "arena_newton.eval", "--task", record.task, "--mode", record.mode]
     words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
