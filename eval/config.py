@@ -51,8 +51,8 @@ class RunConfig:
     episodes: tuple[plan.Episode, ...]
     """The plan."""
     repeats: int
+    """As in the flags, like the device, but never left open."""
     device: str
-    """As in the flags, but never left open."""
     policy: str
     """Spec that the policy is made with, a path in it as the user gave it."""
     policy_label: str
@@ -161,12 +161,11 @@ def resolve(options: RunOptions) -> RunConfig:
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
-    label = f"{scheme}:{_label(Path(target))}" if policy_path else options.policy
+    shown = Path(target).parent if Path(target).name == "actions" else Path(target)
+    label = f"{scheme}:{shown.name or Path(target).name}" if policy_path else options.policy
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
-    for name in tasks:
-        task_specs.get(name)
     default_repeats = QUICK_REPEATS if quick else plan.PROTOCOL_REPEATS
     repeats = default_repeats if options.repeats is None else options.repeats
     flags = dataclasses.replace(
@@ -180,29 +179,39 @@ def resolve(options: RunOptions) -> RunConfig:
         variant=str(variant) if variant else None,
         policy=f"{scheme}:{policy_path}" if policy_path else options.policy,
     )
-    _episodes(flags, label, repeats)  # names and numbers are wrong at once, before Warp starts
-    config = RunConfig(
-        flags=flags,
-        episodes=(),
+    episodes = plan.expand(
+        flags.task,
+        tracker=flags.tracker,
+        policy=label,
+        modes=flags.mode,
+        rules=flags.rules,
+        seeds=flags.seeds,
         repeats=repeats,
-        device="",
+        max_steps=flags.max_steps,
+    )
+    video_size, policy_options = _size(options.video_size), _policy_options(options)
+    policy_hash = hash_path(policy_path) if policy_path else None
+    variant_hash = _variant_hash(variant) if variant else None
+    engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
+    return RunConfig(
+        flags=dataclasses.replace(flags, engine=engine, device=device),
+        episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in episodes),
+        repeats=repeats,
+        device=device,
         policy=options.policy,
         policy_label=label,
         checkpoint=checkpoint,
         variant=variant,
         drive=DRIVES[options.drive],
-        video_size=_size(options.video_size),
-        policy_options=_policy_options(options),
+        video_size=video_size,
+        policy_options=policy_options,
         checkpoint_hash=checkpoint_hash,
-        policy_hash=hash_path(policy_path) if policy_path else None,
+        policy_hash=policy_hash,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
-        variant_hash=_variant_hash(variant) if variant else None,
+        variant_hash=variant_hash,
         scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
         code_hash=code_hash(),
     )
-    engine, device = resolve_engine(options.engine, options.device)
-    flags = dataclasses.replace(flags, engine=engine, device=device)
-    return dataclasses.replace(config, flags=flags, device=device, episodes=_episodes(flags, label, repeats))
 
 
 def _check_flags(options: RunOptions) -> None:
@@ -229,31 +238,6 @@ def _check_flags(options: RunOptions) -> None:
 
 def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
-
-
-def _episodes(flags: RunOptions, label: str, repeats: int) -> tuple[plan.Episode, ...]:
-    """The run's episodes in plan order.
-
-    Raises:
-        InputError: An unknown task or mode, something named twice, or a number out of range.
-    """
-    return tuple(
-        plan.expand(
-            flags.task,
-            tracker=flags.tracker,
-            policy=label,
-            modes=flags.mode,
-            rules=flags.rules,
-            engine=flags.engine,
-            seeds=flags.seeds,
-            repeats=repeats,
-            max_steps=flags.max_steps,
-        )
-    )
-
-
-def _label(path: Path) -> str:
-    return path.parent.name if path.name == "actions" and path.parent.name else path.name
 
 
 def _size(given: str | None) -> tuple[int, int] | None:
