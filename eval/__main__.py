@@ -190,7 +190,7 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     if as_json:
         from arena_newton.eval import plan
 
-        rows = [json.dumps(row, allow_nan=False) for row in plan.to_list_json(episodes)]
+        rows = [json.dumps(plan.listed(episode), allow_nan=False) for episode in episodes]
         print("[\n" + ",\n".join(rows) + "\n]")
         return 0
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")

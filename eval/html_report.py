@@ -11,7 +11,7 @@ import base64
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,16 +121,10 @@ def page(
         shown=[_Episode(record) for record in shown],
         folded=[_Episode(record) for record in folded],
         episodes=[_Episode(record, command(record=record)) for record in records],
-        filters=[
-            (name, _distinct(getattr(record, name) for record in records)) for name in ("outcome", "task", "mode")
-        ],
+        filters=[(n, dict.fromkeys(plain(getattr(r, n)) for r in records)) for n in ("outcome", "task", "mode")],
         columns=[(name, name if name in SORTED else None) for name in COLUMNS],
         folds=_folds(document, records),
     )
-
-
-def _distinct(values: Iterable[object]) -> list[str]:
-    return list(dict.fromkeys(map(plain, values)))
 
 
 def _facts(document: Document, results: Results) -> list[tuple[str, str]]:

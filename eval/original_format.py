@@ -90,11 +90,7 @@ def episode_json(record: EpisodeRecord, gym_id: str, seeds: Sequence[int], repea
         "finished_at": record.finished_at,
         "duration_sec": (record.durations or {}).get("wall_s"),
         "error": record.error,
-        "terminal_detail": {
-            "reason": record.reason,
-            "margin": record.margin,
-            "startup_fall": record.startup_fall,
-        },
+        "terminal_detail": {key: getattr(record, key) for key in ("reason", "margin", "startup_fall")},
     }
 
 
@@ -200,10 +196,7 @@ def write_original(
         rows = [_row(record, gym_ids[task], seeds, repeats) for record in own]
         for record in own:
             content = episode_json(record, gym_ids[task], seeds, repeats)
-            name = (
-                f"{content['model_label']}__seed_{content['seed']}__repeat_{content['repeat_idx']}"
-                f"__episode_{content['episode_index']}.json"
-            )
+            name = "{model_label}__seed_{seed}__repeat_{repeat_idx}__episode_{episode_index}.json".format(**content)
             write(run / "episodes" / name, json.dumps(content, indent=2) + "\n")
         write(run / "summary.csv", _csv(rows, SUMMARY_COLUMNS))
         write(run / "summary.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
