@@ -182,17 +182,8 @@ class _Run:
             self.progress.close()
 
     def _done(self) -> set[int]:
-        """Numbers of the finished episodes; each must be the plan's."""
-        planned = {episode.index: episode for episode in self.config.episodes}
-        ended: dict[int, str] = {}
-        for record in self.journal.records:
-            episode = planned.get(record.index)
-            if episode is None or any(getattr(record, key) != value for key, value in _planned(episode).items()):
-                raise InputError(
-                    f"{self.journal.path}: episode {record.index} is not that of the plan; the journal was changed "
-                    "by hand"
-                )
-            ended[record.index] = record.outcome
+        """Numbers of the finished episodes."""
+        ended = {record.index: record.outcome for record in self.journal.records}
         again = self.config.flags.retry_errors
         return {index for index, outcome in ended.items() if not (again and outcome == "error")}
 
@@ -295,19 +286,14 @@ def _recorder(config: RunConfig, folder: Path) -> EpisodeRecorder | None:
     return EpisodeRecorder(folder, video=flags.video, strip=flags.strip, **given)
 
 
-def _planned(episode: Episode) -> JsonObject:
-    """What the plan says of an episode, by the journal's keys."""
-    said = dataclasses.asdict(episode)
-    del said["rank"]
-    return said
-
-
 def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str | None]) -> EpisodeRecord:
     """Journal line of an episode that ended now."""
     finished = time.time()
+    planned = dataclasses.asdict(result.episode)
+    del planned["rank"]
     return EpisodeRecord(
         schema=SCHEMA,
-        **_planned(result.episode),
+        **planned,
         hashes=hashes,
         outcome=result.outcome,
         reason=result.reason,

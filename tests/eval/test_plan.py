@@ -96,7 +96,7 @@ def test_planning_imports_no_heavy_package():
     """A plan needs NumPy alone."""
     code = (
         "import sys; from arena_newton.eval import plan;"
-        "plan.to_list_json(plan.expand(['all'], tracker='pd', policy='stand', repeats=1));"
+        "[plan.listed(e) for e in plan.expand(['all'], tracker='pd', policy='stand', repeats=1)];"
         "print([m for m in ('warp', 'torch', 'pxr', 'mujoco', 'newton', 'cv2') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
