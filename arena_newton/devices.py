@@ -1,6 +1,7 @@
 """Which engine and device a run gets; asked while it is planned, so Warp is loaded only where a GPU is looked for."""
 
 from arena_newton.errors import InputError
+from arena_newton.quiet import quiet_warp
 
 __all__ = ["resolve_engine"]
 
@@ -19,6 +20,7 @@ def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
         raise InputError(f"--device {device}: unknown, choose cpu, cuda or cuda:N")
     import warp as wp
 
+    quiet_warp()
     cuda = wp.is_cuda_available()
     if device is not None:
         if not cuda:

@@ -6,25 +6,26 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import json
 import signal
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import tyro
+
 from arena_newton.command_line import INTERRUPTED, exit_code
 from arena_newton.errors import InputError
+from arena_newton.eval.options import BenchOptions, EngineOptions, ReportOptions, RunOptions, is_quick
 
 if TYPE_CHECKING:
-    from arena_newton.eval.options import RunOptions
     from arena_newton.eval.run import Factories
 
 __all__ = ["main"]
 
 PROG = "python -m arena_newton.eval"
-COMMANDS = ("run", "resume", "report", "bench", "engines", "list")
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
@@ -35,33 +36,21 @@ OVERVIEW = f"""commands:
 """
 
 
-@dataclass(frozen=True)
-class ReportOptions:
-    """Write tables and reports of a results folder again from its journal."""
-
-    json: bool = False
-    """Print results.json instead of the table."""
-
-
 def main(argv: Sequence[str] | None = None, factories: Factories | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: arguments; those of the process by default.
-        factories: builders of the parts of a run; the real ones by default.
+    """Run the command line, with the arguments of the process and the real parts of a run by default.
 
     Returns:
         Exit code: 0 done, 1 episodes with errors or missing, 2 bad input, no room or a run that had to stop, 130
         interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    command = arguments.pop(0) if arguments and arguments[0] in COMMANDS else "run"
+    command = arguments.pop(0) if arguments and arguments[0] in _COMMANDS else "run"
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     def work() -> int:
         if command == "run" and arguments and not arguments[0].startswith("-"):
-            raise InputError(f"{arguments[0]}: unknown command, known are {' '.join(COMMANDS)}")
+            raise InputError(f"{arguments[0]}: unknown command, known are {' '.join(_COMMANDS)}")
         return _COMMANDS[command](arguments, factories)
 
     return exit_code(work)
@@ -69,8 +58,6 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
 
 def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | None = None) -> T:
     """Parse flags with tyro; a complaint becomes one line of our own."""
-    import tyro
-
     prog = f"{PROG} {command}".rstrip()
     missing = tyro.MISSING_NONPROP if default is None else default
     try:
@@ -87,8 +74,6 @@ def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
 
     tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
     """
-    import tyro
-
     groups: list[list[str]] = []
     for argument in arguments:
         if not groups or argument[:1] == "-" and not argument[1:2].isdigit():
@@ -121,50 +106,55 @@ def _wants_help(arguments: Sequence[str]) -> bool:
 
 
 def _run(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.options import RunOptions
-
     if _wants_help(arguments):
         print(OVERVIEW)
     options = _parse(RunOptions, arguments, "run")
     from arena_newton.eval.folder import results_folder
-    from arena_newton.eval.options import is_quick
-    from arena_newton.eval.run import execute
 
     if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
-        return execute(options, factories)
+        return _execute(options, factories)
     folder = results_folder(options.out)
-    code = execute(dataclasses.replace(options, out=str(folder)), factories)
+    code = _execute(dataclasses.replace(options, out=str(folder)), factories)
     return code if code == INTERRUPTED else max(code, _show_expert(options, folder / "expert", factories))
+
+
+def _execute(options: RunOptions, factories: Factories | None) -> int:
+    """Run; what is wrong with flags or folder is found before the libraries of physics load, which takes seconds."""
+    from arena_newton.doctor import versions
+    from arena_newton.eval.config import resolve
+    from arena_newton.eval.folder import ResultsFolder, results_folder
+
+    config = resolve(options)
+    folder = ResultsFolder(results_folder(options.out), config, versions())
+    folder.check()
+    from arena_newton.eval.run import execute
+
+    return execute(folder, factories)
 
 
 def _show_expert(options: RunOptions, folder: Path, factories: Factories | None) -> int:
     """End the quick look with a policy that solves its task, and name a picture of it."""
-    from arena_newton.eval.run import execute
-
     print("\nAll of these stood still. One that solves its task:")
     one = dataclasses.replace(
         options, task=("vis_navi",), policy="expert", seeds=(0,), repeats=1, worlds=1, strip=True, out=str(folder)
     )
-    code = execute(one, factories)
+    code = _execute(one, factories)
     for strip in sorted((folder / "strips").glob("*__world.*")):
         print(f"see it: {strip}")
     return code
 
 
 def _resume(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.options import RunOptions
-
     if _wants_help(arguments):
         print(f"usage: {PROG} resume <out> [flags]; flags that change the results are refused\n")
         _parse(RunOptions, ["--help"], "resume <out>")
     folder = _folder(arguments, "resume")
     from arena_newton.eval.folder import stored_options
-    from arena_newton.eval.run import execute
 
     options = _parse(RunOptions, arguments, "resume", default=stored_options(folder))
     if options.out != str(folder):
         raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
-    return execute(options, factories)
+    return _execute(options, factories)
 
 
 def _report(arguments: list[str], factories: Factories | None) -> int:
@@ -172,8 +162,6 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
         _parse(ReportOptions, ["--help"], "report <out>")
     folder = _folder(arguments, "report")
     options = _parse(ReportOptions, arguments, "report")
-    import json
-
     from arena_newton.eval import report
     from arena_newton.eval.results import load_run
 
@@ -190,8 +178,6 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _list(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.options import RunOptions
-
     as_json = "--json" in arguments
     if _wants_help(arguments):
         print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
@@ -202,11 +188,9 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
     episodes = resolve(options).episodes
     if as_json:
-        import json
-
         from arena_newton.eval import plan
 
-        rows = [json.dumps(row, allow_nan=False) for row in plan.to_list_json(episodes)]
+        rows = [json.dumps(plan.listed(episode), allow_nan=False) for episode in episodes]
         print("[\n" + ",\n".join(rows) + "\n]")
         return 0
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
@@ -219,25 +203,20 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _bench(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(BenchOptions, arguments, "bench")
     from arena_newton.eval import bench
 
-    return bench.run(_parse(bench.BenchOptions, arguments, "bench"))
+    return bench.run(options)
 
 
 def _engines(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(EngineOptions, arguments, "engines")
     from arena_newton.eval import engines
 
-    return engines.run(_parse(engines.EngineOptions, arguments, "engines"))
+    return engines.run(options)
 
 
-_COMMANDS = {
-    "run": _run,
-    "resume": _resume,
-    "report": _report,
-    "list": _list,
-    "bench": _bench,
-    "engines": _engines,
-}
+_COMMANDS = {"run": _run, "resume": _resume, "report": _report, "bench": _bench, "engines": _engines, "list": _list}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""A run as it is executed: flags are checked and resolved once, and only go down from there."""
+"""A run as it is executed: flags are checked and resolved once, and only go down from there.
+
+No library of physics or pictures is loaded before all that needs none was checked.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +11,24 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
+from arena_newton.devices import resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_MAX_STEPS, QUICK_REPEATS, QUICK_SEEDS, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
-from arena_newton.physics import resolve_engine
-from arena_newton.pictures.camera import CameraConfig
-from arena_newton.pictures.recorder import video_sizes
-from arena_newton.policies.base import Policy
-from arena_newton.quiet import quiet_warp
+from arena_newton.pictures.settings import CameraConfig, video_sizes
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
-from arena_newton.trackers.base import Tracker
-from arena_newton.usd_scenes import validate
+
+if TYPE_CHECKING:
+    from arena_newton.policies.base import Policy
+    from arena_newton.trackers.base import Tracker
 
 __all__ = ["DRIVES", "RunConfig", "plain_facts", "resolve"]
 
@@ -48,8 +51,8 @@ class RunConfig:
     episodes: tuple[plan.Episode, ...]
     """The plan."""
     repeats: int
+    """As in the flags, like the device, but never left open."""
     device: str
-    """As in the flags, but never left open."""
     policy: str
     """Spec that the policy is made with, a path in it as the user gave it."""
     policy_label: str
@@ -158,12 +161,11 @@ def resolve(options: RunOptions) -> RunConfig:
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
-    label = f"{scheme}:{_label(Path(target))}" if policy_path else options.policy
+    shown = Path(target).parent if Path(target).name == "actions" else Path(target)
+    label = f"{scheme}:{shown.name or Path(target).name}" if policy_path else options.policy
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
-    for name in tasks:
-        task_specs.get(name)
     default_repeats = QUICK_REPEATS if quick else plan.PROTOCOL_REPEATS
     repeats = default_repeats if options.repeats is None else options.repeats
     flags = dataclasses.replace(
@@ -177,31 +179,39 @@ def resolve(options: RunOptions) -> RunConfig:
         variant=str(variant) if variant else None,
         policy=f"{scheme}:{policy_path}" if policy_path else options.policy,
     )
-    _episodes(flags, label, repeats)  # names and numbers are wrong at once, before Warp starts
-    config = RunConfig(
-        flags=flags,
-        episodes=(),
+    episodes = plan.expand(
+        flags.task,
+        tracker=flags.tracker,
+        policy=label,
+        modes=flags.mode,
+        rules=flags.rules,
+        seeds=flags.seeds,
         repeats=repeats,
-        device="",
+        max_steps=flags.max_steps,
+    )
+    video_size, policy_options = _size(options.video_size), _policy_options(options)
+    policy_hash = hash_path(policy_path) if policy_path else None
+    variant_hash = _variant_hash(variant) if variant else None
+    engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
+    return RunConfig(
+        flags=dataclasses.replace(flags, engine=engine, device=device),
+        episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in episodes),
+        repeats=repeats,
+        device=device,
         policy=options.policy,
         policy_label=label,
         checkpoint=checkpoint,
         variant=variant,
         drive=DRIVES[options.drive],
-        video_size=_size(options.video_size),
-        policy_options=_policy_options(options),
+        video_size=video_size,
+        policy_options=policy_options,
         checkpoint_hash=checkpoint_hash,
-        policy_hash=hash_path(policy_path) if policy_path else None,
+        policy_hash=policy_hash,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
-        # A USD file counts with every layer and asset that it names; the validator walks them before USD composes any.
-        variant_hash=config_hash(sorted(map(hash_path, validate.layers(variant)))) if variant else None,
-        scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names()), hash_path),
+        variant_hash=variant_hash,
+        scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
         code_hash=code_hash(),
     )
-    quiet_warp()
-    engine, device = resolve_engine(options.engine, options.device)
-    flags = dataclasses.replace(flags, engine=engine, device=device)
-    return dataclasses.replace(config, flags=flags, device=device, episodes=_episodes(flags, label, repeats))
 
 
 def _check_flags(options: RunOptions) -> None:
@@ -230,31 +240,6 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def _episodes(flags: RunOptions, label: str, repeats: int) -> tuple[plan.Episode, ...]:
-    """The run's episodes in plan order.
-
-    Raises:
-        InputError: An unknown task or mode, something named twice, or a number out of range.
-    """
-    return tuple(
-        plan.expand(
-            flags.task,
-            tracker=flags.tracker,
-            policy=label,
-            modes=flags.mode,
-            rules=flags.rules,
-            engine=flags.engine,
-            seeds=flags.seeds,
-            repeats=repeats,
-            max_steps=flags.max_steps,
-        )
-    )
-
-
-def _label(path: Path) -> str:
-    return path.parent.name if path.name == "actions" and path.parent.name else path.name
-
-
 def _size(given: str | None) -> tuple[int, int] | None:
     """Width and height of --video-size."""
     if given is None:
@@ -263,6 +248,13 @@ def _size(given: str | None) -> tuple[int, int] | None:
     if not numbers:
         raise InputError(f"--video-size {given}: expected width x height, such as 960x540")
     return video_sizes((int(numbers[1]), int(numbers[2])))["world"]
+
+
+def _variant_hash(variant: Path) -> str:
+    """A USD file counts with every layer and asset that it names; the validator walks them before USD composes any."""
+    from arena_newton.usd_scenes import validate
+
+    return config_hash(sorted(map(hash_path, validate.layers(variant))))
 
 
 def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:

@@ -21,10 +21,7 @@ __all__ = ["announce", "broken", "environment", "failed", "kept", "result"]
 def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str], Sequence[Episode]]) -> None:
     """Print configuration and size of the run in two lines, or the configuration as a whole.
 
-    Args:
-        config: The run.
-        folder: Its results folder.
-        waiting: Episodes to play, by task and mode.
+    `waiting` are the episodes to play, by task and mode.
     """
     flags = config.flags
     if flags.verbose:
@@ -84,14 +81,7 @@ def failed(group: str, error: OSError) -> str:
 
 
 def result(run: RunRecord, results: Results, resume: str, seconds: float) -> None:
-    """Print the table, what a reader must know besides it, and why episodes ended as errors.
-
-    Args:
-        run: What the results folder holds.
-        results: Content of results.json.
-        resume: Command that continues the run.
-        seconds: Time that it took [s].
-    """
+    """Print the table, what a reader must know besides it, why episodes ended as errors, and the command to resume."""
     print(f"\n{report.table(results)}")
     for note in report.notes(run, results):
         print(note)

@@ -147,11 +147,6 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
     No episode that the plan lacks or that another run played, none twice under two numbers, and none again that had
     ended as something else than an error; seeds and step budgets are the plan's.
 
-    Args:
-        folder: The results folder, for messages.
-        records: Lines of its journal, in their order.
-        document: Content of config.json.
-
     Raises:
         InputError: A record belongs to another plan or another run.
     """

@@ -13,54 +13,25 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from tqdm import tqdm
 
+from arena_newton import policies, trackers
+from arena_newton.devices import resolve_engine
+from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import write_atomic
+from arena_newton.eval.options import EngineOptions
 from arena_newton.eval.records import MAX_CONFIG_BYTES, check_types, parse, plain_text, read_regular
+from arena_newton.interfaces import Spawn
 from arena_newton.intervals import wilson
+from arena_newton.policies.base import Policy
 from arena_newton.quiet import quiet_warp
+from arena_newton.rollout import Rollout
+from arena_newton.tasks.base import TaskSpec
 
-if TYPE_CHECKING:
-    from arena_newton.interfaces import Spawn
-    from arena_newton.policies.base import Policy
-    from arena_newton.tasks.base import TaskSpec
-
-__all__ = ["EngineOptions", "Rates", "fisher", "measure", "run"]
-
-
-@dataclass(frozen=True)
-class EngineOptions:
-    """Fall and success rates of one task on each engine, over rollouts with slightly moved spawn positions."""
-
-    policy: str = "stand"
-    """Policy, such as `replay:walk.pkl`."""
-    task: str = "double_desk"
-    """Task."""
-    tracker: str = "twist2"
-    """Tracker."""
-    checkpoint: str | None = None
-    """Its weights."""
-    engines: tuple[str, ...] = ("mujoco",)
-    """Engines: `mujoco` (CPU), `warp` (CUDA where there is one)."""
-    rollouts: int = 200
-    """Rollouts an engine."""
-    noise: float = 1e-3
-    """Standard deviation of the spawn position, x and y [m]."""
-    worlds: int = 20
-    """Worlds in a batch."""
-    max_steps: int | None = None
-    """Step budget instead of the rule set's [ticks]."""
-    fast_physics: bool = False
-    """Physics at 5 ms x 4."""
-    seed: int = 0
-    """Seed of the moved spawn positions; another range of it gives independent rollouts."""
-    against: str | None = None
-    """JSON file of an earlier call, possibly on another machine, to compare with."""
-    out: str | None = None
-    """Write the rates to this JSON file."""
+__all__ = ["Rates", "fisher", "measure", "run"]
 
 
 @dataclass(frozen=True)
@@ -100,12 +71,6 @@ def fisher(a: int, n: int, b: int, m: int) -> float:
 
 def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
     """Run the rollouts on one engine."""
-    from tqdm import tqdm
-
-    from arena_newton import trackers
-    from arena_newton.env import ArenaEnv
-    from arena_newton.rollout import Rollout
-
     env = ArenaEnv(
         options.task,
         worlds=min(options.worlds, options.rollouts),
@@ -176,9 +141,6 @@ def run(options: EngineOptions) -> int:
             raise InputError(f"{flag} {value}: must be at least {least}")
     if not (math.isfinite(options.noise) and options.noise >= 0.0):
         raise InputError(f"--noise {options.noise}: must be a distance of 0 or more [m]")
-    from arena_newton import policies
-    from arena_newton.physics import resolve_engine
-
     policy = policies.get(options.policy)
     policy.check()
     policy.check_task(options.task)

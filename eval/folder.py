@@ -21,7 +21,6 @@ from arena_newton.eval.options import RunOptions
 from arena_newton.eval.records import JsonObject, check_types
 from arena_newton.files import PARTIAL
 from arena_newton.text import plain_text
-from arena_newton.usd_scenes import validate
 
 __all__ = ["BREAK_FILE", "SUBFOLDERS", "ResultsFolder", "iso", "results_folder", "setting", "stored_options"]
 
@@ -67,13 +66,7 @@ class ResultsFolder:
     """The folder that a run writes."""
 
     def __init__(self, path: Path, config: RunConfig, installed: Mapping[str, str | None]):
-        """Name the folder; nothing is read or written.
-
-        Args:
-            path: The folder.
-            config: The run.
-            installed: Versions of the libraries.
-        """
+        """Name the folder, the run and the versions of the libraries; nothing is read or written."""
         self.path, self.config, self.installed = path, config, dict(installed)
         self.document: Document
         """Content of config.json, once the folder is settled."""
@@ -137,9 +130,7 @@ class ResultsFolder:
     def settle(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
         """Write config.json into a new folder, or hold the run to the one that is there; the journal's lock is held.
 
-        Args:
-            config: The run, with what tracker and policy say of themselves.
-            played: Lines of the journal.
+        `config` now has what tracker and policy say of themselves; `played` are the lines of the journal.
 
         Raises:
             InputError: The folder cannot be the run's.
@@ -168,6 +159,8 @@ class ResultsFolder:
             "environments": {},
         }
         if config.variant is not None:
+            from arena_newton.usd_scenes import validate
+
             document["variant_changes"] = validate.differences(config.variant, config.flags.task[0])
         return document
 
@@ -231,11 +224,7 @@ class ResultsFolder:
         return plain
 
     def hashes(self, environment: JsonObject) -> dict[str, str | None]:
-        """What a journal line names its run by.
-
-        Args:
-            environment: What the environment of the episode said of itself.
-        """
+        """What a journal line names its run by, given what the environment of the episode said of itself."""
         config = self.config
         return {
             "config": self.document["config_hash"],

@@ -11,7 +11,7 @@ import base64
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ import jinja2
 from arena_newton.eval.document import Document
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.results import Results, RunRecord
-from arena_newton.eval.stats import Cell, ErrorReason
+from arena_newton.eval.stats import ErrorReason, ResultCell
 from arena_newton.eval.wording import (
     MEDIA,
     environment_facts,
@@ -49,19 +49,9 @@ TICKS = (0, 25, 50, 75, 100)
 """Marks of the axis of rates [%]."""
 SEED_SPACING = 9
 """Distance of the dots of group seeds with one rate [px]."""
-COLUMNS = (
-    ("task", "task"),
-    ("mode", "mode"),
-    ("seed", "seed"),
-    ("repeat", "repeat"),
-    ("outcome", "outcome"),
-    ("reason", None),
-    ("steps", "steps"),
-    ("margin", "margin"),
-    ("pictures", None),
-    ("play it again", None),
-)
-"""Columns of the list of episodes and the keys that they are sorted by."""
+SORTED = ("task", "mode", "seed", "repeat", "outcome", "steps", "margin")
+"""Columns of the list of episodes by which a reader can sort it."""
+COLUMNS = ("task", "mode", "seed", "repeat", "outcome", "reason", "steps", "margin", "pictures", "play it again")
 
 
 @functools.cache
@@ -109,13 +99,7 @@ def page(
 ) -> str:
     """The page as text, the same for the same content byte for byte.
 
-    Args:
-        run: What the results folder holds.
-        results: Content of results.json.
-        notes: What a reader must know besides the table.
-        head: Column names of the table.
-        rows: The table: a row per cell, then a row per suite.
-        reasons: Why episodes ended as errors.
+    `head` and `rows` are the table: a row per cell, then a row per suite; `notes` what a reader must know besides it.
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
@@ -137,16 +121,10 @@ def page(
         shown=[_Episode(record) for record in shown],
         folded=[_Episode(record) for record in folded],
         episodes=[_Episode(record, command(record=record)) for record in records],
-        filters=[
-            (name, _distinct(getattr(record, name) for record in records)) for name in ("outcome", "task", "mode")
-        ],
-        columns=COLUMNS,
+        filters=[(n, dict.fromkeys(plain(getattr(r, n)) for r in records)) for n in ("outcome", "task", "mode")],
+        columns=[(name, name if name in SORTED else None) for name in COLUMNS],
         folds=_folds(document, records),
     )
-
-
-def _distinct(values: Iterable[object]) -> list[str]:
-    return list(dict.fromkeys(map(plain, values)))
 
 
 def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
@@ -190,17 +168,17 @@ def _per_cent(fraction: float | None) -> str:
     return f"{100 * (fraction or 0.0):.2f}%"
 
 
-def _bars(cells: Sequence[Cell]) -> list[dict[str, object]]:
+def _bars(cells: Sequence[ResultCell]) -> list[dict[str, object]]:
     """A bar of outcomes per cell; under it the success rate with its interval and the rates of the group seeds."""
 
-    def names(cell: Cell) -> tuple[str, str, str]:
+    def names(cell: ResultCell) -> tuple[str, str, str]:
         return plain(cell["tracker"]), plain(cell["policy"]), plain(cell["mode"])
 
     differing = [i for i in range(3) if len({names(cell)[i] for cell in cells}) > 1]
     return [_bar(" ".join([plain(cell["task"]), *(names(cell)[i] for i in differing)]), cell) for cell in cells]
 
 
-def _bar(title: str, cell: Cell) -> dict[str, object]:
+def _bar(title: str, cell: ResultCell) -> dict[str, object]:
     numbers = (cell["successes"], cell["timeouts"], cell["falls"], cell["errors"])
     counts = dict(zip(OUTCOMES, numbers, strict=True))
     parts, done = [], 0

@@ -29,25 +29,10 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
+_REPORTING = """__main__ bench config console document engines folder html_report identity journal options
+    original_format progress records report results stats wording"""
 UNHASHED = (
-    "eval/__main__.py",
-    "eval/bench.py",
-    "eval/config.py",
-    "eval/console.py",
-    "eval/document.py",
-    "eval/engines.py",
-    "eval/folder.py",
-    "eval/html_report.py",
-    "eval/identity.py",
-    "eval/journal.py",
-    "eval/options.py",
-    "eval/original_format.py",
-    "eval/progress.py",
-    "eval/records.py",
-    "eval/report.py",
-    "eval/results.py",
-    "eval/stats.py",
-    "eval/wording.py",
+    *(f"eval/{name}.py" for name in _REPORTING.split()),
     "trackers/evaluate.py",
     "trackers/evaluation",
     "trackers/train",
@@ -128,23 +113,15 @@ def code_files(root: Path = PACKAGE) -> list[Path]:
     return [file for file in package_files(root) if counts(file)]
 
 
-def code_hash(root: Path = PACKAGE, digest: Callable[[Path], str] = hash_path) -> str:
-    """Hash of the code that a run executes, by names and contents.
-
-    Args:
-        root: Package folder.
-        digest: Hash of one file.
-    """
-    return hash_paths(root, code_files(root), digest)
+def code_hash(root: Path = PACKAGE) -> str:
+    """Hash of the code that a run executes, by names and contents."""
+    return hash_paths(root, code_files(root))
 
 
 def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> list[Path]:
     """Layers, textures and what else is stored next to the built-in scenes of a run's tasks.
 
-    Args:
-        root: Package folder.
-        tasks: Tasks of the run.
-        known: All tasks; the folders of those that the run lacks do not count, nor does the trackers' `lab`.
+    Of all `known` tasks the folders of those that the run lacks do not count, nor does the trackers' `lab`.
     """
     others = {"lab", *known} - set(tasks)
     scenes = root / "usd_scenes"
@@ -152,7 +129,7 @@ def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> l
     return [file for file in found if file.relative_to(scenes).parts[0] not in others]
 
 
-def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str]) -> str:
+def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str] = hash_path) -> str:
     """Hash of files below a folder, by names and contents."""
     return config_hash([[file.relative_to(root).as_posix(), digest(file)] for file in files])
 
@@ -171,4 +148,4 @@ def own_code(part: object) -> str | None:
     file = Path(str(top.__file__)).resolve()
     if not hasattr(top, "__path__"):
         return hash_path(file)
-    return hash_paths(file.parent, [f for f in package_files(file.parent) if f.suffix == ".py"], hash_path)
+    return hash_paths(file.parent, [f for f in package_files(file.parent) if f.suffix == ".py"])

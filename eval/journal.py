@@ -113,11 +113,7 @@ class EpisodeRecord:
 
     @classmethod
     def from_json(cls, where: str, line: Mapping[str, Json]) -> EpisodeRecord:
-        """The record of a line; keys that this version does not know are left out.
-
-        Args:
-            where: File and line, for messages.
-            line: What the line holds.
+        """The record of a line; keys that this version does not know are left out. Messages say `where` it is.
 
         Raises:
             InputError: It is not a record of an episode, or a newer version wrote it.

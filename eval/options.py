@@ -1,4 +1,4 @@
-"""Flags of a run, as a user gives them."""
+"""Flags of the commands, as a user gives them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ from typing import Annotated
 
 import tyro
 
-__all__ = ["QUICK_MAX_STEPS", "QUICK_REPEATS", "QUICK_SEEDS", "RunOptions", "is_quick"]
+__all__ = [
+    "QUICK_MAX_STEPS",
+    "QUICK_REPEATS",
+    "QUICK_SEEDS",
+    "BenchOptions",
+    "EngineOptions",
+    "ReportOptions",
+    "RunOptions",
+    "is_quick",
+]
 
 QUICK_SEEDS = (0,)
 QUICK_REPEATS = 4
@@ -92,3 +101,63 @@ def is_quick(options: RunOptions) -> bool:
     """Whether the flags leave the plan open: a quick look at all tasks."""
     named = options.task or options.mode or options.seeds
     return not named and (options.repeats, options.max_steps) == (None, None)
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Write tables and reports of a results folder again from its journal."""
+
+    json: bool = False
+    """Print results.json instead of the table."""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
+
+    what: tuple[str, ...] = ("all",)
+    """What to measure: help tick throughput camera pictures episodes tests, or `all` (everything but tests)."""
+    checkpoint: str | None = None
+    """Weights of TWIST2; those that come with the package when none are named."""
+    worlds: int = 20
+    """Worlds of engine mujoco."""
+    cuda_worlds: int = 4096
+    """Worlds on CUDA."""
+    camera_worlds: int = 1024
+    """Worlds of the camera on CUDA."""
+    rounds: int = 20
+    """Rounds of each ratio; their medians are compared."""
+    json: bool = False
+    """Print one JSON array instead of the table."""
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """Fall and success rates of one task on each engine, over rollouts with slightly moved spawn positions."""
+
+    policy: str = "stand"
+    """Policy, such as `replay:walk.pkl`."""
+    task: str = "double_desk"
+    """Task."""
+    tracker: str = "twist2"
+    """Tracker."""
+    checkpoint: str | None = None
+    """Its weights."""
+    engines: tuple[str, ...] = ("mujoco",)
+    """Engines: `mujoco` (CPU), `warp` (CUDA where there is one)."""
+    rollouts: int = 200
+    """Rollouts an engine."""
+    noise: float = 1e-3
+    """Standard deviation of the spawn position, x and y [m]."""
+    worlds: int = 20
+    """Worlds in a batch."""
+    max_steps: int | None = None
+    """Step budget instead of the rule set's [ticks]."""
+    fast_physics: bool = False
+    """Physics at 5 ms x 4."""
+    seed: int = 0
+    """Seed of the moved spawn positions; another range of it gives independent rollouts."""
+    against: str | None = None
+    """JSON file of an earlier call, possibly on another machine, to compare with."""
+    out: str | None = None
+    """Write the rates to this JSON file."""

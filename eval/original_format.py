@@ -23,29 +23,11 @@ from arena_newton.eval.stats import population_std, seed_rates
 
 __all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]
 
-SUMMARY_COLUMNS = (
-    "task",
-    "model_path",
-    "model_label",
-    "seed",
-    "repeat_idx",
-    "episode_seed",
-    "episode_index",
-    "episode_object_seed",
-    "episode_object_seed_source",
-    "success",
-    "failure_reason",
-    "episode_steps",
-    "max_steps",
-    "final_reward",
-    "final_reward_scaled",
-    "max_reward",
-    "max_reward_scaled",
-    "video_path",
-    "log_path",
-    "vla_trace_path",
-    "server_url",
-    "returncode",
+SUMMARY_COLUMNS = tuple(
+    """task model_path model_label seed repeat_idx episode_seed episode_index
+    episode_object_seed episode_object_seed_source success failure_reason episode_steps max_steps
+    final_reward final_reward_scaled max_reward max_reward_scaled
+    video_path log_path vla_trace_path server_url returncode""".split()
 )
 """Columns of `summary.csv` and keys of `summary.jsonl`, in the original's order."""
 
@@ -108,11 +90,7 @@ def episode_json(record: EpisodeRecord, gym_id: str, seeds: Sequence[int], repea
         "finished_at": record.finished_at,
         "duration_sec": (record.durations or {}).get("wall_s"),
         "error": record.error,
-        "terminal_detail": {
-            "reason": record.reason,
-            "margin": record.margin,
-            "startup_fall": record.startup_fall,
-        },
+        "terminal_detail": {key: getattr(record, key) for key in ("reason", "margin", "startup_fall")},
     }
 
 
@@ -218,10 +196,7 @@ def write_original(
         rows = [_row(record, gym_ids[task], seeds, repeats) for record in own]
         for record in own:
             content = episode_json(record, gym_ids[task], seeds, repeats)
-            name = (
-                f"{content['model_label']}__seed_{content['seed']}__repeat_{content['repeat_idx']}"
-                f"__episode_{content['episode_index']}.json"
-            )
+            name = "{model_label}__seed_{seed}__repeat_{repeat_idx}__episode_{episode_index}.json".format(**content)
             write(run / "episodes" / name, json.dumps(content, indent=2) + "\n")
         write(run / "summary.csv", _csv(rows, SUMMARY_COLUMNS))
         write(run / "summary.jsonl", "".join(json.dumps(row) + "\n" for row in rows))

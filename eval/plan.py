@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton import rule_sets, seeding, tasks
@@ -11,7 +11,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.records import MAX_COUNT, MAX_EPISODES, MAX_SEED, JsonObject
 from arena_newton.rules import MODES
 
-__all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "to_list_json"]
+__all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "listed"]
 
 PROTOCOL_SEEDS = (0, 1, 2)
 """Group seeds of the benchmark's protocol (original benchmark: 3 seeds)."""
@@ -61,16 +61,8 @@ def expand(
 ) -> list[Episode]:
     """Episodes of a run: tasks × modes × group seeds × repeats, in this order.
 
-    Args:
-        task_names: Names of tasks, or `all` alone.
-        tracker: Name that results carry.
-        policy: Name that results carry.
-        modes: Test modes.
-        rules: Name of the rule set.
-        engine: Name of the physics engine.
-        seeds: Group seeds.
-        repeats: Episodes per group seed.
-        max_steps: Cap on the rule set's step budgets, or None.
+    `task_names` may be `all` alone; `repeats` are the episodes per group seed; `max_steps` caps the rule set's step
+    budgets; tracker, policy, rules and engine are the names that results carry.
 
     Raises:
         InputError: Unknown task, mode or rule set, something named twice, or nothing to run.
@@ -132,16 +124,12 @@ def _cut(number: int) -> str:
     return str(number) if number < 10**40 else f"{str(number)[:40]}..."
 
 
-def to_list_json(episodes: Iterable[Episode]) -> list[JsonObject]:
-    """What `list --json` prints: one object per episode.
+def listed(episode: Episode) -> JsonObject:
+    """What `list --json` prints of an episode.
 
     `sampled` and `placed` are keyed by the object's name in the original's records. A placed object names its prim, its
     `position` [m] and its `orientation` (wxyz). `light` is the episode's distant light, or null under the scene's dome.
     """
-    return [_listed(episode) for episode in episodes]
-
-
-def _listed(episode: Episode) -> JsonObject:
     spec = tasks.get(episode.task)
     draws = spec.draw(episode.episode_seed, episode.mode, rule_sets.get(episode.rules))
     placed = {}
@@ -152,16 +140,6 @@ def _listed(episode: Episode) -> JsonObject:
     if draws.light is not None:
         light = dataclasses.asdict(draws.light)
         light |= {"direction": list(draws.light.direction), "color": list(draws.light.color)}
-    return {
-        "task": episode.task,
-        "mode": episode.mode,
-        "rules": episode.rules,
-        "group_seed": episode.group_seed,
-        "repeat": episode.repeat,
-        "episode_seed": episode.episode_seed,
-        "object_seed": episode.object_seed,
-        "sampled": draws.sampled,
-        "placed": placed,
-        "light": light,
-        "max_steps": episode.max_steps,
-    }
+    keys = ("task", "mode", "rules", "group_seed", "repeat", "episode_seed", "object_seed")
+    said = {key: getattr(episode, key) for key in keys}
+    return said | {"sampled": draws.sampled, "placed": placed, "light": light, "max_steps": episode.max_steps}

@@ -45,12 +45,8 @@ def simulated(ticks: int) -> str:
 def kernels_to_compile(cache: Path, engine: str, device: str) -> bool:
     """Whether Warp's cache lacks kernels of ours for a device, so that the first steps compile them.
 
-    A look at the folder's names, which costs nothing; kernels that a newer version changed are not noticed.
-
-    Args:
-        cache: Warp's kernel cache.
-        engine: `mujoco` or `warp`; the latter has kernels of its own.
-        device: Such as `cpu` or `cuda:0`.
+    A look at the folder's names, which costs nothing; kernels that a newer version changed are not noticed. Engine
+    `warp` has kernels of its own.
     """
     binaries = ("*.cubin", "*.ptx") if device.startswith("cuda") else ("*.o",)
     wanted = ["wp_arena_newton.kernels.*", *(["wp_mujoco_warp*"] if engine == "warp" else [])]
@@ -74,11 +70,11 @@ class Progress:
 
         Args:
             budget: Ticks of all planned episodes.
-            planned: Planned episodes.
-            finished: Episodes that are finished already.
+            planned: Number of planned episodes.
+            finished: Number of them that have ended already.
             done: Their ticks.
-            stream: Where to write; the error stream by default.
-            clock: Seconds that pass.
+            stream: The error stream by default.
+            clock: Gives seconds.
         """
         self.budget, self.planned, self.finished, self.done = max(budget, 1), planned, finished, done
         self._stream = stream or sys.stderr

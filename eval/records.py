@@ -264,10 +264,7 @@ def _required(kind: type) -> frozenset[str]:
 def fit(where: str, values: Mapping[str, Json], kind: type) -> None:
     """Hold stored values to the fields of a dataclass or of a typed dictionary.
 
-    Args:
-        where: File and line, for messages.
-        values: Stored values by field; others are not looked at.
-        kind: The class; its annotations may hold `Fit` and `Known`.
+    Its annotations may hold `Fit` and `Known`; values of other names are not checked. Messages begin with `where`.
 
     Raises:
         InputError: One is absent or unfit.
@@ -288,11 +285,6 @@ def shown(value: Json) -> str:
 
 def check_types(where: str, values: Mapping[str, Json], kind: type) -> JsonObject:
     """Values of a dataclass that were stored as JSON; arrays become tuples, texts are printable.
-
-    Args:
-        where: File, for messages.
-        values: Stored values by field.
-        kind: The dataclass.
 
     Raises:
         InputError: An unknown field, or a value of another type.

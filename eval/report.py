@@ -11,38 +11,22 @@ from arena_newton.eval import html_report
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.original_format import write_original
 from arena_newton.eval.results import Results, RunRecord, results_json
-from arena_newton.eval.stats import Cell, Suite, error_reasons, outside_suites
+from arena_newton.eval.stats import ResultCell, Suite, error_reasons, outside_suites
 from arena_newton.eval.wording import environment_facts, media_of, plain, rules_that_ran, tasks_of
 from arena_newton.robot import TICK
 from arena_newton.text import counted
 
 __all__ = ["notes", "table", "write_reports"]
 
-_COLUMNS = (
-    "task",
-    "tracker",
-    "policy",
-    "mode",
-    "episodes",
-    "successes",
-    "falls",
-    "startup_falls",
-    "timeouts",
-    "errors",
-    "sr",
-    "sr_seed_std",
-    "ci95_low",
-    "ci95_high",
-    "afr",
-    "mean_steps",
-)
+_COLUMNS = """task tracker policy mode episodes successes falls startup_falls timeouts errors
+    sr sr_seed_std ci95_low ci95_high afr mean_steps""".split()
 
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _cell_text(cell: Cell) -> list[str]:
+def _cell_text(cell: ResultCell) -> list[str]:
     low_high = "-" if cell["ci95"] is None else f"{100 * cell['ci95'][0]:.1f} to {100 * cell['ci95'][1]:.1f}"
     running = cell["falls"] - cell["startup_falls"]
     return [

@@ -24,11 +24,6 @@ class RunRecord:
     """Finished episodes in plan order; of an episode that was run twice the last."""
 
     @property
-    def planned(self) -> int:
-        """Number of episodes of the plan."""
-        return self.document["planned"]
-
-    @property
     def config(self) -> Identity:
         """The run's identity."""
         return self.document["config"]
@@ -78,9 +73,9 @@ def results_json(run: RunRecord) -> Results:
     results: Results = {
         "config_hash": run.document["config_hash"],
         "config": run.config,
-        "planned": run.planned,
+        "planned": run.document["planned"],
         "finished": len(run.records),
-        "complete": len(run.records) == run.planned,
+        "complete": len(run.records) == run.document["planned"],
         "cells": figures["cells"],
         "suites": figures["suites"],
     }

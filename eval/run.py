@@ -16,14 +16,12 @@ from pathlib import Path
 import warp as wp
 
 from arena_newton import policies, trackers
-from arena_newton.doctor import versions
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import console, report
-from arena_newton.eval.config import RunConfig, resolve
-from arena_newton.eval.folder import ResultsFolder, iso, results_folder
+from arena_newton.eval.config import RunConfig
+from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
-from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
@@ -32,6 +30,7 @@ from arena_newton.eval.results import load_run
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.policies.base import Policy, PolicyUnavailable
+from arena_newton.quiet import quiet_warp
 from arena_newton.robot import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.text import counted, plain_text
@@ -62,8 +61,8 @@ class Factories:
     """Raises InputError for a file that is not a scene of the task."""
 
 
-def execute(options: RunOptions, factories: Factories | None = None) -> int:
-    """Run or continue the run that `options` describe.
+def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
+    """Run or continue the run of a folder that was checked.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -73,10 +72,8 @@ def execute(options: RunOptions, factories: Factories | None = None) -> int:
         StorageError: The results folder cannot be written; finished episodes are kept.
         RunStopped: Simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
-    factories = factories or Factories()
-    config = resolve(options)
-    folder = ResultsFolder(results_folder(options.out), config, versions())
-    folder.check()
+    quiet_warp()
+    factories, config = factories or Factories(), folder.config
     try:
         config, policy = _check_parts(config, factories)
     except SystemExit as stop:
@@ -185,17 +182,8 @@ class _Run:
             self.progress.close()
 
     def _done(self) -> set[int]:
-        """Numbers of the finished episodes; each must be the plan's."""
-        planned = {episode.index: episode for episode in self.config.episodes}
-        ended: dict[int, str] = {}
-        for record in self.journal.records:
-            episode = planned.get(record.index)
-            if episode is None or any(getattr(record, key) != value for key, value in _planned(episode).items()):
-                raise InputError(
-                    f"{self.journal.path}: episode {record.index} is not that of the plan; the journal was changed "
-                    "by hand"
-                )
-            ended[record.index] = record.outcome
+        """Numbers of the finished episodes."""
+        ended = {record.index: record.outcome for record in self.journal.records}
         again = self.config.flags.retry_errors
         return {index for index, outcome in ended.items() if not (again and outcome == "error")}
 
@@ -298,19 +286,14 @@ def _recorder(config: RunConfig, folder: Path) -> EpisodeRecorder | None:
     return EpisodeRecorder(folder, video=flags.video, strip=flags.strip, **given)
 
 
-def _planned(episode: Episode) -> JsonObject:
-    """What the plan says of an episode, by the journal's keys."""
-    said = dataclasses.asdict(episode)
-    del said["rank"]
-    return said
-
-
 def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str | None]) -> EpisodeRecord:
     """Journal line of an episode that ended now."""
     finished = time.time()
+    planned = dataclasses.asdict(result.episode)
+    del planned["rank"]
     return EpisodeRecord(
         schema=SCHEMA,
-        **_planned(result.episode),
+        **planned,
         hashes=hashes,
         outcome=result.outcome,
         reason=result.reason,

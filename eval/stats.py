@@ -13,7 +13,7 @@ from arena_newton.text import plain_text
 
 __all__ = [
     "Aggregate",
-    "Cell",
+    "ResultCell",
     "ErrorReason",
     "Figures",
     "PooledFigures",
@@ -53,7 +53,7 @@ class Figures(TypedDict):
     """Over the episodes without error [ticks]."""
 
 
-class Cell(Figures):
+class ResultCell(Figures):
     """Figures of one task x tracker x policy x mode."""
 
     task: str
@@ -85,7 +85,7 @@ class Suite(PooledFigures):
 class Aggregate(TypedDict):
     """Figures of a run."""
 
-    cells: list[Cell]
+    cells: list[ResultCell]
     suites: list[Suite]
 
 
@@ -202,7 +202,7 @@ def aggregate(records: Iterable[EpisodeRecord]) -> Aggregate:
     groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
     for record in sorted(records, key=lambda r: r.index):
         groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
-    cells: list[Cell] = [
+    cells: list[ResultCell] = [
         {"task": task, "tracker": tracker, "policy": policy, "mode": mode, **cell(group)}
         for (task, tracker, policy, mode), group in groups.items()
     ]

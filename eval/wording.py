@@ -35,8 +35,6 @@ REPLAYED = ("policy", "tracker", "checkpoint", "rules", "drive", "engine", "devi
 """Flags with a value on which an episode depends, besides its task, mode, seed and repeat."""
 REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
 """Flags that belong to a policy server → their defaults; others are named in the command."""
-RULE_OWNERS = {"ball": "football"}
-"""First word of a rule's item → the task that it belongs to."""
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"
 _PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
@@ -62,10 +60,7 @@ def media_of(record: EpisodeRecord) -> dict[str, str]:
 def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: object = None) -> str:
     """The command line that plays an episode again, the last one of its seed's that it plays.
 
-    Args:
-        options: Flags of the run, as config.json has them.
-        record: The episode.
-        worlds: How many worlds asked at once, where the policy depends on it.
+    `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
     words: list[object] = ["python", "-m", "arena_newton.eval", "--task", record.task, "--mode", record.mode]
     words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
@@ -106,27 +101,25 @@ def tasks_of(config: Identity, records: Sequence[EpisodeRecord]) -> list[str]:
 
 def rules_that_ran(rule_set: Mapping[str, str], tasks: Sequence[str]) -> list[tuple[str, str]]:
     """The rows of a rule set that speak of the tasks of a run, or of all tasks."""
-    others = [name for name in specs.names() if name not in tasks]
-    objects = {o.record for name in tasks if name in specs.names() for o in specs.get(name).objects}
-    foreign = {o.record for name in others for o in specs.get(name).objects} - objects
+    known = {name: specs.get(name) for name in specs.names()}
+    owners = {item: name for name, spec in known.items() for item, _ in spec.rules.paper.success.notes()}
+    records = {name: {o.record for o in spec.objects} for name, spec in known.items()}
+    ours = set(tasks) & set(known)
+    ours |= {record for name in ours for record in records[name]}
+    others = {*known, *(record for found in records.values() for record in found)} - ours
     rows = []
     for item, said in rule_set.items():
-        words = re.findall(r"\w+", plain(item))
-        owner = RULE_OWNERS.get(words[0]) if words else None
-        named = {word for word in words if word in specs.names()} | ({owner} if owner else set())
+        named = {*re.findall(r"\w+", plain(item)), owners.get(plain(item), "")} & set(known)
         if named and not named & set(tasks):
             continue
         text = plain(said).replace("see the ranges below", "ranges: docs/rules.md")
         # A remark on other tasks alone is left out; lists of tasks or of their objects keep what belongs to the run.
         for remark in re.findall(r" \([^()]*\)", text):
-            named_here = set(re.findall(r"\w+", remark)) & set(specs.names())
+            named_here = set(re.findall(r"\w+", remark)) & set(known)
             text = text.replace(remark, "") if named_here and not named_here & set(tasks) else text
         parts = text.split(", ")
-        heads = [part.split(" ")[0] for part in parts]
-        if all(head in foreign or head in objects or head in specs.names() for head in heads):
-            kept = [part for part, head in zip(parts, heads, strict=True) if head not in foreign and head not in others]
-            if not kept:
-                continue
-            text = ", ".join(kept)
-        rows.append((plain(item), text))
+        if all(part.split(" ")[0] in ours | others for part in parts):
+            parts = [part for part in parts if part.split(" ")[0] in ours]
+        if parts:
+            rows.append((plain(item), ", ".join(parts)))
     return rows

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.registry import Registry
 
 if TYPE_CHECKING:
+    import torch
+
     from arena_newton.interfaces import World
     from arena_newton.pictures.camera import CameraConfig
 
@@ -31,7 +32,7 @@ __all__ = [
 
 Json = dict[str, Any]
 """A JSON object."""
-Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
+type Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
 """Worlds, bool, shape [worlds]; None: all."""
 
 
@@ -74,12 +75,7 @@ class Policy:
         """
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
-        """Check before the first episode that the policy can do a task.
-
-        Args:
-            task: The task.
-            mode: Mode of the next episodes, if it is known yet.
-            seeds: Their episode seeds, if they are known yet.
+        """Check before the first episode that the policy can do a task, in a mode and with episode seeds if known yet.
 
         Raises:
             InputError: It cannot.
@@ -88,21 +84,12 @@ class Policy:
     def attach(self, env: World) -> None:
         """Take the environment of the next episodes; only privileged policies (experts) read its state.
 
-        Args:
-            env: The environment.
-
         Raises:
             InputError: The policy cannot work in this environment.
         """
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
-        """Begin new episodes in the worlds of `mask`.
-
-        Args:
-            seeds: Episode seeds, one per world (those outside the mask are ignored).
-            tasks: Gym ids, one per world.
-            mask: Worlds that begin.
-        """
+        """Begin new episodes in the worlds of `mask`, given an episode seed and a Gym id per world of the batch."""
 
     def act(self, observation: Observation) -> Chunk:
         """Actions for the worlds that ask."""
@@ -127,41 +114,21 @@ POLICIES: Registry[Policy] = Registry(
         "stand": "arena_newton.policies.stand:from_spec",
     },
 )
-"""Makers of policies; each takes the text after the colon, or None."""
+"""Makers of policies; each takes the text after the colon, or None, and the options of `get` that it knows."""
+register = POLICIES.register
+names = POLICIES.names
 
 
 def world_mask(mask: Mask, worlds: int) -> np.ndarray:
     """A mask as bool array of shape [worlds]."""
     if mask is None:
         return np.ones(worlds, dtype=bool)
-    if isinstance(mask, torch.Tensor):
-        mask = mask.detach().cpu()
-    return np.asarray(mask).astype(bool).reshape(worlds)
-
-
-def register(name: str, factory: Callable[..., Policy]) -> None:
-    """Offer a policy under `name` in this process.
-
-    Args:
-        name: What is written before the colon of a spec.
-        factory: Takes the text after the colon, or None; and the options of `get` as keywords, if it knows any.
-
-    Raises:
-        InputError: A built-in policy has that name.
-    """
-    POLICIES.register(name, factory)
-
-
-def names() -> tuple[str, ...]:
-    """Names of all policies that `get` knows, sorted."""
-    return POLICIES.names()
+    values = mask if isinstance(mask, Sequence | np.ndarray) else mask.detach().cpu()
+    return np.asarray(values).astype(bool).reshape(worlds)
 
 
 def check_spec(spec: str) -> None:
     """Check a spec without making the policy; secrets, which results would publish, are refused and not printed.
-
-    Args:
-        spec: As for `get`.
 
     Raises:
         InputError: Unknown name, a name that is offered twice, or an address with a user name or password in it.
@@ -178,9 +145,7 @@ def check_spec(spec: str) -> None:
 def get(spec: str, **options: Any) -> Policy:
     """Make a policy from `name` or `name:argument`, such as `stand`, `replay:clip.pkl` or `remote:http://host:8443`.
 
-    Args:
-        spec: Name and argument.
-        options: Keywords for a policy that takes some, such as `timeout` of `remote`.
+    Some policies take `options`, such as `timeout` of `remote`.
 
     Raises:
         InputError: Unknown name, or an argument that is missing or unfit.

@@ -215,8 +215,7 @@ class RemotePolicy(Policy):
             verify_ssl: Check the certificate of an https server.
 
         Raises:
-            InputError: Not a valid address, or one with a user name or password, or the token has characters that no
-                HTTP header can carry.
+            InputError: Not a valid address, one with a user name or password, or a token that no HTTP header can carry.
         """
         host, port, secure = _address(url)
         if not (math.isfinite(timeout) and 0.0 < timeout <= 86400.0):
@@ -546,11 +545,7 @@ def _cause(error: BaseException) -> str:
 
 
 def from_spec(argument: str | None, **options: Any) -> RemotePolicy:
-    """Make the policy for `--policy remote:<url>`.
-
-    Args:
-        argument: The address.
-        options: Keywords of `RemotePolicy`.
+    """Make the policy for `--policy remote:<url>` with keywords of `RemotePolicy`.
 
     Raises:
         InputError: No address was given, or it is not valid.

@@ -143,11 +143,7 @@ class ReplayEpisodes(Policy):
         self._steps = np.zeros(0, dtype=np.int64)
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
-        """Refuse a task without a recording, or episodes of which none has one.
-
-        Raises:
-            InputError: There is none.
-        """
+        """Refuse a task without a recording, or episodes of which none has one."""
         gym_id = task_registry.get(task).gym_id
         here = {(recorded, seed) for name, recorded, seed in self._episodes if name == gym_id}
         where = f"--policy replay:{self.path}"

@@ -23,7 +23,7 @@ HEAVY |= {"safetensors", "trimesh"}
 STARTS = ("__main__", "eval.__main__", "trackers.__main__", "trackers.evaluate", "trackers.train.__main__")
 STARTS += ("trackers.motions.__main__", "usd_scenes.__main__")
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
-PLANNING = ("eval.plan", "rule_sets", "devices", "pictures.settings", *(f"tasks.{name}" for name in tasks.names()))
+PLANNING = ("eval.config", "eval.folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are
 imported by name."""
 LATE = {

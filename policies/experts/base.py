@@ -106,12 +106,7 @@ class Expert:
         """Episodes begin in the worlds of `mask`: the robot stands; dropped objects may still roll."""
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
-        """The command of the next chunk.
-
-        Args:
-            mask: Worlds that ask, bool, shape [worlds].
-            dt: Length of the chunk [s].
-        """
+        """The command of the next chunk, `dt` [s] long, for the worlds that ask: `mask`, bool, shape [worlds]."""
         raise TypeError(f"expert of {self.task!r} defines no command()")
 
     def phases(self) -> list[str] | None:
@@ -143,32 +138,19 @@ class ExpertPolicy(Policy):
     name = "expert"
 
     def __init__(self, chunk_size: int = 5):
-        """Set the length of a chunk.
-
-        Args:
-            chunk_size: Ticks between two readings of the world's state.
-        """
+        """Set the length of a chunk: the ticks between two readings of the world's state."""
         self.chunk_size = chunk_size
         self.expert: Expert | None = None
         """The expert of the environment's task; None before `attach`."""
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
-        """Refuse a task without an expert.
-
-        Raises:
-            InputError: There is no expert for the task.
-        """
+        """See `Policy.check_task`."""
         expert_class(task)
 
     def attach(self, env: World) -> None:
-        """Take the privileged view of an environment and pick the expert of its task.
-
-        Raises:
-            InputError: There is no expert for the task.
-        """
-        expert = expert_class(env.spec.name)
+        """Take the privileged view of an environment and pick the expert of its task."""
         self.sight = Sight(env)
-        self.expert = expert(self.sight)
+        self.expert = expert_class(env.spec.name)(self.sight)
         self.generator = ReferenceGenerator(env.worlds, env.torch_device)
         self._begins = np.ones(env.worlds, dtype=bool)
 
@@ -179,11 +161,7 @@ class ExpertPolicy(Policy):
 
     @torch.inference_mode()
     def act(self, observation: Observation) -> Chunk:
-        """The next actions of the worlds that ask.
-
-        Raises:
-            InputError: No environment was attached.
-        """
+        """See `Policy.act`."""
         if self.expert is None:
             raise InputError("--policy expert: sees the world itself; run it in this process, with attach(env)")
         worlds, device = len(observation.state), self.sight.device
@@ -206,8 +184,4 @@ class ExpertPolicy(Policy):
 
     def describe(self) -> Json:
         """Name, the tasks that have an expert and the length of the chunks."""
-        return {
-            "name": self.name,
-            "tasks": solved_tasks(),
-            "chunk_size": self.chunk_size,
-        }
+        return {"name": self.name, "tasks": solved_tasks(), "chunk_size": self.chunk_size}

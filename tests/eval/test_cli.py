@@ -212,6 +212,38 @@ def test_help_is_quick_and_imports_nothing_heavy(command):
     assert "usage" in done.stdout
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run --task football nosuch",
+        "run --drive stiff",
+        "run --worlds 0",
+        "run --policy nosuch",
+        "run --checkpoint absent.onnx",
+        "run --rules mine",
+        "run --mode bases",
+        "run --strip --video-size 9x9",
+        "run --engine bullet",
+        "run --engine mujoco --out /dev/null",
+        "list --device tpu",
+        "list --task football --engine mujoco",
+    ],
+)
+def test_planning_imports_nothing_heavy(command):
+    """A plan, and what is wrong with one, need no library of physics, networks or pictures."""
+    code = (
+        "import sys; from arena_newton.eval.__main__ import main\n"
+        "code = main(sys.argv[1:])\n"
+        "heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'cv2', 'av'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+        "sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True)
+    right = command == "list --task football --engine mujoco"
+    assert done.returncode == (0 if right else 2), done.stderr
+    assert right or done.stderr.startswith(f"error: --{command.split(' --')[-1].split(' ')[0]}")
+
+
 def test_doctor_names_what_is_missing(monkeypatch, capsys):
     """A missing required package is a problem with advice and code 1; a missing extra is a note."""
     from arena_newton import doctor

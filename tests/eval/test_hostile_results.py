@@ -12,7 +12,7 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton import doctor
-from arena_newton.eval import config, identity, run
+from arena_newton.eval import config, identity
 from arena_newton.eval.__main__ import main
 
 COUNT = 160
@@ -87,7 +87,7 @@ def spoiled(data, rng):
 def base(tmp_path, monkeypatch):
     """A small results folder two floors down, and files beside it that must not change."""
     installed = doctor.versions()
-    monkeypatch.setattr(run, "versions", lambda: installed)
+    monkeypatch.setattr(doctor, "versions", lambda: installed)
     cached = functools.cache(identity.hash_path)
     monkeypatch.setattr(config, "code_hash", lambda: "0" * 12)
     for module in (config, identity):

@@ -41,7 +41,7 @@ def test_one_seed_for_every_mode_and_rule_set():
 
 def test_listing_holds_the_recorded_draws():
     """`list --json` shows the original's samples and their world poses, as plain JSON."""
-    (row,) = plan.to_list_json(expand("double_desk", seeds=(0,), repeats=1))
+    (row,) = map(plan.listed, expand("double_desk", seeds=(0,), repeats=1))
     assert list(row) == KEYS
     assert json.loads(json.dumps(row)) == row
     assert row["sampled"]["hammer"]["yaw"] == pytest.approx(-0.317236, abs=5e-7)
@@ -49,7 +49,7 @@ def test_listing_holds_the_recorded_draws():
     assert row["placed"]["basket"]["position"] == pytest.approx([-3.573021, -0.122363, 0.745], abs=5e-7)
     assert row["placed"]["hammer"]["prim"] == "/World/Hammer"
     assert row["light"] is None
-    (row,) = plan.to_list_json(expand("double_desk", seeds=(0,), repeats=1, rules="released"))
+    (row,) = map(plan.listed, expand("double_desk", seeds=(0,), repeats=1, rules="released"))
     assert row["placed"]["basket"]["position"] == pytest.approx([-2.83573, -0.10122, 0.75245], abs=5e-6)
     assert row["light"]["direction"] == [0.0, 0.0, -1.0]
 
@@ -58,7 +58,7 @@ def test_listing_holds_the_recorded_draws():
 def test_every_episode_lists_as_json(rules):
     """Every task in every mode lists all its objects; visual mode lists its light."""
     modes = ("base", "execution", "semantic", "visual")
-    rows = plan.to_list_json(expand(modes=modes, rules=rules, seeds=(2,), repeats=2))
+    rows = [plan.listed(e) for e in expand(modes=modes, rules=rules, seeds=(2,), repeats=2)]
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     for row in rows:
         records = {o.record for o in tasks.get(row["task"]).objects}
@@ -96,7 +96,7 @@ def test_planning_imports_no_heavy_package():
     """A plan needs NumPy alone."""
     code = (
         "import sys; from arena_newton.eval import plan;"
-        "plan.to_list_json(plan.expand(['all'], tracker='pd', policy='stand', repeats=1));"
+        "[plan.listed(e) for e in plan.expand(['all'], tracker='pd', policy='stand', repeats=1)];"
         "print([m for m in ('warp', 'torch', 'pxr', 'mujoco', 'newton', 'cv2') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

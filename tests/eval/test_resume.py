@@ -18,7 +18,6 @@ from eval_fakes import FakeEnv, FakePolicy, factories
 from arena_newton import doctor, seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import journal as journal_module
-from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
 from arena_newton.policies.base import PolicyUnavailable
 
@@ -327,12 +326,12 @@ def test_other_versions_are_refused_unless_accepted(tmp_path, uninterrupted, cap
     kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
     (folder / "episodes.jsonl").write_text("".join(kept))
     installed = doctor.versions()
-    monkeypatch.setattr(run, "versions", lambda: installed | {"tqdm": "9.9"})
+    monkeypatch.setattr(doctor, "versions", lambda: installed | {"tqdm": "9.9"})
     assert (
         main(["resume", str(folder), "--worlds", "1", "--task", "football", "boxing", "--seeds", "9"], factories()) == 2
     )
     assert "seeds was 0 1 2, now 9" in capsys.readouterr().err  # a progress bar changes nothing
-    monkeypatch.setattr(run, "versions", lambda: installed | {"torch": "9.9"})
+    monkeypatch.setattr(doctor, "versions", lambda: installed | {"torch": "9.9"})
     assert main(["resume", str(folder)], factories()) == 2
     assert f"torch {installed['torch']}, installed is 9.9" in capsys.readouterr().err
     for _ in range(2):

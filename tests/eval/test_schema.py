@@ -5,20 +5,25 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 from rows import episodes, full, record
 
 from arena_newton.errors import InputError
+from arena_newton.eval import journal
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, read_journal
 from arena_newton.eval.plan import expand
+from arena_newton.eval.records import Fit
 from arena_newton.eval.results import load_run
 from arena_newton.eval.run import _record
 from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
 JOURNALS = Path(__file__).parent / "journals"
 NEW_KEYS = ("schema", "phases", "predicates", "progress", "events")
+RAN = {1: ("stand", 20), 2: ("expert", 150)}
+"""Schema → policy and steps of its run."""
 
 
 def stored(schema, folder):
@@ -34,10 +39,17 @@ def test_journals_of_every_schema_are_reported(tmp_path, capsys, schema):
     """A folder that any version wrote is read whole and gives all reports."""
     folder = stored(schema, tmp_path / "run")
     run = load_run(folder)
-    assert [(r.schema, r.task, r.outcome, r.steps) for r in run.records] == [(schema, "boxing", "timeout", 20)] * 2
+    policy, steps = RAN[schema]
+    lines = [(r.schema, r.task, r.policy, r.outcome, r.steps) for r in run.records]
+    assert lines == [(schema, "boxing", policy, "timeout", steps)] * 2
     assert (run.status is None) == (schema == 1)
+    reached = [(r.phases, r.predicates) for r in run.records]
+    if schema > 1:
+        phases = (("approach", 0),)
+        nothing, near = {"approach": None, "contact": None}, {"approach": 128, "contact": None}
+        assert reached == [(phases, nothing), (phases, near)]
     assert main(["report", str(folder)]) == 0
-    assert "| boxing | twist2  | stand  | base | 2 |" in capsys.readouterr().out
+    assert f"| boxing | twist2  | {policy:<6} | base | 2 |" in capsys.readouterr().out
     assert {"report.html", "table.csv", "results.json", "original"} <= {path.name for path in folder.iterdir()}
 
 
@@ -100,6 +112,25 @@ def test_unfit_values_of_new_keys_are_named(key, value, message):
     """New keys are held to their types and ranges as the old ones are."""
     with pytest.raises(InputError, match=f"here: {message}"):
         EpisodeRecord.from_json("here", full(episodes("football", (1,))[0]) | {key: value})
+
+
+def test_a_new_key_is_one_field(tmp_path, monkeypatch, capsys):
+    """One field of the record is all that writing, reading, checking and reporting a new key need; a run fills it."""
+    hint = Annotated[float | None, Fit("a number of joules")]
+    longer = dataclasses.make_dataclass("Longer", [("energy", hint, None)], bases=(EpisodeRecord,), frozen=True)
+    monkeypatch.setattr(journal, "EpisodeRecord", longer)
+    folder = stored(SCHEMA, tmp_path / "run")
+    (folder / "episodes.jsonl").unlink()
+    with Journal(folder / "episodes.jsonl") as written:
+        for old in read_journal(JOURNALS / f"schema_{SCHEMA}.jsonl")[0]:
+            written.append(dataclasses.replace(old, energy=7.5))
+    assert [r.energy for r in load_run(folder).records] == [7.5, 7.5]
+    assert main(["report", str(folder)]) == 0
+    text = (folder / "episodes.jsonl").read_text()
+    (folder / "episodes.jsonl").write_text(text.replace('"energy":7.5', '"energy":"much"', 1))
+    capsys.readouterr()
+    assert main(["report", str(folder)]) == 2
+    assert 'line 1: energy is "much", expected a number of joules' in capsys.readouterr().err
 
 
 def test_unknown_keys_are_left_out():

@@ -201,7 +201,7 @@ def test_single_action(server, policy):
     [
         ("nan", "is nan, expected a finite number"),
         ("39", "39 numbers, expected 40"),
-        ("words", "no number"),
+        ("words", "not a number"),
         ("500", "status 500, CUDA out of memory"),
         ("text", "not JSON"),
         ("empty", "neither action_chunk nor action"),

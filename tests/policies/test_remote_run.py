@@ -1,5 +1,6 @@
 """Runs with a policy server: what flags reach it, what results are known by, and what no results folder holds."""
 
+import importlib.metadata
 import json
 import threading
 from types import SimpleNamespace
@@ -147,7 +148,7 @@ def test_example_server_with_pictures(monkeypatch):
 def test_entry_points_and_options(monkeypatch):
     """A package's policy is found; one that is called like another, or makes none, is one line."""
     points = []
-    monkeypatch.setattr(policies.base, "_entry_points", lambda: points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
 
     def offer(name, factory, package="theirs"):
         points.append(SimpleNamespace(name=name, load=lambda: factory, dist=SimpleNamespace(name=package)))
