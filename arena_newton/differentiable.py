@@ -165,4 +165,5 @@ def success_margin(launch: Callable[..., None], **arguments: object) -> torch.Te
             launch(**dict(zip(floats, arrays, strict=True)), **fixed, **made, margin=margin)
         return tape, [margin]
 
-    return _Recorded.apply(record, *floats.values())[0]
+    margin: torch.Tensor = _Recorded.apply(record, *floats.values())[0]
+    return margin

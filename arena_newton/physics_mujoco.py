@@ -171,7 +171,8 @@ class MujocoPhysics(Physics):
             force = np.einsum("ck,ckj->cj", np.column_stack([normal, tangent]), frame)
             np.add.at(total, bodies[:, 1], force)
             np.subtract.at(total, bodies[:, 0], force)
-        return np.linalg.norm(total, axis=1)
+        norm: np.ndarray = np.linalg.norm(total, axis=1)
+        return norm
 
     def _contact_forces(
         self, d: mujoco.MjData, pick: slice | np.ndarray

@@ -234,7 +234,8 @@ def _own_batch(scene: Scene, rate: PhysicsRate) -> tuple[mujoco_warp.Model, mujo
 def _cloned[T](value: T) -> T:
     """A deep copy of a struct of Warp arrays; everything else in it is shared."""
     if isinstance(value, wp.array):
-        return wp.clone(value)
+        copy: T = wp.clone(value)
+        return copy
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: _cloned(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
         return dataclasses.replace(value, **fields)

@@ -73,7 +73,8 @@ class Registry[T]:
         self.check(name)
         if name not in self._registered and name in self.built_in:
             module, _, attribute = self.built_in[name].partition(":")
-            return getattr(importlib.import_module(module), attribute)(*arguments, **options)
+            own: Callable[..., T] = getattr(importlib.import_module(module), attribute)
+            return own(*arguments, **options)
         factory = self._registered.get(name) or self._loaded(name)
         try:
             inspect.signature(factory).bind(*arguments, **options)
@@ -89,7 +90,8 @@ class Registry[T]:
 
     def _loaded(self, name: str) -> Callable[..., T]:
         try:
-            return self.points(name)[0].load()
+            factory: Callable[..., T] = self.points(name)[0].load()
+            return factory
         except Exception as error:
             reason = " ".join(str(error).split())
             message = f"--{self.noun} {name}: its package does not load ({type(error).__name__}: {reason})"

@@ -187,7 +187,8 @@ def turned_by(quat: Tensor, vector: Tensor) -> Tensor:
         (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a),
         -1,
     )
-    return out / out.norm(dim=-1, keepdim=True)
+    unit: Tensor = out / out.norm(dim=-1, keepdim=True)
+    return unit
 
 
 def heading_np(quat: np.ndarray) -> float:

@@ -97,7 +97,8 @@ class ByRules[T]:
             InputError: Unknown rule set.
         """
         check_name(rules_name)
-        return getattr(self, rules_name)
+        value: T = getattr(self, rules_name)
+        return value
 
 
 def check_name(rules_name: str) -> None:
@@ -238,7 +239,8 @@ class RuleSet:
     @property
     def ball_restitution(self) -> float:
         """Coefficient of restitution of a ball in a scene of no task (the lab): that of the first task with a ball."""
-        return next(value for task in self.tasks if (value := task.success.bounce()) is not None)
+        found: float = next(value for task in self.tasks if (value := task.success.bounce()) is not None)
+        return found
 
     def bounce(self, task: str) -> float:
         """Coefficient of restitution of the ball in a task's scene, or in a scene of no task."""
@@ -247,7 +249,8 @@ class RuleSet:
 
     def to_dict(self) -> dict[str, object]:
         """Plain data, ready for JSON."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
+        plain: dict[str, object] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return plain
 
     @functools.cached_property
     def hash(self) -> str:

@@ -17,4 +17,5 @@ def on_torch_stream(device: torch.device) -> contextlib.AbstractContextManager[o
     # Where torch already works on Warp's own stream, a second handle of it would end the first one with its life.
     if torch.cuda.current_stream(device).cuda_stream == wp.get_stream(str(device)).cuda_stream:
         return contextlib.nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(device))
+    stream: contextlib.AbstractContextManager[object] = wp.ScopedStream(wp.stream_from_torch(device))
+    return stream

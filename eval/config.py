@@ -124,7 +124,8 @@ class RunConfig:
     def stored_flags(self) -> JsonObject:
         """What `resume` starts from: all flags but those of one call."""
         once = dict.fromkeys(("retry_errors", "accept_versions", "skip_broken", "verbose"), False)
-        return json.loads(json.dumps(dataclasses.asdict(self.flags) | once))
+        flags: JsonObject = json.loads(json.dumps(dataclasses.asdict(self.flags) | once))
+        return flags
 
     def with_parts(self, tracker: Tracker, policy: Policy) -> RunConfig:
         """The run with what tracker and policy say of themselves."""
@@ -145,7 +146,8 @@ def _facts(part: Tracker | Policy) -> JsonObject:
 
 def plain_facts(facts: Mapping[str, object]) -> JsonObject:
     """Facts as strict JSON gives them back; anything else as text."""
-    return json.loads(json.dumps(facts, default=str))
+    plain: JsonObject = json.loads(json.dumps(facts, default=str))
+    return plain
 
 
 def resolve(options: RunOptions) -> RunConfig:

@@ -256,7 +256,8 @@ def _fields(kind: type) -> dict[str, tuple[Callable[[Json], bool], str]]:
 @functools.cache
 def _required(kind: type) -> frozenset[str]:
     if typing.is_typeddict(kind):
-        return kind.__required_keys__  # type: ignore[attr-defined]  # of a typed dictionary
+        required: frozenset[str] = kind.__required_keys__  # type: ignore[attr-defined]  # of a typed dictionary
+        return required
     free = (dataclasses.MISSING, dataclasses.MISSING)
     return frozenset(f.name for f in dataclasses.fields(kind) if (f.default, f.default_factory) == free)
 

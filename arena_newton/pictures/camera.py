@@ -306,7 +306,7 @@ class Camera:
         self._shadows: ShadowMaps | None = None
         self.trace_shadows = False
         """Shadows by ray instead of by map: exact and slow, the reference for the maps."""
-        self._torch_image = wp.to_torch(self.image)
+        self._torch_image: torch.Tensor = wp.to_torch(self.image)
         self._torch_view_world = wp.to_torch(self._view_world)
         self._every = torch.arange(self.views, dtype=torch.int32, device=self._torch_image.device)
 
@@ -438,7 +438,8 @@ class Camera:
         row = 0.5 * (1.0 - points[:, 1] / ahead / self._tangents[1]) * height
         rows = torch.as_tensor(np.clip(row, 0, height - 1).astype(np.int64), device=self._every.device)
         columns = torch.as_tensor(np.clip(column, 0, width - 1).astype(np.int64), device=self._every.device)
-        return wp.to_torch(self.buffers.depth)[view, rows, columns].cpu().numpy()
+        seen: np.ndarray = wp.to_torch(self.buffers.depth)[view, rows, columns].cpu().numpy()
+        return seen
 
     def _render(self, state: newton.State, body: wp.array | None) -> torch.Tensor:
         """Draw the views; `body` carries each one's camera, None leaves `poses` as they are."""

@@ -26,7 +26,8 @@ def get(name: str) -> TaskSpec:
         return _registered[name]
     if name not in _NAMES:
         raise InputError(f"--task {name}: unknown, choose from {', '.join(names())} or all")
-    return importlib.import_module(f"arena_newton.tasks.{name}").TASK
+    spec: TaskSpec = importlib.import_module(f"arena_newton.tasks.{name}").TASK
+    return spec
 
 
 def register(spec: TaskSpec) -> None:
