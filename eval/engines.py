@@ -19,9 +19,10 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import write_atomic
-from arena_newton.eval.records import MAX_CONFIG_BYTES, check_types, parse, plain_text, read_regular
+from arena_newton.eval.records import MAX_CONFIG_BYTES, check_types, parse, read_regular
 from arena_newton.intervals import wilson
 from arena_newton.quiet import quiet_warp
+from arena_newton.text import plain_text
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import Spawn

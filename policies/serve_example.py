@@ -13,7 +13,7 @@ import numpy as np
 from arena_newton.canonical import STAND_ACTION
 
 
-def act(image, state, instruction, rng):
+def act(image: np.ndarray, state: np.ndarray, instruction: str, rng: np.random.Generator) -> np.ndarray:
     """The model: picture uint8 [480, 640, 3], state [64], text and noise → actions [n, 40], here 0.4 s of standing."""
     actions = np.tile(STAND_ACTION, (20, 1))
     actions[:, 9:38] += 0.01 * rng.standard_normal(29)
@@ -25,7 +25,7 @@ class Handler(BaseHTTPRequestHandler):
 
     protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
 
-    def do_POST(self):  # noqa: N802 (the name that http.server calls)
+    def do_POST(self) -> None:  # noqa: N802 (the name that http.server calls)
         """Answer /reset and /infer."""
         asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         reply = {"ok": True, "seeded": True, "policy": "standing with noise"}
