@@ -143,11 +143,9 @@ def launch_predicates(
 ) -> None:
     """Which predicates hold at this tick; launch after the task's success kernel.
 
+    Arguments that `success` describes are not repeated.
+
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        qpos: Positions, MuJoCo layout, shape [worlds, nq].
-        qvel: Velocities, MuJoCo layout, shape [worlds, nv].
         latched: 1 = the latch holds the leaf, int32, shape [worlds].
         success: 1 = success, int32, shape [worlds]; becomes the last predicate.
         margin: Signed distance to success, shape [worlds].
