@@ -438,6 +438,7 @@ options = tyro.cli(TrainOptions, args=sys.argv[2:])
 runner = session.build(options)
 runner.learn(options.iterations)
 torch.save(runner.alg.get_policy().state_dict(), sys.argv[1])
+torch.distributed.destroy_process_group()  # its threads must not outlive the interpreter
 """
 
 
