@@ -46,7 +46,6 @@ class CriticWarmUp:
         """Freeze the network, if the training begins within the warm-up.
 
         Args:
-            algorithm: The learner.
             alone: Iterations of the critic alone, 0 = none.
             first: Iteration at which the training begins or is resumed.
             rate: Learning rate after the warm-up: during it nothing diverges, and the adaptive rate only grows.

@@ -132,8 +132,7 @@ def check_folder(options: TrainOptions) -> None:
             )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise InputError(f"--log-dir {folder}: cannot be written ({error.strerror})") from None
 

@@ -164,11 +164,7 @@ class TrackerEnv(VecEnv):
 
     @torch.no_grad()
     def reset(self, frame: torch.Tensor | None = None) -> None:
-        """Start an episode in every world.
-
-        Args:
-            frame: Frames of the library to start in, shape [worlds]; sampled ones by default.
-        """
+        """Start an episode in every world, in sampled frames of the library or given ones, shape [worlds]."""
         self._restart(self._every, frame)
         self._observe(self._every)
 

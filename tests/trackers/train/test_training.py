@@ -19,7 +19,7 @@ from PIL import Image
 from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import interface, train
+from arena_newton.trackers import base, interface, train
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
@@ -518,9 +518,9 @@ def test_start_from_unfit_weights(env, tmp_path):
     """Weights of another width are refused by the flag's name."""
     with pytest.raises(InputError, match="--start-from .*: no such|--start-from .*absent"):
         make_runner(env).start_from(tmp_path / "absent.safetensors")
-    if weights_file.default_path("twist2").is_file():
+    if base.weights_path("twist2").is_file():
         with pytest.raises(InputError, match="other widths"):
-            make_runner(env).start_from(weights_file.default_path("twist2"))
+            make_runner(env).start_from(base.weights_path("twist2"))
 
 
 def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
