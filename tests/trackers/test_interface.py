@@ -16,12 +16,12 @@ from arena_newton.robot import PhysicsRate
 from arena_newton.trackers import interface, sonic, twist2
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.figures import Result, figures
-from arena_newton.trackers.evaluation.rollout import Outcome, make_plan
+from arena_newton.trackers.evaluation.suite_rollout import Outcome, make_plan
 from arena_newton.trackers.front_end import NetworkTracker
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, mlp
-from arena_newton.trackers.train import options
-from arena_newton.trackers.train.options import TrainOptions, check
+from arena_newton.trackers.train import train_options
+from arena_newton.trackers.train.train_options import TrainOptions, check
 
 RATE = PhysicsRate(dt=0.005, substeps=4)
 
@@ -82,7 +82,7 @@ def test_training_finds_it(small):
 
 def test_the_command_line_offers_it(small, monkeypatch, capsys):
     """`--tracker` of a training takes the names of `interface.names()`, a third one included, and no other."""
-    spec = importlib.util.spec_from_file_location("options_again", options.__file__)
+    spec = importlib.util.spec_from_file_location("options_again", train_options.__file__)
     again = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "options_again", again)
     spec.loader.exec_module(again)  # as in a new process: the choices are those at the time of the import

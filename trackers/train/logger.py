@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from rsl_rl.utils.logger import Logger
 
-from arena_newton.trackers.train.options import TrainOptions
+from arena_newton.trackers.train.train_options import TrainOptions
 
 __all__ = ["DeviceLogger", "IterationTimes"]
 

@@ -15,8 +15,8 @@ import warp as wp
 from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.scene import load_scene
 from arena_newton.trackers.motions.library import FIXTURES
-from arena_newton.trackers.train.options import TrainOptions
 from arena_newton.trackers.train.references import KEY_LINKS
+from arena_newton.trackers.train.train_options import TrainOptions
 
 __all__ = ["Simulation", "share_stream"]
 

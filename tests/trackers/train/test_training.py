@@ -26,12 +26,12 @@ from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.critic import CRITIC
 from arena_newton.trackers.train.export import export
-from arena_newton.trackers.train.options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.tracker_env import TrackerEnv
+from arena_newton.trackers.train.train_options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
@@ -433,7 +433,7 @@ def test_the_end_of_a_time_limit_is_annealed(env):
 SECOND_PROCESS = """
 import sys, torch, tyro
 from arena_newton.trackers.train import session
-from arena_newton.trackers.train.options import TrainOptions
+from arena_newton.trackers.train.train_options import TrainOptions
 options = tyro.cli(TrainOptions, args=sys.argv[2:])
 runner = session.build(options)
 runner.learn(options.iterations)
