@@ -119,12 +119,9 @@ def shipped_weights(spec: str) -> Path | None:
 
 
 def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
-    """Make a tracker by name.
+    """Make a built-in, registered or entry-point tracker by name.
 
-    Args:
-        spec: Name of a built-in, registered or entry-point tracker.
-        checkpoint: Weights (`--checkpoint`): a file, or whatever path the tracker documents, such as a folder. Without
-            it a tracker takes the weights it comes with.
+    A checkpoint is a file, or whatever path the tracker documents; without one a tracker takes its own weights.
 
     Raises:
         InputError: Unknown name, or a checkpoint that is absent or unfit.

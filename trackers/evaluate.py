@@ -153,7 +153,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from arena_newton.trackers.evaluation import chart, tracker_report
     from arena_newton.trackers.evaluation.figures import Result
     from arena_newton.trackers.evaluation.inference_times import inference
-    from arena_newton.trackers.evaluation.rollout import make_plan, play
+    from arena_newton.trackers.evaluation.suite_rollout import make_plan, play
     from arena_newton.trackers.evaluation.tracker_film import film
 
     resolve_engine(args.engine, args.device)

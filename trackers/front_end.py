@@ -46,12 +46,7 @@ class Mirror:
     """The mirror image (left for right) of rows of numbers: `mirror(x)[:, i] = sign[i] * x[:, index[i]]`."""
 
     def __init__(self, parts: Sequence[tuple[Sequence[int], Sequence[float]]], device: torch.device | str = "cpu"):
-        """Join parts to a row.
-
-        Args:
-            parts: For each part the index within it and the sign of every number.
-            device: Torch device of the rows.
-        """
+        """Join parts to a row: for each the index within it and the sign of every number."""
         index: list[int] = []
         for positions, _ in parts:
             start = len(index)
@@ -95,13 +90,7 @@ class FrontEnd(abc.ABC):
         self.action_form = action_form
 
     def bind(self, worlds: int, device: torch.device | str = "cpu", obs: torch.Tensor | None = None) -> None:
-        """Allocate buffers.
-
-        Args:
-            worlds: Number of worlds.
-            device: Torch device.
-            obs: Buffer for the observation, float32, shape [worlds, obs_width]; a new one by default.
-        """
+        """Allocate buffers; `obs`, if it is given, receives the observation, float32, shape [worlds, obs_width]."""
         self.worlds, self.device = worlds, torch.device(device)
         self.obs = torch.zeros(worlds, self.obs_width, device=self.device) if obs is None else obs
         self.last_action = torch.zeros(worlds, self.action_width, device=self.device)
@@ -227,14 +216,9 @@ class NetworkTracker(Tracker):
 
     def describe(self) -> dict[str, Any]:
         """What a result must record to name this tracker exactly; once it is bound, what runs its network too."""
-        inference = self._inference()
-        return super().describe() | ({} if inference is None else {"inference": inference})
-
-    def _inference(self) -> str | None:
-        runner = getattr(self, "_runner", None)
-        if runner is None:
-            return None
-        return f"{runner.path}, CUDA graph" if self._graph is not None else runner.path
+        if (runner := getattr(self, "_runner", None)) is None:
+            return super().describe()
+        return super().describe() | {"inference": runner.path + (", CUDA graph" if self._graph is not None else "")}
 
     @property
     def _graphable(self) -> bool:

@@ -50,11 +50,7 @@ class ActionForm:
 
 
 def residual_form(drive: DriveGains) -> ActionForm:
-    """Residual action: one unit commands a quarter of a joint's torque limit through its position gain; up to 6 count.
-
-    Args:
-        drive: The drive that executes the targets.
-    """
+    """Residual action: one unit commands a quarter of a joint's torque limit through its position gain; 6 at most."""
     return ActionForm("residual", tuple(0.25 * e / k for e, k in zip(drive.effort, drive.kp, strict=True)), clip=6.0)
 
 
@@ -101,10 +97,7 @@ class Interface:
         return dataclasses.replace(self.official_form, clip=10.0) if kind == "default" else residual_form(self.drive)
 
     def make_network(self, config: Mapping[str, Any] | None = None) -> TrackerNetwork:
-        """A new network.
-
-        Args:
-            config: Hidden widths, as `TrackerNetwork.config` gives them; the defaults without it.
+        """A new network with the hidden widths of `TrackerNetwork.config`; the defaults without them.
 
         Raises:
             InputError: Arguments that do not fit.

@@ -263,14 +263,8 @@ class SonicFrontEnd(FrontEnd):
     def mirror_obs(self) -> Mirror:
         """Mirror image of an observation; the zeros of the other modes stay where they are."""
         anchor = plain(1, -1, -1, 1, 1, -1)
-        reference = [
-            plain(*[1] * LAYOUT["mode"]),
-            *[_MIRROR] * (2 * FRAMES),
-            plain(*[1] * LAYOUT["heights"]),
-            anchor,
-            *[anchor] * FRAMES,
-        ]
-        rest = plain(*[1] * LAYOUT["other_modes"])
+        mode, heights, rest = (plain(*[1] * LAYOUT[name]) for name in ("mode", "heights", "other_modes"))
+        reference = [mode, *[_MIRROR] * (2 * FRAMES), heights, *[anchor] * (1 + FRAMES)]
         past = [*[plain(-1, 1, -1)] * FRAMES, *[_MIRROR] * (3 * FRAMES), *[plain(1, -1, 1)] * FRAMES]
         return Mirror([*reference, rest, *past], self.device)
 

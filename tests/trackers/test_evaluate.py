@@ -18,8 +18,8 @@ from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
 from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
 from arena_newton.trackers.evaluation.meter import FEET, LINKS, Meter, TickReference
-from arena_newton.trackers.evaluation.rollout import Outcome, find_sill, make_plan, play
 from arena_newton.trackers.evaluation.suite import Cell, Navigation
+from arena_newton.trackers.evaluation.suite_rollout import Outcome, find_sill, make_plan, play
 from arena_newton.trackers.motions import primitives
 from arena_newton.trackers.train.curves import PANELS, draw
 

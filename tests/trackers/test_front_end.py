@@ -6,7 +6,7 @@ import torch
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
-from arena_newton.trackers import RobotState, TrackerCommand
+from arena_newton.trackers import RobotState, TrackerCommand, base
 from arena_newton.trackers.front_end import ActionForm, residual_form
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.sonic import SonicFrontEnd
@@ -87,7 +87,7 @@ def test_action_forms():
 @pytest.mark.parametrize("name", ["twist2", "sonic"])
 def test_symmetric_weights_answer_the_mean_of_both_ways(name):
     """What is deployed is the mean of the network's action and the mirrored action of the mirrored observation."""
-    weights = weights_file.load(weights_file.default_path(name), name)
+    weights = weights_file.load(base.weights_path(name), name)
     tracker = trackers.get(name)
     tracker.bind(4)
     tracker.observation().copy_(torch.randn(4, tracker.front_end.obs_width, generator=torch.Generator().manual_seed(0)))

@@ -1,12 +1,14 @@
 """A trainable tracker is a module with its `INTERFACE`, a line in `interface.MODULES` and a weights file."""
 
 import dataclasses
+import importlib.util
 import sys
 import types
 
 import numpy as np
 import pytest
 import torch
+import tyro
 from torch import nn
 
 from arena_newton.errors import InputError
@@ -14,11 +16,12 @@ from arena_newton.robot import PhysicsRate
 from arena_newton.trackers import interface, sonic, twist2
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.figures import Result, figures
-from arena_newton.trackers.evaluation.rollout import Outcome, make_plan
+from arena_newton.trackers.evaluation.suite_rollout import Outcome, make_plan
 from arena_newton.trackers.front_end import NetworkTracker
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, mlp
-from arena_newton.trackers.train.options import TrainOptions, check
+from arena_newton.trackers.train import train_options
+from arena_newton.trackers.train.train_options import TrainOptions, check
 
 RATE = PhysicsRate(dt=0.005, substeps=4)
 
@@ -75,6 +78,20 @@ def test_training_finds_it(small):
     assert isinstance(front, SmallFrontEnd) and (found.drive, found.rate) == (small.drive, RATE)
     assert "small" in interface.names() and front.obs_width == small.obs_width
     check(TrainOptions(tracker="small"))
+
+
+def test_the_command_line_offers_it(small, monkeypatch, capsys):
+    """`--tracker` of a training takes the names of `interface.names()`, a third one included, and no other."""
+    spec = importlib.util.spec_from_file_location("options_again", train_options.__file__)
+    again = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "options_again", again)
+    spec.loader.exec_module(again)  # as in a new process: the choices are those at the time of the import
+    for name in interface.names():
+        assert tyro.cli(again.TrainOptions, args=["--tracker", name]).tracker == name
+    with pytest.raises(SystemExit):
+        tyro.cli(again.TrainOptions, args=["--tracker", "nosuch"])
+    shown = capsys.readouterr().err
+    assert all(name in shown for name in ("small", "sonic", "twist2"))
 
 
 def test_weights_round_trip(small, tmp_path):

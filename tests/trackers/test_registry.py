@@ -11,7 +11,6 @@ from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
 from arena_newton.trackers import base
-from arena_newton.trackers.inference import weights_file
 
 
 def message(spec: str, checkpoint=None) -> str:
@@ -35,7 +34,7 @@ def test_unknown_name():
 @pytest.mark.parametrize("name", ["twist2", "sonic"])
 def test_needs_weights(name, monkeypatch, tmp_path):
     """A tracker whose weights are not installed says what to do."""
-    monkeypatch.setattr(weights_file, "default_path", lambda interface: tmp_path / f"{interface}.safetensors")
+    monkeypatch.setattr(base, "weights_path", lambda interface: tmp_path / f"{interface}.safetensors")
     text = message(name)
     assert "--checkpoint" in text and "--tracker pd" in text and str(tmp_path) in text
 

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import RobotState, TrackerCommand
+from arena_newton.trackers import RobotState, TrackerCommand, base
 from arena_newton.trackers.front_end import residual_form
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm
@@ -202,7 +202,7 @@ def test_save_refuses(files, tmp_path):
 
 def test_defaults(files, monkeypatch):
     """Without `--checkpoint` the trackers take the weights beside the package."""
-    monkeypatch.setattr(weights_file, "default_path", lambda interface: files / f"{interface}.safetensors")
+    monkeypatch.setattr(base, "weights_path", lambda interface: files / f"{interface}.safetensors")
     for interface in ("twist2", "sonic"):
         assert trackers.get(interface).checkpoint == str(files / f"{interface}.safetensors")
 
@@ -210,7 +210,7 @@ def test_defaults(files, monkeypatch):
 @pytest.mark.parametrize("interface", ["twist2", "sonic"])
 def test_shipped(interface):
     """Weights that come with the package load, are at most 8 MB, and carry a card."""
-    path = weights_file.default_path(interface)
+    path = base.weights_path(interface)
     if not path.is_file():
         pytest.skip(f"no {path.name} here yet")
     weights = weights_file.load(path, interface)

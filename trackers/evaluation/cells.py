@@ -93,26 +93,21 @@ def _posture() -> list[Cell]:
 
 
 def _seated() -> list[Cell]:
-    cells = []
-    for z in (0.38, 0.42, 0.45):
-        script = p.stand(0.5) + p.sit(z, hold=3.5) + p.rise(z) + p.stand(1.0)
-        cells.append(_cell(f"sit {z:.2f}", "sit", script, support=Placed("Seat", z, -SEAT_GAP - SEAT_DEPTH / 2)))
-    return cells
+    scripts = {z: p.stand(0.5) + p.sit(z, hold=3.5) + p.rise(z) + p.stand(1.0) for z in (0.38, 0.42, 0.45)}
+    x = -SEAT_GAP - SEAT_DEPTH / 2
+    return [_cell(f"sit {z:.2f}", "sit", script, support=Placed("Seat", z, x)) for z, script in scripts.items()]
 
 
 def _contact() -> list[Cell]:
-    cells = []
-    for speed in (1.5, 2.5, 3.5):
-        cells.append(_cell(f"kick {speed:g}", "kick", p.stand(0.5) + p.kick("right", speed, pause=1.0)))
-    kick = p.stand(0.5) + p.kick("right", 3.5, pause=1.0)
-    cells.append(_cell("ball, standing kick", "ball", kick, ball=Ball((0.26, 0.30), RIGHT_FOOT)))
+    kicks = {speed: p.stand(0.5) + p.kick("right", speed, pause=1.0) for speed in (1.5, 2.5, 3.5)}
+    cells = [_cell(f"kick {speed:g}", "kick", script) for speed, script in kicks.items()]
+    cells.append(_cell("ball, standing kick", "ball", kicks[3.5], ball=Ball((0.26, 0.30), RIGHT_FOOT)))
     through = p.walk(0.6, seconds=4.5, pause=2.5)
     cells.append(_cell("ball, walk through 0.6", "ball", through, ball=Ball((1.0, 1.6), RIGHT_FOOT)))
-    for z in (0.05, 0.07, 0.09):
-        over = p.stand(0.3) + p.step_over(seconds=5.0)
-        cells.append(_cell(f"sill {z:.2f}", "sill", over, support=Placed("Sill", z)))
-    for z in (0.06, 0.10):
-        cells.append(_cell(f"platform {z:.2f}", "platform", p.step_up(z), support=Placed("Platform", z)))
+    over = p.stand(0.3) + p.step_over(seconds=5.0)
+    cells += [_cell(f"sill {z:.2f}", "sill", over, support=Placed("Sill", z)) for z in (0.05, 0.07, 0.09)]
+    up = {z: p.step_up(z) for z in (0.06, 0.10)}
+    cells += [_cell(f"platform {z:.2f}", "platform", up[z], support=Placed("Platform", z)) for z in up]
     down = p.step_up(0.10, pairs=3, down=True)
     cells.append(_cell("platform 0.10, up and down", "platform", down, support=Placed("Platform", 0.10)))
     for payload in (0.0, 1.0, 2.0):
@@ -131,8 +126,7 @@ def _contact() -> list[Cell]:
         blow = Push(impulse / 0.1, (3.0, 4.0), 0.1)
         name = f"push {impulse} N·s, " + (f"walk {speed:g}" if speed else "stand")
         cells.append(_cell(name, "push", _go(8.0, speed), push=blow))
-    for mu in (0.4, 0.7, 1.2):
-        cells.append(_cell(f"friction {mu:g}, walk 0.6", "friction", _go(8.0, 0.6), friction=mu))
+    cells += [_cell(f"friction {mu:g}, walk 0.6", "friction", _go(8.0, 0.6), friction=mu) for mu in (0.4, 0.7, 1.2)]
     cells.append(_cell("friction 0.4, turn 0.8", "friction", _go(8.0, 0.0, 0.0, 0.8), friction=0.4))
     return cells
 

@@ -11,9 +11,9 @@ import numpy as np
 from arena_newton.intervals import wilson
 from arena_newton.trackers import interface
 from arena_newton.trackers.evaluation.cells import suite
-from arena_newton.trackers.evaluation.rollout import Outcome, Plan
+from arena_newton.trackers.evaluation.suite_rollout import Outcome, Plan
 
-__all__ = ["BARS", "Bar", "Figure", "Result", "figures"]
+__all__ = ["BARS", "FigureBar", "Figure", "Result", "figures"]
 
 BASELINE = "twist2"
 """Interface whose official checkpoints set the bar of the fall rate for everyone."""
@@ -119,7 +119,7 @@ Numbers = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Bar:
+class FigureBar:
     """How a figure is read off the suite, and its bar."""
 
     name: str
@@ -214,39 +214,39 @@ def _mean(measure: str) -> Callable[[Sample], Numbers]:
 
 
 # fmt: off
-def _walk(speed: str, leg_rmse: float) -> tuple[Bar, ...]:
+def _walk(speed: str, leg_rmse: float) -> tuple[FigureBar, ...]:
     cells, name = (f"walk {speed}",), f"walk {speed} m/s"
     return (
-        Bar(f"speed reached, {name}", cells, _speed, "{percent:.0f} %", "≥ {percent:.0f} %", 0.9, at_least=True),
-        Bar(f"leg joint RMSE, {name}", cells, _mean("leg_rmse"), "{mean:.3f} rad", "≤ {limit:g} rad", leg_rmse),
-        Bar(f"drift per 10 s, {name}, open loop", cells, _mean("drift_10s"), "{mean:.2f} m", "≤ {limit:.2f} m",
+        FigureBar(f"speed reached, {name}", cells, _speed, "{percent:.0f} %", "≥ {percent:.0f} %", 0.9, at_least=True),
+        FigureBar(f"leg joint RMSE, {name}", cells, _mean("leg_rmse"), "{mean:.3f} rad", "≤ {limit:g} rad", leg_rmse),
+        FigureBar(f"drift per 10 s, {name}, open loop", cells, _mean("drift_10s"), "{mean:.2f} m", "≤ {limit:.2f} m",
             key=f"drift, walk {speed}"),
     )
 
 
-BARS: tuple[Bar, ...] = (
-    Bar("fall rate, whole suite", (), _fall_rate, "{falls}", "≤ {percent:g} %", key="fall_rate", whole=True),
-    Bar("fall rate, these cells only", (), _fall_rate, "{falls}", "", whole=False),
+BARS: tuple[FigureBar, ...] = (
+    FigureBar("fall rate, whole suite", (), _fall_rate, "{falls}", "≤ {percent:g} %", key="fall_rate", whole=True),
+    FigureBar("fall rate, these cells only", (), _fall_rate, "{falls}", "", whole=False),
     *_walk("0.3", 0.045),
     *_walk("0.6", 0.06),
-    Bar("goals reached in closed loop", ("goal",), _goals,
+    FigureBar("goals reached in closed loop", ("goal",), _goals,
         "{reached}/{count} (worst {distance:.3f} m, {turn:.1f}°, falls {fell})",
         "all within 0.08 m and 5°, no fall", 1.0, at_least=True, no_fall=True),
-    Bar("squat to 0.45 m and back", ("squat 0.45",), _mean("lowest"),
+    FigureBar("squat to 0.45 m and back", ("squat 0.45",), _mean("lowest"),
         "falls {fell}/{count}, lowest {mean:.2f} m", "no fall, ≤ {limit:.2f} m", 0.50, no_fall=True),
-    Bar("sit on 0.42 m (100 N for 2 s) and rise", ("sit 0.42",), _sit,
+    FigureBar("sit on 0.42 m (100 N for 2 s) and rise", ("sit 0.42",), _sit,
         "falls {fell}/{count}, seated {seated}, risen {risen}",
         "no fall, all seated and risen", 1.0, at_least=True, no_fall=True),
-    Bar("step over a 9 cm sill", ("sill 0.09",), _sill, "falls {fell}/{count}, over {over}, touched {touched}",
+    FigureBar("step over a 9 cm sill", ("sill 0.09",), _sill, "falls {fell}/{count}, over {over}, touched {touched}",
         "no fall, all over", 1.0, at_least=True, no_fall=True),
-    Bar("ball speed: walk through 0.6", ("ball, walk through 0.6",), _ball, _BALL,
+    FigureBar("ball speed: walk through 0.6", ("ball, walk through 0.6",), _ball, _BALL,
         "median ≥ {limit:g} m/s, no fall", BALL_SPEED, at_least=True, no_fall=True),
-    Bar("ball speed: standing kick", ("ball, standing kick",), _standing_ball, _BALL,
+    FigureBar("ball speed: standing kick", ("ball, standing kick",), _standing_ball, _BALL,
         "≥ 1.5 m/s in {percent:g} %, no fall", 0.8, at_least=True, no_fall=True),
-    Bar("10 N against the chest, walk 0.35 m/s", ("chest 10 N, walk 0.35",), _mean("speed_x"),
+    FigureBar("10 N against the chest, walk 0.35 m/s", ("chest 10 N, walk 0.35",), _mean("speed_x"),
         "{mean:.2f} m/s, falls {fell}/{count}", "≥ {limit:g} m/s, no fall", 0.2, at_least=True, no_fall=True),
-    Bar("push of 40 N·s in 0.1 s while walking, falls", ("push 40 N·s, walk 0.3", "push 40 N·s, walk 0.6"), _fall_rate,
-        "{falls}", "≤ {percent:g} %", 0.15),
+    FigureBar("push of 40 N·s in 0.1 s while walking, falls", ("push 40 N·s, walk 0.3", "push 40 N·s, walk 0.6"),
+        _fall_rate, "{falls}", "≤ {percent:g} %", 0.15),
 )
 # fmt: on
 """Figures in the order of the table."""

@@ -113,8 +113,6 @@ class Lab:
         Args:
             kinds: Properties of each world.
             watched: Worlds whose force between supports and robot is reported, bool, shape [worlds].
-            drive: Gains of the robot's drives.
-            rate: Physics step and substeps per tick.
             engine: `auto`, `mujoco` or `warp`.
             device: Warp device.
             threads: CPU threads of engine `mujoco`; all by default.

@@ -13,7 +13,7 @@ from arena_newton.pictures.video import film_strip
 from arena_newton.robot import TICK
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.lab import Lab
-from arena_newton.trackers.evaluation.rollout import Settings, make_plan, play
+from arena_newton.trackers.evaluation.suite_rollout import Settings, make_plan, play
 
 __all__ = ["FILMED", "film"]
 
@@ -90,7 +90,7 @@ def film(
 ) -> list[Path]:
     """Play the filmed cells once and write one strip per cell into a folder; returns the files.
 
-    The tracker is not bound yet; file names and the line above a strip name it `label`. The rest is `rollout.play`'s.
+    File names and the line above a strip call the tracker `label`; the rest is as in `suite_rollout.play`.
     """
     cells = [cell for cell in suite("full") if cell.name in FILMED]
     names = [cell.name for cell in cells]

@@ -39,11 +39,7 @@ class InputNorm(nn.Module):
 
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
-        """Take a batch into the running statistics, together with those of the other processes, if there are any.
-
-        Args:
-            x: Inputs, shape [rows, width].
-        """
+        """Take inputs, shape [rows, width], of all processes into the running statistics."""
         rows = torch.full((), x.shape[0], dtype=torch.float64, device=x.device)
         # Sums around the present mean keep their precision in float32.
         centred = x - self.mean

@@ -8,7 +8,6 @@ checks the short list against the node-by-node evaluation.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -92,9 +91,6 @@ class OnnxNetwork(torch.nn.Module):
     def __init__(self, graph: _Graph):
         """Compile a graph; see `load`."""
         super().__init__()
-        self.in_width: int = graph.in_width
-        self.out_width: int = 0
-        self.sha256: str = ""
         self.layers = torch.nn.ModuleList([module for module, _, _ in graph.steps])
         self._calls = [(module.forward, inputs, output) for module, inputs, output in graph.steps]
         self._input, self._output = graph.input, graph.output
@@ -426,13 +422,12 @@ def load(
         InputError: The file is absent, not an ONNX network, holds an unknown operator, or has other widths.
     """
     where = f"{flag} {path}"
-    model, data = read(path, in_width=in_width, flag=flag)
+    model, _ = read(path, in_width=in_width, flag=flag)
     try:
         graph = _Graph(model, in_width, fuse=fuse)
         network = OnnxNetwork(graph).eval()
         x = _probe(_CHECK_ROWS, graph.in_width)
         got, expected = network(x), graph.evaluate(x, {})
-        network.out_width = expected.shape[-1]
         if expected.shape != (_CHECK_ROWS, out_width):
             raise InputError(f"{where}: the network gives {expected.shape[-1]} numbers, expected {out_width}")
         if not (got - expected).abs().max() <= _CHECK_TOLERANCE * (1.0 + expected.abs().max()):
@@ -441,5 +436,4 @@ def load(
         raise
     except Exception as error:  # a damaged graph fails anywhere inside numpy or torch
         raise InputError(f"{where}: {_reason(error)}") from error
-    network.sha256 = hashlib.sha256(data).hexdigest()
     return network

@@ -61,9 +61,7 @@ class OnnxSession(torch.nn.Module):
             reason = " ".join(str(error).split())[:160]
             raise InputError(f"{where}: not a usable ONNX file ({type(error).__name__}: {reason})") from error
         if got.ndim != 2:
-            raise InputError(
-                f"{where}: the network gives shape {list(got.shape)}, expected {out_width} numbers per row"
-            )
+            raise InputError(f"{where}: the network gives shape {list(got.shape)}, not {out_width} numbers per row")
         if got.shape[1] != out_width:
             raise InputError(f"{where}: the network gives {got.shape[1]} numbers, expected {out_width}")
 

@@ -29,18 +29,7 @@ from arena_newton.trackers import base, interface
 from arena_newton.trackers.inference.networks import TrackerNetwork
 from arena_newton.trackers.interface import JOINTS, ActionForm
 
-__all__ = [
-    "FORMAT",
-    "METADATA_KEY",
-    "Weights",
-    "action_form",
-    "default",
-    "default_path",
-    "drive",
-    "load",
-    "physics",
-    "save",
-]
+__all__ = ["FORMAT", "METADATA_KEY", "Weights", "action_form", "default", "drive", "load", "physics", "save"]
 
 FORMAT = "arena-newton-tracker-1"
 """Format that this module writes and reads."""
@@ -85,18 +74,13 @@ class Weights:
         }
 
 
-def default_path(name: str) -> Path:
-    """Path of the weights that come with the package: `trackers/weights/<interface>.safetensors`."""
-    return base.weights_path(name)
-
-
 def default(name: str, otherwise: str) -> Path:
     """The weights that come with the package.
 
     Raises:
         InputError: There are none; it says what to pass `otherwise`.
     """
-    path = default_path(name)
+    path = base.weights_path(name)
     if not path.is_file():
         raise InputError(
             f"--tracker {name}: no weights come with this installation ({path} is absent); pass {otherwise}, "
@@ -125,12 +109,7 @@ def save(path: str | Path, weights: Weights) -> None:
 
 
 def load(path: str | Path, wanted: str | None = None, *, flag: str = "--checkpoint") -> Weights:
-    """Read a weights file.
-
-    Args:
-        path: The file.
-        wanted: Interface that the caller needs; any by default.
-        flag: Command-line flag that errors name.
+    """Read a weights file, of the interface `wanted` if one is given; errors name the command line's `flag`.
 
     Raises:
         InputError: The file is absent, damaged, of another kind or interface, or its tensors do not fit.

@@ -9,7 +9,7 @@ import tyro
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.trackers.train.options import CurveOptions, ExportCommand, TrainOptions
+from arena_newton.trackers.train.train_options import CurveOptions, ExportCommand, TrainOptions
 
 __all__ = ["main"]
 

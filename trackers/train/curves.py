@@ -67,11 +67,7 @@ def read(folder: Path) -> list[dict[str, Any]]:
 
 
 def draw(folders: Sequence[Path], out: Path) -> Path:
-    """Draw trainings over each other; the thin lines are what was logged, the thick ones running means.
-
-    Args:
-        folders: Their folders, or log files.
-        out: Picture, `.png`, `.svg` or `.pdf`.
+    """Draw folders or log files over each other: thin what was logged, thick its running mean.
 
     Raises:
         InputError: A log or the picture's path does not fit.

@@ -11,7 +11,7 @@ from arena_newton.files import replace_atomically
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
 from arena_newton.trackers.train.checkpoint import Checkpoint
-from arena_newton.trackers.train.options import ExportOptions
+from arena_newton.trackers.train.train_options import ExportOptions
 
 __all__ = ["export", "write"]
 

@@ -14,10 +14,8 @@ __all__ = ["captured"]
 def captured(work: Callable[[], None], option: str, stream: torch.cuda.Stream | None = None) -> torch.cuda.CUDAGraph:
     """Capture work in a graph; it is recorded, not executed.
 
-    Args:
-        work: What to capture: without host synchronisation, on the same tensors each time.
-        option: The command line's switch of this graph, such as `tick-graph`.
-        stream: Stream of the capture; torch chooses one by default.
+    It must not wait for the device, and must use the same tensors each time. `option` is the command line's switch of
+    this graph, such as `tick-graph`.
 
     Raises:
         TrainingError: The work cannot be captured. The device's random numbers may be unusable then.

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from rsl_rl.utils.logger import Logger
 
-from arena_newton.trackers.train.options import TrainOptions
+from arena_newton.trackers.train.train_options import TrainOptions
 
 __all__ = ["DeviceLogger", "IterationTimes"]
 
@@ -34,13 +34,7 @@ class DeviceLogger(Logger):
     """rsl_rl's log, fetched from the device once per iteration."""
 
     def __init__(self, options: TrainOptions, best_reward: float, **settings: Any):
-        """Empty buffers; means are over the episodes of ten iterations.
-
-        Args:
-            options: The intervals of the log.
-            best_reward: Reward per second of perfect tracking, for the printed line.
-            settings: rsl_rl's.
-        """
+        """Empty buffers; means are over ten iterations' episodes, `best_reward` per second is perfect tracking's."""
         super().__init__(**settings)
         self.options, self.best_reward = options, best_reward
         self.history: list[dict[str, float]] = []
@@ -67,9 +61,8 @@ class DeviceLogger(Logger):
         self.cur_reward_sum += rewards
         self.cur_episode_length += 1
         done = (dones > 0).float()
-        self._ended += torch.stack(
-            (done.sum(), (self.cur_reward_sum * done).sum(), (self.cur_episode_length * done).sum())
-        )
+        lived, earned = self.cur_episode_length * done, self.cur_reward_sum * done
+        self._ended += torch.stack((done.sum(), earned.sum(), lived.sum()))
         keep = 1.0 - done
         self.cur_reward_sum *= keep
         self.cur_episode_length *= keep
@@ -89,7 +82,6 @@ class DeviceLogger(Logger):
 
         Args:
             progress: `iteration`, `samples`, `seconds`, `learning_rate` and `std`.
-            times: What it took.
             measured: Losses as `Loss/<name>` and the environment's means.
             first: Whether it is the first iteration of a call.
         """

@@ -20,10 +20,10 @@ from arena_newton.errors import InputError, naming
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.logger import DeviceLogger, IterationTimes
-from arena_newton.trackers.train.options import TrainOptions, runner_config
 from arena_newton.trackers.train.ppo import TrackerPPO
 from arena_newton.trackers.train.rewards import maximum
 from arena_newton.trackers.train.tracker_env import TrackerEnv
+from arena_newton.trackers.train.train_options import TrainOptions, runner_config
 
 __all__ = ["CriticWarmUp", "TrackerRunner", "annealed"]
 
@@ -46,7 +46,6 @@ class CriticWarmUp:
         """Freeze the network, if the training begins within the warm-up.
 
         Args:
-            algorithm: The learner.
             alone: Iterations of the critic alone, 0 = none.
             first: Iteration at which the training begins or is resumed.
             rate: Learning rate after the warm-up: during it nothing diverges, and the adaptive rate only grows.

@@ -69,13 +69,7 @@ class ClipSampler:
         self.cumulative = torch.cumsum(self.base, 0)
 
     def record(self, frame: torch.Tensor, failed: torch.Tensor, tick: float) -> None:
-        """Count one tick of every world.
-
-        Args:
-            frame: Frame reached, shape [worlds].
-            failed: Whether the world lost its reference, bool, shape [worlds].
-            tick: Length of the tick [s].
-        """
+        """Count one tick [s] of every world: its frame, and whether it lost its reference, shape [worlds] each."""
         bins = self.bin_of.index_select(0, frame)
         self.seconds.index_add_(0, bins, torch.full_like(failed, tick, dtype=torch.float32))
         self.failures.index_add_(0, bins, failed.float())

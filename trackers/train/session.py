@@ -27,11 +27,11 @@ from arena_newton.trackers.motions.formats import read_library
 from arena_newton.trackers.motions.library import MotionLibrary
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.export import export
-from arena_newton.trackers.train.options import FAMILY_WEIGHTS, ExportOptions, TrainOptions, check
 from arena_newton.trackers.train.rewards import configured, maximum
 from arena_newton.trackers.train.runner import TrackerRunner
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tracker_env import TrackerEnv
+from arena_newton.trackers.train.train_options import FAMILY_WEIGHTS, ExportOptions, TrainOptions, check
 
 __all__ = ["build", "check_folder", "make_library", "train"]
 
@@ -132,8 +132,7 @@ def check_folder(options: TrainOptions) -> None:
             )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise InputError(f"--log-dir {folder}: cannot be written ({error.strerror})") from None
 

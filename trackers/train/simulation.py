@@ -15,8 +15,8 @@ import warp as wp
 from arena_newton.robot import DriveGains, PhysicsRate
 from arena_newton.scene import load_scene
 from arena_newton.trackers.motions.library import FIXTURES
-from arena_newton.trackers.train.options import TrainOptions
 from arena_newton.trackers.train.references import KEY_LINKS
+from arena_newton.trackers.train.train_options import TrainOptions
 
 __all__ = ["Simulation", "share_stream"]
 
@@ -57,7 +57,6 @@ class Simulation:
         # A full contact buffer would print a line per world and step; it is counted by `overflow` instead.
         self._m.opt.warn_overflow = 0
         host, handles, d, m = self.scene.mj_model, self.scene.robot, self._d, self._m
-        self.mj_model = host
         view = wp.to_torch
         self.qpos, self.qvel, self.ctrl = view(d.qpos), view(d.qvel), view(d.ctrl)
         self.warmstart, self.acceleration = view(d.qacc_warmstart), view(d.qacc)

@@ -41,16 +41,9 @@ class Tally:
     def __init__(self, rewards: Sequence[str], ends: Sequence[str], families: Sequence[str], device: str):
         """Name the sums."""
         self.rewards, self.ends, self.families = tuple(rewards), tuple(ends), tuple(families)
-        sizes = {
-            "reward": len(rewards),
-            "ended": len(ends),
-            "error": len(ERRORS),
-            "family_seconds": len(families),
-            "family_falls": len(families),
-            "ticks": 1,
-            "falls": 1,
-            "overflow": 1,
-        }
+        sizes = {"reward": len(rewards), "ended": len(ends), "error": len(ERRORS)}
+        sizes |= {"family_seconds": len(families), "family_falls": len(families)}
+        sizes |= {"ticks": 1, "falls": 1, "overflow": 1}
         self._sums = {name: torch.zeros(size, device=device) for name, size in sizes.items()}
         self._guarded = [*(f"reward {n}" for n in rewards), "observation actor", "observation critic", "action"]
         self._bad_world = torch.full((len(self._guarded),), -1, dtype=torch.long, device=device)
@@ -88,9 +81,7 @@ class Tally:
     def guard(self, values: torch.Tensor, *others: torch.Tensor) -> None:
         """Remember a world for each guarded quantity that is not finite.
 
-        Args:
-            values: Reward terms, shape [worlds, terms].
-            others: Observation of the actor, of the critic, and action, each of shape [worlds, n].
+        These are the reward terms, then the observations of actor and critic and the action, each [worlds, n].
         """
         bad = torch.cat([~torch.isfinite(values), *(~torch.isfinite(v).all(1, keepdim=True) for v in others)], 1)
         self._bad_world.copy_(torch.where(bad.any(0), bad.int().argmax(0), self._bad_world))

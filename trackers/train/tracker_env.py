@@ -24,13 +24,13 @@ from arena_newton.robot import DEFAULT_POSE, TICK
 from arena_newton.trackers.train import critic, events
 from arena_newton.trackers.train.graphs import captured
 from arena_newton.trackers.train.measurement import TickMeasurement
-from arena_newton.trackers.train.options import TrainOptions
 from arena_newton.trackers.train.references import FEET, KEY_LINKS, Frame, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS, TERMINATION_REWARD, Term
 from arena_newton.trackers.train.sampling import ClipSampler
 from arena_newton.trackers.train.simulation import Simulation
 from arena_newton.trackers.train.tally import Tally
 from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
+from arena_newton.trackers.train.train_options import TrainOptions
 
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd
@@ -164,11 +164,7 @@ class TrackerEnv(VecEnv):
 
     @torch.no_grad()
     def reset(self, frame: torch.Tensor | None = None) -> None:
-        """Start an episode in every world.
-
-        Args:
-            frame: Frames of the library to start in, shape [worlds]; sampled ones by default.
-        """
+        """Start an episode in every world, in sampled frames of the library or given ones, shape [worlds]."""
         self._restart(self._every, frame)
         self._observe(self._every)
 

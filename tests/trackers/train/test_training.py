@@ -19,19 +19,19 @@ from PIL import Image
 from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import interface, train
+from arena_newton.trackers import base, interface, train
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.critic import CRITIC
 from arena_newton.trackers.train.export import export
-from arena_newton.trackers.train.options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.tracker_env import TrackerEnv
+from arena_newton.trackers.train.train_options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.twist2 import Twist2Tracker
 
 WORLDS = 8
@@ -433,11 +433,12 @@ def test_the_end_of_a_time_limit_is_annealed(env):
 SECOND_PROCESS = """
 import sys, torch, tyro
 from arena_newton.trackers.train import session
-from arena_newton.trackers.train.options import TrainOptions
+from arena_newton.trackers.train.train_options import TrainOptions
 options = tyro.cli(TrainOptions, args=sys.argv[2:])
 runner = session.build(options)
 runner.learn(options.iterations)
 torch.save(runner.alg.get_policy().state_dict(), sys.argv[1])
+torch.distributed.destroy_process_group()  # its threads must not outlive the interpreter
 """
 
 
@@ -517,9 +518,9 @@ def test_start_from_unfit_weights(env, tmp_path):
     """Weights of another width are refused by the flag's name."""
     with pytest.raises(InputError, match="--start-from .*: no such|--start-from .*absent"):
         make_runner(env).start_from(tmp_path / "absent.safetensors")
-    if weights_file.default_path("twist2").is_file():
+    if base.weights_path("twist2").is_file():
         with pytest.raises(InputError, match="other widths"):
-            make_runner(env).start_from(weights_file.default_path("twist2"))
+            make_runner(env).start_from(base.weights_path("twist2"))
 
 
 def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):

@@ -329,14 +329,9 @@ def play(
     observer: Callable[[Lab, int], None] | None = None,
     **settings: Unpack[Settings],
 ) -> Outcome:
-    """Play a plan.
+    """Play a plan with a tracker that is not bound yet.
 
-    Args:
-        tracker: A tracker, not bound yet.
-        plan: Cells and draws.
-        fast_physics: Use the tracker's fast physics rate.
-        observer: Called as observer(lab, tick) after every tick, for films.
-        settings: See `Settings`.
+    After every tick `observer(lab, tick)` is called, for films.
     """
     rollout = SuiteRollout(tracker, plan, fast_physics=fast_physics, **settings)
     rollout.prepare()
