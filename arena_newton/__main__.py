@@ -16,13 +16,13 @@ from arena_newton import __version__
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
 
-__all__ = ["COMMANDS", "Entry", "main"]
+__all__ = ["COMMANDS", "Command", "main"]
 
 PROG = "arena-newton"
 
 
 @dataclass(frozen=True)
-class Entry:
+class Command:
     """One command, with flags and subcommands of its own."""
 
     words: str
@@ -34,14 +34,14 @@ class Entry:
 
 
 COMMANDS = (
-    Entry("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
-    Entry("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
-    Entry("rules", "arena_newton.rule_sets", "print both rule sets"),
-    Entry("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
-    Entry("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
-    Entry("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
-    Entry("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
-    Entry("trackers motions", "arena_newton.trackers.motions.__main__", "convert, inspect, render, generate motions"),
+    Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
+    Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
+    Command("rules", "arena_newton.rule_sets", "print both rule sets"),
+    Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
+    Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
+    Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
+    Command("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
+    Command("trackers motions", "arena_newton.trackers.motions.__main__", "convert, inspect, render, generate motions"),
 )
 
 

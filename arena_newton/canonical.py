@@ -3,8 +3,6 @@
 State and action hold their joints in canonical order, the mimic command in MuJoCo (TWIST2) order.
 """
 
-from typing import Any
-
 import numpy as np
 
 from arena_newton import robot
@@ -24,11 +22,7 @@ __all__ = [
     "validate_action",
 ]
 
-STATE: dict[str, slice] = {
-    "root_rot6d": slice(0, 6),
-    "joint_pos": slice(6, 35),
-    "joint_vel": slice(35, 64),
-}
+STATE: dict[str, slice] = {"root_rot6d": slice(0, 6), "joint_pos": slice(6, 35), "joint_vel": slice(35, 64)}
 """State: root orientation without the episode's initial heading, joint positions [rad], joint velocities [rad/s]."""
 STATE_WIDTH = 64
 
@@ -77,7 +71,7 @@ def element_name(index: int) -> str:
     raise IndexError(f"action index {index} is outside 0..{ACTION_WIDTH - 1}")
 
 
-def validate_action(action: Any, where: str) -> np.ndarray:
+def validate_action(action: object, where: str) -> np.ndarray:
     """Checks canonical actions and returns them as float32.
 
     Args:

@@ -4,59 +4,60 @@ Forward runs the very kernel that the benchmark runs, recorded on a `wp.Tape`; b
 those of a function that is smooth almost everywhere: at ties of a minimum they are one of the one-sided ones.
 """
 
-import functools
+from __future__ import annotations
+
+import dataclasses
 import inspect
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import torch
+import warp as wp
+
+from arena_newton.kernels.canonical import ReferencePose, launch_integrate
 from arena_newton.quiet import quiet_warp
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
 from arena_newton.streams import on_torch_stream
 
-if TYPE_CHECKING:
-    import torch
-
-    from arena_newton.kernels.canonical import ReferencePose
-
 __all__ = ["ReferenceState", "reference_step", "success_margin"]
 
+quiet_warp()  # a tensor handed over may be the first that the process asks of Warp
+
+Recording = Callable[..., tuple[wp.Tape, list[wp.array]]]
+"""Launches on a tape: (arrays) → the tape and its outputs."""
 _FLOAT_STATE = ("position", "quat", "joints", "prev_yaw", "prev_z")
 
 
 class ReferenceState(NamedTuple):
     """What one step of the reference hands to the next, as torch tensors."""
 
-    position: "torch.Tensor"
+    position: torch.Tensor
     """World position [m], shape [worlds, 3]."""
-    quat: "torch.Tensor"
+    quat: torch.Tensor
     """World orientation of the target, wxyz, shape [worlds, 4]."""
-    joints: "torch.Tensor"
+    joints: torch.Tensor
     """Joint targets [rad], canonical order, shape [worlds, 29]."""
-    prev_yaw: "torch.Tensor"
+    prev_yaw: torch.Tensor
     """Yaw of the last target [rad], shape [worlds]."""
-    prev_z: "torch.Tensor"
+    prev_z: torch.Tensor
     """Height of the last action [m], shape [worlds]."""
-    heading: "torch.Tensor"
+    heading: torch.Tensor
     """Heading of the robot at reset [rad], shape [worlds]; a constant."""
-    steps: "torch.Tensor"
+    steps: torch.Tensor
     """Steps since the reset, int32, shape [worlds]."""
-    joint_vel: "torch.Tensor"
+    joint_vel: torch.Tensor
     """Backward difference of the joint targets [rad/s], shape [worlds, 29]; an output only."""
 
     @classmethod
-    def of(cls, ref: "ReferencePose") -> "ReferenceState":
+    def of(cls, ref: ReferencePose) -> ReferenceState:
         """Copies the state of a reference pose."""
-        import warp as wp
-
         return cls(*(wp.to_torch(getattr(ref, name), requires_grad=False).clone() for name in cls._fields))
 
 
 def _backpropagate(
-    tape: Any, inputs: Sequence[Any], outputs: Sequence[Any], grads: Sequence["torch.Tensor | None"]
-) -> list["torch.Tensor | None"]:
+    tape: wp.Tape, inputs: Sequence[wp.array], outputs: Sequence[wp.array], grads: Sequence[torch.Tensor | None]
+) -> list[torch.Tensor | None]:
     """Runs a tape backward from gradients of its outputs; gives gradients of its inputs, None where none is kept."""
-    import warp as wp
-
     seeds = {
         array: wp.from_torch(grad.detach().contiguous(), dtype=array.dtype)
         for array, grad in zip(outputs, grads, strict=True)
@@ -68,42 +69,31 @@ def _backpropagate(
     return result
 
 
-@functools.cache
-def _function() -> "type[torch.autograd.Function]":
-    """The autograd function, made once torch is there; this may be the first that the process asks of Warp."""
-    import torch
+class _Recorded(torch.autograd.Function):
+    """`record(*arrays) -> (tape, outputs)` as a torch function of the tensors behind the arrays."""
 
-    quiet_warp()
+    @staticmethod
+    def forward(ctx: Any, record: Recording, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        with on_torch_stream(tensors[0].device):
+            arrays = [
+                wp.from_torch(t.detach().contiguous(), requires_grad=need)
+                for t, need in zip(tensors, ctx.needs_input_grad[1:], strict=True)
+            ]
+            tape, outputs = record(*arrays)
+            results = tuple(wp.to_torch(o, requires_grad=False).clone() for o in outputs)
+        ctx.tape, ctx.arrays, ctx.outputs = tape, arrays, outputs
+        return results
 
-    class _Recorded(torch.autograd.Function):
-        """`record(*arrays) -> (tape, outputs)` as a torch function of the tensors behind the arrays."""
-
-        @staticmethod
-        def forward(ctx: Any, record: Callable, *tensors: "torch.Tensor") -> tuple["torch.Tensor", ...]:
-            import warp as wp
-
-            with on_torch_stream(tensors[0].device):
-                arrays = [
-                    wp.from_torch(t.detach().contiguous(), requires_grad=need)
-                    for t, need in zip(tensors, ctx.needs_input_grad[1:], strict=True)
-                ]
-                tape, outputs = record(*arrays)
-                results = tuple(wp.to_torch(o, requires_grad=False).clone() for o in outputs)
-            ctx.tape, ctx.arrays, ctx.outputs = tape, arrays, outputs
-            return results
-
-        @staticmethod
-        @torch.autograd.function.once_differentiable
-        def backward(ctx: Any, *grads: "torch.Tensor | None") -> tuple:
-            with on_torch_stream(next(g for g in grads if g is not None).device):
-                return None, *_backpropagate(ctx.tape, ctx.arrays, ctx.outputs, grads)
-
-    return _Recorded
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        with on_torch_stream(next(g for g in grads if g is not None).device):
+            return None, *_backpropagate(ctx.tape, ctx.arrays, ctx.outputs, grads)
 
 
 def reference_step(
-    action: "torch.Tensor", state: ReferenceState, *, max_root_delta_deg: float = 0.0
-) -> tuple["torch.Tensor", ReferenceState]:
+    action: torch.Tensor, state: ReferenceState, *, max_root_delta_deg: float = 0.0
+) -> tuple[torch.Tensor, ReferenceState]:
     """One step of the canonical reference, differentiable in the action and in the state before it.
 
     Args:
@@ -114,13 +104,6 @@ def reference_step(
     Returns:
         The mimic command, shape [worlds, 35], and the state after, whose position and quat are the target pose.
     """
-    import dataclasses
-
-    import torch
-    import warp as wp
-
-    from arena_newton.kernels.canonical import ReferencePose, launch_integrate
-
     worlds = action.shape[0]
     steps = torch.empty_like(state.steps)
 
@@ -142,13 +125,13 @@ def reference_step(
         steps.copy_(wp.to_torch(after.steps))
         return tape, [after.mimic, *(getattr(after, name) for name in _FLOAT_STATE), after.joint_vel]
 
-    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = _function().apply(
+    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = _Recorded.apply(
         record, action, *(getattr(state, name) for name in _FLOAT_STATE)
     )
     return mimic, ReferenceState(position, quat, joints, prev_yaw, prev_z, state.heading, steps, joint_vel)
 
 
-def success_margin(launch: Callable[..., None], **arguments: Any) -> "torch.Tensor":
+def success_margin(launch: Callable[..., None], **arguments: object) -> torch.Tensor:
     """The margin of a success predicate, differentiable in every floating-point tensor among the arguments.
 
     Args:
@@ -159,10 +142,6 @@ def success_margin(launch: Callable[..., None], **arguments: Any) -> "torch.Tens
     Returns:
         The margin [m], shape [worlds].
     """
-    import torch
-    import warp as wp
-
-    function = _function()
     floats = {k: v for k, v in arguments.items() if isinstance(v, torch.Tensor) and v.is_floating_point()}
     if not floats:
         raise TypeError(f"{launch.__name__} needs at least one floating-point tensor to differentiate")
@@ -186,4 +165,4 @@ def success_margin(launch: Callable[..., None], **arguments: Any) -> "torch.Tens
             launch(**dict(zip(floats, arrays, strict=True)), **fixed, **made, margin=margin)
         return tape, [margin]
 
-    return function.apply(record, *floats.values())[0]
+    return _Recorded.apply(record, *floats.values())[0]

@@ -78,13 +78,9 @@ def _packages() -> list[Finding]:
         Finding("python", f"{found['python']} ({sys.executable})", "ok" if minor == (3, 12) else "bad", advice),
         Finding("arena-newton", str(found["arena-newton"])),
     ]
-    for name, purpose in _REQUIRED.items():
-        version = found[name]
-        missing = Finding(name, "missing", "bad", f"needed for {purpose}: {_INSTALL}")
-        findings.append(missing if version is None else Finding(name, version))
-    for name, purpose in _OPTIONAL.items():
-        version = found[name]
-        missing = Finding(name, "missing", "note", f"needed for {purpose}: {_INSTALL}")
+    for name, purpose in (_REQUIRED | _OPTIONAL).items():
+        version, status = found[name], "bad" if name in _REQUIRED else "note"
+        missing = Finding(name, "missing", status, f"needed for {purpose}: {_INSTALL}")
         findings.append(missing if version is None else Finding(name, version))
     return findings
 
@@ -166,21 +162,15 @@ def _storage() -> list[Finding]:
 
 
 def _scenes() -> list[Finding]:
-    import arena_newton
+    from arena_newton import tasks
 
-    root = Path(arena_newton.__file__).parent / "usd_scenes"
+    root = tasks.base.SCENES
     findings = []
-    for name in ("g1/g1.usda", *(f"{task}/scene.usda" for task in _task_names())):
+    for name in ("g1/g1.usda", *(f"{task}/scene.usda" for task in tasks.names())):
         if not (root / name).is_file():
             advice = "run `python -m arena_newton.usd_scenes build`"
             findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
     return findings or [Finding("scenes", f"robot and all tasks in {root}")]
-
-
-def _task_names() -> tuple[str, ...]:
-    from arena_newton import tasks
-
-    return tuple(tasks.names())
 
 
 def _short(error: BaseException) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -126,8 +126,10 @@ class ArenaEnv:
         self._chosen, self._stepping = WorldMask(worlds, self.device), WorldMask(worlds, self.device)
         self._lights: WorldLights | None = None
         self._newton_state: newton.State | None = None
-        self.camera: Camera | None = None if camera is None else self._camera(camera)
+        self.camera: Camera | None = None
         """Head camera of policies that see."""
+        if camera is not None:
+            self.camera = Camera.from_scene(self.scene, lights=self.lights, **dataclasses.asdict(camera))
         self._bind_kernels()
 
     def _bind_kernels(self) -> None:
@@ -160,7 +162,7 @@ class ArenaEnv:
 
         self._rule = record(launch_rules)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """What ran, for results to record: engine, physics rate, drive, start-up and tracker."""
         return {
             "engine": self.engine,
@@ -178,17 +180,6 @@ class ArenaEnv:
         """Release the physics' threads; the environment steps no more."""
         self.physics.close()
         self.active[:] = False
-
-    def _camera(self, config: CameraConfig) -> Camera:
-        return Camera.from_scene(
-            self.scene,
-            prim=config.prim,
-            width=config.width,
-            height=config.height,
-            lights=self.lights,
-            fit=config.fit,
-            samples=config.samples,
-        )
 
     @property
     def lights(self) -> WorldLights:

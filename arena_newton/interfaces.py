@@ -181,7 +181,6 @@ class Planned(Protocol):
     @property
     def episode_seed(self) -> int:
         """Everything random about the episode follows from it."""
-        ...
 
 
 class Tracker(Protocol):
@@ -196,19 +195,15 @@ class Tracker(Protocol):
 
     def rate(self, *, fast: bool = False) -> PhysicsRate:
         """Physics step and substeps per tick."""
-        ...
 
     def bind(self, worlds: int, device: Any = "cpu") -> None:
         """Allocate buffers for `worlds` worlds on a torch device."""
-        ...
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Forget the past of the worlds in `mask`, bool, shape [worlds]; all without one."""
-        ...
 
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the observation history of the masked worlds with the current frame."""
-        ...
 
     def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; valid until the next call.
@@ -219,11 +214,9 @@ class Tracker(Protocol):
             mask: Worlds that advance, bool, shape [worlds]; all without one. The history of the others stays as it is,
                 bit for bit, and their rows of the answer mean nothing.
         """
-        ...
 
     def describe(self) -> dict[str, Any]:
         """What a result must record to name this tracker exactly, as JSON."""
-        ...
 
 
 class Policy(Protocol):
@@ -234,15 +227,12 @@ class Policy(Protocol):
 
     def attach(self, env: World) -> None:
         """Get to know the environment before its first episode."""
-        ...
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: np.ndarray | None = None) -> None:
         """Begin new episodes in the worlds of `mask`."""
-        ...
 
     def act(self, observation: Observation) -> Chunk:
         """Actions for the worlds that ask."""
-        ...
 
 
 class Physics(Protocol):
@@ -267,44 +257,37 @@ class Physics(Protocol):
     @property
     def models(self) -> Sequence[mujoco.MjModel]:
         """One MuJoCo model for all worlds, or one per world."""
-        ...
 
     @property
     def external_force(self) -> wp.array:
-        """Force [N] and torque [N·m] on each body, world frame, shape [worlds, nbody, 6]; stays until changed."""
-        ...
+        """Force [N] and torque [N·m] on each body, world frame, float32, shape [worlds, nbody, 6].
+
+        Acts at the body's centre of mass and stays until it is changed or the world is reset.
+        """
 
     def add_velocity(self, change: np.ndarray, mask: np.ndarray | None = None) -> None:
         """Add to the robot root's velocity: linear [m/s], world frame; angular [rad/s], body frame; [worlds, 6]."""
-        ...
 
     def set_active(self, mask: np.ndarray) -> None:
         """Worlds that `step` moves, bool, shape [worlds]; the others keep every bit of their state."""
-        ...
 
     def step(self) -> None:
         """Advance the active worlds by one 50 Hz tick under the present `ctrl`."""
-        ...
 
     def snapshot(self) -> Any:
         """Everything that the next tick depends on, as an opaque value for `restore`."""
-        ...
 
     def restore(self, snapshot: Any, mask: np.ndarray | None = None) -> None:
         """Put the masked worlds (all without a mask) back into the state of a snapshot, bit for bit."""
-        ...
 
     def write_newton_state(self, state: newton.State) -> None:
         """Write body poses into a Newton state, for rendering."""
-        ...
 
     def overflowed(self, world: int) -> bool:
         """Whether a contact or constraint buffer overflowed in this world since its reset."""
-        ...
 
     def close(self) -> None:
         """Release threads; the physics steps no more."""
-        ...
 
 
 class Judge(Protocol):
@@ -323,11 +306,9 @@ class Judge(Protocol):
 
     def evaluate(self, physics: Any) -> None:
         """Fill the outputs for the state after this tick."""
-        ...
 
     def reset(self, mask: wp.array) -> None:
         """Forget the past of the worlds in `mask`, int32, shape [worlds], 1 = reset."""
-        ...
 
 
 class World(Protocol):
@@ -350,26 +331,21 @@ class World(Protocol):
     @property
     def physics(self) -> Physics:
         """What moves the worlds."""
-        ...
 
     @property
     def lights(self) -> WorldLights:
         """Light of each world, for cameras."""
-        ...
 
     def reset(
         self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, *, spawn: Spawn | None = None
     ) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone."""
-        ...
 
     def release(self, worlds: Sequence[int] | np.ndarray) -> None:
         """End the episodes of `worlds`: they stand still until their next reset."""
-        ...
 
     def observe(self, mask: np.ndarray | None = None, *, image: bool = False) -> Observation:
         """State of every world and, if asked, the head camera's picture of the worlds in `mask`."""
-        ...
 
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
         """Advance active worlds (those of a bool mask, if given) by one tick.
@@ -377,23 +353,18 @@ class World(Protocol):
         Returns:
             Status codes of `arena_newton.kernels.tick`, int32, shape [worlds].
         """
-        ...
 
     def render(self, camera: Any, mask: np.ndarray | None = None) -> torch.Tensor:
         """Picture of one camera, uint8, shape [worlds, H, W, 3]."""
-        ...
 
     def verdict(self, world: int) -> Verdict:
         """What judge and physics say of a world's episode so far."""
-        ...
 
     def describe(self) -> dict[str, Any]:
         """What ran, for results to record, as JSON."""
-        ...
 
     def close(self) -> None:
         """Release the physics' threads; the environment steps no more."""
-        ...
 
 
 class Recorder:

@@ -4,39 +4,6 @@ A limit is some ten times what a real file needs, and small enough that reading 
 Whoever needs more changes the number here.
 """
 
-__all__ = [
-    "ARCHIVE_MEMBERS",
-    "ARC_DEPTH",
-    "ARRAY_BYTES",
-    "ARRAY_GROWTH",
-    "CRATE_BYTES",
-    "CRATE_MEMORY",
-    "CRATE_SECONDS",
-    "FARTHEST",
-    "HEADER_BYTES",
-    "IMAGE_BYTES",
-    "IMAGE_PIXELS",
-    "LAYERS",
-    "MESH_POINTS",
-    "NESTING",
-    "NETWORK_BYTES",
-    "NETWORK_LAYERS",
-    "NETWORK_MEMORY",
-    "NETWORK_NODES",
-    "NETWORK_NUMBERS",
-    "NETWORK_SECONDS",
-    "PENETRATION",
-    "PICKLE_BYTES",
-    "PRIMS",
-    "SCENE_PIXELS",
-    "SCENE_POINTS",
-    "TABLE_BYTES",
-    "TEXT_BYTES",
-    "TEXT_LINES",
-    "TEXT_NUMBERS",
-    "VARIANTS",
-]
-
 MIB = 2**20
 
 # Scenes

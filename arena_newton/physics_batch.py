@@ -9,12 +9,13 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 import warp as wp
 
+from arena_newton import interfaces
 from arena_newton.ball import set_restitution
 from arena_newton.kernels import latch, newton_state
 from arena_newton.scene import Scene
@@ -27,20 +28,9 @@ if TYPE_CHECKING:
 __all__ = ["Physics"]
 
 
-class Physics(ABC):
-    """A batch of worlds; implements `interfaces.Physics`."""
+class Physics(interfaces.Physics, ABC):
+    """A batch of worlds; what `interfaces.Physics` promises is not described again."""
 
-    engine: str
-    qpos: wp.array
-    """Positions, shape [worlds, nq]."""
-    qvel: wp.array
-    """Velocities, shape [worlds, nv]."""
-    ctrl: wp.array
-    """Actuator targets, shape [worlds, nu]."""
-    xpos: wp.array
-    """Body positions [m], shape [worlds, nbody, 3]."""
-    xquat: wp.array
-    """Body orientations wxyz, shape [worlds, nbody, 4]."""
     xipos: wp.array
     """Body centres of mass [m], shape [worlds, nbody, 3]."""
 
@@ -82,14 +72,6 @@ class Physics(ABC):
         """The MuJoCo model of the first world."""
         return self._models[0]
 
-    @property
-    @abstractmethod
-    def external_force(self) -> wp.array:
-        """Force [N] and torque [N·m] on each body, world frame, float32, shape [worlds, nbody, 6].
-
-        Acts at the body's centre of mass and stays until it is changed or the world is reset.
-        """
-
     @abstractmethod
     def watch_pair(self, geoms_a: Sequence[int], geoms_b: Sequence[int], worlds: np.ndarray | None = None) -> None:
         """Report the normal force between two groups of geoms in `pair_force` [N], shape [worlds].
@@ -101,33 +83,8 @@ class Physics(ABC):
         """
 
     @abstractmethod
-    def set_active(self, mask: np.ndarray) -> None:
-        """Worlds that `step` moves, bool, shape [worlds]; the others keep every bit of their state."""
-
-    @abstractmethod
-    def step(self) -> None:
-        """Advance the active worlds by one 50 Hz tick under the present `ctrl`."""
-
-    @abstractmethod
     def mj_step_only(self) -> None:
         """Nothing but the solver's steps of one tick: what `bench` divides by."""
-
-    @abstractmethod
-    def overflowed(self, world: int) -> bool:
-        """Whether a contact or constraint buffer overflowed in this world since its reset."""
-
-    @abstractmethod
-    def snapshot(self) -> Any:
-        """Everything that the next tick depends on, as an opaque value for `restore`."""
-
-    @abstractmethod
-    def restore(self, snapshot: Any, mask: np.ndarray | None = None) -> None:
-        """Put worlds back into the state of a snapshot of this physics, bit for bit.
-
-        Args:
-            snapshot: What `snapshot` gave.
-            mask: Worlds to restore, bool, shape [worlds]; all by default.
-        """
 
     @abstractmethod
     def reset_worlds(self, worlds: np.ndarray, qpos: np.ndarray, mocap_pos: np.ndarray, mocap_quat: np.ndarray) -> None:
@@ -141,15 +98,10 @@ class Physics(ABC):
         """
 
     def close(self) -> None:  # noqa: B027 - an engine without threads has nothing to release
-        """Release threads; the physics steps no more."""
+        """See `interfaces.Physics.close`."""
 
     def add_velocity(self, change: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """Add to the velocity of the robot's root.
-
-        Args:
-            change: Linear [m/s] in the world frame, angular [rad/s] in the body frame, shape [worlds, 6].
-            mask: Worlds to change, bool, shape [worlds]; all by default.
-        """
+        """See `interfaces.Physics.add_velocity`."""
         rows = np.arange(self.worlds) if mask is None else np.flatnonzero(mask)
         root = self.scene.robot.root_qvel
         qvel = self.qvel.numpy()
@@ -161,7 +113,7 @@ class Physics(ABC):
         latch.launch_lock(mask, self.latch_locked)
 
     def write_newton_state(self, state: newton.State) -> None:
-        """Write body poses into a Newton state (for rendering)."""
+        """See `interfaces.Physics.write_newton_state`."""
         newton_state.launch_body_q(self.xpos, self.xquat, self._newton_bodies, state.body_q)
 
     def _reset_all(self) -> None:

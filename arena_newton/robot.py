@@ -17,7 +17,6 @@ __all__ = [
     "HAND_CLOSE_RIGHT",
     "HAND_JOINTS",
     "HAND_OPEN",
-    "KNEES",
     "LEGS",
     "MUJOCO_JOINTS",
     "MUJOCO_TO_CANONICAL",
@@ -54,8 +53,6 @@ WAIST: tuple[int, ...] = (12, 13, 14)
 """Waist joints in MuJoCo order: yaw, roll, pitch."""
 ARMS: tuple[int, ...] = tuple(range(15, 29))
 """Arm joints in MuJoCo order, left arm first, wrists included."""
-KNEES: tuple[int, ...] = (3, 9)
-"""Knee joints in MuJoCo order, left, right."""
 
 CANONICAL_TO_MUJOCO: tuple[int, ...] = (
     0, 6, 12, 1, 7, 13, 2, 8, 14, 3, 9, 15, 22, 4, 10, 16, 23, 5, 11, 17, 24, 18, 25, 19, 26, 20, 27, 21, 28,

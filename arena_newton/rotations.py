@@ -140,16 +140,9 @@ def matrix_from_quat(quat: Tensor) -> Tensor:
 def quat_from_matrix(matrix: Tensor) -> Tensor:
     """Unit quaternions wxyz of rotation matrices [..., 3, 3], by the best conditioned of Shepperd's four formulas."""
     m00, m11, m22 = matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 2, 2]
-    a, b, c = (
-        matrix[..., 2, 1] - matrix[..., 1, 2],
-        matrix[..., 0, 2] - matrix[..., 2, 0],
-        matrix[..., 1, 0] - matrix[..., 0, 1],
-    )
-    d, e, f = (
-        matrix[..., 1, 0] + matrix[..., 0, 1],
-        matrix[..., 0, 2] + matrix[..., 2, 0],
-        matrix[..., 2, 1] + matrix[..., 1, 2],
-    )
+    pairs = ((2, 1), (0, 2), (1, 0))
+    a, b, c = (matrix[..., i, j] - matrix[..., j, i] for i, j in pairs)
+    f, e, d = (matrix[..., i, j] + matrix[..., j, i] for i, j in pairs)
     # Row i is 4 q_i q: the one with the largest diagonal has the least cancellation.
     rows = torch.stack(
         [

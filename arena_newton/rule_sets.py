@@ -110,10 +110,7 @@ def table(rules: RuleSet) -> list[tuple[str, str]]:
         ("step budget (50 Hz ticks)", ", ".join(f"{t.task} {t.max_steps}" for t in rules.tasks)),
         ("fall", _fall_text(rules.fall)),
         *(row for t in rules.tasks for row in ((t.task, t.success.sentence()), *t.success.notes())),
-        (
-            "standing",
-            f"root z ≥ {num(rules.standing.min_root_z)} m and up-axis ≥ {num(rules.standing.min_up)}",
-        ),
+        ("standing", f"root z ≥ {num(rules.standing.min_root_z)} m and up-axis ≥ {num(rules.standing.min_up)}"),
         ("placed absolutely", _placement_text(rules, "absolute")),
         ("placed as offset from the initial pose", _placement_text(rules, "offset")),
         ("placed as initial pose + spawn scale × sample", _placement_text(rules, "scaled")),

@@ -245,7 +245,7 @@ class RuleSet:
         own = next((entry.success.bounce() for entry in self.tasks if entry.task == task), None)
         return self.ball_restitution if own is None else own
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Plain data, ready for JSON."""
         return json.loads(json.dumps(dataclasses.asdict(self)))
 

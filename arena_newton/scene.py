@@ -6,10 +6,11 @@ Handles (bodies, joints, geoms, markers, frames) are found by prim path; of a ta
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,12 +34,7 @@ from arena_newton.usd_scenes.shapes import check_buildable, open_stage
 if TYPE_CHECKING:
     from arena_newton.rules import RuleSet
 
-__all__ = [
-    "SCENES",
-    "Scene",
-    "load_scene",
-    "scene_path",
-]
+__all__ = ["SCENES", "Scene", "load_scene", "scene_path"]
 
 ROBOT = "/World/Robot"
 LATCH = "arena:latch"
@@ -96,7 +92,6 @@ class Scene:
     """A physics of engine `warp` steps the solver's own batch; the next one copies it."""
     ball_restitution: float | None = None
     """Coefficient of restitution of `/World/Ball`; None: no ball, or no rule set that says so."""
-    _robot: RobotHandles | None = field(default=None, repr=False)
 
     def body_id(self, prim_path: str) -> int:
         """MuJoCo body of a rigid prim.
@@ -118,12 +113,6 @@ class Scene:
             if path.startswith(f"{ROBOT}/") and path.rsplit("/", 1)[1] == name:
                 return body
         raise InputError(f"{self.path}: robot link {name} is missing under {ROBOT}")
-
-    def joint(self, prim_path: str) -> int:
-        """MuJoCo joint of a joint prim."""
-        if prim_path not in self.joint_ids:
-            raise InputError(f"{self.path}: joint prim {prim_path} is missing")
-        return self.joint_ids[prim_path]
 
     def joint_qpos(self, prim_path: str) -> int:
         """Address in qpos of a joint prim, or of the free joint of a rigid prim."""
@@ -188,13 +177,13 @@ class Scene:
         return Marker(body, pos, quat, (x, y, z), bool(prim.GetAttribute("arena:round").Get()))
 
     def _find(self, name_or_path: str) -> Usd.Prim:
-        prim = self.stage.GetPrimAtPath(name_or_path) if name_or_path.startswith("/") else None
-        if prim is None or not prim:
+        if name_or_path.startswith("/"):
+            prim = self.stage.GetPrimAtPath(name_or_path)
+        else:
             base = self.stage.GetPrimAtPath(ROBOT)
-            prim = None
-            if not name_or_path.startswith("/") and base:
-                prim = next((p for p in Usd.PrimRange(base) if p.GetName() == name_or_path), None)
-        if prim is None or not prim:
+            under = Usd.PrimRange(base) if base else ()
+            prim = next((p for p in under if p.GetName() == name_or_path), None)
+        if not prim:
             raise InputError(f"{self.path}: prim {name_or_path} is missing")
         return prim
 
@@ -211,14 +200,9 @@ class Scene:
         im = q.GetImaginary()
         return body, (p[0], p[1], p[2]), (q.GetReal(), im[0], im[1], im[2])
 
-    @property
+    @functools.cached_property
     def robot(self) -> RobotHandles:
         """Addresses of the robot."""
-        if self._robot is None:
-            self._robot = self._robot_handles()
-        return self._robot
-
-    def _robot_handles(self) -> RobotHandles:
         m = self.mj_model
         by_name = {p.rsplit("/", 1)[1]: j for p, j in self.joint_ids.items() if p.startswith(ROBOT + "/")}
         actuator_of_joint = {int(m.actuator_trnid[a, 0]): a for a in range(m.nu)}
@@ -230,13 +214,8 @@ class Scene:
         root = self.link("pelvis")
         root_joint = int(m.body_jntadr[root])
         links = {p.rsplit("/", 1)[1]: b for p, b in self.body_ids.items() if p.startswith(ROBOT + "/")}
-        critical = tuple(
-            sorted(
-                b
-                for n, b in links.items()
-                if any(w in n for w in g1.CRITICAL_BODY_WORDS) and "ankle" not in n and "foot" not in n
-            )
-        )
+        named = {b for n, b in links.items() if any(word in n for word in g1.CRITICAL_BODY_WORDS)}
+        critical = sorted(named - {b for n, b in links.items() if "ankle" in n or "foot" in n})
         return RobotHandles(
             root_body=root,
             root_qpos=int(m.jnt_qposadr[root_joint]),
@@ -247,7 +226,7 @@ class Scene:
             hand_qpos=np.array([m.jnt_qposadr[j] for j in hand], dtype=np.int32),
             hand_ctrl=np.array([actuator_of_joint[j] for j in hand], dtype=np.int32),
             bodies=tuple(sorted(links.values())),
-            critical_bodies=critical,
+            critical_bodies=tuple(critical),
         )
 
 
@@ -280,11 +259,11 @@ def _open_stage(path: Path, variant: str | None, hands: str) -> Usd.Stage:
     sets = world.GetVariantSets()
     if variant is None:
         return stage
-    if variant != "base":
-        if not sets.HasVariantSet("semantics") or variant not in sets.GetVariantSet("semantics").GetVariantNames():
-            raise InputError(f"{path}: prim /World has no variant {variant!r} in variant set 'semantics'")
-    if sets.HasVariantSet("semantics") and variant in sets.GetVariantSet("semantics").GetVariantNames():
+    known = sets.GetVariantSet("semantics").GetVariantNames() if sets.HasVariantSet("semantics") else ()
+    if variant in known:
         sets.GetVariantSet("semantics").SetVariantSelection(variant)
+    elif variant != "base":
+        raise InputError(f"{path}: prim /World has no variant {variant!r} in variant set 'semantics'")
     return stage
 
 
@@ -320,16 +299,10 @@ def _add_latch(builder: newton.ModelBuilder, stage: Usd.Stage) -> tuple[int, flo
     for prim in stage.Traverse():
         if prim.HasAttribute("arena:latch") and prim.GetAttribute("arena:latch").Get():
             leaf = builder.joint_label.index(str(prim.GetPath()))
-            handle = next(
-                (
-                    j
-                    for j, label in enumerate(builder.joint_label)
-                    if label == str(prim.GetPath().GetParentPath()) + "/HandleHinge"
-                ),
-                None,
-            )
-            if handle is None:
+            hinge = f"{prim.GetPath().GetParentPath()}/HandleHinge"
+            if hinge not in builder.joint_label:
                 raise InputError(f"{stage.GetRootLayer().identifier}: {prim.GetPath()} has a latch but no HandleHinge")
+            handle = builder.joint_label.index(hinge)
             # leaf = 0 + 0·handle: the leaf is held at its closed angle while the equality is active.
             newton_mujoco.add_equality_joint(
                 builder, leaf, handle, polycoef=(0.0, 0.0), label=LATCH, enabled=True, solimp=LATCH_SOLIMP
@@ -383,9 +356,14 @@ def load_scene(
     """
     path = scene_path(variant_file or task)
     stage = _open_stage(path, variant, hands)
-    template = newton.ModelBuilder()
-    newton.solvers.SolverMuJoCo.register_custom_attributes(template)
-    template.rigid_gap = 0.0
+
+    def empty() -> newton.ModelBuilder:
+        builder = newton.ModelBuilder()
+        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+        builder.rigid_gap = 0.0
+        return builder
+
+    template = empty()
     if not _is_own(path):
         check_buildable(stage, path)
     with _naming(path):
@@ -397,9 +375,7 @@ def load_scene(
         add_skin(template)
 
     def finalize(count: int) -> newton.Model:
-        builder = newton.ModelBuilder()
-        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-        builder.rigid_gap = 0.0
+        builder = empty()
         builder.replicate(template, count)
         return builder.finalize(device=device)
 

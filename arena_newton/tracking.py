@@ -28,8 +28,8 @@ from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
 
 if TYPE_CHECKING:
+    from arena_newton.handles import RobotHandles
     from arena_newton.interfaces import Physics, Tracker
-    from arena_newton.scene import RobotHandles
 
 __all__ = ["TrackerLoop", "WorldMask"]
 

@@ -24,13 +24,14 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.options import EngineOptions
-from arena_newton.eval.records import MAX_CONFIG_BYTES, check_types, parse, plain_text, read_regular
+from arena_newton.eval.records import MAX_CONFIG_BYTES, check_types, parse, read_regular
 from arena_newton.interfaces import Spawn
 from arena_newton.intervals import wilson
 from arena_newton.policies.base import Policy
 from arena_newton.quiet import quiet_warp
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.base import TaskSpec
+from arena_newton.text import plain_text
 
 __all__ = ["Rates", "fisher", "measure", "run"]
 

@@ -67,13 +67,15 @@ def load_run(folder: Path) -> RunRecord:
 
 def results_json(run: RunRecord) -> Results:
     """Content of results.json."""
+    figures = aggregate(run.records)
     results: Results = {
         "config_hash": run.document["config_hash"],
         "config": run.config,
         "planned": run.document["planned"],
         "finished": len(run.records),
         "complete": len(run.records) == run.document["planned"],
-        **aggregate(run.records),
+        "cells": figures["cells"],
+        "suites": figures["suites"],
     }
     if run.status is not None:
         results["status"] = run.status["state"]

@@ -6,7 +6,6 @@ pass Warp does not run a kernel's loops again, but it does call functions again.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Protocol
 
 import warp as wp
@@ -25,6 +24,7 @@ __all__ = [
     "slack_box",
     "slack_standing",
     "slack_xy",
+    "upload_boxes",
     "world_half",
 ]
 
@@ -38,61 +38,46 @@ class BoxLike(Protocol):
     @property
     def body_id(self) -> int:
         """Carrying body, 0 = world."""
-        ...
 
     @property
     def pos(self) -> Iterable[float]:
         """Centre [m] in the body's frame, 3 numbers."""
-        ...
 
     @property
     def quat(self) -> Iterable[float]:
         """Orientation in the body's frame, wxyz."""
-        ...
 
     @property
     def half(self) -> Iterable[float]:
         """Half extents [m], 3 numbers."""
-        ...
 
 
-@dataclass(frozen=True)
+@wp.struct
 class Boxes:
     """Oriented boxes on the device, one entry per marker."""
 
-    body: wp.array
+    body: wp.array[int]
     """Carrying body, 0 = world, int32, shape [boxes]."""
-    pos: wp.array
-    """Centre [m] in the body's frame, vec3, shape [boxes]."""
-    quat: wp.array
-    """Orientation in the body's frame, wxyz in a vec4, shape [boxes]."""
-    half: wp.array
-    """Half extents [m], vec3, shape [boxes]."""
+    pos: wp.array[wp.vec3]
+    """Centre [m] in the body's frame, shape [boxes]."""
+    quat: wp.array[wp.vec4]
+    """Orientation in the body's frame, wxyz, shape [boxes]."""
+    half: wp.array[wp.vec3]
+    """Half extents [m], shape [boxes]."""
 
-    @classmethod
-    def from_boxes(cls, markers: Iterable[BoxLike], device: wp.DeviceLike = None) -> "Boxes":
-        """Boxes on a device.
 
-        Args:
-            markers: Objects with `body_id`, `pos` (3), `quat` (4, wxyz) and `half` (3).
-            device: Warp device.
-        """
-        rows = list(markers)
+def upload_boxes(markers: Iterable[BoxLike], device: wp.DeviceLike = None) -> Boxes:
+    """Boxes on a Warp device."""
+    rows = list(markers)
 
-        def vectors(values: list, dtype: type) -> wp.array:
-            return wp.array([dtype(*(float(v) for v in row)) for row in values], dtype=dtype, device=device)
+    def vectors(values: list, dtype: type) -> wp.array:
+        return wp.array([dtype(*(float(v) for v in row)) for row in values], dtype=dtype, device=device)
 
-        return cls(
-            body=wp.array([int(m.body_id) for m in rows], dtype=wp.int32, device=device),
-            pos=vectors([m.pos for m in rows], wp.vec3),
-            quat=vectors([m.quat for m in rows], wp.vec4),
-            half=vectors([m.half for m in rows], wp.vec3),
-        )
-
-    @property
-    def arrays(self) -> list[wp.array]:
-        """Kernel arguments: body, pos, quat, half."""
-        return [self.body, self.pos, self.quat, self.half]
+    boxes = Boxes()
+    boxes.body = wp.array([int(m.body_id) for m in rows], dtype=wp.int32, device=device)
+    boxes.pos, boxes.half = vectors([m.pos for m in rows], wp.vec3), vectors([m.half for m in rows], wp.vec3)
+    boxes.quat = vectors([m.quat for m in rows], wp.vec4)
+    return boxes
 
 
 @wp.func
@@ -114,25 +99,16 @@ def body_position(xpos: wp.array3d[float], world: int, body: int) -> wp.vec3:
 
 
 @wp.func
-def box_rotation(
-    xquat: wp.array3d[float], body: wp.array[int], quat: wp.array[wp.vec4], world: int, box: int
-) -> wp.quat:
+def box_rotation(xquat: wp.array3d[float], boxes: Boxes, world: int, box: int) -> wp.quat:
     """World orientation of a box."""
-    return body_rotation(xquat, world, body[box]) * wp.normalize(quat_from_wxyz(quat[box]))
+    return body_rotation(xquat, world, boxes.body[box]) * wp.normalize(quat_from_wxyz(boxes.quat[box]))
 
 
 @wp.func
-def box_centre(
-    xpos: wp.array3d[float],
-    xquat: wp.array3d[float],
-    body: wp.array[int],
-    pos: wp.array[wp.vec3],
-    world: int,
-    box: int,
-) -> wp.vec3:
+def box_centre(xpos: wp.array3d[float], xquat: wp.array3d[float], boxes: Boxes, world: int, box: int) -> wp.vec3:
     """World position [m] of a box's centre."""
-    b = body[box]
-    return body_position(xpos, world, b) + wp.quat_rotate(body_rotation(xquat, world, b), pos[box])
+    b = boxes.body[box]
+    return body_position(xpos, world, b) + wp.quat_rotate(body_rotation(xquat, world, b), boxes.pos[box])
 
 
 @wp.func

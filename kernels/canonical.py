@@ -170,13 +170,7 @@ def launch_state64(
         heading0: Heading of the robot at reset [rad], shape [worlds].
         state: Output, shape [worlds, 64].
     """
-    launch(
-        state64_kernel,
-        dim=state.shape[0],
-        inputs=[qpos, qvel, root_qpos_adr, joint_qpos, joint_qvel, heading0],
-        outputs=[state],
-        device=state.device,
-    )
+    launch(state64_kernel, state.shape[0], [qpos, qvel, root_qpos_adr, joint_qpos, joint_qvel, heading0], [state])
 
 
 @wp.kernel
@@ -230,24 +224,9 @@ def launch_reset_reference(ref: ReferencePose, qpos: wp.array, root_qpos_adr: in
         root_qpos_adr: Address of the robot's free joint in `qpos`.
         mask: 1 = reset this world, int32, shape [worlds].
     """
-    launch(
-        reset_reference_kernel,
-        dim=mask.shape[0],
-        inputs=[qpos, root_qpos_adr, mask, ref.canonical_to_mujoco],
-        outputs=[
-            ref.position,
-            ref.quat,
-            ref.joints,
-            ref.joint_vel,
-            ref.heading,
-            ref.prev_yaw,
-            ref.prev_z,
-            ref.hands,
-            ref.mimic,
-            ref.steps,
-        ],
-        device=mask.device,
-    )
+    inputs = [qpos, root_qpos_adr, mask, ref.canonical_to_mujoco]
+    outputs = [ref.position, ref.quat, ref.joints, ref.joint_vel, ref.heading, ref.prev_yaw, ref.prev_z]
+    launch(reset_reference_kernel, mask.shape[0], inputs, [*outputs, ref.hands, ref.mimic, ref.steps])
 
 
 @wp.kernel
@@ -343,36 +322,10 @@ def launch_integrate(
         out: Where to write instead, for differentiation.
     """
     to = ref if out is None else out
-    launch(
-        integrate_kernel,
-        dim=action.shape[0],
-        inputs=[
-            action,
-            mask,
-            math.radians(max_root_delta_deg),
-            ref.tick,
-            ref.canonical_to_mujoco,
-            ref.heading,
-            ref.position,
-            ref.quat,
-            ref.joints,
-            ref.prev_yaw,
-            ref.prev_z,
-            ref.steps,
-        ],
-        outputs=[
-            to.position,
-            to.quat,
-            to.joints,
-            to.joint_vel,
-            to.prev_yaw,
-            to.prev_z,
-            to.hands,
-            to.mimic,
-            to.steps,
-        ],
-        device=action.device,
-    )
+    inputs = [action, mask, math.radians(max_root_delta_deg), ref.tick, ref.canonical_to_mujoco, ref.heading]
+    inputs += [ref.position, ref.quat, ref.joints, ref.prev_yaw, ref.prev_z, ref.steps]
+    outputs = [to.position, to.quat, to.joints, to.joint_vel, to.prev_yaw, to.prev_z, to.hands, to.mimic, to.steps]
+    launch(integrate_kernel, action.shape[0], inputs, outputs)
 
 
 @wp.kernel
@@ -397,4 +350,4 @@ def launch_validate_action(action: wp.array, bad: wp.array) -> None:
         action: Canonical actions, shape [worlds, 40].
         bad: Output: 0 good, `ACTION_NONFINITE`, or `ACTION_BAD_ROT6D` (|c0 x c1| < 1e-6), int32, shape [worlds].
     """
-    launch(validate_action_kernel, dim=action.shape[0], inputs=[action], outputs=[bad], device=action.device)
+    launch(validate_action_kernel, action.shape[0], [action], [bad])

@@ -8,6 +8,8 @@ last bits of a sum, may change from run to run; on the CPU backend they are the 
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch
+
 __all__ = ["GROUP_A", "GROUP_B", "launch_contact_force"]
 
 wp.set_module_options({"enable_backward": False})
@@ -131,23 +133,7 @@ def launch_contact_force(
     """
     net_force.zero_()
     pair_force.zero_()
-    wp.launch(
-        contact_force_kernel,
-        dim=geom.shape[0],
-        inputs=[
-            contact_count,
-            geom,
-            world_id,
-            frame,
-            friction,
-            dim,
-            efc_address,
-            efc_force,
-            int(pyramidal),
-            geom_body,
-            geom_group,
-        ],
-        outputs=[net_force, pair_force],
-        device=net_force.device,
-    )
-    wp.launch(force_norm_kernel, dim=net_force.shape, inputs=[net_force], outputs=[force_norm], device=net_force.device)
+    contacts = [contact_count, geom, world_id, frame, friction, dim, efc_address, efc_force]
+    inputs = [*contacts, int(pyramidal), geom_body, geom_group]
+    launch(contact_force_kernel, geom.shape[0], inputs, [net_force, pair_force])
+    launch(force_norm_kernel, net_force.shape, [net_force], [force_norm])

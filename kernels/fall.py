@@ -109,20 +109,6 @@ def launch_fall(
         confirm_ticks: Ticks in a row that confirm, 5 in both rule sets.
         at_once: Which rule: True `paper`, False `released`.
     """
-    launch(
-        fall_kernel,
-        dim=fallen.shape[0],
-        inputs=[
-            qpos,
-            root_qpos_adr,
-            contact_force,
-            critical_body_ids,
-            math.cos(math.radians(soft_tilt_deg)),
-            math.cos(math.radians(hard_tilt_deg)),
-            force_threshold,
-            confirm_ticks,
-            int(at_once),
-        ],
-        outputs=[streak, fallen, trigger, pressed],
-        device=fallen.device,
-    )
+    soft_up, hard_up = math.cos(math.radians(soft_tilt_deg)), math.cos(math.radians(hard_tilt_deg))
+    inputs = [qpos, root_qpos_adr, contact_force, critical_body_ids, soft_up, hard_up, force_threshold]
+    launch(fall_kernel, fallen.shape[0], [*inputs, confirm_ticks, int(at_once)], [streak, fallen, trigger, pressed])

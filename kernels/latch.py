@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch
+
 __all__ = ["launch_lock", "launch_release"]
 
 wp.set_module_options({"enable_backward": False})
@@ -24,13 +26,7 @@ def launch_release(qpos: wp.array, handle_qpos_adr: int, release_angle: float, l
         release_angle: Angle of release [rad], negative.
         locked: 1 = locked, updated, int32, shape [worlds].
     """
-    wp.launch(
-        release_kernel,
-        dim=locked.shape[0],
-        inputs=[qpos, handle_qpos_adr, release_angle],
-        outputs=[locked],
-        device=locked.device,
-    )
+    launch(release_kernel, locked.shape[0], [qpos, handle_qpos_adr, release_angle], [locked])
 
 
 @wp.kernel
@@ -48,4 +44,4 @@ def launch_lock(mask: wp.array, locked: wp.array) -> None:
         mask: 1 = lock, int32, shape [worlds].
         locked: 1 = locked, updated, int32, shape [worlds].
     """
-    wp.launch(lock_kernel, dim=mask.shape[0], inputs=[mask], outputs=[locked], device=locked.device)
+    launch(lock_kernel, mask.shape[0], [mask], [locked])

@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["Recorded", "launch", "launch_again", "record"]
+__all__ = ["Recorded", "launch", "record"]
 
 
 class Recorded:
@@ -58,15 +58,12 @@ def record(launcher: Callable[..., None], *args: Any, **kwargs: Any) -> Recorded
 
 
 def launch(
-    kernel: wp.Kernel, *, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
+    kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device = None
 ) -> None:
-    """Do what `wp.launch` does; inside `record`, keep the launch for later."""
+    """Do what `wp.launch` does, on the first output's device by default; inside `record`, keep the launch for later."""
+    device = outputs[0].device if device is None else device
     if _recording.into is None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
     else:
         command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
         _recording.into.commands.append(command)
-
-
-launch_again = launch
-"""Earlier name."""

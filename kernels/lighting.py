@@ -17,6 +17,7 @@ from typing import Any
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch
 from arena_newton.kernels.raster import srgb
 
 __all__ = ["launch_camera_poses", "launch_shade"]
@@ -55,7 +56,7 @@ def launch_camera_poses(body_q: wp.array, body: wp.array, local: wp.transform, p
         local: Camera in the body's frame.
         poses: Out, shape [worlds].
     """
-    wp.launch(_camera_poses, dim=poses.shape[0], inputs=[body_q, body, local], outputs=[poses], device=poses.device)
+    launch(_camera_poses, poses.shape[0], [body_q, body, local], [poses])
 
 
 @wp.func
@@ -188,25 +189,6 @@ def launch_shade(
         origin: Row and column of its first pixel in `image` [px].
         image: Out, uint8 [views, rows, columns, 3].
     """
-    wp.launch(
-        _shade_kernel(*method),
-        dim=(views[1], *size),
-        inputs=[
-            views[0],
-            view_world,
-            poses,
-            rays,
-            albedo,
-            normals,
-            depth,
-            decode,
-            shadows,
-            distant,
-            direction,
-            light,
-            samples,
-            *origin,
-        ],
-        outputs=[image],
-        device=image.device,
-    )
+    surfaces = [view_world, poses, rays, albedo, normals, depth, decode]
+    inputs = [views[0], *surfaces, shadows, distant, direction, light, samples, *origin]
+    launch(_shade_kernel(*method), (views[1], *size), inputs, [image])

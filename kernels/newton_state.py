@@ -4,6 +4,8 @@ from typing import Any
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch
+
 __all__ = ["launch_body_q", "launch_latch", "launch_overflow", "launch_put_back"]
 
 
@@ -24,7 +26,7 @@ def _body_q(
 
 def launch_body_q(xpos: wp.array, xquat: wp.array, newton_body: wp.array, body_q: wp.array) -> None:
     """Write body poses [worlds, nbody] (position [m], quaternion wxyz) into Newton's `State.body_q`."""
-    wp.launch(_body_q, dim=newton_body.shape, inputs=[xpos, xquat, newton_body], outputs=[body_q], device=xpos.device)
+    launch(_body_q, newton_body.shape, [xpos, xquat, newton_body], [body_q])
 
 
 @wp.kernel
@@ -35,7 +37,7 @@ def _latch(locked: wp.array[wp.int32], equality: wp.int32, eq_active: wp.array2d
 
 def launch_latch(locked: wp.array, equality: int, eq_active: wp.array) -> None:
     """Set an equality constraint active where `locked` [worlds] is 1."""
-    wp.launch(_latch, dim=locked.shape[0], inputs=[locked, equality], outputs=[eq_active], device=locked.device)
+    launch(_latch, locked.shape[0], [locked, equality], [eq_active])
 
 
 @wp.kernel
@@ -51,7 +53,7 @@ LOST_CONTACTS = 0b10111111
 
 def launch_overflow(mask: wp.array, seen: wp.array) -> None:
     """Remember in `seen` [worlds] that a contact or constraint buffer overflowed since the last reset."""
-    wp.launch(_overflow, dim=seen.shape[0], inputs=[mask, LOST_CONTACTS], outputs=[seen], device=seen.device)
+    launch(_overflow, seen.shape[0], [mask, LOST_CONTACTS], [seen])
 
 
 @wp.kernel
@@ -63,4 +65,4 @@ def _put_back(mask: wp.array[wp.int32], saved: wp.array2d[Any], rows: wp.array2d
 
 def launch_put_back(mask: wp.array, saved: wp.array, rows: wp.array) -> None:
     """Copy the rows of the masked worlds (int32, 1 = copy) from `saved` into `rows`, both [worlds, n]."""
-    wp.launch(_put_back, dim=rows.shape, inputs=[mask, saved], outputs=[rows], device=rows.device)
+    launch(_put_back, rows.shape, [mask, saved], [rows])

@@ -9,7 +9,7 @@ boxes are fixed to bodies. Nothing here is differentiable; the margins in `succe
 import warp as wp
 
 from arena_newton.kernels.boxes import FAR, Boxes, body_position, body_rotation, box_centre, box_rotation
-from arena_newton.kernels.launching import launch_again
+from arena_newton.kernels.launching import launch
 
 __all__ = ["ANGLE", "AWAY", "CLEAR", "MARGIN", "NEAR", "TERM", "TOWARD", "UNLATCHED", "launch_predicates"]
 
@@ -73,10 +73,7 @@ def predicates_kernel(
     limits: wp.array[float],
     point_body: wp.array[int],
     point_pos: wp.array[wp.vec3],
-    box_body: wp.array[int],
-    box_pos: wp.array[wp.vec3],
-    box_quat: wp.array[wp.vec4],
-    box_half: wp.array[wp.vec3],
+    boxes: Boxes,
     predicates: wp.array2d[int],
 ):
     """One thread per world and predicate; the last predicate is the success flag."""
@@ -99,9 +96,9 @@ def predicates_kernel(
                 body = point_body[p]
                 point = body_position(xpos, w, body) + wp.quat_rotate(body_rotation(xquat, w, body), point_pos[p])
                 for b in range(b0, terms[t, 6]):
-                    offset = point - box_centre(xpos, xquat, box_body, box_pos, w, b)
-                    v = wp.quat_rotate_inv(box_rotation(xquat, box_body, box_quat, w, b), offset)
-                    nearest = wp.min(nearest, distance_to_box(v, box_half[b], horizontal))
+                    offset = point - box_centre(xpos, xquat, boxes, w, b)
+                    v = wp.quat_rotate_inv(box_rotation(xquat, boxes, w, b), offset)
+                    nearest = wp.min(nearest, distance_to_box(v, boxes.half[b], horizontal))
             if kind == NEAR:
                 ok = wp.where(nearest <= limit, 1, 0)
             else:
@@ -112,7 +109,7 @@ def predicates_kernel(
             body = point_body[p0]
             turn = body_rotation(xquat, w, body)
             point = body_position(xpos, w, body) + wp.quat_rotate(turn, point_pos[p0])
-            goal = level(box_centre(xpos, xquat, box_body, box_pos, w, b0) - point, horizontal)
+            goal = level(box_centre(xpos, xquat, boxes, w, b0) - point, horizontal)
             if kind == TOWARD:
                 v = wp.vec3(qvel[w, address], qvel[w, address + 1], qvel[w, address + 2])
                 ok = wp.where(wp.dot(level(v, horizontal), wp.normalize(goal)) >= limit, 1, 0)
@@ -146,11 +143,9 @@ def launch_predicates(
 ) -> None:
     """Which predicates hold at this tick; launch after the task's success kernel.
 
+    Arguments that `success` describes are not repeated.
+
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        qpos: Positions, MuJoCo layout, shape [worlds, nq].
-        qvel: Velocities, MuJoCo layout, shape [worlds, nv].
         latched: 1 = the latch holds the leaf, int32, shape [worlds].
         success: 1 = success, int32, shape [worlds]; becomes the last predicate.
         margin: Signed distance to success, shape [worlds].
@@ -162,24 +157,6 @@ def launch_predicates(
         boxes: Boxes, at least one.
         predicates: Output, 1 = holds, int32, shape [worlds, n].
     """
-    launch_again(
-        predicates_kernel,
-        dim=predicates.shape,
-        inputs=[
-            xpos,
-            xquat,
-            qpos,
-            qvel,
-            latched,
-            success,
-            margin,
-            first,
-            terms,
-            limits,
-            point_body,
-            point_pos,
-            *boxes.arrays,
-        ],
-        outputs=[predicates],
-        device=predicates.device,
-    )
+    state = [xpos, xquat, qpos, qvel, latched, success, margin]
+    conditions = [first, terms, limits, point_body, point_pos, boxes]
+    launch(predicates_kernel, predicates.shape, [*state, *conditions], [predicates])

@@ -5,6 +5,8 @@ Each triangle is drawn once into a depth buffer of 64-bit keys (nearness above, 
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch
+
 __all__ = ["Soup", "launch_rasterize"]
 
 NEAR = wp.constant(wp.float32(0.002))
@@ -321,19 +323,6 @@ def launch_rasterize(
         normals: Out, world-space normals, same shape.
         depth: Out, distance along the ray [m], 0 where it met nothing, same shape.
     """
-    device = depth.device
-    wp.launch(_clear, dim=nearest.shape, inputs=[view_world], outputs=[nearest], device=device)
-    wp.launch(
-        _rasterize,
-        dim=(poses.shape[0], triangles),
-        inputs=[view_world, poses, soup, *tangents],
-        outputs=[nearest],
-        device=device,
-    )
-    wp.launch(
-        _resolve,
-        dim=depth.shape,
-        inputs=[view_world, poses, rays, soup, nearest],
-        outputs=[albedo, normals, depth],
-        device=device,
-    )
+    launch(_clear, nearest.shape, [view_world], [nearest])
+    launch(_rasterize, (poses.shape[0], triangles), [view_world, poses, soup, *tangents], [nearest])
+    launch(_resolve, depth.shape, [view_world, poses, rays, soup, nearest], [albedo, normals, depth])

@@ -24,7 +24,6 @@ __all__ = [
     "up_of",
     "vec6",
     "wrap_angle",
-    "wxyz_from_quat",
 ]
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -40,12 +39,6 @@ DEGENERATE = wp.constant(1.0e-6)
 def quat_from_wxyz(v: wp.vec4) -> wp.quat:
     """The quaternion stored as (w, x, y, z)."""
     return wp.quat(v[1], v[2], v[3], v[0])
-
-
-@wp.func
-def wxyz_from_quat(q: wp.quat) -> wp.vec4:
-    """The numbers (w, x, y, z) of a quaternion, as arrays store them."""
-    return wp.vec4(q[3], q[0], q[1], q[2])
 
 
 @wp.func

@@ -1,4 +1,7 @@
-"""Success predicates of the tasks that move an object: Football, DoubleDesk, P&PBox. Read `success` first."""
+"""Success predicates of the tasks that move an object: Football, DoubleDesk, P&PBox.
+
+Arguments that `success` describes are not repeated.
+"""
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
 
@@ -15,12 +18,11 @@ from arena_newton.kernels.boxes import (
     slack_xy,
     world_half,
 )
-from arena_newton.kernels.launching import launch_again
+from arena_newton.kernels.launching import launch
 from arena_newton.kernels.rotations import load_vec3
 
 __all__ = [
-    "launch_double_desk_paper",
-    "launch_double_desk_released",
+    "launch_double_desk",
     "launch_football",
     "launch_pp_box_paper",
     "launch_pp_box_released",
@@ -32,14 +34,8 @@ def football_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
     ball: int,
-    goal_body: wp.array[int],
-    goal_pos: wp.array[wp.vec3],
-    goal_quat: wp.array[wp.vec4],
-    goal_half: wp.array[wp.vec3],
-    pitch_body: wp.array[int],
-    pitch_pos: wp.array[wp.vec3],
-    pitch_quat: wp.array[wp.vec4],
-    pitch_half: wp.array[wp.vec3],
+    goal: Boxes,
+    pitch: Boxes,
     rear_bound: int,
     judge_out: int,
     min_z: float,
@@ -50,10 +46,10 @@ def football_kernel(
     """One thread per world."""
     w = wp.tid()
     p = load_vec3(xpos, w, ball)
-    q = box_rotation(xquat, goal_body, goal_quat, w, 0)
-    c = box_centre(xpos, xquat, goal_body, goal_pos, w, 0)
+    q = box_rotation(xquat, goal, w, 0)
+    c = box_centre(xpos, xquat, goal, w, 0)
     v = wp.quat_rotate_inv(q, p - c)
-    h = goal_half[0]
+    h = goal.half[0]
     m = wp.min(wp.min(h[0] - wp.abs(v[0]), h[2] - wp.abs(v[2])), h[1] + v[1])
     if rear_bound != 0:
         m = wp.min(m, h[1] - v[1])
@@ -61,10 +57,10 @@ def football_kernel(
     success[w] = holds(m)
     out = int(0)
     if judge_out != 0:
-        pq = box_rotation(xquat, pitch_body, pitch_quat, w, 0)
-        pc = box_centre(xpos, xquat, pitch_body, pitch_pos, w, 0)
+        pq = box_rotation(xquat, pitch, w, 0)
+        pc = box_centre(xpos, xquat, pitch, w, 0)
         pv = wp.quat_rotate_inv(pq, p - pc)
-        if slack_xy(pv, pitch_half[0]) < 0.0 or p[2] < min_z:
+        if slack_xy(pv, pitch.half[0]) < 0.0 or p[2] < min_z:
             out = 1
     event[w] = wp.where(m >= 0.0, 0, out)
 
@@ -86,25 +82,16 @@ def launch_football(
     """Football: the ball's centre inside the goal's volume, with (`paper`) or without (`released`) its rear face.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
         ball_body: The ball.
         goal: One box whose +y face is the rear of the net.
         pitch: One box; xy beyond its upright faces is out.
         rear_bound: Whether the +y face bounds the goal.
         judge_out: Whether leaving the field is an event.
         min_z: A ball below this height [m] has left the field.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
         event: Output, 1 = the ball left the field without a goal, int32, shape [worlds].
     """
-    launch_again(
-        football_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, ball_body, *goal.arrays, *pitch.arrays, int(rear_bound), int(judge_out), min_z],
-        outputs=[success, margin, event],
-        device=success.device,
-    )
+    inputs = [xpos, xquat, ball_body, goal, pitch, int(rear_bound), int(judge_out), min_z]
+    launch(football_kernel, success.shape[0], inputs, [success, margin, event])
 
 
 @wp.kernel
@@ -113,10 +100,7 @@ def double_desk_kernel(
     xquat: wp.array3d[float],
     xipos: wp.array3d[float],
     hammer: int,
-    box_body: wp.array[int],
-    box_pos: wp.array[wp.vec3],
-    box_quat: wp.array[wp.vec4],
-    box_half: wp.array[wp.vec3],
+    box: Boxes,
     world_aligned: int,
     min_z: float,
     success: wp.array[int],
@@ -125,69 +109,38 @@ def double_desk_kernel(
     """One thread per world."""
     w = wp.tid()
     p = load_vec3(xipos, w, hammer)
-    q = box_rotation(xquat, box_body, box_quat, w, 0)
-    offset = p - box_centre(xpos, xquat, box_body, box_pos, w, 0)
+    q = box_rotation(xquat, box, w, 0)
+    offset = p - box_centre(xpos, xquat, box, w, 0)
     m = float(0.0)
     if world_aligned != 0:
-        m = wp.min(slack_box(offset, world_half(q, box_half[0])), p[2] - min_z)
+        m = wp.min(slack_box(offset, world_half(q, box.half[0])), p[2] - min_z)
     else:
-        m = slack_box(wp.quat_rotate_inv(q, offset), box_half[0])
+        m = slack_box(wp.quat_rotate_inv(q, offset), box.half[0])
     margin[w] = m
     success[w] = holds(m)
 
 
-def launch_double_desk_paper(
+def launch_double_desk(
     xpos: wp.array,
     xquat: wp.array,
     xipos: wp.array,
     *,
     hammer_body: int,
     inside: Boxes,
+    min_z: float | None = None,
     success: wp.array,
     margin: wp.array,
 ) -> None:
-    """DoubleDesk, `paper`: the hammer's centre of mass inside the crate's box in the crate's own frame.
+    """DoubleDesk: the hammer's centre of mass inside the crate's box.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        xipos: Centres of mass [m], shape [worlds, nbody, 3].
         hammer_body: The hammer.
         inside: One box, the crate's.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
+        min_z: None: the box is in the crate's own frame (`paper`). Otherwise it is the world-axis box around the
+            crate's, cut at this height [m] (`released`).
     """
-    launch_again(
-        double_desk_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, xipos, hammer_body, *inside.arrays, 0, 0.0],
-        outputs=[success, margin],
-        device=success.device,
-    )
-
-
-def launch_double_desk_released(
-    xpos: wp.array,
-    xquat: wp.array,
-    xipos: wp.array,
-    *,
-    hammer_body: int,
-    inside: Boxes,
-    min_z: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
-    """DoubleDesk, `released`: the hammer's centre of mass inside the crate's world-axis box and not below `min_z` [m].
-
-    Other arguments as `launch_double_desk_paper`.
-    """
-    launch_again(
-        double_desk_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, xipos, hammer_body, *inside.arrays, 1, min_z],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    floor = (0, 0.0) if min_z is None else (1, min_z)
+    launch(double_desk_kernel, success.shape[0], [xpos, xquat, xipos, hammer_body, inside, *floor], [success, margin])
 
 
 @wp.func
@@ -196,19 +149,16 @@ def slack_on_deck(
     xquat: wp.array3d[float],
     centre: wp.vec3,
     bottom: float,
-    deck_body: wp.array[int],
-    deck_pos: wp.array[wp.vec3],
-    deck_quat: wp.array[wp.vec4],
-    deck_half: wp.array[wp.vec3],
+    decks: Boxes,
     world: int,
     deck: int,
     height_tolerance: float,
 ) -> float:
     """Slack [m] of a box on one deck: its centre within the span, its bottom near the deck's top face."""
-    q = box_rotation(xquat, deck_body, deck_quat, world, deck)
-    c = box_centre(xpos, xquat, deck_body, deck_pos, world, deck)
-    top = c + wp.quat_rotate(q, wp.vec3(0.0, 0.0, deck_half[deck][2]))
-    span = slack_xy(wp.quat_rotate_inv(q, centre - c), deck_half[deck])
+    q = box_rotation(xquat, decks, world, deck)
+    c = box_centre(xpos, xquat, decks, world, deck)
+    top = c + wp.quat_rotate(q, wp.vec3(0.0, 0.0, decks.half[deck][2]))
+    span = slack_xy(wp.quat_rotate_inv(q, centre - c), decks.half[deck])
     return wp.min(span, height_tolerance - wp.abs(bottom - top[2]))
 
 
@@ -218,20 +168,15 @@ def best_deck(
     xquat: wp.array3d[float],
     centre: wp.vec3,
     bottom: float,
-    deck_body: wp.array[int],
-    deck_pos: wp.array[wp.vec3],
-    deck_quat: wp.array[wp.vec4],
-    deck_half: wp.array[wp.vec3],
+    decks: Boxes,
     world: int,
     height_tolerance: float,
 ) -> int:
     """The deck with the largest slack."""
     best = int(0)
     best_slack = float(-FAR)
-    for d in range(deck_body.shape[0]):
-        s = slack_on_deck(
-            xpos, xquat, centre, bottom, deck_body, deck_pos, deck_quat, deck_half, world, d, height_tolerance
-        )
+    for d in range(decks.body.shape[0]):
+        s = slack_on_deck(xpos, xquat, centre, bottom, decks, world, d, height_tolerance)
         if s > best_slack:
             best_slack = s
             best = d
@@ -244,14 +189,8 @@ def pp_box_paper_kernel(
     xquat: wp.array3d[float],
     qvel: wp.array2d[float],
     box_qvel_adr: int,
-    box_body: wp.array[int],
-    box_pos: wp.array[wp.vec3],
-    box_quat: wp.array[wp.vec4],
-    box_half: wp.array[wp.vec3],
-    deck_body: wp.array[int],
-    deck_pos: wp.array[wp.vec3],
-    deck_quat: wp.array[wp.vec4],
-    deck_half: wp.array[wp.vec3],
+    box: Boxes,
+    decks: Boxes,
     height_tolerance: float,
     max_speed: float,
     confirm_ticks: int,
@@ -262,10 +201,10 @@ def pp_box_paper_kernel(
 ):
     """One thread per world."""
     w = wp.tid()
-    p = box_centre(xpos, xquat, box_body, box_pos, w, 0)
-    bottom = p[2] - world_half(box_rotation(xquat, box_body, box_quat, w, 0), box_half[0])[2]
-    best = best_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, height_tolerance)
-    m = slack_on_deck(xpos, xquat, p, bottom, deck_body, deck_pos, deck_quat, deck_half, w, best, height_tolerance)
+    p = box_centre(xpos, xquat, box, w, 0)
+    bottom = p[2] - world_half(box_rotation(xquat, box, w, 0), box.half[0])[2]
+    best = best_deck(xpos, xquat, p, bottom, decks, w, height_tolerance)
+    m = slack_on_deck(xpos, xquat, p, bottom, decks, w, best, height_tolerance)
     v = wp.vec3(qvel[w, box_qvel_adr], qvel[w, box_qvel_adr + 1], qvel[w, box_qvel_adr + 2])
     speed = wp.sqrt(wp.dot(v, v) + 1.0e-12)
     m = wp.min(m, (max_speed - speed) * window)
@@ -297,9 +236,6 @@ def launch_pp_box_paper(
     time.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        qvel: Velocities, MuJoCo layout, shape [worlds, nv].
         box: One box, the one to move.
         box_qvel_adr: Address of its free joint in `qvel`.
         decks: Boxes whose top faces are the decks' surfaces, at least one.
@@ -307,27 +243,12 @@ def launch_pp_box_paper(
         max_speed: Largest speed [m/s], 0.05.
         confirm_ticks: Ticks in a row, 10.
         tick: Control period [s].
-        counter: Ticks in a row so far, updated, int32, shape [worlds]; clear it at reset.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
+    launch(
         pp_box_paper_kernel,
-        dim=success.shape[0],
-        inputs=[
-            xpos,
-            xquat,
-            qvel,
-            box_qvel_adr,
-            *box.arrays,
-            *decks.arrays,
-            height_tolerance,
-            max_speed,
-            confirm_ticks,
-            confirm_ticks * tick,
-        ],
-        outputs=[counter, success, margin],
-        device=success.device,
+        success.shape[0],
+        [xpos, xquat, qvel, box_qvel_adr, box, decks, height_tolerance, max_speed, confirm_ticks, confirm_ticks * tick],
+        [counter, success, margin],
     )
 
 
@@ -335,14 +256,8 @@ def launch_pp_box_paper(
 def pp_box_released_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
-    box_body: wp.array[int],
-    box_pos: wp.array[wp.vec3],
-    box_quat: wp.array[wp.vec4],
-    box_half: wp.array[wp.vec3],
-    deck_body: wp.array[int],
-    deck_pos: wp.array[wp.vec3],
-    deck_quat: wp.array[wp.vec4],
-    deck_half: wp.array[wp.vec3],
+    box: Boxes,
+    decks: Boxes,
     deck: int,
     plane_below: float,
     height_tolerance: float,
@@ -351,10 +266,10 @@ def pp_box_released_kernel(
 ):
     """One thread per world."""
     w = wp.tid()
-    p = box_centre(xpos, xquat, box_body, box_pos, w, 0)
-    half = box_half[0]
-    h = world_half(box_rotation(xquat, deck_body, deck_quat, w, deck), deck_half[deck])
-    offset = p - box_centre(xpos, xquat, deck_body, deck_pos, w, deck)
+    p = box_centre(xpos, xquat, box, w, 0)
+    half = box.half[0]
+    h = world_half(box_rotation(xquat, decks, w, deck), decks.half[deck])
+    offset = p - box_centre(xpos, xquat, decks, w, deck)
     m = slack_xy(offset, wp.vec3(h[0] - half[0], h[1] - half[1], h[2]))
     m = wp.min(m, height_tolerance - wp.abs(offset[2] - half[2] - (h[2] - plane_below)))
     margin[w] = m
@@ -376,20 +291,11 @@ def launch_pp_box_released(
     """P&PBox, `released`: box centre in the target deck's world-axis span less the box's half, bottom near a plane.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
         box: One box, the one to move; half its xy extents shrink the span, half its z is taken off its centre's height.
         decks: The shelf's decks.
         deck: Which of them is the target.
         plane_below: How far the target plane is below that deck's upper face [m].
         height_tolerance: Largest distance to the plane [m], 0.06.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        pp_box_released_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, *box.arrays, *decks.arrays, deck, plane_below, height_tolerance],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    inputs = [xpos, xquat, box, decks, deck, plane_below, height_tolerance]
+    launch(pp_box_released_kernel, success.shape[0], inputs, [success, margin])

@@ -1,4 +1,7 @@
-"""Success predicates of the tasks between robot and scene: OpenDoor, SitSofa, Boxing, VisNavi. Read `success` first."""
+"""Success predicates of the tasks between robot and scene: OpenDoor, SitSofa, Boxing, VisNavi.
+
+Arguments that `success` describes are not repeated.
+"""
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
 
@@ -15,7 +18,7 @@ from arena_newton.kernels.boxes import (
     slack_xy,
     world_half,
 )
-from arena_newton.kernels.launching import launch_again
+from arena_newton.kernels.launching import launch
 from arena_newton.kernels.rotations import load_quat3, load_vec3
 
 __all__ = [
@@ -34,9 +37,7 @@ def open_door_paper_kernel(
     xquat: wp.array3d[float],
     qpos: wp.array2d[float],
     root: int,
-    door_body: wp.array[int],
-    door_pos: wp.array[wp.vec3],
-    door_quat: wp.array[wp.vec4],
+    doorway: Boxes,
     half_width: float,
     min_y: float,
     stand_height: float,
@@ -47,8 +48,8 @@ def open_door_paper_kernel(
     """One thread per world."""
     w = wp.tid()
     p = wp.vec3(qpos[w, root], qpos[w, root + 1], qpos[w, root + 2])
-    q = box_rotation(xquat, door_body, door_quat, w, 0)
-    v = wp.quat_rotate_inv(q, p - box_centre(xpos, xquat, door_body, door_pos, w, 0))
+    q = box_rotation(xquat, doorway, w, 0)
+    v = wp.quat_rotate_inv(q, p - box_centre(xpos, xquat, doorway, w, 0))
     m = wp.min(half_width - wp.abs(v[0]), v[1] - min_y)
     m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
     margin[w] = m
@@ -72,37 +73,12 @@ def launch_open_door_paper(
     """OpenDoor, `paper`: the root has passed the frame's plane y = 0 within the doorway, and the robot stands.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        qpos: Positions, MuJoCo layout, shape [worlds, nq].
-        root_qpos_adr: Address of the robot's free joint in `qpos`.
         doorway: One box; its frame's y = 0 is the plane, x = 0 the middle of the leaf.
         half_width: Largest |x| [m], 0.55.
         min_y: Smallest y [m], 0.02.
-        stand_height: Smallest root height of a standing robot [m], 0.45.
-        stand_up: Smallest up-axis z of a standing robot, 0.60; its slack counts as metres at 1 m up the robot's axis.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        open_door_paper_kernel,
-        dim=success.shape[0],
-        inputs=[
-            xpos,
-            xquat,
-            qpos,
-            root_qpos_adr,
-            doorway.body,
-            doorway.pos,
-            doorway.quat,
-            half_width,
-            min_y,
-            stand_height,
-            stand_up,
-        ],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    inputs = [xpos, xquat, qpos, root_qpos_adr, doorway, half_width, min_y, stand_height, stand_up]
+    launch(open_door_paper_kernel, success.shape[0], inputs, [success, margin])
 
 
 @wp.kernel
@@ -144,23 +120,12 @@ def launch_open_door_released(
     Angles enter the margin as the arc [m] at 1 m from the hinge; a latched leaf counts as closed.
 
     Args:
-        qpos: Positions, MuJoCo layout, shape [worlds, nq].
-        root_qpos_adr: Address of the robot's free joint in `qpos`.
         leaf_qpos_adr: Address of the leaf's hinge in `qpos`, 0 rad = closed.
         latched: 1 = the latch still holds the leaf, int32, shape [worlds].
         min_angle: Smallest |angle| of the leaf [rad], 60 deg, positive.
-        stand_height: Smallest root height of a standing robot [m], 0.45.
-        stand_up: Smallest up-axis z of a standing robot, 0.60.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        open_door_released_kernel,
-        dim=success.shape[0],
-        inputs=[qpos, root_qpos_adr, leaf_qpos_adr, latched, min_angle, stand_height, stand_up],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    inputs = [qpos, root_qpos_adr, leaf_qpos_adr, latched, min_angle, stand_height, stand_up]
+    launch(open_door_released_kernel, success.shape[0], inputs, [success, margin])
 
 
 @wp.kernel
@@ -201,24 +166,14 @@ def launch_sit_sofa_paper(
     """SitSofa, `paper`: pelvis, hips and thighs press the seat hard enough and the root is low, several ticks in a row.
 
     Args:
-        qpos: Positions, MuJoCo layout, shape [worlds, nq].
         seat_force: Normal force of those links on the seat [N], shape [worlds].
-        root_qpos_adr: Address of the robot's free joint in `qpos`.
         min_force: Smallest force [N], 50.
         max_root_z: Root height below which the robot sits [m], 0.62.
         confirm_ticks: Ticks in a row, 25.
         stiffness: Turns force into length for the margin alone [N/m]; 500 puts no force 0.1 m away from 50 N.
-        counter: Ticks in a row so far, updated, int32, shape [worlds]; clear it at reset.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        sit_sofa_paper_kernel,
-        dim=success.shape[0],
-        inputs=[qpos, root_qpos_adr, seat_force, min_force, max_root_z, stiffness, confirm_ticks],
-        outputs=[counter, success, margin],
-        device=success.device,
-    )
+    inputs = [qpos, root_qpos_adr, seat_force, min_force, max_root_z, stiffness, confirm_ticks]
+    launch(sit_sofa_paper_kernel, success.shape[0], inputs, [counter, success, margin])
 
 
 @wp.func
@@ -307,10 +262,7 @@ def sit_sofa_released_kernel(
     xquat: wp.array3d[float],
     contact_force: wp.array2d[float],
     bodies: wp.array[int],
-    seat_body: wp.array[int],
-    seat_pos: wp.array[wp.vec3],
-    seat_quat: wp.array[wp.vec4],
-    seat_half: wp.array[wp.vec3],
+    seat: Boxes,
     below: float,
     above: float,
     min_force: float,
@@ -320,8 +272,8 @@ def sit_sofa_released_kernel(
 ):
     """One thread per world."""
     w = wp.tid()
-    c = box_centre(xpos, xquat, seat_body, seat_pos, w, 0)
-    h = world_half(box_rotation(xquat, seat_body, seat_quat, w, 0), seat_half[0])
+    c = box_centre(xpos, xquat, seat, w, 0)
+    h = world_half(box_rotation(xquat, seat, w, 0), seat.half[0])
     pressing = most_pressing(xpos, contact_force, bodies, c, h, w, below, above, min_force, stiffness)
     m = slack_pressing(xpos, contact_force, c, h, w, pressing, below, above, min_force, stiffness)
     second = second_deepest(xpos, bodies, c, h, w, below, above)
@@ -348,8 +300,6 @@ def launch_sit_sofa_released(
     """SitSofa, `released`: one listed body in the seat volume with contact, or two in it without; one tick.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
         contact_force: Norm of the net contact force on each body [N], shape [worlds, nbody].
         bodies: Bodies that count, at least one, int32, shape [k]; one that is listed twice counts as two.
         seat: One box; its world-axis box is the seat.
@@ -357,16 +307,9 @@ def launch_sit_sofa_released(
         above: How far above the seat's top a body still counts [m], 0.35.
         min_force: Smallest contact force [N], 5.
         stiffness: Turns force into length for the margin alone [N/m].
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        sit_sofa_released_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, contact_force, bodies, *seat.arrays, below, above, min_force, stiffness],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    inputs = [xpos, xquat, contact_force, bodies, seat, below, above, min_force, stiffness]
+    launch(sit_sofa_released_kernel, success.shape[0], inputs, [success, margin])
 
 
 @wp.func
@@ -412,10 +355,7 @@ def boxing_kernel(
     xquat: wp.array3d[float],
     palm_body: wp.array[int],
     palm_offset: wp.array[wp.vec3],
-    target_body: wp.array[int],
-    target_pos: wp.array[wp.vec3],
-    target_quat: wp.array[wp.vec4],
-    target_half: wp.array[wp.vec3],
+    target: Boxes,
     min_radius: float,
     pad: float,
     success: wp.array[int],
@@ -423,8 +363,8 @@ def boxing_kernel(
 ):
     """One thread per world."""
     w = wp.tid()
-    centre = box_centre(xpos, xquat, target_body, target_pos, w, 0)
-    h = target_half[0]
+    centre = box_centre(xpos, xquat, target, w, 0)
+    h = target.half[0]
     reach = wp.max(wp.max(wp.max(h[0], h[1]), h[2]), min_radius) + pad
     best = nearest_fist(xpos, xquat, centre, palm_body, palm_offset, w)
     m = reach - fist_distance(xpos, xquat, centre, palm_body, palm_offset, w, best)
@@ -447,23 +387,14 @@ def launch_boxing(
     """Boxing: a palm within max(bounding radius, min_radius) + pad of the target's centre.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
         palm_body: Bodies that carry the palms, int32, shape [k].
         palm_offset: Palms in those bodies' frames [m], vec3, shape [k].
         target: One box; half of its largest extent is the bounding radius.
         min_radius: 0 in `paper`, 0.10 in `released` [m].
         pad: Reach beyond the radius [m], 0.08.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        boxing_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, palm_body, palm_offset, *target.arrays, min_radius, pad],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    inputs = [xpos, xquat, palm_body, palm_offset, target, min_radius, pad]
+    launch(boxing_kernel, success.shape[0], inputs, [success, margin])
 
 
 @wp.func
@@ -513,10 +444,7 @@ def vis_navi_kernel(
     qpos: wp.array2d[float],
     root: int,
     feet: wp.array[int],
-    zone_body: wp.array[int],
-    zone_pos: wp.array[wp.vec3],
-    zone_quat: wp.array[wp.vec4],
-    zone_half: wp.array[wp.vec3],
+    zone: Boxes,
     round_zone: int,
     stand_height: float,
     stand_up: float,
@@ -525,10 +453,10 @@ def vis_navi_kernel(
 ):
     """One thread per world."""
     w = wp.tid()
-    q = box_rotation(xquat, zone_body, zone_quat, w, 0)
-    c = box_centre(xpos, xquat, zone_body, zone_pos, w, 0)
-    worst = worst_foot(xpos, feet, c, q, zone_half[0], round_zone, w)
-    m = foot_slack(xpos, feet, c, q, zone_half[0], round_zone, w, worst)
+    q = box_rotation(xquat, zone, w, 0)
+    c = box_centre(xpos, xquat, zone, w, 0)
+    worst = worst_foot(xpos, feet, c, q, zone.half[0], round_zone, w)
+    m = foot_slack(xpos, feet, c, q, zone.half[0], round_zone, w, worst)
     m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
     margin[w] = m
     success[w] = holds(m)
@@ -551,22 +479,9 @@ def launch_vis_navi(
     """VisNavi: the origins of all foot links inside the zone, seen from above, and the robot stands.
 
     Args:
-        xpos: Body positions [m], shape [worlds, nbody, 3].
-        xquat: Body orientations, wxyz, shape [worlds, nbody, 4].
-        qpos: Positions, MuJoCo layout, shape [worlds, nq].
-        root_qpos_adr: Address of the robot's free joint in `qpos`.
         feet: Ankle links, int32, shape [k].
         zone: One box.
         round_zone: Whether the zone is the upright cylinder inscribed in the box, its diameter the smaller extent.
-        stand_height: Smallest root height of a standing robot [m], 0.45.
-        stand_up: Smallest up-axis z of a standing robot, 0.60.
-        success: Output, int32, shape [worlds].
-        margin: Output [m], shape [worlds].
     """
-    launch_again(
-        vis_navi_kernel,
-        dim=success.shape[0],
-        inputs=[xpos, xquat, qpos, root_qpos_adr, feet, *zone.arrays, int(round_zone), stand_height, stand_up],
-        outputs=[success, margin],
-        device=success.device,
-    )
+    inputs = [xpos, xquat, qpos, root_qpos_adr, feet, zone, int(round_zone), stand_height, stand_up]
+    launch(vis_navi_kernel, success.shape[0], inputs, [success, margin])

@@ -86,7 +86,7 @@ def launch_write_ctrl(
     """
     dim = (ctrl.shape[0], joint_ctrl.shape[0] + hand_ctrl.shape[0])
     inputs = [targets, joint_ctrl, hands, hand_ctrl, hand_open, hand_close, mask]
-    launch(_write_ctrl, dim=dim, inputs=inputs, outputs=[ctrl], device=ctrl.device)
+    launch(_write_ctrl, dim, inputs, [ctrl])
 
 
 @wp.kernel
@@ -114,7 +114,7 @@ def launch_check_targets(targets: wp.array, joint_ctrl: wp.array, ctrl: wp.array
         ctrl: Actuator targets [rad], shape [worlds, nu].
         bad: Output, 1 = a target was not finite, int32, shape [worlds].
     """
-    launch(_check_targets, dim=bad.shape[0], inputs=[targets, joint_ctrl, ctrl], outputs=[bad], device=bad.device)
+    launch(_check_targets, bad.shape[0], [targets, joint_ctrl, ctrl], [bad])
 
 
 @wp.kernel
@@ -126,7 +126,7 @@ def _sanitize(bad: wp.array[wp.int32], neutral: wp.array[wp.float32], action: wp
 
 def launch_sanitize(bad: wp.array, neutral: wp.array, action: wp.array) -> None:
     """Replace the actions of worlds flagged `bad` [worlds] by `neutral` [40]."""
-    launch(_sanitize, dim=action.shape, inputs=[bad, neutral], outputs=[action], device=action.device)
+    launch(_sanitize, action.shape, [bad, neutral], [action])
 
 
 @wp.kernel
@@ -159,7 +159,7 @@ def _status(
 def launch_status(success, fallen, event, bad_state, bad_action, bad_targets, status) -> None:
     """One code per world, int32 [worlds], in the original's order: error, then success, then fall, then task events."""
     inputs = [success, fallen, event, bad_state, bad_action, bad_targets]
-    launch(_status, dim=status.shape[0], inputs=inputs, outputs=[status], device=status.device)
+    launch(_status, status.shape[0], inputs, [status])
 
 
 @dataclass
@@ -217,13 +217,8 @@ def launch_clear_log(log: EpisodeLog, mask: wp.array, first: int) -> None:
         mask: 1 = clear, int32, shape [worlds].
         first: Tick that they are at: 0, or minus the length of the start-up.
     """
-    launch(
-        _clear_log,
-        dim=mask.shape[0],
-        inputs=[mask, first],
-        outputs=[log.tick, log.fall_trigger, log.event, log.contact_tick, log.predicate_ticks],
-        device=mask.device,
-    )
+    cleared = [log.tick, log.fall_trigger, log.event, log.contact_tick, log.predicate_ticks]
+    launch(_clear_log, mask.shape[0], [mask, first], cleared)
 
 
 @wp.kernel
@@ -262,12 +257,7 @@ def _log(
 
 
 def launch_log(
-    log: EpisodeLog,
-    mask: wp.array,
-    fall_now: wp.array,
-    event_now: wp.array,
-    pressed: wp.array,
-    predicates: wp.array,
+    log: EpisodeLog, mask: wp.array, fall_now: wp.array, event_now: wp.array, pressed: wp.array, predicates: wp.array
 ) -> None:
     """Count a tick of the masked worlds and keep what happens at it for the first time.
 
@@ -281,18 +271,5 @@ def launch_log(
         pressed: 1 = a critical body is pressed, int32, shape [worlds].
         predicates: 1 where a predicate holds at this tick, int32, shape [worlds, n].
     """
-    launch(
-        _log,
-        dim=mask.shape[0],
-        inputs=[mask, fall_now, event_now, pressed, predicates],
-        outputs=[
-            log.tick,
-            log.fall_trigger,
-            log.fall_tick,
-            log.event,
-            log.event_tick,
-            log.contact_tick,
-            log.predicate_ticks,
-        ],
-        device=mask.device,
-    )
+    kept = [log.tick, log.fall_trigger, log.fall_tick, log.event, log.event_tick, log.contact_tick, log.predicate_ticks]
+    launch(_log, mask.shape[0], [mask, fall_now, event_now, pressed, predicates], kept)

@@ -36,13 +36,12 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 """Libraries that may be absent."""
 MOST_ANY = 30
 ANY = {
+    "arena_newton/differentiable.py": "a context of autograd keeps whatever it is given",
     "arena_newton/foreign.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/registry.py": "what a maker takes is its own business",
     "policies/base.py": "what a maker takes is its own business, and JSON",
-    "policies/experts/base.py": "JSON",
     "policies/remote.py": "options of the command line and JSON",
-    "policies/replay.py": "JSON",
 }
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
 MOST_LINES = 600
@@ -53,6 +52,8 @@ STEMS = {
     "vis_navi": "a task and its expert",
     "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",
     "canonical": "the layout, and its kernels",
+    "options": "every command line keeps its flags in one record",
+    "rollout": "episodes of a policy, and cells of the tracker suite",
 }
 """Stems that two modules share, and why."""
 

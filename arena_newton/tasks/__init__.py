@@ -5,18 +5,7 @@ import importlib
 from arena_newton.errors import InputError
 from arena_newton.tasks.base import Draws, LightDraw, ObjectSpec, Pose, Required, TaskSpec
 
-__all__ = [
-    "Draws",
-    "LightDraw",
-    "ObjectSpec",
-    "Pose",
-    "Required",
-    "TaskSpec",
-    "get",
-    "names",
-    "register",
-    "unregister",
-]
+__all__ = ["Draws", "LightDraw", "ObjectSpec", "Pose", "Required", "TaskSpec", "get", "names", "register", "unregister"]
 
 _NAMES = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
 _registered: dict[str, TaskSpec] = {}

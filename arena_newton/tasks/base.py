@@ -6,6 +6,7 @@ Drawing is pure: an episode's draws depend on its seed, its mode and the rule se
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -189,7 +190,7 @@ def paper_execution(base: PoseRange, original: PoseRange, void: bool) -> PoseRan
     return PoseRange(*(axis(getattr(base, k), getattr(original, k)) for k in ("x", "y", "z", "yaw")))  # type: ignore[arg-type]
 
 
-def draw_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+def draw_uniform(rng: np.random.Generator | random.Random, bounds: tuple[float, float]) -> float:
     """One number; reversed bounds are harmless, equal bounds consume nothing."""
     low, high = min(bounds), max(bounds)
     return float(rng.uniform(low, high)) if high > low else low
@@ -254,14 +255,9 @@ def light_direction(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Vec3:
 def draw_light(episode_seed: int, ranges: LightRange) -> LightDraw:
     """Visual mode's light; equal bounds consume no draw."""
     rng = seeding.light_rng(episode_seed)
-
-    def draw(bounds: tuple[float, float]) -> float:
-        low, high = min(bounds), max(bounds)
-        return rng.uniform(low, high) if high > low else low
-
-    yaw, pitch, roll = draw(ranges.yaw_deg), draw(ranges.pitch_deg), draw(ranges.roll_deg)
-    intensity = draw(ranges.intensity)
-    red, green, blue = (draw(c) for c in ranges.color)
+    yaw, pitch, roll = (draw_uniform(rng, bounds) for bounds in (ranges.yaw_deg, ranges.pitch_deg, ranges.roll_deg))
+    intensity = draw_uniform(rng, ranges.intensity)
+    red, green, blue = (draw_uniform(rng, bounds) for bounds in ranges.color)
     return LightDraw(light_direction(yaw, pitch, roll), intensity, (red, green, blue), pitch, roll, yaw)
 
 

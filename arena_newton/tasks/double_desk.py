@@ -90,12 +90,15 @@ class DoubleDeskJudge(Judge):
         """See `Judge.decide`."""
         from arena_newton.kernels import success
 
-        state = (physics.xpos, physics.xquat, physics.xipos)
-        common = {"hammer_body": self.hammer, "inside": self.inside, **self.outputs()}
-        if self.rule.min_z is None:
-            success.launch_double_desk_paper(*state, **common)
-        else:
-            success.launch_double_desk_released(*state, min_z=self.rule.min_z, **common)
+        success.launch_double_desk(
+            physics.xpos,
+            physics.xquat,
+            physics.xipos,
+            hammer_body=self.hammer,
+            inside=self.inside,
+            min_z=self.rule.min_z,
+            **self.outputs(),
+        )
 
 
 TASK = TaskSpec(

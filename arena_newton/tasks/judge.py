@@ -177,9 +177,9 @@ class Judge:
 
     def boxes(self, *markers: Marker) -> Boxes:
         """Boxes on the device, for kernels."""
-        from arena_newton.kernels.boxes import Boxes
+        from arena_newton.kernels.boxes import upload_boxes
 
-        return Boxes.from_boxes(markers, self.device)
+        return upload_boxes(markers, self.device)
 
     def points(self, *points: BodyFrame) -> tuple[wp.array, wp.array]:
         """Bodies that carry some points, int32, and the points in their frames [m], vec3; both of shape [points]."""

@@ -181,7 +181,7 @@ def _turn(physics, hinge, torque, worlds):
     """Let a torque [N·m] act about a hinge of the door in the listed worlds, from now on."""
     scene, at_rest = physics.scene, mujoco.MjData(physics.models[0])
     mujoco.mj_kinematics(physics.models[0], at_rest)
-    joint = scene.joint(f"/World/Door/{hinge}")
+    joint = scene.joint_ids[f"/World/Door/{hinge}"]
     force = physics.external_force.numpy()
     force[worlds, scene.mj_model.jnt_bodyid[joint], 3:] = torque * at_rest.xaxis[joint]
     physics.external_force.assign(force)
@@ -307,7 +307,7 @@ over "World"
     assert scene.mj_model.neq == 2 and scene.latch.equality == 1, "the layer's weld comes first"
     held = [int(scene.mj_model.eq_type[e]) for e in range(scene.mj_model.neq)]
     assert held[scene.latch.equality] == mujoco.mjtEq.mjEQ_JOINT
-    assert int(scene.mj_model.eq_obj1id[scene.latch.equality]) == scene.joint("/World/Door/LeafHinge")
+    assert int(scene.mj_model.eq_obj1id[scene.latch.equality]) == scene.joint_ids["/World/Door/LeafHinge"]
 
 
 def test_an_unstable_world_writes_no_file(football_native, tmp_path, monkeypatch):

@@ -117,7 +117,7 @@ class Stage:
 
     def boxes(self, *markers):
         """Uploads markers."""
-        return success.Boxes.from_boxes(markers, self.device)
+        return success.upload_boxes(markers, self.device)
 
     def judge(self, launch, *arrays, outputs=("success", "margin"), **options):
         """Runs a launch on uploaded arrays; gives its outputs as NumPy."""

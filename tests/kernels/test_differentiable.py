@@ -121,14 +121,14 @@ def test_reference_step_gradients_have_the_known_ones(device, twin):
 
 
 def _box(twin, device, body, half, quat=(0.9, 0.05, -0.1, 0.3)):
-    return success.Boxes.from_boxes([twin.Marker(body, (0.05, -0.02, 0.04), quat, half)], device)
+    return success.upload_boxes([twin.Marker(body, (0.05, -0.02, 0.04), quat, half)], device)
 
 
 def _cases(twin, device):
     """Each predicate: launch, fixed arguments, names of its float arrays."""
     ids = [wp.array(v, dtype=wp.int32, device=device) for v in ([1, 2], [2, 6, 1], [1, 2, 6, 5])]
     offsets = wp.array([(0.1, 0.02, 0.0), (0.05, 0.0, 0.03)], dtype=wp.vec3, device=device)
-    decks = success.Boxes.from_boxes(
+    decks = success.upload_boxes(
         [twin.Marker(3, (0, 0, z), (0.95, 0.02, 0.03, 0.2), (0.5, 0.4, 0.05)) for z in (-0.4, 0.0, 0.4)], device
     )
     free = {"latched": wp.zeros(WORLDS, dtype=wp.int32, device=device)}
@@ -148,8 +148,8 @@ def _cases(twin, device):
     return {
         "football paper": (success.launch_football, football | {"rear_bound": True}, poses),
         "football released": (success.launch_football, football | {"rear_bound": False}, poses),
-        "double_desk paper": (success.launch_double_desk_paper, desk, (*poses, "xipos")),
-        "double_desk released": (success.launch_double_desk_released, desk | {"min_z": -0.2}, (*poses, "xipos")),
+        "double_desk paper": (success.launch_double_desk, desk, (*poses, "xipos")),
+        "double_desk released": (success.launch_double_desk, desk | {"min_z": -0.2}, (*poses, "xipos")),
         "pp_box paper": (success.launch_pp_box_paper, box | paper_box, (*poses, "qvel")),
         "pp_box released": (success.launch_pp_box_released, box | {"deck": 1, "plane_below": 0.15}, poses),
         "open_door paper": (success.launch_open_door_paper, door | root | STAND, (*poses, "qpos")),

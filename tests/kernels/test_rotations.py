@@ -6,6 +6,12 @@ import warp as wp
 from arena_newton.kernels import rotations as rot
 
 
+@wp.func
+def wxyz(q: wp.quat) -> wp.vec4:
+    """The numbers (w, x, y, z) of a quaternion."""
+    return wp.vec4(q[3], q[0], q[1], q[2])
+
+
 @wp.kernel
 def _angles(quat: wp.array2d[float], out: wp.array2d[float]):
     w = wp.tid()
@@ -14,7 +20,7 @@ def _angles(quat: wp.array2d[float], out: wp.array2d[float]):
     out[w, 1] = rot.pitch_of(q)
     out[w, 2] = rot.heading_yaw(q)
     out[w, 3] = rot.up_of(q)
-    v = rot.wxyz_from_quat(rot.quat_from_wxyz(wp.vec4(quat[w, 0], quat[w, 1], quat[w, 2], quat[w, 3])))
+    v = wxyz(rot.quat_from_wxyz(wp.vec4(quat[w, 0], quat[w, 1], quat[w, 2], quat[w, 3])))
     for i in range(4):
         out[w, 4 + i] = v[i]
 
@@ -31,7 +37,7 @@ def _encode(quat: wp.array2d[float], out: wp.array2d[float]):
 def _decode(rot6d: wp.array2d[float], out: wp.array2d[float], degenerate: wp.array[int]):
     w = wp.tid()
     v = rot.vec6(rot6d[w, 0], rot6d[w, 1], rot6d[w, 2], rot6d[w, 3], rot6d[w, 4], rot6d[w, 5])
-    q = rot.wxyz_from_quat(rot.quat_from_rot6d(v))
+    q = wxyz(rot.quat_from_rot6d(v))
     for i in range(4):
         out[w, i] = q[i]
     degenerate[w] = wp.where(rot.rot6d_is_degenerate(v), 1, 0)
@@ -45,7 +51,7 @@ def _wrap(angle: wp.array[float], out: wp.array[float]):
 @wp.kernel
 def _heading(yaw: wp.array[float], out: wp.array2d[float]):
     w = wp.tid()
-    q = rot.wxyz_from_quat(rot.heading_quat(yaw[w]))
+    q = wxyz(rot.heading_quat(yaw[w]))
     for i in range(4):
         out[w, i] = q[i]
 
@@ -53,7 +59,7 @@ def _heading(yaw: wp.array[float], out: wp.array2d[float]):
 @wp.kernel
 def _limit(a: wp.array2d[float], b: wp.array2d[float], limit: float, out: wp.array2d[float]):
     w = wp.tid()
-    q = rot.wxyz_from_quat(rot.limit_rotation(rot.load_quat2(a, w, 0), rot.load_quat2(b, w, 0), limit))
+    q = wxyz(rot.limit_rotation(rot.load_quat2(a, w, 0), rot.load_quat2(b, w, 0), limit))
     for i in range(4):
         out[w, i] = q[i]
 

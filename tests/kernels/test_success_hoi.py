@@ -90,10 +90,10 @@ def test_double_desk_random(device, twin):
     arrays, boxes = (stage.xpos, quats, com), stage.boxes(inside)
     centre, r = twin.box_pose(inside, stage.xpos, quats)
     half = np.float64(np.float32(inside.half))
-    ok, margin = stage.judge(success.launch_double_desk_paper, *arrays, hammer_body=6, inside=boxes)
+    ok, margin = stage.judge(success.launch_double_desk, *arrays, hammer_body=6, inside=boxes)
     local = np.einsum("wij,wi->wj", r, com[:, 6] - centre)
     twin.check(ok, margin, twin.inside(local, -half, half))
-    ok, margin = stage.judge(success.launch_double_desk_released, *arrays, hammer_body=6, inside=boxes, min_z=-0.1)
+    ok, margin = stage.judge(success.launch_double_desk, *arrays, hammer_body=6, inside=boxes, min_z=-0.1)
     low, high = twin.world_box(centre, r, inside.half)
     expected = np.minimum(twin.inside(com[:, 6].astype(np.float64), low, high), com[:, 6, 2] + 0.1)
     twin.check(ok, margin, expected)
@@ -121,9 +121,9 @@ def test_double_desk_thresholds(device, twin, com, paper, released):
     centre = np.zeros((1, BODIES, 3), np.float32)
     centre[0, 6] = com
     arrays = (stage.xpos, stage.xquat, centre)
-    ok, _ = stage.judge(success.launch_double_desk_paper, *arrays, hammer_body=6, inside=boxes)
+    ok, _ = stage.judge(success.launch_double_desk, *arrays, hammer_body=6, inside=boxes)
     assert ok[0] == paper
-    ok, _ = stage.judge(success.launch_double_desk_released, *arrays, hammer_body=6, inside=boxes, min_z=0.445)
+    ok, _ = stage.judge(success.launch_double_desk, *arrays, hammer_body=6, inside=boxes, min_z=0.445)
     assert ok[0] == released
 
 
@@ -134,7 +134,7 @@ def test_double_desk_released_has_a_floor(device, twin):
     com = np.zeros((2, BODIES, 3), np.float32)
     com[:, 6, 2] = 0.444, 0.446
     ok, margin = stage.judge(
-        success.launch_double_desk_released, stage.xpos, stage.xquat, com, hammer_body=6, inside=boxes, min_z=0.445
+        success.launch_double_desk, stage.xpos, stage.xquat, com, hammer_body=6, inside=boxes, min_z=0.445
     )
     assert ok.tolist() == [0, 1]
     np.testing.assert_allclose(margin, [-0.001, 0.001], atol=2e-6)
