@@ -60,8 +60,6 @@ class RunConfig:
     checkpoint: Path | None
     """The tracker's weights, or several with a comma between; None: those that come with the package."""
     variant: Path | None
-    drive: DriveGains | None
-    """None: what rule set and tracker ask for."""
     video_size: tuple[int, int] | None
     """Size of the world camera's pictures [px]; None: the usual one."""
     policy_options: JsonObject
@@ -204,7 +202,6 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_label=label,
         checkpoint=checkpoint,
         variant=variant,
-        drive=DRIVES[options.drive],
         video_size=video_size,
         policy_options=policy_options,
         checkpoint_hash=checkpoint_hash,

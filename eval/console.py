@@ -8,14 +8,13 @@ from pathlib import Path
 from arena_newton.eval import report, stats
 from arena_newton.eval.config import RunConfig
 from arena_newton.eval.folder import BREAK_FILE, setting
-from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import duration, simulated
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.results import Results, RunRecord
 from arena_newton.text import counted, plain_text
 
-__all__ = ["announce", "broken", "environment", "failed", "kept", "result"]
+__all__ = ["announce", "broken", "environment", "failed", "result"]
 
 
 def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str], Sequence[Episode]]) -> None:
@@ -55,11 +54,6 @@ def environment(group: str, facts: JsonObject) -> str:
     """What an environment says of itself, in one line."""
     listed = ", ".join(f"{key} {setting(value)}" for key, value in facts.items() if key != "tracker")
     return f"  {group}: {listed}, tracker {setting(facts.get('tracker'))}"
-
-
-def kept(planned: int, records: Sequence[EpisodeRecord]) -> str:
-    """How many of the planned episodes are in the journal."""
-    return f"{len({record.index for record in records})} of {counted(planned, 'episode')} kept"
 
 
 def broken(group: str, message: str, running: Sequence[Episode]) -> str:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from tqdm import tqdm
@@ -51,11 +52,6 @@ class Rates:
     """Wall-clock time without building and compiling [s]."""
 
 
-@dataclass(frozen=True)
-class _Rollout:
-    episode_seed: int
-
-
 def fisher(a: int, n: int, b: int, m: int) -> float:
     """Two-sided p-value of `a` of `n` against `b` of `m` under one common rate.
 
@@ -79,7 +75,7 @@ def measure(options: EngineOptions, engine: str, policy: Policy) -> Rates:
         engine=engine,
         fast_physics=options.fast_physics,
     )
-    rollouts = [_Rollout(options.seed * 1_000_003 + i) for i in range(options.rollouts)]
+    rollouts = [SimpleNamespace(episode_seed=options.seed * 1_000_003 + i) for i in range(options.rollouts)]
     began = time.perf_counter()
     with tqdm(total=len(rollouts), desc=engine, unit="rollout", disable=None) as bar:  # none in a log file
         results = Rollout(
@@ -115,12 +111,12 @@ def moved_spawn(spec: TaskSpec, noise: float) -> Spawn:
 
 
 def _line(rates: Rates) -> str:
-    def share(count: int) -> str:
+    def rate(count: int) -> str:
         low, high = wilson(count, rates.rollouts)
         return f"{count}/{rates.rollouts} ({count / rates.rollouts:.1%}, 95 % {low:.1%} to {high:.1%})"
 
     return (
-        f"{rates.engine:<7} {rates.device:<7} falls {share(rates.falls)}  successes {share(rates.successes)}  "
+        f"{rates.engine:<7} {rates.device:<7} falls {rate(rates.falls)}  successes {rate(rates.successes)}  "
         f"errors {rates.errors}  overflows {rates.overflows}  {rates.wall_s:.0f} s"
     )
 
@@ -147,11 +143,9 @@ def run(options: EngineOptions) -> int:
     policy.check_task(options.task)
     earlier = _earlier(options.against)
     quiet_warp()
-    for engine in options.engines:  # an unknown one is told before the first rollout
+    for engine in options.engines:  # an unknown one is refused before the first rollout
         resolve_engine(engine, None)
-    rates = [*earlier]
-    for engine in options.engines:
-        rates.append(measure(options, engine, policy))
+    rates = [*earlier, *(measure(options, engine, policy) for engine in options.engines)]
     for one in rates:
         print(_line(one), flush=True)
     for i, one in enumerate(rates):

@@ -146,7 +146,7 @@ class EngineOptions:
     engines: tuple[str, ...] = ("mujoco",)
     """Engines: `mujoco` (CPU), `warp` (CUDA where there is one)."""
     rollouts: int = 200
-    """Rollouts an engine."""
+    """Rollouts per engine."""
     noise: float = 1e-3
     """Standard deviation of the spawn position, x and y [m]."""
     worlds: int = 20

@@ -171,12 +171,7 @@ def _csv(rows: Iterable[JsonObject], columns: Sequence[str]) -> str:
 
 
 def write_original(
-    folder: Path,
-    records: Sequence[EpisodeRecord],
-    *,
-    gym_ids: Mapping[str, str],
-    seeds: Sequence[int],
-    repeats: int,
+    folder: Path, records: Sequence[EpisodeRecord], *, gym_ids: Mapping[str, str], seeds: Sequence[int], repeats: int
 ) -> None:
     """Write the original's files for every task, tracker and mode among `records` (sorted by plan order).
 

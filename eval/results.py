@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NotRequired
 
 from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
@@ -34,18 +35,15 @@ class RunRecord:
         return self.document.get("status")
 
 
-class _Results(Aggregate):
+class Results(Aggregate):
+    """Content of results.json."""
+
     config_hash: str
     config: Identity
     planned: int
     finished: int
     complete: bool
-
-
-class Results(_Results, total=False):
-    """Content of results.json."""
-
-    status: str
+    status: NotRequired[str]
     """State of `document.Status`; absent in a folder of a version without status."""
 
 

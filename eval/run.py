@@ -19,13 +19,12 @@ from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import console, report
-from arena_newton.eval.config import RunConfig
+from arena_newton.eval.config import DRIVES, RunConfig
 from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
-from arena_newton.eval.records import JsonObject
 from arena_newton.eval.results import load_run
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
@@ -46,16 +45,12 @@ class RunStopped(ArenaError):
     exit_code = 2
 
 
-def _make_tracker(spec: str, checkpoint: Path | None) -> Tracker:
-    return trackers.get(spec, checkpoint=str(checkpoint) if checkpoint else None)
-
-
 @dataclass(frozen=True)
 class Factories:
     """What a run builds its parts with; tests put their own in."""
 
     env: Callable[..., World] = ArenaEnv
-    tracker: Callable[[str, Path | None], Tracker] = _make_tracker
+    tracker: Callable[[str, Path | None], Tracker] = trackers.get
     policy: Callable[..., Policy] = policies.get
     check_variant: Callable[[Path, str], None] = validate.check
     """Raises InputError for a file that is not a scene of the task."""
@@ -156,7 +151,8 @@ class _Run:
 
     def kept(self) -> str:
         """How many of the planned episodes are in the journal, in words."""
-        return console.kept(len(self.config.episodes), self.journal.records)
+        kept = len({record.index for record in self.journal.records})
+        return f"{kept} of {counted(len(self.config.episodes), 'episode')} kept"
 
     def play(self) -> None:
         """Run what is missing, task by task and mode by mode."""
@@ -242,7 +238,7 @@ class _Run:
                 variant_file=str(config.variant) if config.variant else None,
                 fast_physics=flags.fast_physics,
                 camera=config.camera,
-                drive=config.drive,
+                drive=DRIVES[flags.drive],
             )
             facts = self.folder.register(f"{task} {mode}", env.describe())
             if flags.verbose:
@@ -281,9 +277,8 @@ def _recorder(config: RunConfig, folder: Path) -> EpisodeRecorder | None:
     flags = config.flags
     if not (flags.video or flags.strip):
         return None
-    asked = {"episodes": flags.video_episodes, "size": config.video_size, "follow": flags.follow}
-    given: JsonObject = {key: value for key, value in asked.items() if value}
-    return EpisodeRecorder(folder, video=flags.video, strip=flags.strip, **given)
+    kinds = {"video": flags.video, "strip": flags.strip, "follow": flags.follow}
+    return EpisodeRecorder(folder, **kinds, episodes=flags.video_episodes, size=config.video_size)
 
 
 def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str | None]) -> EpisodeRecord:

@@ -1,16 +1,13 @@
 """The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policies.md).
 
-`POST /reset` begins an episode, `POST /infer` sends image and state and returns a chunk of actions. A server of that
-protocol knows one robot only, so there is one request per world. A world whose request fails ends as `error`; the
-others go on. A server that is gone, or that gives no usable answer to any world, stops the run.
-
-Every request carries the episode's seed and the step, so that a server which draws its noise from these two gives an
-episode the same actions whatever other episodes run. A server says so with `"seeded": true` in its replies to `/reset`.
+A server of that protocol knows one robot only, so there is one request per world. A world whose request fails ends as
+`error`; the others go on. A server that is gone, or that gives no usable answer to any world, stops the run.
 """
 
 from __future__ import annotations
 
 import base64
+import functools
 import http.client
 import json
 import math
@@ -68,7 +65,9 @@ class _Connection:
     def __init__(self, url: str, context: ssl.SSLContext | None, headers: dict[str, str]):
         parts = urlsplit(url)
         self._url, self._path, self._headers = url, parts.path.rstrip("/"), headers
-        self._host, self._port, self._context = parts.hostname or "", parts.port, context
+        kind = http.client.HTTPConnection
+        self._open = kind if context is None else functools.partial(http.client.HTTPSConnection, context=context)
+        self._server = (parts.hostname or "", parts.port)
         self._http: http.client.HTTPConnection | None = None
         self._busy = self._aborted = False
 
@@ -125,11 +124,7 @@ class _Connection:
         if self._http is not None and self._dropped():
             self.close()
         if self._http is None:
-            left = max(end - time.monotonic(), 0.001)
-            if self._context is not None:
-                self._http = http.client.HTTPSConnection(self._host, self._port, timeout=left, context=self._context)
-            else:
-                self._http = http.client.HTTPConnection(self._host, self._port, timeout=left)
+            self._http = self._open(*self._server, timeout=max(end - time.monotonic(), 0.001))
             self._http.connect()
             self._http.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._limit(end)
@@ -540,8 +535,7 @@ def _one_line(text: object) -> str:
 
 
 def _cause(error: BaseException) -> str:
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return _one_line(text)
+    return _one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)
 
 
 def from_spec(argument: str | None, **options: Any) -> RemotePolicy:

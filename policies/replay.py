@@ -66,7 +66,7 @@ class ReplayPolicy(Policy):
             actions = clip_actions(clip)
             lead = startup_actions(actions[0], stand=startup_stand, blend=startup_blend)
             self.actions = np.concatenate([lead, actions])
-        self._startup = (startup_stand, startup_blend)
+        self._startup = {"startup_stand": startup_stand, "startup_blend": startup_blend}
         self._hash = hashlib.sha256(self.path.read_bytes()).hexdigest()[:12]
         self._steps = np.zeros(0, dtype=np.int64)
 
@@ -86,16 +86,8 @@ class ReplayPolicy(Policy):
 
     def describe(self) -> Json:
         """File name and hash, and the times of the start."""
-        stand, blend = self._startup
-        return {
-            "name": self.name,
-            "file": self.path.name,
-            "hash": self._hash,
-            "ticks": len(self.actions),
-            "trimmed": self.trimmed,
-            "startup_stand": stand,
-            "startup_blend": blend,
-        }
+        played = {"name": self.name, "file": self.path.name, "hash": self._hash, "ticks": len(self.actions)}
+        return played | {"trimmed": self.trimmed} | self._startup
 
     def _grow(self, worlds: int) -> None:
         if len(self._steps) != worlds:
@@ -191,11 +183,7 @@ class ReplayEpisodes(Policy):
 
 
 def from_spec(argument: str | None) -> ReplayPolicy | ReplayEpisodes:
-    """Make the policy for `--policy replay:<path>`.
-
-    Raises:
-        InputError: No path was given, or the file is unfit.
-    """
+    """Make the policy for `--policy replay:<path>`; without a path it is refused."""
     if not argument:
         raise InputError(
             "--policy replay: needs a file or a folder, as in replay:walk.pkl, replay:actions.npz, replay:run/actions"

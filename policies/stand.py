@@ -24,11 +24,7 @@ class StandPolicy(Policy):
 
 
 def from_spec(argument: str | None) -> StandPolicy:
-    """Make the policy for `--policy stand`.
-
-    Raises:
-        InputError: There is text after a colon.
-    """
+    """Make the policy for `--policy stand`; text after a colon is refused."""
     if argument is not None:
         raise InputError(f"--policy stand:{argument}: stand takes no argument")
     return StandPolicy()

@@ -7,11 +7,7 @@ __all__ = ["Expert", "ExpertPolicy", "Sight", "from_spec"]
 
 
 def from_spec(argument: str | None) -> ExpertPolicy:
-    """Make the policy for `--policy expert`.
-
-    Raises:
-        InputError: There is text after a colon.
-    """
+    """Make the policy for `--policy expert`; text after a colon is refused."""
     if argument is not None:
         raise InputError(f"--policy expert:{argument}: expert takes no argument; it picks by the task")
     return ExpertPolicy()

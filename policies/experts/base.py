@@ -149,8 +149,9 @@ class ExpertPolicy(Policy):
 
     def attach(self, env: World) -> None:
         """Take the privileged view of an environment and pick the expert of its task."""
+        expert = expert_class(env.spec.name)
         self.sight = Sight(env)
-        self.expert = expert_class(env.spec.name)(self.sight)
+        self.expert = expert(self.sight)
         self.generator = ReferenceGenerator(env.worlds, env.torch_device)
         self._begins = np.ones(env.worlds, dtype=bool)
 

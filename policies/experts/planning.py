@@ -49,17 +49,10 @@ class Paths:
 
 
 def footprint(pos: Tensor, quat: Tensor, half: Tensor) -> Tensor:
-    """Rectangles on the floor that cover boxes in any orientation.
+    """Rectangles on the floor that cover boxes in any orientation: x, y, yaw, half length, half width, shape [..., 5].
 
-    Exact for upright boxes. The rectangle lies along the box axis that is longest seen from above.
-
-    Args:
-        pos: Centres [m], shape [..., 3].
-        quat: Orientations wxyz, shape [..., 4].
-        half: Half sizes [m], shape [..., 3].
-
-    Returns:
-        x, y, yaw, half length, half width, shape [..., 5].
+    Exact for upright boxes. The rectangle is parallel to the box axis that is longest seen from above. Given are
+    centres [m], orientations wxyz and half sizes [m], shapes [..., 3], [..., 4] and [..., 3].
     """
     w, x, y, z = quat.unbind(-1)
     top = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1)
@@ -117,13 +110,8 @@ def _freed(point: Tensor, boxes: Tensor, grow: Tensor) -> Tensor:
 def plan(start: Tensor, goal: Tensor, floor: Floor, clearances: tuple[float, ...] = CLEARANCES) -> Paths:
     """Paths from start to goal.
 
-    A start or goal too near a box is first moved away from it; the path still ends at the goal itself.
-
-    Args:
-        start: [m], shape [worlds, 2].
-        goal: [m], shape [worlds, 2].
-        floor: Obstacles and walls.
-        clearances: Clearances to try [m].
+    A start or goal too near a box is first moved away from it; the path still ends at the goal itself. Start and goal
+    are in m, shape [worlds, 2]; `clearances` [m] are those to try.
     """
     worlds, tries = len(start), len(clearances)
     boxes = floor.boxes.repeat(tries, 1, 1)
