@@ -52,8 +52,6 @@ STEMS = {
     "vis_navi": "a task and its expert",
     "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",
     "canonical": "the layout, and its kernels",
-    "options": "every command line keeps its flags in one record",
-    "rollout": "episodes of a policy, and cells of the tracker suite",
 }
 """Stems that two modules share, and why."""
 

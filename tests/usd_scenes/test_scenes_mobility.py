@@ -74,7 +74,7 @@ def test_door_hinge_values_reach_the_model():
     """Damping, friction, spring and limits arrive in radians and newton metres."""
     scene = scene_of("open_door")
     m = scene.mj_model
-    leaf, handle = (scene.joint(f"/World/Door/{n}") for n in ("LeafHinge", "HandleHinge"))
+    leaf, handle = (scene.joint_ids[f"/World/Door/{n}"] for n in ("LeafHinge", "HandleHinge"))
     assert np.degrees(m.jnt_range[leaf]) == pytest.approx([-2, 110], abs=1e-4)
     assert np.degrees(m.jnt_range[handle]) == pytest.approx([-50, 2], abs=1e-4)
     assert m.dof_damping[m.jnt_dofadr[leaf]] == pytest.approx(1.5, rel=1e-5)

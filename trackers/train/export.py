@@ -48,12 +48,14 @@ def export(checkpoint: Path, options: ExportOptions) -> Path:
     card |= {name: text for name in ("note", "hardware") if (text := getattr(options, name))}
     if options.metrics is not None:
         card["metrics"] = _figures(options.metrics, card["tracker"])
+    try:
+        read = weights_file.action_form(form), weights_file.drive(drive), weights_file.physics(physics)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{checkpoint}: the card's action form, drive or physics rate is unfit ({error})") from None
     weights = weights_file.Weights(
-        interface=card["tracker"],
-        network=network,
-        action_form=weights_file.action_form(form),
-        drive=weights_file.drive(drive),
-        physics=weights_file.physics(physics),
+        card["tracker"],
+        network,
+        *read,
         symmetric=options.symmetric,
         card=card | {"symmetric": options.symmetric},
     )
