@@ -18,7 +18,7 @@ PARTIAL = ".part"
 
 @contextlib.contextmanager
 def replace_atomically(path: str | Path, *, sync: bool = False) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `path`; at the end of the block it takes its name, on an error it goes.
+    """Open a temporary file next to `path`: renamed to it at the end of the block, removed on an error.
 
     The folder is made where there is none; links at the temporary name are not followed.
 

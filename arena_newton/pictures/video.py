@@ -49,7 +49,7 @@ def _named(error: OSError, path: Path) -> OSError:
 class VideoWriter:
     """An H.264 MP4 (yuv420p) that appears under its name only when it is complete.
 
-    Frames go to `<name>.part` beside the target; `close` renames it. Odd sizes are padded by one black row or column,
+    Frames go to `<name>.part` next to the target; `close` renames it. Odd sizes are padded by one black row or column,
     because yuv420p halves both.
     """
 
@@ -80,7 +80,7 @@ class VideoWriter:
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.height, self._stream.width = self._size
         self._stream.pix_fmt = "yuv420p"
-        # One encoder thread: videos are written beside a simulation that uses every core.
+        # One encoder thread: videos are written during a simulation that uses every core.
         self._stream.codec_context.thread_count = 1
         self._stream.options = {"crf": str(crf), "preset": "veryfast"}
 
