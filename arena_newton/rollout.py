@@ -223,7 +223,7 @@ class Rollout:
             error=error,
             phases=tuple(running.phases),
             predicates=verdict.predicates,
-            progress=verdict.progress,
+            progress=1.0 if outcome == "success" else verdict.progress,
             events=verdict.events,
         )
         self._results[running.index] = result

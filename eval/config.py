@@ -158,6 +158,7 @@ def resolve(options: RunOptions) -> RunConfig:
     quick = is_quick(options)
     tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
     checkpoint, checkpoint_hash = _checkpoint(options)
+    trackers.check_spec(options.tracker)
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None

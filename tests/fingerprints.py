@@ -61,13 +61,18 @@ class Fingerprints:
 
     def __init__(self, root: Path, work: Path):
         self.root, self.work = root.resolve(), work
+        asked = "import arena_newton; print(arena_newton.__file__)"
+        environment = os.environ | {"PYTHONPATH": str(self.root)}
+        found = subprocess.run([sys.executable, "-c", asked], cwd=work, env=environment, capture_output=True, text=True)
+        if found.stdout.strip() != str(self.root / "arena_newton" / "__init__.py"):
+            raise SystemExit(f"--root {root}: is not a checkout whose package can be imported\n{found.stderr}")
 
     def call(self, module: str, *flags: str) -> str:
         """Standard output of a command of the checkout; a failure ends the comparison."""
         environment = os.environ | {"PYTHONPATH": str(self.root), "COLUMNS": "150"}
         command = [sys.executable, "-m", f"arena_newton.{module}", *flags]
         done = subprocess.run(command, cwd=self.work, env=environment, capture_output=True, text=True)
-        if done.returncode not in (0, 1):
+        if done.returncode:
             raise SystemExit(f"{' '.join(command)}: exit code {done.returncode}\n{done.stderr[-3000:]}")
         return done.stdout
 

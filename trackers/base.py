@@ -23,6 +23,7 @@ __all__ = [
     "RobotState",
     "Tracker",
     "TrackerCommand",
+    "check_spec",
     "get",
     "names",
     "register",
@@ -116,6 +117,15 @@ def shipped_weights(spec: str) -> Path | None:
     """The weights that come with the package for a built-in tracker; None without any."""
     path = weights_path(spec)
     return path if spec in _TRACKERS.built_in and path.is_file() else None
+
+
+def check_spec(spec: str) -> None:
+    """Validate a tracker's name without making the tracker.
+
+    Raises:
+        InputError: Unknown name, or a name that is offered twice.
+    """
+    _TRACKERS.check(spec)
 
 
 def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:

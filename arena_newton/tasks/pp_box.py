@@ -34,7 +34,7 @@ ON_DECK = 0.06
 PREDICATES = (
     Predicate("approach", f"root within {num(REACH)} m of the box, seen from above"),
     Predicate("contact", f"a palm within {num(TOUCH)} m of the box"),
-    Predicate("lift", f"the box's bottom {num(LIFT)} m above the table"),
+    Predicate("lift", f"the box's centre {num(LIFT)} m above where it is when the box rests on the table"),
     Predicate("transport", f"the box's centre within {num(OVER_SHELF)} m of the shelf's decks, seen from above"),
     Predicate("place", f"the box's centre over a deck, its bottom within {num(ON_DECK)} m of it"),
     Predicate("release", f"the same, and no palm within {num(TOUCH)} m of the box"),
@@ -94,7 +94,7 @@ class PPBoxJudge(Judge):
         self.rule: PPBoxAnyDeckRule | PPBoxOneDeckRule = rules.task("pp_box").success
         box, decks = bounding_box(scene, BOX), tuple(scene.marker(path) for path in DECKS)
         centre, half = BodyFrame(box.body_id, box.pos, IDENTITY), box.half[2]
-        bottom = BodyFrame(box.body_id, (box.pos[0], box.pos[1], box.pos[2] - half), IDENTITY)
+        centre = BodyFrame(box.body_id, box.pos, IDENTITY)
         placed = Condition("near", 0.0, (centre,), tuple(on_deck(deck, half) for deck in decks))
         super().__init__(
             scene,
@@ -102,7 +102,7 @@ class PPBoxJudge(Judge):
             {
                 "approach": [near(links(scene, "pelvis"), box, REACH, horizontal=True)],
                 "contact": [near(palms(scene), box, TOUCH)],
-                "lift": [above(bottom, top(scene, TABLE) + LIFT)],
+                "lift": [above(centre, top(scene, TABLE) + half + LIFT)],
                 "transport": [near([centre], decks[0], OVER_SHELF, horizontal=True)],
                 "place": [placed],
                 "release": [placed, Condition("clear", TOUCH, palms(scene), (box,))],

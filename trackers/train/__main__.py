@@ -9,7 +9,7 @@ import tyro
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.trackers.train.train_options import CurveOptions, ExportCommand, TrainOptions
+from arena_newton.trackers.train.train_options import CurveOptions, ExportCommand, TrainOptions, check
 
 __all__ = ["main"]
 
@@ -32,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             (_export if arguments[0] == "export" else _curves)(arguments[1:])
             return
         options = tyro.cli(TrainOptions, args=arguments, prog=PROG)
+        check(options)  # before the libraries are loaded
         from arena_newton.quiet import quiet_warp
         from arena_newton.trackers.train.session import train
 
