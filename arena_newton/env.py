@@ -389,6 +389,6 @@ class ArenaEnv:
             margin=float(self.judge.margin.numpy()[row]),
             overflow=self.physics.overflowed(row),
             predicates=dict(zip(names, ticks, strict=True)),
-            progress=1.0 if ticks[-1] is not None else held / len(ticks),
+            progress=1.0 if ticks and ticks[-1] is not None else held / max(len(ticks), 1),
             events=tuple(sorted(events, key=lambda event: event.tick)),
         )

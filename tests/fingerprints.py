@@ -61,16 +61,18 @@ class Fingerprints:
 
     def __init__(self, root: Path, work: Path):
         self.root, self.work = root.resolve(), work
-        asked = "import arena_newton; print(arena_newton.__file__)"
-        environment = os.environ | {"PYTHONPATH": str(self.root)}
-        found = subprocess.run([sys.executable, "-c", asked], cwd=work, env=environment, capture_output=True, text=True)
-        if found.stdout.strip() != str(self.root / "arena_newton" / "__init__.py"):
-            raise SystemExit(f"--root {root}: is not a checkout whose package can be imported\n{found.stderr}")
+        imported = self.python("-c", "import arena_newton; print(arena_newton.__file__)").strip()
+        if imported != str(self.root / "arena_newton" / "__init__.py"):
+            raise SystemExit(f"--root {root}: is not a checkout, the package would be imported from {imported}")
 
     def call(self, module: str, *flags: str) -> str:
-        """Standard output of a command of the checkout; a failure ends the comparison."""
+        """Standard output of a command of the checkout."""
+        return self.python("-m", f"arena_newton.{module}", *flags)
+
+    def python(self, *arguments: str) -> str:
+        """Standard output of Python on the checkout's package; a failure ends the comparison."""
         environment = os.environ | {"PYTHONPATH": str(self.root), "COLUMNS": "150"}
-        command = [sys.executable, "-m", f"arena_newton.{module}", *flags]
+        command = [sys.executable, *arguments]
         done = subprocess.run(command, cwd=self.work, env=environment, capture_output=True, text=True)
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}: exit code {done.returncode}\n{done.stderr[-3000:]}")
@@ -97,9 +99,7 @@ class Fingerprints:
 
     def families(self, clips: int) -> list[str]:
         """Flags for some clips of every family that the checkout's generator knows."""
-        found = "from arena_newton.trackers.motions.programs import FAMILIES; print(*FAMILIES)"
-        environment = os.environ | {"PYTHONPATH": str(self.root)}
-        names = subprocess.check_output([sys.executable, "-c", found], cwd=self.work, env=environment, text=True)
+        names = self.python("-c", "from arena_newton.trackers.motions.programs import FAMILIES; print(*FAMILIES)")
         return [flag for name in names.split() for flag in ("--family", f"{name}={clips}")]
 
     def evaluations(self) -> Iterator[tuple[str, str]]:
