@@ -14,6 +14,7 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import Floor, plan, signed_distance
+from arena_newton.policies.experts.style import Style
 from arena_newton.rotations import rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import PALMS, TARGET
@@ -96,7 +97,7 @@ class BoxingExpert(Expert):
         self._clock = torch.zeros(worlds, device=device)
         self._correction = torch.zeros(worlds, 3, device=device)
 
-    def begin(self, mask: Tensor) -> None:
+    def begin(self, mask: Tensor, style: Style) -> None:
         """Choose bag, stance and hand."""
         self._tries = self._tries.masked_fill(mask, 0)
         self.navigator.reset(mask)
