@@ -30,6 +30,8 @@ from arena_newton.trackers.motions.primitives import FORWARD_ARMS
 __all__ = ["SitSofaExpert"]
 
 SOFA, TABLE = "/World/Sofa", "/World/CoffeeTable"
+SHOULDER_PITCHES, ELBOWS = [0, 7], [3, 10]
+"""Among the 14 columns of `MotionCommand.arms`."""
 
 GATE_ASIDE = (0.26, 0.36, 0.46, 0.56, 0.66)
 """How far beyond the end of the seat the robot may turn its back to the sofa [m]: the nearest one that is free. The
@@ -42,11 +44,16 @@ GATE_WITHIN = (0.12, 0.20)
 """Errors at the gate that the way sideways takes up [m, rad]."""
 MOVED = 0.06
 """A carton that moved farther than this since the path was planned requires a new one [m]."""
-SEAT_ASIDE = (-0.36, -0.30)
-"""Where to sit, from the end of the seat [m], range of the style: shoulder and arm fit next to the armrest."""
-INSIDE_AHEAD = 0.30
-"""How far in front of the edge the robot goes sideways [m]: half of the gap."""
-SEAT_AHEAD = 0.16
+SEAT_ASIDE = (-0.50, -0.42)
+"""Where to sit, from the end of the seat [m], range of the style: shoulder and arm fit next to the armrest from -0.32 on,
+and farther in the back points at the middle of the seat within 45° (the task's predicate `turn`)."""
+INSIDE_AHEAD = (0.28, 0.33)
+"""How far in front of the edge the robot goes sideways [m], range of the style: half of the gap."""
+PACE = (0.92, 1.0)
+"""Fraction of the navigator's speed on the way to the gate, range of the style: the step budget allows no less."""
+ARMS_UP, ELBOWS_OUT = 0.15, 0.20
+"""Shoulders' pitch and elbows differ by up to this from `FORWARD_ARMS` while the robot sits down [rad]: style."""
+SEAT_AHEAD = 0.12
 """Pelvis in front of the edge at the end of the way back [m]: the calves are about to touch the sofa."""
 SIDEWAYS, BACKWARD, TURN = 0.30, 0.22, 0.6
 """Largest speeds in the gap [m/s, m/s, rad/s]."""
@@ -66,7 +73,7 @@ LONGEST = {
     "stand": 0.8,
     "lower": 2.2,
     "press": 1.0,
-    "sit": 2.5,
+    "sit": 1.5,
     "rise": 1.8,
     "straighten": 1.2,
     "forward": 2.0,
@@ -114,14 +121,21 @@ class SitSofaExpert(Expert):
         self._seen = torch.zeros(worlds, len(CARTONS), 5, device=device)
         self._seat_aside = torch.zeros(worlds, device=device)
         self._nearer = torch.zeros(worlds, device=device)
+        self._inside_ahead = torch.zeros(worlds, device=device)
         self._pace = torch.ones(worlds, device=device)
+        self._arms = self._forward_arms.repeat(worlds, 1)
 
     def begin(self, mask: Tensor, style: Style) -> None:
         """Draw the style, plan from the robot's position."""
         self.phase.begin(mask)
         self.walk.begin(mask)
-        aside = style.uniform("seat aside", *SEAT_ASIDE)
-        self._seat_aside = select(mask, aside, self._seat_aside)
+        self._seat_aside = select(mask, style.uniform("seat aside", *SEAT_ASIDE), self._seat_aside)
+        self._inside_ahead = select(mask, style.uniform("inside ahead", *INSIDE_AHEAD), self._inside_ahead)
+        self._pace = select(mask, style.uniform("pace", *PACE), self._pace)
+        arms = self._forward_arms.repeat(self.sight.worlds, 1)
+        arms[:, SHOULDER_PITCHES] += style.uniform("arms up", -ARMS_UP, ARMS_UP)[:, None]
+        arms[:, ELBOWS] += style.uniform("elbows", -ELBOWS_OUT, ELBOWS_OUT)[:, None]
+        self._arms = select(mask, arms, self._arms)
         self._nearer = self._nearer.masked_fill(mask, 0.0)
         self._plan(mask, self._boxes(self._cartons))
 
@@ -183,7 +197,7 @@ class SitSofaExpert(Expert):
             "approach": (walk.distance < GATE_WITHIN[0]) & (walk.heading_error.abs() < GATE_WITHIN[1]),
             "sideways": (place[:, 0] - self._seat_aside).abs() < BESIDE,
             "back": place[:, 1] < SEAT_AHEAD - self._nearer + BACKED,
-            "forward": place[:, 1] > INSIDE_AHEAD,
+            "forward": place[:, 1] > self._inside_ahead,
         }
         late = self.phase.late
         never = torch.zeros_like(late)
@@ -216,13 +230,13 @@ class SitSofaExpert(Expert):
         bent = lowering | pressing
         command.pitch = LEAN * bent + RISE_LEAN[0] * rising
         command.waist[:, 2] = LEAN * bent + RISE_LEAN[1] * rising
-        command.arms = select(bent | rising | at("stand"), self._forward_arms.expand_as(command.arms), command.arms)
+        command.arms = select(bent | rising | at("stand"), self._arms, command.arms)
         return command
 
     def _drift(self, place: Tensor) -> Tensor:
         """Velocity in the gap: sideways, back or forward with the back to the sofa, shape [worlds, 3]."""
         backwards = self.phase.at("back")
-        ahead = torch.where(backwards, SEAT_AHEAD - self._nearer, INSIDE_AHEAD) - place[:, 1]
+        ahead = torch.where(backwards, SEAT_AHEAD - self._nearer, self._inside_ahead) - place[:, 1]
         left = place[:, 0] - self._seat_aside
         wanted = GAIN * torch.stack([ahead, left], dim=1)
         most = torch.tensor([BACKWARD, SIDEWAYS], device=place.device)
