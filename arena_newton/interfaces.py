@@ -251,6 +251,8 @@ class Physics(Protocol):
     """Body positions [m], shape [worlds, nbody, 3]."""
     xquat: wp.array
     """Body orientations wxyz, shape [worlds, nbody, 4]."""
+    xipos: wp.array
+    """Body centres of mass [m], shape [worlds, nbody, 3]."""
     contact_force: wp.array
     """Norm of the net contact force on each body [N], shape [worlds, nbody]."""
 

@@ -31,9 +31,6 @@ __all__ = ["Physics"]
 class Physics(interfaces.Physics, ABC):
     """A batch of worlds; what `interfaces.Physics` promises is not described again."""
 
-    xipos: wp.array
-    """Body centres of mass [m], shape [worlds, nbody, 3]."""
-
     def __init__(self, scene: Scene, rate: PhysicsRate, models: Sequence[mujoco.MjModel] | None):
         """Bind a scene; `models` are variants of its model, one per world."""
         if models is not None and len(models) != scene.worlds:

@@ -20,16 +20,19 @@ from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Json, Mask, Policy, world_mask
+from arena_newton.policies.experts.style import Style
 from arena_newton.robot import TICK
 from arena_newton.rotations import heading
+from arena_newton.trackers.motions.commands import COLUMNS, MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
-    from arena_newton.trackers.motions.commands import MotionCommand
 
 __all__ = ["Expert", "ExpertPolicy", "Sight"]
 
+DECISION = 5
+"""Ticks between two decisions of an expert, counted from the start of a world's episode."""
 REALIGN = TICK / 10.0
 """Fraction of the heading error between reference and robot that is corrected in the reference per tick of a walk.
 Slow, because a tracker that does not observe its heading interprets the correction as a yaw rate; not slower, because
@@ -47,8 +50,14 @@ class Sight:
         self.task: str = env.spec.name
         root = env.scene.robot.root_qpos
         qpos = wp.to_torch(env.physics.qpos)
+        self._qpos, self._qvel = qpos, wp.to_torch(env.physics.qvel)
         self._root = qpos[:, root : root + 7]
         self._xpos, self._xquat = wp.to_torch(env.physics.xpos), wp.to_torch(env.physics.xquat)
+        self._xipos = wp.to_torch(env.physics.xipos)
+        self._joint_qpos, self._joint_qvel = (
+            torch.from_numpy(addresses).long().to(self.device)
+            for addresses in (env.scene.robot.joint_qpos, env.scene.robot.joint_qvel)
+        )
 
     @property
     def pose(self) -> Tensor:
@@ -59,6 +68,41 @@ class Sight:
     def height(self) -> Tensor:
         """Root height [m], shape [worlds]."""
         return self._root[:, 2]
+
+    @property
+    def root_position(self) -> Tensor:
+        """Pelvis x, y, z [m], shape [worlds, 3]."""
+        return self._root[:, :3]
+
+    @property
+    def root_quat(self) -> Tensor:
+        """Orientation of the pelvis, wxyz, shape [worlds, 4]."""
+        return self._root[:, 3:7]
+
+    @property
+    def joints(self) -> Tensor:
+        """Angles of the 29 body joints [rad], MuJoCo order, shape [worlds, 29]."""
+        return self._qpos[:, self._joint_qpos]
+
+    @property
+    def joint_velocities(self) -> Tensor:
+        """Their velocities [rad/s], shape [worlds, 29]."""
+        return self._qvel[:, self._joint_qvel]
+
+    def joint(self, prim: str) -> Callable[[], Tensor]:
+        """Reader of the position [rad or m] of a joint prim of the scene, shape [worlds]."""
+        address = self.scene.joint_qpos(prim)
+        return lambda: self._qpos[:, address]
+
+    def velocity(self, prim: str) -> Callable[[], Tensor]:
+        """Reader of the linear velocity [m/s] of a free body's origin, world, shape [worlds, 3]."""
+        address = self.scene.joint_qvel(prim)
+        return lambda: self._qvel[:, address : address + 3]
+
+    def com(self, prim: str) -> Callable[[], Tensor]:
+        """Reader of the centre of mass [m] of a rigid prim, shape [worlds, 3]."""
+        body = self.scene.body_id(prim)
+        return lambda: self._xipos[:, body]
 
     def body(self, body: int) -> tuple[Tensor, Tensor]:
         """Position [m] and orientation wxyz of a body, shapes [worlds, 3] and [worlds, 4]."""
@@ -102,11 +146,16 @@ class Expert:
         """
         self.sight = sight
 
-    def begin(self, mask: Tensor) -> None:
-        """Episodes begin in the worlds of `mask`: the robot stands; dropped objects may still roll."""
+    def begin(self, mask: Tensor, style: Style) -> None:
+        """Episodes begin in the worlds of `mask`: the robot stands; dropped objects may still roll.
+
+        Args:
+            mask: Worlds, bool, shape [worlds].
+            style: Seeded numbers of every world's episode, which make two demonstrations differ.
+        """
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
-        """The command of the next chunk, `dt` [s] long, for the worlds that ask: `mask`, bool, shape [worlds]."""
+        """The command of the next `dt` [s] for the worlds that decide now: `mask`, bool, shape [worlds]."""
         raise TypeError(f"expert of {self.task!r} defines no command()")
 
     def phases(self) -> list[str] | None:
@@ -133,13 +182,17 @@ def expert_class(task: str) -> type[Expert]:
 
 
 class ExpertPolicy(Policy):
-    """`--policy expert`: the expert of the task that the environment runs."""
+    """`--policy expert`: the expert of the task that the environment runs.
+
+    It gives one action at a time, so that all worlds share one step of the generator whenever their episodes began; the
+    expert itself decides every `DECISION` ticks of a world's own episode.
+    """
 
     name = "expert"
+    chunk_size = 1
 
-    def __init__(self, chunk_size: int = 5):
-        """Set the length of a chunk: the ticks between two readings of the world's state."""
-        self.chunk_size = chunk_size
+    def __init__(self) -> None:
+        """Know no environment yet."""
         self.expert: Expert | None = None
         """The expert of the environment's task; None before `attach`."""
 
@@ -153,12 +206,18 @@ class ExpertPolicy(Policy):
         self.sight = Sight(env)
         self.expert = expert(self.sight)
         self.generator = ReferenceGenerator(env.worlds, env.torch_device)
+        self.style = Style(env.worlds, env.torch_device)
         self._begins = np.ones(env.worlds, dtype=bool)
+        self._asked = np.zeros(env.worlds, dtype=np.int64)
+        self._commands = MotionCommand.neutral(env.worlds, env.torch_device).pack()
+        self._phases: list[str] | None = None
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """New episodes in the worlds of `mask`; the expert reads their state when they ask first."""
         if self.expert is not None:
-            self._begins |= world_mask(mask, len(seeds))
+            begins = world_mask(mask, len(seeds))
+            self._begins |= begins
+            self.style.begin(begins, seeds)
 
     @torch.inference_mode()
     def act(self, observation: Observation) -> Chunk:
@@ -168,21 +227,33 @@ class ExpertPolicy(Policy):
         worlds, device = len(observation.state), self.sight.device
         asking = world_mask(observation.mask, worlds)
         mask = torch.from_numpy(asking).to(device)
-        beginning = asking & self._begins
-        if beginning.any():
-            begins, pose = torch.from_numpy(beginning).to(device), self.sight.pose
-            self.generator.reset(begins, root_xy=pose[:, :2], yaw=pose[:, 2])
-            self.expert.begin(begins)
-            self._begins &= ~beginning
-        command = self.expert.command(mask, self.chunk_size * TICK)
-        actions = torch.empty(worlds, self.chunk_size, ACTION_WIDTH, device=device)
-        yaw, fraction = self.sight.pose[:, 2], REALIGN * (mask & (command.velocity != 0).any(dim=1))
-        for tick in range(self.chunk_size):
-            self.generator.realign(yaw, fraction)
-            self.generator.step(command, mask)
-            actions[:, tick] = self.generator.action()
-        return Chunk(actions, phases=self.expert.phases())
+        self._begin(asking & self._begins)
+        self._decide(asking & (self._asked % DECISION == 0))
+        self._asked[asking] += 1
+        walking = (self._commands[:, COLUMNS["velocity"]] != 0).any(dim=1)
+        self.generator.realign(self.sight.pose[:, 2], REALIGN * (mask & walking))
+        self.generator.step(MotionCommand.unpack(self._commands), mask)
+        return Chunk(self.generator.action()[:, None].clone(), phases=self._phases)
+
+    def _begin(self, beginning: np.ndarray) -> None:
+        """Start the episodes of the worlds that ask first."""
+        if self.expert is None or not beginning.any():
+            return
+        begins, pose = torch.from_numpy(beginning).to(self.sight.device), self.sight.pose
+        self.generator.reset(begins, root_xy=pose[:, :2], yaw=pose[:, 2])
+        self.expert.begin(begins, self.style)
+        self._begins &= ~beginning
+        self._asked[beginning] = 0
+
+    def _decide(self, deciding: np.ndarray) -> None:
+        """Let the expert renew the commands of some worlds."""
+        if self.expert is None or not deciding.any():
+            return
+        mask = torch.from_numpy(deciding).to(self.sight.device)
+        command = self.expert.command(mask, DECISION * TICK)
+        self._commands = torch.where(mask[:, None], command.pack(), self._commands)
+        self._phases = self.expert.phases()
 
     def describe(self) -> Json:
-        """Name, the tasks that have an expert and the length of the chunks."""
-        return {"name": self.name, "tasks": solved_tasks(), "chunk_size": self.chunk_size}
+        """Name, the tasks that have an expert and the ticks between two decisions."""
+        return {"name": self.name, "tasks": solved_tasks(), "decision_ticks": DECISION}

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
+from arena_newton.policies.experts.style import Style
 from arena_newton.rotations import heading, rotate_xy
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.vis_navi import SIGN
@@ -60,7 +61,7 @@ class VisNaviExpert(Expert):
         _, quat = self.sight.body(body)
         return footprint(self.sight.point(body, offset), quat, half.expand(len(quat), 3))
 
-    def begin(self, mask: Tensor) -> None:
+    def begin(self, mask: Tensor, style: Style) -> None:
         """Plan from the robot's position."""
         self.navigator.reset(mask)
         self._plan(mask, self.boxes())
