@@ -103,7 +103,7 @@ RESTART_ROUNDS = wp.constant(16)
 STEP = wp.constant(0.4)
 """Largest change of a joint in one Gauss-Newton step [rad]."""
 SETTLED = wp.constant(1.0e-6)
-"""A limb whose joints change by less than this in a step has arrived [rad]: the next steps would change its last bits."""
+"""A limb whose joints change by less than this in a step has arrived [rad]: more steps would change its last bits."""
 ARM_SPEED = wp.constant(0.12)
 """Largest change of an arm joint by IK per tick [rad]: 6 rad/s."""
 SEAT_SOFTNESS = wp.constant(0.02)
