@@ -33,7 +33,7 @@ SOFA, TABLE = "/World/Sofa", "/World/CoffeeTable"
 SHOULDER_PITCHES, ELBOWS = [0, 7], [3, 10]
 """Among the 14 columns of `MotionCommand.arms`."""
 
-GATE_ASIDE = (0.26, 0.36, 0.46, 0.56, 0.66, 0.76)
+GATE_ASIDE = (0.26, 0.34, 0.42, 0.50, 0.60, 0.70)
 """How far beyond the end of the seat the robot may turn its back to the sofa [m]. The armrest ends 0.10 m beyond it."""
 GATE_AHEAD = (0.36, 0.26, 0.16, 0.06, -0.04, -0.14, -0.24)
 """How far in front of the seat's edge it may do so [m], negative next to the armrest. The best gate is the first one
@@ -55,13 +55,13 @@ ARMS_UP, ELBOWS_OUT = 0.15, 0.20
 """Shoulders' pitch and elbows differ by up to this from `FORWARD_ARMS` while the robot sits down [rad]: style."""
 SEAT_AHEAD = 0.12
 """Pelvis in front of the edge at the end of the way back [m]: the calves are about to touch the sofa."""
-SIDEWAYS, BACKWARD, TURN = 0.30, 0.22, 0.6
+SIDEWAYS, BACKWARD, TURN = 0.34, 0.22, 0.6
 """Largest speeds in the gap [m/s, m/s, rad/s]."""
 GAIN, HEADING_GAIN = 1.5, 1.5
 """Speed for a distance, yaw rate for a heading error [1/s]."""
 CRAWL = 0.06
 """Smallest speed on the way sideways or back [m/s]; without it the last centimetres take seconds."""
-BESIDE = 0.08
+BESIDE = 0.15
 """Distance sideways at which the way back begins [m]: it takes up the rest."""
 BACKED = 0.02
 """Distance to the end of the way back that is good enough [m]."""
@@ -113,7 +113,7 @@ class SitSofaExpert(Expert):
         self._cartons = [sight.box(carton) for carton in CARTONS]
         self._half = torch.tensor(self._seat.half, dtype=torch.float32, device=device)
         self._forward_arms = torch.tensor(FORWARD_ARMS, dtype=torch.float32, device=device)
-        limits = NavigationLimits(forward=0.55, turn=0.9, sideways=0.28, arrive_position=0.045, arrive_heading=0.06)
+        limits = NavigationLimits(forward=0.58, turn=0.9, sideways=0.28, arrive_position=0.045, arrive_heading=0.06)
         self.walk = Walk(sight, limits)
         self.phase = Phases(LONGEST, worlds, device)
         """Where each world is in the task."""
