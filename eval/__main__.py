@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from arena_newton.command_line import INTERRUPTED, exit_code
+from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.eval.options import BenchOptions, EngineOptions, ReportOptions, RunOptions, is_quick
+from arena_newton.eval.options import BenchOptions, EngineOptions, ReportOptions, RunOptions
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -109,13 +109,7 @@ def _run(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
         print(OVERVIEW)
     options = _parse(RunOptions, arguments, "run")
-    from arena_newton.eval.folder import results_folder
-
-    if not is_quick(options) or options.policy != "stand" or options.tracker == "pd":
-        return _execute(options, factories)
-    folder = results_folder(options.out)
-    code = _execute(dataclasses.replace(options, out=str(folder)), factories)
-    return code if code == INTERRUPTED else max(code, _show_expert(options, folder / "expert", factories))
+    return _execute(options, factories)
 
 
 def _execute(options: RunOptions, factories: Factories | None) -> int:
@@ -130,18 +124,6 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
     from arena_newton.eval.run import execute
 
     return execute(folder, factories)
-
-
-def _show_expert(options: RunOptions, folder: Path, factories: Factories | None) -> int:
-    """End the quick look with a policy that solves its task, and name a picture of it."""
-    print("\nAll of these stood still. One that solves its task:")
-    one = dataclasses.replace(
-        options, task=("vis_navi",), policy="expert", seeds=(0,), repeats=1, worlds=1, strip=True, out=str(folder)
-    )
-    code = _execute(one, factories)
-    for strip in sorted((folder / "strips").glob("*__world.*")):
-        print(f"see it: {strip}")
-    return code
 
 
 def _resume(arguments: list[str], factories: Factories | None) -> int:
@@ -196,7 +178,7 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
     for episode in episodes:
         print(
-            f"{episode.index:>5} {episode.task:<12} {episode.mode:<10} seed {episode.group_seed} "
+            f"{episode.index:>5} {episode.task:<12} {episode.tracker:<8} {episode.mode:<10} seed {episode.group_seed} "
             f"repeat {episode.repeat:>2} episode_seed {episode.episode_seed:>10} max_steps {episode.max_steps}"
         )
     return 0

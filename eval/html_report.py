@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jinja2
 
-from arena_newton.eval.document import Document
+from arena_newton.eval.document import Document, trackers_of
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.results import Results, RunRecord
 from arena_newton.eval.stats import ErrorReason, ResultCell
@@ -49,9 +49,23 @@ TICKS = (0, 25, 50, 75, 100)
 """Marks of the axis of rates [%]."""
 SEED_SPACING = 9
 """Distance of the dots of group seeds with one rate [px]."""
-SORTED = ("task", "mode", "seed", "repeat", "outcome", "steps", "margin")
+FILTERED = ("outcome", "task", "tracker", "mode")
+"""Columns of the list of episodes by whose values a reader can choose rows."""
+SORTED = ("task", "tracker", "mode", "seed", "repeat", "outcome", "steps", "margin")
 """Columns of the list of episodes by which a reader can sort it."""
-COLUMNS = ("task", "mode", "seed", "repeat", "outcome", "reason", "steps", "margin", "pictures", "play it again")
+COLUMNS = (
+    "task",
+    "tracker",
+    "mode",
+    "seed",
+    "repeat",
+    "outcome",
+    "reason",
+    "steps",
+    "margin",
+    "pictures",
+    "play it again",
+)
 
 
 @functools.cache
@@ -121,7 +135,7 @@ def page(
         shown=[_Episode(record) for record in shown],
         folded=[_Episode(record) for record in folded],
         episodes=[_Episode(record, command(record=record)) for record in records],
-        filters=[(n, dict.fromkeys(plain(getattr(r, n)) for r in records)) for n in ("outcome", "task", "mode")],
+        filters=[(n, dict.fromkeys(plain(getattr(r, n)) for r in records)) for n in FILTERED],
         columns=[(name, name if name in SORTED else None) for name in COLUMNS],
         folds=_folds(document, records),
     )
@@ -131,9 +145,9 @@ def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
     """What the page opens with, by name."""
     config = document["config"]
     found = [("episodes", f"{results['finished']} of {results['planned']}")]
-    found += [(name, plain(config.get(name))) for name in ("policy", "tracker", "rules") if name in config]
-    for name in ("task", "mode", "seeds"):
-        values = config.get(name)
+    found += [(name, plain(config.get(name))) for name in ("policy", "rules") if name in config]
+    for name in ("tracker", "task", "mode", "seeds"):
+        values = trackers_of(config) if name == "tracker" else config.get(name)
         if isinstance(values, list):
             found.append((name + "s" if name != "seeds" and len(values) > 1 else name, " ".join(map(plain, values))))
     found.append(("repeats", plain(config["repeats"])))
@@ -214,11 +228,11 @@ def _strips(records: Sequence[EpisodeRecord]) -> tuple[list[EpisodeRecord], list
         return FAILURES_FIRST.index(record.outcome) if record.outcome in FAILURES_FIRST else 0
 
     ordered = sorted(filmed, key=order)  # stable: plan order within an outcome
-    # One episode of every task and mode comes first, then the second ones.
-    turns: dict[tuple[str, str, bool], int] = {}
+    # One episode of every task, tracker and mode comes first, then the second ones.
+    turns: dict[tuple[str, str, str, bool], int] = {}
     turn = {}
     for record in ordered:
-        cell = (plain(record.task), plain(record.mode), record.outcome == "success")
+        cell = (plain(record.task), plain(record.tracker), plain(record.mode), record.outcome == "success")
         turn[id(record)] = turns[cell] = turns.get(cell, -1) + 1
     wins = sorted((r for r in ordered if r.outcome == "success"), key=lambda r: turn[id(r)])
     failures = sorted((r for r in ordered if r.outcome != "success"), key=lambda r: turn[id(r)])
@@ -240,7 +254,8 @@ class _Episode:
     @property
     def title(self) -> str:
         r = self.record
-        return f"{plain(r.task)} {plain(r.mode)}, seed {plain(r.group_seed)} repeat {plain(r.repeat)}"
+        cell = " ".join(map(plain, (r.task, r.tracker, r.mode)))
+        return f"{cell}, seed {plain(r.group_seed)} repeat {plain(r.repeat)}"
 
     @property
     def length(self) -> str:

@@ -31,8 +31,8 @@ __all__ = [
 
 MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head camera", "world": "world camera"}
 """Media of an episode that the page knows → what they show."""
-REPLAYED = ("policy", "tracker", "checkpoint", "rules", "drive", "engine", "device", "variant", "max_steps")
-"""Flags with a value on which an episode depends, besides its task, mode, seed and repeat."""
+REPLAYED = ("policy", "checkpoint", "rules", "drive", "engine", "device", "variant", "max_steps")
+"""Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
 REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
 """Flags that belong to a policy server → their defaults; others are named in the command."""
 
@@ -63,7 +63,7 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
     `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
     words: list[object] = ["python", "-m", "arena_newton.eval", "--task", record.task, "--mode", record.mode]
-    words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
+    words += ["--tracker", record.tracker, "--seeds", record.group_seed, "--repeats", record.repeat + 1]
     for name in REPLAYED:
         value = options.get(name)
         if value not in (None, "", "auto"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import factories
 
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
@@ -19,19 +20,24 @@ SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "1", "--seeds"
 
 
 def test_default_run(tmp_path, capsys, monkeypatch):
-    """Without flags all seven tasks run, a table is printed and the report lies where the last line says."""
+    """Without flags the experts do their tasks through both trackers, with full budgets, film strips and a report."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
+    filmed = []
+    # These worlds have nothing to draw.
+    monkeypatch.setattr(run, "_recorder", lambda config, folder, tracker: filmed.append((config.flags.strip, tracker)))
     assert main(["--device", "cpu"], factories()) == 0
     output = capsys.readouterr().out
-    assert all(re.search(rf"^\| {task} ", output, re.M) for task in TASKS)
+    planned = [name for name in TASKS if tasks.get(name).expert is not None]
+    assert planned and all(re.search(rf"^\| {task} ", output, re.M) for task in planned)
     report = re.search(r"^report: (.*)$", output, re.M)[1]
     assert Path(report).is_file() and Path(report).parts[0] == "results"
     results = json.loads((Path(report).parent / "results.json").read_text())
-    assert [cell["task"] for cell in results["cells"]] == TASKS
-    assert [suite["suite"] for suite in results["suites"]] == ["HOI_AVG", "HSI_AVG", "ALL_AVG"]
-    (expert,) = json.loads((Path(report).parent / "expert" / "results.json").read_text())["cells"]
-    assert (expert["task"], expert["policy"], expert["episodes"]) == ("vis_navi", "expert", 1)
+    cells = [(cell["task"], cell["tracker"], cell["policy"]) for cell in results["cells"]]
+    assert cells == [(task, tracker, "expert") for task in planned for tracker in ("twist2", "sonic")]
+    assert filmed == [(True, tracker) for _ in planned for tracker in ("twist2", "sonic")]
+    lines = (Path(report).parent / "episodes.jsonl").read_text().splitlines()
+    budgets = {row["task"]: row["max_steps"] for row in map(json.loads, lines)}
+    assert budgets == {task: tasks.get(task).max_steps(rule_sets.get("paper")) for task in planned}
 
 
 def test_configuration_is_two_lines(tmp_path, capsys):
@@ -40,7 +46,7 @@ def test_configuration_is_two_lines(tmp_path, capsys):
     brief = capsys.readouterr().out.split("\n\n")[0].splitlines()
     assert len(brief) == 2
     assert re.match(
-        r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy stand, rules paper, ", brief[0]
+        r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy expert, rules paper, ", brief[0]
     )
     assert "  1 episode, 1 world at once, at most 1,300 world-ticks (26 s simulated) -> " in brief[1]
     assert main(["resume", str(tmp_path / "a")], factories()) == 0
@@ -51,7 +57,7 @@ def test_configuration_is_two_lines(tmp_path, capsys):
     captured = capsys.readouterr()
     full = captured.out.split("\n\n")[0].splitlines()
     assert {"rules_hash", "code", "tracker_facts", "drive"} <= {line.split()[0] for line in full}
-    assert "  football base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
+    assert "  football twist2 base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
 
 
 def test_a_log_file_gets_lines(tmp_path):
@@ -62,7 +68,7 @@ def test_a_log_file_gets_lines(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, env=environment, check=True)
     assert b"\r" not in done.stderr and b"\r" not in done.stdout
     assert 1 <= done.stderr.count(b"\n") < 10
-    assert b"boxing base: 120 of 120 episodes, 100% of the tick budget" in done.stderr
+    assert b"boxing twist2 base: 120 of 120 episodes, 100% of the tick budget" in done.stderr
 
 
 def test_protocol_is_the_default_of_a_named_task(tmp_path):
@@ -92,6 +98,9 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["--engine", "mujoco", "--device", "cuda:0"], "--device cuda:0"),
         (["--tracker", "nobody"], "--tracker nobody"),
         (["--checkpoint", "absent.onnx"], "--checkpoint absent.onnx: no such file"),
+        (["--checkpoint", "absent.onnx", "--tracker", "twist2", "sonic"], "--checkpoint absent.onnx: name the one"),
+        (["--tracker", "pd", "pd"], "--tracker pd: given twice"),
+        (["--tracker", "pd", "twist2", "--actions"], "--actions: name the one --tracker"),
         (["--policy", "replay:absent.npz"], "--policy absent.npz: no such file"),
         (["--variant", "absent.usda"], "--variant absent.usda: no such file"),
         (["--repeats", "0"], "--repeats 0"),

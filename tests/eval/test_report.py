@@ -222,12 +222,13 @@ EMPTY = episodes("boxing", (1,))[0]
 
 def test_command_plays_the_episode_again(tmp_path):
     """An episode's command names its task, mode, seed and repeat and all that it depends on, quoted for a shell."""
-    options = {"policy": "replay:a b;rm", "tracker": "twist2", "max_steps": 50, "rules": "paper", "out": "secret"}
+    options = {"policy": "replay:a b;rm", "tracker": ["u", "t"], "max_steps": 50, "rules": "paper", "out": "secret"}
     row = {"task": "boxing", "mode": "visual", "group_seed": 2, "repeat": 3}
     command = replay_command(options, record(EMPTY | row))
     words = shlex.split(command)
     assert words[:3] == ["python", "-m", "arena_newton.eval"] and "secret" not in words
-    assert words[3:11] == ["--task", "boxing", "--mode", "visual", "--seeds", "2", "--repeats", "4"]
+    assert words[3:7] == ["--task", "boxing", "--mode", "visual"]
+    assert words[7:13] == ["--tracker", "t", "--seeds", "2", "--repeats", "4"]
     assert words[words.index("--policy") + 1] == "replay:a b;rm"
     assert words[words.index("--max-steps") + 1] == "50"
     assert not {"--worlds", "--remote-timeout", "--remote-insecure"} & set(words)

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.kernels.footwork import kick_seconds
 from arena_newton.robot import DEFAULT_POSE
 from arena_newton.trackers.motions.commands import CHANNELS, COLUMNS, COMMAND_WIDTH, MotionCommand, neutral_row
-from arena_newton.trackers.motions.footwork import kick_seconds
 
 __all__ = [
     "CARRY_ARMS",
