@@ -1,4 +1,4 @@
-"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|list] ...``."""
+"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|certify|list] ...``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import tyro
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.eval.options import BenchOptions, EngineOptions, ReportOptions, RunOptions
+from arena_newton.eval.options import BenchOptions, CertifyOptions, EngineOptions, ReportOptions, RunOptions
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -33,6 +33,7 @@ OVERVIEW = f"""commands:
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
+  {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
 """
 
 
@@ -198,7 +199,22 @@ def _engines(arguments: list[str], factories: Factories | None) -> int:
     return engines.run(options)
 
 
-_COMMANDS = {"run": _run, "resume": _resume, "report": _report, "bench": _bench, "engines": _engines, "list": _list}
+def _certify(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(CertifyOptions, arguments, "certify")
+    from arena_newton.eval import certify
+
+    return certify.run(options, factories)
+
+
+_COMMANDS = {
+    "run": _run,
+    "resume": _resume,
+    "report": _report,
+    "bench": _bench,
+    "engines": _engines,
+    "certify": _certify,
+    "list": _list,
+}
 
 
 if __name__ == "__main__":
