@@ -31,7 +31,10 @@ def engines(context: Context) -> Finding:
     rows, pairs = [], []
     for tracker in context.trackers:
         for task in context.tasks:
-            records = [context.evaluate(recorded(context, task, tracker)), context.evaluate(Cell(task, tracker, engine=other))]
+            records = [
+                context.evaluate(recorded(context, task, tracker)),
+                context.evaluate(Cell(task, tracker, engine=other)),
+            ]
             a, b = map(score, records)
             falls = [sum(record.outcome == "fall" for record in found) for found in records]
             p = fisher(a.successes, a.episodes, b.successes, b.episodes)
@@ -42,8 +45,18 @@ def engines(context: Context) -> Finding:
     apart = [f"{task} through {tracker}" for task, tracker, p, q in pairs if min(p, q) < level]
     least = min((min(p, q) for _, _, p, q in pairs), default=1.0)
     this = context.options.engine
-    head = ("task", "tracker", this, "95 % interval", f"{other} on {device}", "95 % interval", "p", "falls", "p of falls")
-    notes = (f"Engines differ where p is below {level:.2g}: {DIFFERENT} over {2 * len(pairs)} tests.",)
+    head = (
+        "task",
+        "tracker",
+        this,
+        "95 % interval",
+        f"{other} on {device}",
+        "95 % interval",
+        "p",
+        "falls",
+        "p of falls",
+    )
+    notes: tuple[str, ...] = (f"Engines differ where p is below {level:.2g}: {DIFFERENT} over {2 * len(pairs)} tests.",)
     notes += tuple(f"{which}: the engines differ" for which in apart)
     summary = f"{this} and {other} on {device}: smallest p of {2 * len(pairs)} tests is {least:.3f}"
     return Finding("fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes)
@@ -61,7 +74,7 @@ def batches(context: Context) -> Finding:
             def measure(task: str = task, tracker: str = tracker) -> JsonObject:
                 return _compare_batches(context, task, tracker, ticks)
 
-            found = context.measured(f"batches_{task}_{tracker}", {"ticks": ticks}, measure)
+            found = context.measured("batches", task, tracker, {"ticks": ticks}, measure)
             assert isinstance(found, dict)
             differs = found["differs"]
             rows.append((task, tracker, f"{int(found['ticks']):,}", "none" if differs is None else str(differs)))
@@ -74,7 +87,7 @@ def batches(context: Context) -> Finding:
 
 def _compare_batches(context: Context, task: str, tracker: str, ticks: int) -> JsonObject:
     """Ticks compared, and the first at which an episode depends on its batch."""
-    seeds = (context.seeds(task) * BATCHED)[:BATCHED] if context.episodes < BATCHED else context.seeds(task)[:BATCHED]
+    seeds = context.seeds(task, BATCHED)
     traces = []
     for worlds, order in ((1, seeds), (BATCHED, seeds), (BATCHED, seeds[::-1])):
         env = world_of(context, task, tracker, worlds=worlds)
@@ -103,7 +116,8 @@ def official(context: Context) -> Finding:
     rows.append(("all", *a.cells(), *b.cells(), f"{p:.3f}"))
     head = ("task", "our weights", "95 % interval", "official weights", "95 % interval", "p")
     sheet = Sheet("Experts through our TWIST2 weights and through the official ones", head, tuple(rows))
-    summary = f"experts succeed in {a.successes} of {a.episodes} with our weights, {b.successes} with the official (p = {p:.2g})"
+    summary = f"experts succeed in {a.successes} of {a.episodes} episodes with our weights, "
+    summary += f"in {b.successes} with the official ones (p = {p:.2g})"
     worse = p < DIFFERENT and a.rate < b.rate
     better = p < DIFFERENT and a.rate > b.rate
     return Finding("fail" if worse else "note" if better else "pass", summary, (sheet,))

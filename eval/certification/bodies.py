@@ -21,8 +21,15 @@ from arena_newton.env import ArenaEnv
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK
-from arena_newton.rotations import heading, quat_conjugate, quat_from_yaw, quat_multiply, rotate_xy
-from arena_newton.rotations import rotation_vector, wrap_angle
+from arena_newton.rotations import (
+    heading,
+    quat_conjugate,
+    quat_from_yaw,
+    quat_multiply,
+    rotate_xy,
+    rotation_vector,
+    wrap_angle,
+)
 from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:

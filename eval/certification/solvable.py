@@ -22,7 +22,7 @@ def solvable(context: Context) -> Finding:
     """Play every task with its expert."""
     rows, low, scores = [], [], []
     for tracker in context.trackers:
-        for rules in rule_sets():
+        for rules in rule_sets() if tracker in context.sample else ("paper",):
             for task in context.tasks:
                 paper = rules == "paper"
                 cell = recorded(context, task, tracker) if paper else Cell(task, tracker, rules)
@@ -38,8 +38,12 @@ def solvable(context: Context) -> Finding:
     total = pooled_score(scores)
     summary = f"experts solve {total.successes} of {total.episodes} episodes"
     head = ("task", "tracker", "rules", "successes", "95 % interval", "falls", "mean steps of a success")
-    notes = [f"An expert is to reach {percent(SOLVED)} within its interval; below that are {', '.join(low)}."] * bool(low)
-    return Finding("fail" if low else "pass", summary, (Sheet("Success of the experts", head, tuple(rows)),), tuple(notes))
+    notes = [f"An expert is to reach {percent(SOLVED)} within its interval; below that are {', '.join(low)}."] * bool(
+        low
+    )
+    return Finding(
+        "fail" if low else "pass", summary, (Sheet("Success of the experts", head, tuple(rows)),), tuple(notes)
+    )
 
 
 CHECKS = (Check("solvable", "Does an expert solve every task, through each tracker, under both rule sets?", solvable),)

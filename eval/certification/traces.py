@@ -1,4 +1,4 @@
-"""Every bit of an episode as text: what tells whether two episodes are the same, and from which tick on they are not."""
+"""Every bit of an episode as text: what tells whether two episodes are the same, and from which tick they are not."""
 
 from __future__ import annotations
 
