@@ -56,7 +56,7 @@ AT_PLACE = (0.045, 0.06)
 """Errors in front of box and shelf that the arms compensate [m, rad]."""
 ALIGN_GAIN = 1.5
 """Integral gain on palms and wrists while they align [1/s]."""
-ALIGNED = 0.015
+ALIGNED = 0.025
 """Error of the palms that is good enough [m]."""
 ASIDE = 0.107
 """Gap between fist and box when the hands align [m]."""
@@ -91,21 +91,23 @@ FACING = 0.9
 BEFORE = (0.50, 0.70)
 """Least and largest distance of pelvis and front edge of the deck from which the robot walks straight to the shelf
 [m]."""
-AT_SHELF = 0.20
+AT_SHELF = 0.18
 """The same when it places the box [m]."""
 SIDE = 0.55
 """Largest distance of the spot from the deck's middle [m]: the opening hands clear the uprights."""
-INSIDE = 0.16
-"""Distance of the placed box's centre from the front edge [m]: 5 cm more than half of it."""
+INSIDE = 0.18
+"""Distance of the placed box's centre from the front edge [m]: 7.5 cm more than half of it."""
 STRETCH = 0.24
 """Most that the hands move ahead for it [m]."""
+SINKING = 0.05
+"""Speed of the box from the lift to the height in which it is carried over the deck [m/s]."""
 LOWERING = 0.08
 """Speed of the box on its way down [m/s]."""
-SUNK = 0.06
+SUNK = 0.10
 """How much farther than to the deck the hands are commanded down [m]: arms that follow roughly get there too."""
 DOWN = 0.008
 """Height above the deck at which the box counts as put down [m]."""
-TURNING = 0.8
+TURNING = 0.6
 """Yaw rate of the turn to the shelf [rad/s]."""
 OPENING = 0.5
 """Speed of each hand when it lets go [m/s]."""
@@ -129,11 +131,11 @@ LONGEST = {
     "close": 2.2,
     "lift": 3.0,
     "back": 4.0,
-    "turn": 3.0,
+    "turn": 4.0,
     "carry": 14.0,
     "step in": 5.0,
     "reach": 3.0,
-    "lower": 2.5,
+    "lower": 3.0,
     "open": 0.6,
     "leave": 3.0,
     "retreat": 3.0,
@@ -309,7 +311,8 @@ class PPBoxExpert(Expert):
         self._approach(done("retreat", away > BACK))
         enter("leave", "stand", off > BACK)
         enter("open", "leave", self.half >= self._opened())
-        enter("lower", "open", self._underside() < self._deck_top() + DOWN)
+        flat = self._deck_top() + self._box_half[2] + DOWN
+        enter("lower", "open", self._centre()[:, 2] < flat)
         enter("reach", "lower", (deck >= self._inside) | (self.grip[:, 0] >= self._near + STRETCH))
         enter("step in", "reach", near(haul, AT_PLACE))
         self.haul.to(enter("carry", "step in", near(haul, PASSING)), self._spot)
@@ -396,7 +399,7 @@ class PPBoxExpert(Expert):
         state, deck = self.state, self._deck_top()
         over = state.at("turn", "carry", "step in", "reach")
         target = torch.where(state.at("lift", "back"), self._table + LIFT, torch.where(over, deck + CLEAR, deck - SUNK))
-        speed = torch.where(state.at("lower"), LOWERING, LIFTING) * dt
+        speed = torch.where(state.at("lift", "back"), LIFTING, torch.where(over, SINKING, LOWERING)) * dt
         moved = self.underside + torch.minimum(torch.maximum(target - self.underside, -speed), speed)
         carried = mask & state.at(*HELD)
         self.underside = select(carried, moved, self.underside)
