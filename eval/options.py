@@ -14,6 +14,7 @@ __all__ = [
     "BenchOptions",
     "CertifyOptions",
     "EngineOptions",
+    "FilmOptions",
     "ReportOptions",
     "RunOptions",
     "is_quick",
@@ -109,10 +110,27 @@ def is_quick(options: RunOptions) -> bool:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Write tables and reports of a results folder again from its journal."""
+    """Write tables and reports of a results folder again from its journal; of several folders print one table."""
 
+    table: bool = False
+    """Print a table of successes per task, tracker and mode as Markdown, and write nothing."""
     json: bool = False
     """Print results.json instead of the table."""
+
+
+@dataclass(frozen=True)
+class FilmOptions:
+    """Show one success per task of one or several results folders in a single film or picture."""
+
+    out: str = "film.webp"
+    """File to write: .webp, .gif or .mp4 is a film of the world videos side by side (run --video), .jpg or .png the
+    world strips one below the other (run --strip)."""
+    seconds: float = 12.0
+    """Length of the film [s]; every episode is played from its start to its end in it."""
+    width: int = 960
+    """Width of the film or picture [px]."""
+    max_mb: float = 3.0
+    """Largest size of a .webp film [MB]; its quality is lowered until it fits."""
 
 
 @dataclass(frozen=True)
