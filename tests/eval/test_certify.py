@@ -14,7 +14,7 @@ from arena_newton.eval import run as runs
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.certification import certificate, legs, solvable, swap
 from arena_newton.eval.certification.bodies import Body
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.kernels import tick as codes
 
@@ -182,7 +182,7 @@ def test_the_page_needs_no_other_file(tmp_path):
     picture = tmp_path / "strip.png"
     picture.write_bytes(b"\x89PNG")
     check = Check("legs", "Are <legs> needed?", lambda context: found)
-    found = Finding(
+    found = CheckFinding(
         "note",
         "three of four",
         (Sheet("A table", ("task",), (("<script>alert(1)</script>",),)),),
