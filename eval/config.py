@@ -189,6 +189,7 @@ def resolve(options: RunOptions) -> RunConfig:
         seeds=tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS),
         repeats=repeats,
         strip=options.strip or quick,
+        follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,
         policy=f"{scheme}:{policy_path}" if policy_path else options.policy,
