@@ -1,4 +1,4 @@
-"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|list] ...``."""
+"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|certify|list] ...``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ import tyro
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.eval.options import BenchOptions, EngineOptions, FilmOptions, ReportOptions, RunOptions
+from arena_newton.eval.options import (
+    BenchOptions,
+    CertifyOptions,
+    EngineOptions,
+    FilmOptions,
+    ReportOptions,
+    RunOptions,
+)
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -34,6 +41,7 @@ OVERVIEW = f"""commands:
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
+  {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
 """
 
 
@@ -229,6 +237,13 @@ def _engines(arguments: list[str], factories: Factories | None) -> int:
     return engines.run(options)
 
 
+def _certify(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(CertifyOptions, arguments, "certify")
+    from arena_newton.eval import certify
+
+    return certify.run(options, factories)
+
+
 _COMMANDS = {
     "run": _run,
     "resume": _resume,
@@ -236,6 +251,7 @@ _COMMANDS = {
     "film": _film,
     "bench": _bench,
     "engines": _engines,
+    "certify": _certify,
     "list": _list,
 }
 

@@ -12,6 +12,7 @@ __all__ = [
     "QUICK_SEEDS",
     "QUICK_TRACKERS",
     "BenchOptions",
+    "CertifyOptions",
     "EngineOptions",
     "FilmOptions",
     "ReportOptions",
@@ -182,3 +183,35 @@ class EngineOptions:
     """JSON file of an earlier call, possibly on another machine, to compare with."""
     out: str | None = None
     """Write the rates to this JSON file."""
+
+
+@dataclass(frozen=True)
+class CertifyOptions:
+    """Prove the benchmark: solvable tasks that need legs, clean axes, agreeing engines, the price of a swapped tracker.
+
+    Every check plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
+    """
+
+    out: str = "results/certify"
+    """Folder of the certificate and of the evaluations behind it."""
+    quick: bool = False
+    """A few episodes of everything: minutes instead of hours, and wide intervals."""
+    task: tuple[str, ...] = ()
+    """Tasks; all that have an expert when none is named."""
+    tracker: tuple[str, ...] = ("twist2", "sonic")
+    """Trackers, with the weights they come with; the first one alone where one is enough."""
+    checks: tuple[str, ...] = ()
+    """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official swap
+    visible; all when none is named."""
+    episodes: int | None = None
+    """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "mujoco"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    twist2_checkpoint: str | None = None
+    """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
+    resume: bool = False
+    """Continue a certification in its folder; what was played is kept."""

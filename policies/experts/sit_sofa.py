@@ -17,7 +17,7 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.phases import Phases, select
-from arena_newton.policies.experts.planning import Floor, footprint, signed_distance
+from arena_newton.policies.experts.planning import CLEARANCES, Floor, footprint, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk
 from arena_newton.rotations import heading, rotate_xy, wrap_angle
@@ -33,20 +33,20 @@ SOFA, TABLE = "/World/Sofa", "/World/CoffeeTable"
 SHOULDER_PITCHES, ELBOWS = [0, 7], [3, 10]
 """Among the 14 columns of `MotionCommand.arms`."""
 
-GATE_ASIDE = (0.26, 0.36, 0.46, 0.56, 0.66)
-"""How far beyond the end of the seat the robot may turn its back to the sofa [m]: the nearest one that is free. The
-armrest ends 0.10 m beyond the seat."""
-GATE_AHEAD = (0.36, 0.30, 0.24)
-"""How far in front of the seat's edge it may do so [m]; the table is 0.59 m in front of it."""
-GATE_CLEARANCE = 0.36
-"""Distance that a gate should keep from everything [m]: a turning robot with its arms."""
+GATE_ASIDE = (0.26, 0.34, 0.42, 0.50, 0.60, 0.70)
+"""How far beyond the end of the seat the robot may turn its back to the sofa [m]. The armrest ends 0.10 m beyond it."""
+GATE_AHEAD = (0.36, 0.26, 0.16, 0.06, -0.04, -0.14, -0.24)
+"""How far in front of the seat's edge it may do so [m], negative next to the armrest. The best gate is the first one
+of both lists; a carton in front of the gap moves it."""
+GATE_CLEARANCE = CLEARANCES[-1] + 0.01
+"""Distance of a gate from all obstacles [m]: with less no path leads to it."""
 GATE_WITHIN = (0.12, 0.20)
 """Errors at the gate that the way sideways takes up [m, rad]."""
 MOVED = 0.06
 """A carton that moved farther than this since the path was planned requires a new one [m]."""
 SEAT_ASIDE = (-0.50, -0.42)
-"""Where to sit, from the end of the seat [m], range of the style: shoulder and arm fit next to the armrest from -0.32 on,
-and farther in the back points at the middle of the seat within 45° (the task's predicate `turn`)."""
+"""Where to sit, from the end of the seat [m], range of the style: shoulder and arm fit next to the armrest from -0.32
+on, and farther in the back points at the middle of the seat within 45° (the task's predicate `turn`)."""
 INSIDE_AHEAD = (0.28, 0.33)
 """How far in front of the edge the robot goes sideways [m], range of the style: half of the gap."""
 PACE = (0.92, 1.0)
@@ -55,13 +55,13 @@ ARMS_UP, ELBOWS_OUT = 0.15, 0.20
 """Shoulders' pitch and elbows differ by up to this from `FORWARD_ARMS` while the robot sits down [rad]: style."""
 SEAT_AHEAD = 0.12
 """Pelvis in front of the edge at the end of the way back [m]: the calves are about to touch the sofa."""
-SIDEWAYS, BACKWARD, TURN = 0.30, 0.22, 0.6
+SIDEWAYS, BACKWARD, TURN = 0.34, 0.22, 0.6
 """Largest speeds in the gap [m/s, m/s, rad/s]."""
 GAIN, HEADING_GAIN = 1.5, 1.5
 """Speed for a distance, yaw rate for a heading error [1/s]."""
 CRAWL = 0.06
 """Smallest speed on the way sideways or back [m/s]; without it the last centimetres take seconds."""
-BESIDE = 0.08
+BESIDE = 0.15
 """Distance sideways at which the way back begins [m]: it takes up the rest."""
 BACKED = 0.02
 """Distance to the end of the way back that is good enough [m]."""
@@ -108,12 +108,12 @@ class SitSofaExpert(Expert):
         worlds, device, scene = sight.worlds, sight.device, sight.scene
         self._seat = scene.marker(SEAT)
         self._edge = sight.frame(SEAT)
-        solids = [scene.geom_labels[geom] for prim in (SOFA, TABLE) for geom in scene.geom_ids(prim)]
-        self._solids = [sight.box(solid) for solid in solids]
+        self._sofa = [sight.box(scene.geom_labels[geom]) for geom in scene.geom_ids(SOFA)]
+        self._table = [sight.box(scene.geom_labels[geom]) for geom in scene.geom_ids(TABLE)]
         self._cartons = [sight.box(carton) for carton in CARTONS]
         self._half = torch.tensor(self._seat.half, dtype=torch.float32, device=device)
         self._forward_arms = torch.tensor(FORWARD_ARMS, dtype=torch.float32, device=device)
-        limits = NavigationLimits(forward=0.55, turn=0.9, sideways=0.28, arrive_position=0.045, arrive_heading=0.06)
+        limits = NavigationLimits(forward=0.58, turn=0.9, sideways=0.28, arrive_position=0.045, arrive_heading=0.06)
         self.walk = Walk(sight, limits)
         self.phase = Phases(LONGEST, worlds, device)
         """Where each world is in the task."""
@@ -169,13 +169,15 @@ class SitSofaExpert(Expert):
     def _plan(self, mask: Tensor, cartons: Tensor) -> None:
         """Choose the gate and the path to it."""
         worlds, device = len(cartons), cartons.device
-        boxes = torch.cat([self._boxes(self._solids), cartons], dim=1)
+        sofa = _cover(self._boxes(self._sofa), self._frame()[1])
+        boxes = torch.cat([sofa[:, None], self._boxes(self._table), cartons], dim=1)
         aside, ahead = torch.cartesian_prod(
             torch.tensor(GATE_ASIDE, device=device), torch.tensor(GATE_AHEAD, device=device)
         ).unbind(1)
         gates = self._world(aside.expand(worlds, -1), ahead.expand(worlds, -1))
-        lack = (GATE_CLEARANCE - signed_distance(gates, boxes)).clamp_min(0.0)
-        price = 3.0 * lack + (aside - GATE_ASIDE[0]) + 0.5 * (GATE_AHEAD[0] - ahead)
+        grown = torch.cat([boxes[..., :3], boxes[..., 3:] + GATE_CLEARANCE], dim=2)
+        lack = (-signed_distance(gates, grown)).clamp_min(0.0)
+        price = 10.0 * lack + (aside - GATE_ASIDE[0]) + 0.5 * (GATE_AHEAD[0] - ahead)
         gate = gates[torch.arange(worlds, device=device), price.argmin(dim=1)]
         back_turned = self._frame()[1] + math.pi / 2
         self.walk.to(mask, torch.cat([gate, back_turned[:, None]], dim=1), Floor(boxes, *ROOM))
@@ -245,3 +247,13 @@ class SitSofaExpert(Expert):
         planar = rotate_xy(-place[:, 2], crawling.clamp(-most, most))
         turn = (-HEADING_GAIN * place[:, 2]).clamp(-TURN, TURN)
         return torch.cat([planar, turn[:, None]], dim=1)
+
+
+def _cover(boxes: Tensor, yaw: Tensor) -> Tensor:
+    """The rectangle with this heading [rad] around some: [W, B, 5] and [W] to [W, 5]."""
+    signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]], device=boxes.device)
+    turned = boxes[..., 2, None].expand(*boxes.shape[:2], 4)
+    corners = (boxes[:, :, None, :2] + rotate_xy(turned, signs * boxes[:, :, None, 3:])).flatten(1, 2)
+    local = rotate_xy(-yaw[:, None].expand(corners.shape[:2]), corners)
+    low, high = local.amin(dim=1), local.amax(dim=1)
+    return torch.cat([rotate_xy(yaw, 0.5 * (low + high)), yaw[:, None], 0.5 * (high - low)], dim=1)

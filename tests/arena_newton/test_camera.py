@@ -250,8 +250,7 @@ def test_bad_input_is_named(model):
 
 
 def test_each_pixel_names_its_shape(model):
-    """`shapes` names the shape that a pixel shows: the box in the middle of its own world, its copy in another, no
-    shape above the horizon."""
+    """A pixel names what it shows: the box of its own world in the middle, no shape above the horizon."""
     lights = WorldLights.allocate(WORLDS, "cpu")
     camera = _camera(model, lights)
     camera.render(model.state())
