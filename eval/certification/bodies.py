@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,8 +21,15 @@ from arena_newton.env import ArenaEnv
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK
-from arena_newton.rotations import heading, quat_conjugate, quat_from_yaw, quat_multiply, rotate_xy
-from arena_newton.rotations import rotation_vector, wrap_angle
+from arena_newton.rotations import (
+    heading,
+    quat_conjugate,
+    quat_from_yaw,
+    quat_multiply,
+    rotate_xy,
+    rotation_vector,
+    wrap_angle,
+)
 from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:
@@ -122,7 +129,7 @@ class HeldLegs(Tracker):
         targets[:, list(LEGS)] = self._held
         return targets
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """See `Tracker.describe`."""
         return self.inner.describe() | {"legs": "held in the standing posture"}
 

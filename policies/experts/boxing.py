@@ -58,7 +58,8 @@ NEXT = dict(zip(PLACES, [*list(PLACES)[1:], next(iter(PLACES))], strict=True))
 PASSED = 0.40
 """Distance to a place from which the robot goes on to the next one [m]: it need not stop to see."""
 GLANCE = -0.6
-"""Waist yaw while it searches [rad]: the bags are on its right."""
+"""Waist yaw while it searches [rad]: the bags are on its right. As far at most it turns to keep a target in view that it
+has seen, so that a learner without memory still sees on the way what the way is for."""
 LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "step up": 6.0, "strike": 3.5}
 """Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the last steps, after which it
 strikes from where it is; one strike, after which the robot moves by the error of its palm."""
@@ -172,8 +173,8 @@ class BoxingExpert(Expert):
         pace = torch.stack([self._pace, self._pace, torch.ones_like(self._pace)], dim=1)
         command.velocity = answer.velocity * pace * (~striking & ~waiting)[:, None]
         command.hands = torch.ones_like(command.hands)
-        searching = self._phases.at(*PLACES)
-        command.waist[:, 0] = torch.where(searching, GLANCE, command.waist[:, 0])
+        searching, going = self._phases.at(*PLACES), self._phases.at("approach", "step up")
+        command.waist[:, 0] = GLANCE * searching + self._gaze() * going
         self._strike(command, striking, mask, dt)
         self._acting = self._phases.names()
 
@@ -201,6 +202,11 @@ class BoxingExpert(Expert):
         glance = self._eyes.sees(ball, self._cylinders).sum(dim=1) >= ENOUGH
         self._glances = self._glances + (mask & glance)
         self.seen = self.seen | (self._glances >= GLANCES)
+
+    def _gaze(self) -> Tensor:
+        """Waist yaw that turns the head to the target [rad], [worlds]."""
+        way = (self._target() - self.sight.root_position)[:, :2]
+        return wrap_angle(torch.atan2(way[:, 1], way[:, 0]) - self.sight.pose[:, 2]).clamp(GLANCE, -GLANCE)
 
     def _search(self, mask: Tensor) -> None:
         """Go on to the next place where the last one has shown nothing."""
