@@ -97,14 +97,14 @@ BESIDE = 0.13
 """The crate's middle is this far to the robot's left [m]: the left arm does not cross over."""
 BEFORE_SILL = 0.85
 """Distance of the pelvis from the sill's middle when it stops to line up [m]: two or three strides."""
-LAST_PAIR = 0.21
+LAST_PAIR = 0.23
 """Distance of the pelvis from the sill's middle when the feet are side by side for the last time before it [m]: the
 ankles are then 5 cm further on, so that a stride of 0.40 m leaves as much room for toes before as for heels behind."""
 PAST_SILL = 0.14
 """Both ankles must be this far beyond the sill's middle [m]: the heel reaches 6 cm back."""
-SILL_SPEED, SILL_STEP, SILL_HEIGHT = 0.44, 0.52, 0.74
+SILL_SPEED, SILL_STEP, SILL_HEIGHT = 0.46, 0.52, 0.74
 """Walk over the sill: speed [m/s], time of a step [s], pelvis [m]."""
-PACE_STAGGER, SILL_STAGGER = 0.17, 0.23
+PACE_STAGGER, SILL_STAGGER = 0.17, 0.25
 """Lead of the left foot by the length of a step on the way to the sill and over it [m]: the right foot lands next to
 it, and the pairs of footprints are 0.3 and 0.4 m apart."""
 PACES = (0.10, 0.48)
@@ -133,7 +133,7 @@ STYLE = {
     "pace": (0.92, 1.0),
     "ready": (0.34, 0.44),
     "aside": (-0.02, 0.02),
-    "swing": (0.17, 0.19),
+    "swing": (0.18, 0.20),
     "palm x": (-0.02, 0.02),
     "palm y": (-0.02, 0.02),
     "palm z": (-0.02, 0.02),
