@@ -97,13 +97,17 @@ SIDE = 0.55
 """Largest distance of the spot from the deck's middle [m]: the opening hands clear the uprights."""
 INSIDE = 0.18
 """Distance of the placed box's centre from the front edge [m]: 7.5 cm more than half of it."""
-STRETCH = 0.24
-"""Most that the hands move ahead for it [m]."""
+DEPTH_GAIN = 2.0
+"""Gain of the hands' way ahead on that distance [1/s]."""
+FARTHEST = 0.52
+"""Largest distance ahead of the pelvis to which the palms are commanded at the shelf [m]."""
+SETTLED = 1.2
+"""Time in which a walk ends: the pelvis rises, and moves back by 6 cm [s]."""
 SINKING = 0.05
 """Speed of the box from the lift to the height in which it is carried over the deck [m/s]."""
 LOWERING = 0.08
 """Speed of the box on its way down [m/s]."""
-SUNK = 0.10
+SUNK = 0.06
 """How much farther than to the deck the hands are commanded down [m]: arms that follow roughly get there too."""
 DOWN = 0.008
 """Height above the deck at which the box counts as put down [m]."""
@@ -135,7 +139,7 @@ LONGEST = {
     "carry": 14.0,
     "step in": 5.0,
     "reach": 3.0,
-    "lower": 3.0,
+    "lower": 2.5,
     "open": 0.6,
     "leave": 3.0,
     "retreat": 3.0,
@@ -312,8 +316,9 @@ class PPBoxExpert(Expert):
         enter("leave", "stand", off > BACK)
         enter("open", "leave", self.half >= self._opened())
         flat = self._deck_top() + self._box_half[2] + DOWN
-        enter("lower", "open", self._centre()[:, 2] < flat)
-        enter("reach", "lower", (deck >= self._inside) | (self.grip[:, 0] >= self._near + STRETCH))
+        sunk = self.underside < self._deck_top() - SUNK + 0.005
+        enter("lower", "open", (self._centre()[:, 2] < flat) | sunk)
+        enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - 0.01) | (self.grip[:, 0] >= FARTHEST)))
         enter("step in", "reach", near(haul, AT_PLACE))
         self.haul.to(enter("carry", "step in", near(haul, PASSING)), self._spot)
         self._choose_spot(enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING))
@@ -407,9 +412,11 @@ class PPBoxExpert(Expert):
         learn = carried & ~state.at("lower")
         self._raised = select(learn, lacking.clamp(-MOST_RAISED, MOST_RAISED), self._raised)
 
-        ahead = torch.where(state.at("reach"), self._near + STRETCH, self._near)
         x, step = self.grip[:, 0], DRAWING * dt
-        x = torch.where(state.at("lift", "lower"), x, x + (ahead - x).clamp(-step, step))
+        depth = self._depth(self._centre()[:, :2])[:, 1]
+        placing = (DEPTH_GAIN * dt * (self._inside - depth)).clamp(-step, step)
+        drawn = torch.where(state.at("reach", "lower"), placing, (self._near - x).clamp(-step, step))
+        x = torch.where(state.at("lift"), x, (x + drawn).clamp(max=FARTHEST))
         z = self._level + self.underside - self._table + self._raised
         grip = torch.stack([x, self.grip[:, 1], z], dim=1)
         self.grip = select(carried, grip, self.grip)
