@@ -95,7 +95,8 @@ def test_expert_by_name():
 
 def test_unknown_task_is_named():
     """A task without an expert is refused by name, with those that have one."""
-    tasks.register(dataclasses.replace(tasks.get("football"), name="waiting", gym_id="Waiting", expert=None))
+    football = tasks.get("football")
+    tasks.register(dataclasses.replace(football, name="waiting", gym_id="Waiting", expert=None, scene=football.layer))
     try:
         with pytest.raises(InputError, match=r"no expert for task waiting; there are .*vis_navi"):
             policies.get("expert").attach(SimpleNamespace(spec=SimpleNamespace(name="waiting")))
