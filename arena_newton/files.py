@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from arena_newton.foreign import create
 
-__all__ = ["PARTIAL", "replace_atomically"]
+__all__ = ["MAX_LABEL", "PARTIAL", "file_label", "replace_atomically"]
 
 PARTIAL = ".part"
 """Ending of a file that is being written; what a killed process leaves has it."""
+MAX_LABEL = 120
+"""Characters of a label; with seed, repeat and episode a file name stays below 255."""
+
+
+def file_label(name: str) -> str:
+    """Name of a tracker or policy as part of a file name; a long one is cut and ends with its hash."""
+    label = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_") or "policy"
+    if len(label) <= MAX_LABEL:
+        return label
+    return f"{label[: MAX_LABEL - 9]}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 @contextlib.contextmanager

@@ -239,7 +239,7 @@ def _camera(options: BenchOptions) -> Iterator[BenchFigure]:
 def _pictures(options: BenchOptions) -> Iterator[BenchFigure]:
     """What strips and videos add to two VisNavi episodes of the expert, taken in turn in one environment."""
     env = ArenaEnv("vis_navi", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu")
-    episodes = plan.expand(["vis_navi"], tracker="twist2", policy="expert", seeds=[0], repeats=2)
+    episodes = plan.expand(["vis_navi"], trackers=["twist2"], policy="expert", seeds=[0], repeats=2)
     policy = policies.get("expert")
     times: dict[str, list[float]] = {"none": [], "strip": [], "video": []}
     with tempfile.TemporaryDirectory() as folder:
@@ -272,7 +272,7 @@ def _episodes(options: BenchOptions) -> Iterator[BenchFigure]:
         began = time.perf_counter()
         env = ArenaEnv("football", worlds=options.worlds, tracker=tracker, engine="mujoco")
         built = time.perf_counter()
-        episodes = plan.expand(["football"], tracker="twist2", policy="stand", max_steps=1300)
+        episodes = plan.expand(["football"], trackers=["twist2"], policy="stand", max_steps=1300)
         results = Rollout(env, policies.get("stand"), episodes).run()
         wall = time.perf_counter() - built
     ticks = sum(result.steps for result in results)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +20,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
-from arena_newton.eval.options import QUICK_MAX_STEPS, QUICK_REPEATS, QUICK_SEEDS, RunOptions, is_quick
+from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
 from arena_newton.pictures.settings import CameraConfig, video_sizes
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
     from arena_newton.trackers.base import Tracker
 
-__all__ = ["DRIVES", "RunConfig", "plain_facts", "resolve"]
+__all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "resolve"]
 
+DEFAULT_TRACKER = "twist2"
+"""Tracker of a run that names tasks or weights, but no tracker."""
 POLICY_PATH_SCHEMES = ("replay",)
 """Policies whose text after the colon is a path."""
 DRIVES: Mapping[str, DriveGains | None] = {
@@ -58,13 +60,14 @@ class RunConfig:
     policy_label: str
     """Name of the policy in tables: the spec, with a local path shortened to its file name."""
     checkpoint: Path | None
-    """The tracker's weights, or several with a comma between; None: those that come with the package."""
+    """Weights of the one tracker, or several with a comma between; None: those that come with the package."""
     variant: Path | None
     video_size: tuple[int, int] | None
     """Size of the world camera's pictures [px]; None: the usual one."""
     policy_options: JsonObject
     """What the policy is made with besides its spec."""
-    checkpoint_hash: str | None
+    checkpoint_hashes: Mapping[str, str | None]
+    """Weights by tracker."""
     policy_hash: str | None
     rules_hash: str
     variant_hash: str | None
@@ -77,7 +80,7 @@ class RunConfig:
     worlds_matter: bool = False
     """Whether the policy depends on how many worlds ask at once; known when it was made and checked."""
     tracker_facts: JsonObject | None = None
-    """`Tracker.describe()`, once the tracker is made."""
+    """`Tracker.describe()` by tracker, once the trackers are made."""
     policy_facts: JsonObject | None = None
     """`Policy.describe()`, once the policy is made."""
 
@@ -93,8 +96,8 @@ class RunConfig:
             "version": __version__,
             "task": list(flags.task),
             "mode": list(flags.mode),
-            "tracker": flags.tracker,
-            "checkpoint": self.checkpoint_hash,
+            "tracker": list(flags.tracker),
+            "checkpoint": dict(self.checkpoint_hashes),
             "policy": self.policy_label,
             "policy_file": self.policy_hash,
             "worlds": flags.worlds if self.worlds_matter else None,
@@ -125,13 +128,13 @@ class RunConfig:
         flags: JsonObject = json.loads(json.dumps(dataclasses.asdict(self.flags) | once))
         return flags
 
-    def with_parts(self, tracker: Tracker, policy: Policy) -> RunConfig:
-        """The run with what tracker and policy say of themselves."""
+    def with_parts(self, made: Mapping[str, Tracker], policy: Policy) -> RunConfig:
+        """The run with what its trackers, by name, and its policy say of themselves."""
         return dataclasses.replace(
             self,
             camera=(policy.camera or CameraConfig()) if policy.needs_image else None,
             worlds_matter=policy.depends_on_worlds,
-            tracker_facts=_facts(tracker),
+            tracker_facts={name: _facts(tracker) for name, tracker in made.items()},
             policy_facts=_facts(policy),
         )
 
@@ -157,8 +160,16 @@ def resolve(options: RunOptions) -> RunConfig:
     _check_flags(options)
     quick = is_quick(options)
     tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
-    checkpoint, checkpoint_hash = _checkpoint(options)
-    trackers.check_spec(options.tracker)
+    if quick and options.policy == "expert":  # a task that was added may have none
+        tasks = tuple(name for name in tasks if task_specs.get(name).expert is not None)
+    # Weights that are named are one tracker's; the default run has two.
+    several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
+    used = tuple(options.tracker) or several
+    if options.actions and len(used) > 1:
+        raise InputError("--actions: name the one --tracker through which the actions are recorded")
+    checkpoint, checkpoint_hashes = _checkpoint(options, used)
+    for tracker in used:
+        trackers.check_spec(tracker)
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
     policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
@@ -172,17 +183,19 @@ def resolve(options: RunOptions) -> RunConfig:
     flags = dataclasses.replace(
         options,
         task=tasks,
+        tracker=used,
         mode=tuple(options.mode) or ("base",),
         seeds=tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS),
         repeats=repeats,
-        max_steps=QUICK_MAX_STEPS if quick else options.max_steps,
+        strip=options.strip or quick,
+        follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,
         policy=f"{scheme}:{policy_path}" if policy_path else options.policy,
     )
     episodes = plan.expand(
         flags.task,
-        tracker=flags.tracker,
+        trackers=flags.tracker,
         policy=label,
         modes=flags.mode,
         rules=flags.rules,
@@ -205,7 +218,7 @@ def resolve(options: RunOptions) -> RunConfig:
         variant=variant,
         video_size=video_size,
         policy_options=policy_options,
-        checkpoint_hash=checkpoint_hash,
+        checkpoint_hashes=checkpoint_hashes,
         policy_hash=policy_hash,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
         variant_hash=variant_hash,
@@ -226,7 +239,7 @@ def _check_flags(options: RunOptions) -> None:
     if options.video_episodes is not None and options.video_episodes < 1:
         raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
     for name in ("video_episodes", "video_size", "follow"):
-        if getattr(options, name) and not (options.video or options.strip):
+        if getattr(options, name) and not (options.video or options.strip or is_quick(options)):
             raise InputError(f"{_flag(name)}: belongs to --video or --strip, neither is given")
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: must be alone, name either all or single tasks")
@@ -257,11 +270,13 @@ def _variant_hash(variant: Path) -> str:
     return config_hash(sorted(map(hash_path, validate.layers(variant))))
 
 
-def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:
-    """The weights' path, and what they hash to: without a path, those that come with the package."""
+def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, dict[str, str | None]]:
+    """The weights' path, and what those of each tracker hash to: without a path, those that come with the package."""
     if options.checkpoint is None:
-        shipped = trackers.shipped_weights(options.tracker)
-        return None, hash_path(shipped) if shipped else None
+        shipped = {tracker: trackers.shipped_weights(tracker) for tracker in used}
+        return None, {tracker: hash_path(path) if path else None for tracker, path in shipped.items()}
+    if len(used) > 1:
+        raise InputError(f"--checkpoint {options.checkpoint}: name the one --tracker whose weights they are")
     given = Path(options.checkpoint).expanduser()
     files = [given] if given.exists() else [Path(part).expanduser() for part in options.checkpoint.split(",")]
     for file in files:
@@ -269,7 +284,7 @@ def _checkpoint(options: RunOptions) -> tuple[Path | None, str | None]:
             raise InputError(f"--checkpoint {options.checkpoint}: no such file")
     path = Path(",".join(str(file.resolve()) for file in files))
     hashes = [hash_path(file) for file in files]
-    return path, hashes[0] if len(hashes) == 1 else config_hash(hashes)
+    return path, {used[0]: hashes[0] if len(hashes) == 1 else config_hash(hashes)}
 
 
 def _policy_options(options: RunOptions) -> JsonObject:

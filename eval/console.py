@@ -17,10 +17,10 @@ from arena_newton.text import counted, plain_text
 __all__ = ["announce", "broken", "environment", "failed", "result"]
 
 
-def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str], Sequence[Episode]]) -> None:
+def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, str], Sequence[Episode]]) -> None:
     """Print configuration and size of the run in two lines, or the configuration as a whole.
 
-    `waiting` are the episodes to play, by task and mode.
+    `waiting` are the episodes to play, by task, tracker and mode.
     """
     flags = config.flags
     if flags.verbose:
@@ -29,7 +29,8 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str], 
             print(f"  {key:<13} {setting(value)}")
     else:
         tasks = " ".join(flags.task) if len(flags.task) < 4 else f"{len(flags.task)} tasks"
-        parts = (tasks, " ".join(flags.mode), f"tracker {flags.tracker}", f"policy {config.policy_label}")
+        used = f"tracker{'s' if len(flags.tracker) > 1 else ''} {' '.join(flags.tracker)}"
+        parts = (tasks, " ".join(flags.mode), used, f"policy {config.policy_label}")
         where = f"rules {flags.rules}, engine {flags.engine} on {config.device}"
         print(f"configuration {config.hash}: {', '.join(parts)}, {where}")
     planned, remain = counted(len(config.episodes), "episode"), sum(map(len, waiting.values()))
@@ -46,7 +47,7 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str], 
             f"  the policy server does not declare that it honours seeds: if it draws random numbers, results "
             f"depend on --worlds {flags.worlds} and on timing; --worlds 1 is reproducible"
         )
-    if flags.tracker == "pd":
+    if "pd" in flags.tracker:
         print("  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2")
 
 

@@ -30,13 +30,17 @@ from arena_newton.eval.records import (
     shown,
 )
 
-__all__ = ["CONFIG_FILE", "Document", "Identity", "Status", "check_plan", "read_document"]
+__all__ = ["CONFIG_FILE", "Document", "Identity", "Status", "check_plan", "read_document", "trackers_of"]
 
 CONFIG_FILE = "config.json"
 
 
 def _distinct(values: list[Json]) -> bool:
     return bool(values) and len(set(values)) == len(values)
+
+
+def _distinct_names(value: list[Json] | str) -> bool:
+    return isinstance(value, str) or _distinct(value)
 
 
 ConfigHash = Annotated[str, Fit("12 hex digits", lambda value: bool(re.fullmatch("[0-9a-f]{12}", value)))]
@@ -58,8 +62,10 @@ class Identity(_Identity, total=False):
     version: Name
     task: Annotated[list[Name], Fit("names of tasks", _distinct)]
     mode: Annotated[list[Name], Fit("names of modes", _distinct)]
-    tracker: Name
-    checkpoint: Hash
+    tracker: Annotated[list[Name] | Name, Fit("names of trackers", _distinct_names)]
+    """One name in a folder of an earlier version."""
+    checkpoint: Annotated[dict[Name, Hash] | Hash, Fit("hashes by tracker")]
+    """The hash alone in a folder of an earlier version."""
     policy: Name
     policy_file: Hash
     worlds: Annotated[float | None, Fit("a number or null")]
@@ -100,8 +106,8 @@ class Document(_Document, total=False):
     """Content of config.json."""
 
     versions: Versions
-    environments: Annotated[dict[Name, Facts], Fit("facts by task and mode")]
-    """What each environment said of itself, by task and mode."""
+    environments: Annotated[dict[Name, Facts], Fit("facts by task, tracker and mode")]
+    """What each environment said of itself, by task, tracker and mode."""
     variant_changes: Annotated[list[str], Fit("sentences")]
     later_versions: Annotated[list[Versions], Fit("versions by library")]
     """Of the libraries that a later `resume --accept-versions` ran with."""
@@ -136,9 +142,15 @@ def read_document(folder: Path) -> Document:
     return document  # type: ignore[return-value]  # what `fit` has tested
 
 
-_Key = tuple[str, str, int, int]
-"""Task, mode, group seed, repeat."""
-_PARTS: tuple[Literal["tracker", "policy", "rules", "engine"], ...] = ("tracker", "policy", "rules", "engine")
+_Key = tuple[str, str, str, int, int]
+"""Task, tracker, mode, group seed, repeat."""
+_PARTS: tuple[Literal["policy", "rules", "engine"], ...] = ("policy", "rules", "engine")
+
+
+def trackers_of(config: Identity) -> list[str] | None:
+    """Names of a run's trackers; None where its configuration names none."""
+    named = config.get("tracker")
+    return [named] if isinstance(named, str) else named
 
 
 def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Document) -> None:
@@ -159,9 +171,11 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
         count = f"planned is {document['planned']}, the plan has {len(plan)}"
         raise InputError(f"{folder / CONFIG_FILE}: {count}; it was changed by hand")
     run: JsonObject = {key: config[key] for key in _PARTS if key in config}
+    named = trackers_of(config)
     for record in records:
-        key = (record.task, record.mode, record.group_seed, record.repeat)
-        name = f"{folder / JOURNAL_FILE}: episode {record.index} ({key[0]} {key[1]} seed {key[2]} repeat {key[3]})"
+        key = (record.task, record.tracker, record.mode, record.group_seed, record.repeat)
+        words = f"{record.task} {record.mode} seed {record.group_seed} repeat {record.repeat}"
+        name = f"{folder / JOURNAL_FILE}: episode {record.index} ({words})"
         if (
             record.index >= document["planned"]
             or record.task not in document["gym_ids"]
@@ -174,6 +188,8 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
             raise InputError(f"{name}: is in the journal as episode {numbers[key]} too")
         seed = seeding.episode_seed(document["gym_ids"][record.task], record.group_seed, record.repeat)
         planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
+        if named is not None and record.tracker not in named:
+            planned["tracker"] = " or ".join(named)
         if record.task in budgets:
             planned["max_steps"] = budgets[record.task]
         if key in plan:
@@ -205,10 +221,11 @@ def _budgets(config: Identity) -> dict[str, int]:
 
 
 def _plan_numbers(path: Path, config: Identity) -> dict[_Key, int]:
-    """Numbers of the plan's episodes by task, mode, group seed and repeat; empty where they are not known."""
-    if "task" not in config or "mode" not in config:
+    """Numbers of the plan's episodes by task, tracker, mode, group seed and repeat; empty where they are not known."""
+    named = trackers_of(config)
+    if "task" not in config or "mode" not in config or named is None:
         return {}
-    parts = (config["task"], config["mode"], config["seeds"], range(config["repeats"]))
+    parts = (config["task"], named, config["mode"], config["seeds"], range(config["repeats"]))
     if math.prod(len(part) for part in parts) > MAX_EPISODES:
         raise InputError(f"{path}: plans more than {MAX_EPISODES:,} episodes")
     return {key: number for number, key in enumerate(itertools.product(*parts))}

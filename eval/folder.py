@@ -24,7 +24,7 @@ from arena_newton.text import plain_text
 
 __all__ = ["BREAK_FILE", "SUBFOLDERS", "ResultsFolder", "iso", "results_folder", "setting", "stored_options"]
 
-SUBFOLDERS = ("videos", "strips", "actions", "original", "expert")
+SUBFOLDERS = ("videos", "strips", "actions", "original")
 """Folders that a run writes inside its own."""
 BREAK_FILE = "break.txt"
 """Where the trace of a break is kept for who looks into it."""
@@ -59,6 +59,8 @@ def setting(value: object) -> str:
     """The value of a setting in a message."""
     if isinstance(value, list):
         return " ".join(map(str, value))
+    if isinstance(value, dict) and all(isinstance(v, str | None) for v in value.values()):
+        return " ".join(f"{key} {setting(part)}" for key, part in value.items())
     return "-" if value is None else str(value)
 
 
@@ -203,13 +205,13 @@ class ResultsFolder:
             self._save()
 
     def register(self, group: str, facts: Mapping[str, object]) -> JsonObject:
-        """Keep what an environment says of itself, once per task and mode; refuse another one than before.
+        """Keep what an environment says of itself, once per task, tracker and mode; refuse another one than before.
 
         Returns:
             The facts as JSON.
 
         Raises:
-            InputError: Earlier episodes of this task and mode were run in an environment that differs.
+            InputError: Earlier episodes of this group were run in an environment that differs.
         """
         plain = plain_facts(facts)
         known = self.document.setdefault("environments", {})
@@ -223,13 +225,13 @@ class ResultsFolder:
             raise InputError(f"{self.path}: {group} {change}; choose another --out")
         return plain
 
-    def hashes(self, environment: JsonObject) -> dict[str, str | None]:
-        """What a journal line names its run by, given what the environment of the episode said of itself."""
+    def hashes(self, tracker: str, environment: JsonObject) -> dict[str, str | None]:
+        """What a journal line names its run by, given the tracker and what the episode's environment said of itself."""
         config = self.config
         return {
             "config": self.document["config_hash"],
             "rules": config.rules_hash,
-            "checkpoint": config.checkpoint_hash,
+            "checkpoint": config.checkpoint_hashes[tracker],
             "policy": config.policy_hash,
             "variant": config.variant_hash,
             "versions": config_hash(moving_versions(self.installed)),

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jinja2
 
-from arena_newton.eval.document import Document
+from arena_newton.eval.document import Document, trackers_of
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.results import Results, RunRecord
 from arena_newton.eval.stats import ErrorReason, ResultCell
@@ -49,9 +49,23 @@ TICKS = (0, 25, 50, 75, 100)
 """Marks of the axis of rates [%]."""
 SEED_SPACING = 9
 """Distance of the dots of group seeds with one rate [px]."""
-SORTED = ("task", "mode", "seed", "repeat", "outcome", "steps", "margin")
+FILTERED = ("outcome", "task", "tracker", "mode")
+"""Columns of the list of episodes by whose values a reader can choose rows."""
+SORTED = ("task", "tracker", "mode", "seed", "repeat", "outcome", "steps", "margin")
 """Columns of the list of episodes by which a reader can sort it."""
-COLUMNS = ("task", "mode", "seed", "repeat", "outcome", "reason", "steps", "margin", "pictures", "play it again")
+COLUMNS = (
+    "task",
+    "tracker",
+    "mode",
+    "seed",
+    "repeat",
+    "outcome",
+    "reason",
+    "steps",
+    "margin",
+    "pictures",
+    "play it again",
+)
 
 
 @functools.cache
@@ -103,6 +117,7 @@ def page(
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
+    opening = _opening(records)
     # The policy's number of worlds is in the configuration only where its answers depend on it.
     command = functools.partial(replay_command, document["options"], worlds=document["config"].get("worlds"))
     return _template().render(
@@ -118,10 +133,11 @@ def page(
         ticks=TICKS,
         cells=_bars(results["cells"]),
         reasons=reasons,
+        opening=[(_Episode(record), strip) for record, strip in opening],
         shown=[_Episode(record) for record in shown],
         folded=[_Episode(record) for record in folded],
         episodes=[_Episode(record, command(record=record)) for record in records],
-        filters=[(n, dict.fromkeys(plain(getattr(r, n)) for r in records)) for n in ("outcome", "task", "mode")],
+        filters=[(n, dict.fromkeys(plain(getattr(r, n)) for r in records)) for n in FILTERED],
         columns=[(name, name if name in SORTED else None) for name in COLUMNS],
         folds=_folds(document, records),
     )
@@ -131,9 +147,9 @@ def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
     """What the page opens with, by name."""
     config = document["config"]
     found = [("episodes", f"{results['finished']} of {results['planned']}")]
-    found += [(name, plain(config.get(name))) for name in ("policy", "tracker", "rules") if name in config]
-    for name in ("task", "mode", "seeds"):
-        values = config.get(name)
+    found += [(name, plain(config.get(name))) for name in ("policy", "rules") if name in config]
+    for name in ("tracker", "task", "mode", "seeds"):
+        values = trackers_of(config) if name == "tracker" else config.get(name)
         if isinstance(values, list):
             found.append((name + "s" if name != "seeds" and len(values) > 1 else name, " ".join(map(plain, values))))
     found.append(("repeats", plain(config["repeats"])))
@@ -206,6 +222,18 @@ def _bar(title: str, cell: ResultCell) -> dict[str, object]:
     }
 
 
+def _opening(records: Sequence[EpisodeRecord]) -> list[tuple[EpisodeRecord, dict[str, str]]]:
+    """One film strip per task, that of its first success from outside; where none succeeded, of its first episode."""
+    found: dict[str, tuple[EpisodeRecord, dict[str, str]]] = {}
+    for record in records:
+        strips = _Episode(record).strips
+        task = plain(record.task)
+        better = task not in found or (record.outcome == "success" and found[task][0].outcome != "success")
+        if strips and better:
+            found[task] = (record, strips[-1])
+    return list(found.values())
+
+
 def _strips(records: Sequence[EpisodeRecord]) -> tuple[list[EpisodeRecord], list[EpisodeRecord]]:
     """Episodes whose film strips are shown, failures first, and those that are folded."""
     filmed = [r for r in records if any(name.endswith("strip") for name in media_of(r))]
@@ -214,11 +242,11 @@ def _strips(records: Sequence[EpisodeRecord]) -> tuple[list[EpisodeRecord], list
         return FAILURES_FIRST.index(record.outcome) if record.outcome in FAILURES_FIRST else 0
 
     ordered = sorted(filmed, key=order)  # stable: plan order within an outcome
-    # One episode of every task and mode comes first, then the second ones.
-    turns: dict[tuple[str, str, bool], int] = {}
+    # One episode of every task, tracker and mode comes first, then the second ones.
+    turns: dict[tuple[str, str, str, bool], int] = {}
     turn = {}
     for record in ordered:
-        cell = (plain(record.task), plain(record.mode), record.outcome == "success")
+        cell = (plain(record.task), plain(record.tracker), plain(record.mode), record.outcome == "success")
         turn[id(record)] = turns[cell] = turns.get(cell, -1) + 1
     wins = sorted((r for r in ordered if r.outcome == "success"), key=lambda r: turn[id(r)])
     failures = sorted((r for r in ordered if r.outcome != "success"), key=lambda r: turn[id(r)])
@@ -240,7 +268,13 @@ class _Episode:
     @property
     def title(self) -> str:
         r = self.record
-        return f"{plain(r.task)} {plain(r.mode)}, seed {plain(r.group_seed)} repeat {plain(r.repeat)}"
+        cell = " ".join(map(plain, (r.task, r.tracker, r.mode)))
+        return f"{cell}, seed {plain(r.group_seed)} repeat {plain(r.repeat)}"
+
+    @property
+    def short_title(self) -> str:
+        """Task and tracker."""
+        return f"{plain(self.record.task)}, {plain(self.record.tracker)}"
 
     @property
     def length(self) -> str:

@@ -8,40 +8,44 @@ from typing import Annotated
 import tyro
 
 __all__ = [
-    "QUICK_MAX_STEPS",
     "QUICK_REPEATS",
     "QUICK_SEEDS",
+    "QUICK_TRACKERS",
     "BenchOptions",
+    "CertifyOptions",
     "EngineOptions",
+    "FilmOptions",
     "ReportOptions",
     "RunOptions",
     "is_quick",
 ]
 
 QUICK_SEEDS = (0,)
-QUICK_REPEATS = 4
-"""Repeats of the default look at all tasks, sized to end within two minutes on a bare CPU."""
-QUICK_MAX_STEPS = 250
-"""Step cap of that look [ticks of 0.02 s]."""
+"""Group seeds of the default run."""
+QUICK_REPEATS = 3
+"""Episodes per task and tracker of the default run, sized to end within four minutes on two CPU cores."""
+QUICK_TRACKERS = ("twist2", "sonic")
+"""Trackers of the default run: those whose weights come with the package."""
 
 
 @dataclass(frozen=True)
 class RunOptions:
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
-    Without --task, --mode, --seeds, --repeats and --max-steps a quick look at all seven tasks runs (about two minutes
-    on a CPU). As soon as one of them is given, the rest follows the benchmark's protocol: 3 seeds x 20 repeats.
+    Without --task, --mode, --seeds, --repeats and --max-steps the experts solve all seven tasks through both trackers,
+    a few episodes each (about four minutes on two CPU cores), and the report opens with film strips. As soon as one of
+    them is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
     task: tuple[str, ...] = ()
     """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
-    tracker: str = "twist2"
-    """Tracker that executes the 40D action: twist2, sonic, pd, ..."""
+    tracker: tuple[str, ...] = ()
+    """Trackers that execute the 40D action, one or several: twist2 (when none is named) sonic pd ..."""
     checkpoint: str | None = None
-    """The tracker's weights: a .safetensors or official .onnx file (SONIC: a folder or two files with a comma between);
-    those that come with the package when none is named."""
-    policy: str = "stand"
-    """Policy that decides it: stand, expert, replay:<clip, or actions of --actions>, remote:<url>."""
+    """Weights of the one tracker named: a .safetensors or official .onnx file (SONIC: a folder or two files with a
+    comma between); those that come with the package when none is named."""
+    policy: str = "expert"
+    """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>, remote:<url>."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
@@ -67,15 +71,16 @@ class RunOptions:
     video: bool = False
     """Write ego and world videos (H.264 MP4), one pair per episode."""
     strip: bool = False
-    """Write the 10-frame picture strip of each episode."""
+    """Write the 10-frame picture strip of each episode; the default run always does, and follows the robot."""
     video_episodes: int | None = None
-    """Videos of only the first so many episodes of each task and mode; of all when not given."""
+    """Videos of only the first so many episodes of each task, tracker and mode; of all when not given."""
     video_size: str | None = None
     """Size of the world camera's pictures, such as 960x540 [px]."""
     follow: bool = False
     """Let the world camera follow the robot."""
     actions: bool = False
-    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker."""
+    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
+    tracker in a run."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
@@ -98,17 +103,34 @@ class RunOptions:
 
 
 def is_quick(options: RunOptions) -> bool:
-    """Whether the flags leave the plan open: a quick look at all tasks."""
+    """Whether the flags leave the plan open: the default run over all tasks."""
     named = options.task or options.mode or options.seeds
     return not named and (options.repeats, options.max_steps) == (None, None)
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Write tables and reports of a results folder again from its journal."""
+    """Write tables and reports of a results folder again from its journal; of several folders print one table."""
 
+    table: bool = False
+    """Print a table of successes per task, tracker and mode as Markdown, and write nothing."""
     json: bool = False
     """Print results.json instead of the table."""
+
+
+@dataclass(frozen=True)
+class FilmOptions:
+    """Show one success per task of one or several results folders in a single film or picture."""
+
+    out: str = "film.webp"
+    """File to write: .webp, .gif or .mp4 is a film of the world videos side by side (run --video), .jpg or .png the
+    world strips one below the other (run --strip)."""
+    seconds: float = 12.0
+    """Length of the film [s]; every episode is played from its start to its end in it."""
+    width: int = 960
+    """Width of the film or picture [px]."""
+    max_mb: float = 3.0
+    """Largest size of a .webp film [MB]; its quality is lowered until it fits."""
 
 
 @dataclass(frozen=True)
@@ -161,3 +183,35 @@ class EngineOptions:
     """JSON file of an earlier call, possibly on another machine, to compare with."""
     out: str | None = None
     """Write the rates to this JSON file."""
+
+
+@dataclass(frozen=True)
+class CertifyOptions:
+    """Prove the benchmark: solvable tasks that need legs, clean axes, agreeing engines, the price of a swapped tracker.
+
+    Every check plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
+    """
+
+    out: str = "results/certify"
+    """Folder of the certificate and of the evaluations behind it."""
+    quick: bool = False
+    """A few episodes of everything: minutes instead of hours, and wide intervals."""
+    task: tuple[str, ...] = ()
+    """Tasks; all that have an expert when none is named."""
+    tracker: tuple[str, ...] = ("twist2", "sonic")
+    """Trackers, with the weights they come with; the first one alone where one is enough."""
+    checks: tuple[str, ...] = ()
+    """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official swap
+    visible; all when none is named."""
+    episodes: int | None = None
+    """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "mujoco"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    twist2_checkpoint: str | None = None
+    """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
+    resume: bool = False
+    """Continue a certification in its folder; what was played is kept."""

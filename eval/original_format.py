@@ -7,11 +7,9 @@ with `episodes/*.json`, `summary.csv`, `summary.jsonl`, `summary.json` and `fina
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord, write_atomic
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.stats import population_std, seed_rates
+from arena_newton.files import file_label
 
 __all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]
 
@@ -34,16 +33,6 @@ SUMMARY_COLUMNS = tuple(
 EPISODE_SEED_FORMULA = "sha256(task_name|group_seed|repeat_idx)_positive_int32"
 REWARD_SCALE = 0.02
 """The original's reward manager multiplies a reward by the control step [s]."""
-MAX_LABEL = 120
-"""Characters of a label; with seed, repeat and episode a file name stays below 255."""
-
-
-def label(policy: str) -> str:
-    """Model label as part of a file name; a long one is cut and ends with its hash."""
-    name = re.sub(r"[^A-Za-z0-9._-]+", "_", policy).strip("_") or "policy"
-    if len(name) <= MAX_LABEL:
-        return name
-    return f"{name[: MAX_LABEL - 9]}_{hashlib.sha256(policy.encode()).hexdigest()[:8]}"
 
 
 def _reason(record: EpisodeRecord) -> str:
@@ -62,7 +51,7 @@ def _common(record: EpisodeRecord, gym_id: str, seeds: Sequence[int], repeats: i
     return {
         "task": gym_id,
         "model_path": record.policy,
-        "model_label": label(record.policy),
+        "model_label": file_label(record.policy),
         "seed": record.group_seed,
         "repeat_idx": record.repeat,
         "episode_seed": record.episode_seed,
@@ -116,8 +105,8 @@ def _counts(records: Sequence[EpisodeRecord]) -> JsonObject:
 def summary_json(records: Sequence[EpisodeRecord], repeats: int) -> JsonObject:
     """Content of `summary.json`."""
     per_model = {}
-    for name in dict.fromkeys(label(record.policy) for record in records):
-        own = [record for record in records if label(record.policy) == name]
+    for name in dict.fromkeys(file_label(record.policy) for record in records):
+        own = [record for record in records if file_label(record.policy) == name]
         rates = seed_rates(own)
         per_model[name] = _counts(own) | {
             "per_seed": {str(seed): _counts([r for r in own if r.group_seed == seed]) for seed in rates},
@@ -142,8 +131,8 @@ def summary_json(records: Sequence[EpisodeRecord], repeats: int) -> JsonObject:
 def final_csv(records: Sequence[EpisodeRecord]) -> str:
     """Content of `final.csv`, e.g. `stand,44/60 (73.3%),4.7%,512.0,0/16 (0.0%)`."""
     rows = []
-    for name in dict.fromkeys(label(record.policy) for record in records):
-        own = [record for record in records if label(record.policy) == name]
+    for name in dict.fromkeys(file_label(record.policy) for record in records):
+        own = [record for record in records if file_label(record.policy) == name]
         won = [record.steps for record in own if record.outcome == "success"]
         failures, falls = len(own) - len(won), sum(record.outcome == "fall" for record in own)
         rows.append(
@@ -187,7 +176,7 @@ def write_original(
 
     for task, tracker, mode in dict.fromkeys((r.task, r.tracker, r.mode) for r in records):
         own = [r for r in records if (r.task, r.tracker, r.mode) == (task, tracker, mode)]
-        run = folder / f"{task}__{label(tracker)}__{mode}"
+        run = folder / f"{task}__{file_label(tracker)}__{mode}"
         rows = [_row(record, gym_ids[task], seeds, repeats) for record in own]
         for record in own:
             content = episode_json(record, gym_ids[task], seeds, repeats)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,18 +40,18 @@ class Episode:
     max_steps: int
     """Step budget [50 Hz ticks]."""
     rank: int = 0
-    """Position among the episodes of its task and mode, from 0."""
+    """Position among the episodes of its task, tracker and mode, from 0."""
 
     @property
     def key(self) -> str:
-        """Name that is unique in a plan, e.g. `football/base/s0/r3`."""
+        """Name that is unique in a plan of one tracker, e.g. `football/base/s0/r3`."""
         return f"{self.task}/{self.mode}/s{self.group_seed}/r{self.repeat}"
 
 
 def expand(
     task_names: Sequence[str],
     *,
-    tracker: str,
+    trackers: Sequence[str],
     policy: str,
     modes: Sequence[str] = ("base",),
     rules: str = "paper",
@@ -59,17 +60,17 @@ def expand(
     repeats: int = PROTOCOL_REPEATS,
     max_steps: int | None = None,
 ) -> list[Episode]:
-    """Episodes of a run: tasks × modes × group seeds × repeats, in this order.
+    """Episodes of a run: tasks × trackers × modes × group seeds × repeats, in this order.
 
     `task_names` may be `all` alone; `repeats` are the episodes per group seed; `max_steps` caps the rule set's step
-    budgets; tracker, policy, rules and engine are the names that results carry.
+    budgets; trackers, policy, rules and engine are the names that results carry.
 
     Raises:
         InputError: Unknown task, mode or rule set, something named twice, or nothing to run.
     """
     rule_set = rule_sets.get(rules)
     names = tasks.names() if list(task_names) == ["all"] else tuple(task_names)
-    for flag, values in (("--task", names), ("--mode", modes), ("--seeds", seeds)):
+    for flag, values in (("--task", names), ("--tracker", trackers), ("--mode", modes), ("--seeds", seeds)):
         if not values:
             raise InputError(f"{flag}: nothing given, at least one value is needed")
         twice = next((v for v in values if list(values).count(v) > 1), None)
@@ -87,7 +88,7 @@ def expand(
         raise InputError(f"--max-steps {max_steps}: expected at least 1")
     if max_steps is not None and max_steps > MAX_COUNT:
         raise InputError(f"--max-steps {_cut(max_steps)}: expected at most {MAX_COUNT:,}")
-    total = len(names) * len(modes) * len(seeds) * repeats
+    total = len(names) * len(trackers) * len(modes) * len(seeds) * repeats
     if total > MAX_EPISODES:
         made = f"{total:,} episodes" if total < 10**12 else "too many episodes"
         raise InputError(f"--repeats {_cut(repeats)}: makes {made}, at most {MAX_EPISODES:,} are planned at once")
@@ -95,7 +96,7 @@ def expand(
     for name in names:
         spec = tasks.get(name)
         budget = spec.max_steps(rule_set)
-        for mode in modes:
+        for tracker, mode in itertools.product(trackers, modes):
             for position, group_seed in enumerate(seeds):
                 for repeat in range(repeats):
                     seed = seeding.episode_seed(spec.gym_id, group_seed, repeat)

@@ -1,4 +1,4 @@
-"""Run a plan: validate everything, build one environment per task and mode, journal every episode, write the report."""
+"""Run a plan: validate, build one environment per task, tracker and mode, journal every episode, write the report."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
 from arena_newton.eval.results import load_run
+from arena_newton.files import file_label
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.policies.base import Policy, PolicyUnavailable
@@ -72,7 +73,7 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
     try:
         config, policy = _check_parts(config, factories)
     except SystemExit as stop:
-        parts = f"--tracker {config.flags.tracker} or --policy {config.policy_label}"
+        parts = f"--tracker {' '.join(config.flags.tracker)} or --policy {config.policy_label}"
         raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
     began = time.perf_counter()
     command = "python -m arena_newton.eval {} " + shlex.quote(str(folder.path))
@@ -91,19 +92,19 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
 
 
 def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
-    """Build tracker and policy and check plan and variant, so that wrong input shows before the first episode.
+    """Build trackers and policy and check plan and variant, so that wrong input shows before the first episode.
 
     Returns:
-        The configuration with what both say of themselves, and the policy.
+        The configuration with what they say of themselves, and the policy.
     """
-    tracker = factories.tracker(config.flags.tracker, config.checkpoint)
+    made = {name: factories.tracker(name, config.checkpoint) for name in config.flags.tracker}
     policy = factories.policy(config.policy, **config.policy_options)
     policy.check()
-    for (task, mode), group in _groups(config.episodes).items():
+    for (task, _, mode), group in _groups(config.episodes).items():
         policy.check_task(task, mode, [episode.episode_seed for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
-    return config.with_parts(tracker, policy), policy
+    return config.with_parts(made, policy), policy
 
 
 def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy: Policy, resume: str) -> bool:
@@ -128,11 +129,11 @@ def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy
     return True
 
 
-def _groups(episodes: Iterable[Episode]) -> dict[tuple[str, str], list[Episode]]:
-    """Episodes by task and mode: a group runs in one environment."""
-    groups: dict[tuple[str, str], list[Episode]] = {}
+def _groups(episodes: Iterable[Episode]) -> dict[tuple[str, str, str], list[Episode]]:
+    """Episodes by task, tracker and mode: a group runs in one environment."""
+    groups: dict[tuple[str, str, str], list[Episode]] = {}
     for episode in episodes:
-        groups.setdefault((episode.task, episode.mode), []).append(episode)
+        groups.setdefault((episode.task, episode.tracker, episode.mode), []).append(episode)
     return groups
 
 
@@ -155,7 +156,7 @@ class _Run:
         return f"{kept} of {counted(len(self.config.episodes), 'episode')} kept"
 
     def play(self) -> None:
-        """Run what is missing, task by task and mode by mode."""
+        """Run what is missing, environment by environment."""
         if self.journal.torn_bytes:
             torn = counted(self.journal.torn_bytes, "byte")
             print(f"  cut a torn last line of {torn} off the journal", file=sys.stderr)
@@ -171,9 +172,9 @@ class _Run:
         )
         try:
             with self.folder.running():
-                for (task, mode), group in waiting.items():
-                    self.progress.group(f"{task} {mode}")
-                    self._play_group(task, mode, group)
+                for names, group in waiting.items():
+                    self.progress.group(" ".join(names))
+                    self._play_group(" ".join(names), group)
         finally:
             self.progress.close()
 
@@ -183,19 +184,18 @@ class _Run:
         again = self.config.flags.retry_errors
         return {index for index, outcome in ended.items() if not (again and outcome == "error")}
 
-    def _play_group(self, task: str, mode: str, episodes: list[Episode]) -> None:
-        """Run the episodes of one task and mode.
+    def _play_group(self, group: str, episodes: list[Episode]) -> None:
+        """Run the episodes of one task, tracker and mode, which name the group.
 
         What breaks an environment as a whole says nothing about its episodes: it stops the run and leaves them
         unplayed. On --skip-broken those that were running end as errors, and the rest goes on in a new environment.
         """
-        group = f"{task} {mode}"
         left = {episode.index: episode for episode in episodes}
         while left:
             started = min(self.config.flags.worlds, len(left))
             order = list(left.values())
             try:
-                self._play_in_one(task, mode, order, left)
+                self._play_in_one(group, order, left)
                 return
             except (InputError, StorageError, PolicyUnavailable, RunStopped):
                 raise
@@ -219,9 +219,10 @@ class _Run:
                     del left[episode.index]
                     self.progress.episode(episode.max_steps, 0)
 
-    def _play_in_one(self, task: str, mode: str, episodes: list[Episode], left: dict[int, Episode]) -> None:
+    def _play_in_one(self, group: str, episodes: list[Episode], left: dict[int, Episode]) -> None:
         """Run episodes in one environment; those that end are taken out of `left`."""
         config, flags = self.config, self.config.flags
+        task, tracker, mode = episodes[0].task, episodes[0].tracker, episodes[0].mode
         self.hashes = {}
         env = recorder = None
         if kernels_to_compile(Path(wp.config.kernel_cache_dir or "."), flags.engine or "", config.device):
@@ -229,7 +230,7 @@ class _Run:
         try:
             env = self.factories.env(
                 task,
-                tracker=self.factories.tracker(flags.tracker, config.checkpoint),
+                tracker=self.factories.tracker(tracker, config.checkpoint),
                 worlds=min(flags.worlds, len(episodes)),
                 engine=flags.engine,
                 device=config.device,
@@ -240,10 +241,10 @@ class _Run:
                 camera=config.camera,
                 drive=DRIVES[flags.drive],
             )
-            facts = self.folder.register(f"{task} {mode}", env.describe())
+            facts = self.folder.register(group, env.describe())
             if flags.verbose:
-                self.progress.say(console.environment(f"{task} {mode}", facts))
-            recorder = _recorder(config, self.folder.path)
+                self.progress.say(console.environment(group, facts))
+            recorder = _recorder(config, self.folder.path, tracker)
             recorders: list[Recorder] = [] if recorder is None else [recorder]
             recorders += [ActionRecorder(self.folder.path / "actions")] if flags.actions else []
 
@@ -253,7 +254,7 @@ class _Run:
                 left.pop(result.episode.index, None)
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK))
 
-            self.hashes = self.folder.hashes(facts)
+            self.hashes = self.folder.hashes(tracker, facts)
             Rollout(
                 env,
                 self.policy,
@@ -272,13 +273,14 @@ class _Run:
             gc.collect()
 
 
-def _recorder(config: RunConfig, folder: Path) -> EpisodeRecorder | None:
-    """What takes the pictures; None when none are wanted."""
+def _recorder(config: RunConfig, folder: Path, tracker: str) -> EpisodeRecorder | None:
+    """What takes the pictures; None when none are wanted. Of several trackers each has its name in its files' names."""
     flags = config.flags
     if not (flags.video or flags.strip):
         return None
     kinds = {"video": flags.video, "strip": flags.strip, "follow": flags.follow}
-    return EpisodeRecorder(folder, **kinds, episodes=flags.video_episodes, size=config.video_size)
+    prefix = file_label(tracker) if len(flags.tracker) > 1 else ""
+    return EpisodeRecorder(folder, **kinds, episodes=flags.video_episodes, size=config.video_size, prefix=prefix)
 
 
 def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str | None]) -> EpisodeRecord:

@@ -21,6 +21,8 @@ from arena_newton.text import plain_text
 __all__ = [
     "MEDIA",
     "environment_facts",
+    "escaped",
+    "markdown_table",
     "media_of",
     "plain",
     "replay_command",
@@ -31,8 +33,8 @@ __all__ = [
 
 MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head camera", "world": "world camera"}
 """Media of an episode that the page knows → what they show."""
-REPLAYED = ("policy", "tracker", "checkpoint", "rules", "drive", "engine", "device", "variant", "max_steps")
-"""Flags with a value on which an episode depends, besides its task, mode, seed and repeat."""
+REPLAYED = ("policy", "checkpoint", "rules", "drive", "engine", "device", "variant", "max_steps")
+"""Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
 REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
 """Flags that belong to a policy server → their defaults; others are named in the command."""
 
@@ -43,6 +45,24 @@ _PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
 def plain(value: object) -> str:
     """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
     return plain_text(value, None, mark="\ufffd")
+
+
+def escaped(text: object) -> str:
+    """Text of a results folder as Markdown that stays text."""
+    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A Markdown table with aligned columns, the first `left` of them flush left; cells are texts and stay so."""
+    lines = [list(head), *([escaped(text) for text in row] for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
+
+    def row(cells: Sequence[str]) -> str:
+        padded = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
+        return f"| {' | '.join(padded)} |"
+
+    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
+    return "\n".join([row(head), rule, *map(row, lines[1:])]) + "\n"
 
 
 def safe_media(path: object) -> str | None:
@@ -63,7 +83,7 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
     `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
     words: list[object] = ["python", "-m", "arena_newton.eval", "--task", record.task, "--mode", record.mode]
-    words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
+    words += ["--tracker", record.tracker, "--seeds", record.group_seed, "--repeats", record.repeat + 1]
     for name in REPLAYED:
         value = options.get(name)
         if value not in (None, "", "auto"):

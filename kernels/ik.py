@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from arena_newton.kernels.launching import launch
+
 __all__ = ["GOAL", "GOAL_WIDTH", "IkState", "Model", "launch_ik", "upload_model"]
 
 # Unrolled, the nested loops take the CUDA compiler a minute instead of six seconds, for no faster a kernel on CPU.
@@ -138,7 +140,7 @@ class IkState:
     """Joint angles [rad], MuJoCo order, shape [worlds, 29]."""
     arms: wp.array
     """Shoulders and elbow of the reaching arms [rad], left then right, shape [worlds, 8]."""
-    hands: wp.array
+    palms: wp.array
     """Hand points of the pose [m], pelvis' heading frame, shape [worlds, 6]."""
     com: wp.array
     """Centre of mass [m], world, shape [worlds, 3]."""
@@ -525,10 +527,9 @@ def launch_ik(model: Model, goal: wp.array, mask: wp.array, state: IkState) -> N
         mask: 1 = solve this world, int32, shape [worlds].
         state: Start and result.
     """
-    wp.launch(
+    launch(
         ik_kernel,
-        dim=goal.shape[0],
-        inputs=[model, goal, mask],
-        outputs=[state.pelvis, state.joints, state.arms, state.hands, state.com, state.error],
-        device=goal.device,
+        goal.shape[0],
+        [model, goal, mask],
+        [state.pelvis, state.joints, state.arms, state.palms, state.com, state.error],
     )

@@ -188,6 +188,7 @@ def pp_box_paper_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
     qvel: wp.array2d[float],
+    robot_force: wp.array[float],
     box_qvel_adr: int,
     box: Boxes,
     decks: Boxes,
@@ -195,6 +196,7 @@ def pp_box_paper_kernel(
     max_speed: float,
     confirm_ticks: int,
     window: float,
+    stiffness: float,
     counter: wp.array[int],
     success: wp.array[int],
     margin: wp.array[float],
@@ -208,6 +210,8 @@ def pp_box_paper_kernel(
     v = wp.vec3(qvel[w, box_qvel_adr], qvel[w, box_qvel_adr + 1], qvel[w, box_qvel_adr + 2])
     speed = wp.sqrt(wp.dot(v, v) + 1.0e-12)
     m = wp.min(m, (max_speed - speed) * window)
+    if robot_force[w] > 0.0:
+        m = wp.min(m, -robot_force[w] / stiffness)
     count = count_up(m, counter[w])
     counter[w] = count
     margin[w] = m
@@ -218,6 +222,7 @@ def launch_pp_box_paper(
     xpos: wp.array,
     xquat: wp.array,
     qvel: wp.array,
+    robot_force: wp.array,
     *,
     box: Boxes,
     box_qvel_adr: int,
@@ -226,16 +231,18 @@ def launch_pp_box_paper(
     max_speed: float,
     confirm_ticks: int,
     tick: float,
+    stiffness: float = 500.0,
     counter: wp.array,
     success: wp.array,
     margin: wp.array,
 ) -> None:
-    """P&PBox, `paper`: box centre above any deck within its span, bottom near the deck, slow, several ticks in a row.
+    """P&PBox, `paper`: box centre above any deck within its span, bottom near the deck, slow, let go, ticks in a row.
 
     The bottom is the box's lowest corner. Speed enters the margin as the length (max_speed - speed) x confirmation
-    time.
+    time, a touch as the length -force / stiffness.
 
     Args:
+        robot_force: Normal force between robot and box [N], any of which restarts the count, shape [worlds].
         box: One box, the one to move.
         box_qvel_adr: Address of its free joint in `qvel`.
         decks: Boxes whose top faces are the decks' surfaces, at least one.
@@ -243,13 +250,11 @@ def launch_pp_box_paper(
         max_speed: Largest speed [m/s], 0.05.
         confirm_ticks: Ticks in a row, 10.
         tick: Control period [s].
+        stiffness: Turns force into length for the margin alone [N/m]; 500 puts a held box (10 N) 2 cm away.
     """
-    launch(
-        pp_box_paper_kernel,
-        success.shape[0],
-        [xpos, xquat, qvel, box_qvel_adr, box, decks, height_tolerance, max_speed, confirm_ticks, confirm_ticks * tick],
-        [counter, success, margin],
-    )
+    limits = [height_tolerance, max_speed, confirm_ticks, confirm_ticks * tick, stiffness]
+    inputs = [xpos, xquat, qvel, robot_force, box_qvel_adr, box, decks, *limits]
+    launch(pp_box_paper_kernel, success.shape[0], inputs, [counter, success, margin])
 
 
 @wp.kernel

@@ -441,6 +441,18 @@ class Camera:
         seen: np.ndarray = wp.to_torch(self.buffers.depth)[view, rows, columns].cpu().numpy()
         return seen
 
+    def shapes(self) -> torch.Tensor:
+        """Shape of the model that each pixel of the last render shows, −1 where it shows none.
+
+        Returns:
+            int64 [views, H, W] on the model's device, of the part of the picture that the lens fills (without the black
+            bars of `fit="pad"`), with `samples` rows and columns per pixel.
+        """
+        # A key's lower half is the triangle (`kernels.raster`); 0 is a pixel that no triangle reached.
+        keys = wp.to_torch(self.buffers.nearest.view(wp.int64))
+        shapes: torch.Tensor = wp.to_torch(self._tracer.soup.shape)[keys & 0xFFFFFFFF].long()
+        return torch.where(keys == 0, -1, shapes)
+
     def _render(self, state: newton.State, body: wp.array | None) -> torch.Tensor:
         """Draw the views; `body` carries each one's camera, None leaves `poses` as they are."""
         tracer, lights, buffers = self._tracer, self.lights, self.buffers

@@ -53,7 +53,7 @@ class EpisodeKey(Protocol):
     group_seed: int
     repeat: int
     rank: int
-    """Number within task and mode, in the order of the plan."""
+    """Number within task, tracker and mode, in the order of the plan."""
 
 
 @dataclass
@@ -94,6 +94,7 @@ class EpisodeRecorder(Recorder):
         size: tuple[int, int] | None = None,
         follow: bool = False,
         every: int = 2,
+        prefix: str = "",
     ):
         """Set up the recorder.
 
@@ -101,13 +102,14 @@ class EpisodeRecorder(Recorder):
             folder: Folder in which `videos/` and `strips/` are written.
             video: Write H.264 MP4s.
             strip: Write film strips.
-            episodes: Number of episodes with videos, the first of each task and mode in the order of the plan; all by
-                default.
+            episodes: Number of episodes with videos, the first of each task, tracker and mode in the order of the plan;
+                all by default.
             size: Width and height of world videos [px]; head camera videos are as high, 4:3. 480×270 (and 320×240) by
                 default. Strips keep their size.
             follow: The world camera keeps the robot in the picture, from behind and the left; by default it is the
                 scene's own.
             every: Ticks between frames (2 is 25 frames/s).
+            prefix: First part of every file's name, such as the tracker's; none by default.
 
         Raises:
             InputError: A number out of range.
@@ -117,18 +119,18 @@ class EpisodeRecorder(Recorder):
             raise InputError(f"--video-episodes {episodes}: expected at least 1")
         if every < 1:
             raise InputError(f"recorder: a frame every {every} ticks, expected at least 1")
-        self.folder = Path(folder)
+        self.folder, self.prefix = Path(folder), prefix
         self.video, self.strip, self.episodes, self.follow, self.every = video, strip, episodes, follow, every
         self._env: World | None = None
         self._cameras: dict[str, Camera] = {}
         self._strip_cameras: dict[str, Camera] = {}
         self._streams: dict[int, _Stream] = {}
 
-    @staticmethod
-    def label(episode: EpisodeKey) -> str:
+    def label(self, episode: EpisodeKey) -> str:
         """File stem of an episode."""
-        parts = [episode.task, episode.mode, f"seed{episode.group_seed}", f"repeat{episode.repeat}"]
-        return "__".join(str(p) for p in parts)
+        parts = [self.prefix] if self.prefix else []
+        parts += [episode.task, episode.mode, f"seed{episode.group_seed}", f"repeat{episode.repeat}"]
+        return "__".join(parts)
 
     def media(self, episode: EpisodeKey) -> dict[str, str]:
         """Files of a finished episode, relative to the folder: `ego`, `world`, `ego strip`, `world strip`."""

@@ -21,7 +21,8 @@ __all__ = ["TASK", "DoubleDeskJudge", "DoubleDeskRule"]
 HAMMER = "/World/Hammer"
 BASKET = "/World/Basket"
 INSIDE = f"{BASKET}/Frame/Inside"
-RIGHT_DESK = "/World/RightDesk"
+RIGHT_DESK, LEFT_DESK = "/World/RightDesk", "/World/LeftDesk"
+SILL = "/World/Sill"
 
 OVER_CRATE = 0.3
 """Distance to the crate, seen from above [m], from which a lifted hammer counts as carried over: the desks are 2.5 m
@@ -113,8 +114,8 @@ TASK = TaskSpec(
         Required(BASKET, "fixture"),
         Required(INSIDE, "marker"),
         Required(RIGHT_DESK, "collider"),
-        Required("/World/LeftDesk", "collider"),
-        Required("/World/Sill", "collider"),
+        Required(LEFT_DESK, "collider"),
+        Required(SILL, "collider"),
     ),
     objects=(
         ObjectSpec(
@@ -142,5 +143,6 @@ TASK = TaskSpec(
     ),
     judge=DoubleDeskJudge,
     predicates=PREDICATES,
+    expert="arena_newton.policies.experts.double_desk:DoubleDeskExpert",
     light=ByRules(paper=None, released=DISTANT_LIGHT),
 )

@@ -44,7 +44,11 @@ PREDICATES = (
 
 @dataclass(frozen=True)
 class PPBoxAnyDeckRule(SuccessRule):
-    """The box rests on any deck."""
+    """The box rests on any deck, and the robot has let go of it.
+
+    The paper's box "rests on the shelf support surface". One that is still squeezed between the hands, held in a few
+    centimetres' distance of a deck, does not.
+    """
 
     height_tolerance: float = 0.06
     """Largest distance of the box's bottom to the deck [m]."""
@@ -56,7 +60,8 @@ class PPBoxAnyDeckRule(SuccessRule):
         """See `SuccessRule.sentence`."""
         return (
             f"box centre above any shelf deck within its span, bottom within {num(self.height_tolerance)} m of the "
-            f"deck, slower than {num(self.max_speed)} m/s for {self.confirm_ticks} ticks"
+            f"deck, slower than {num(self.max_speed)} m/s and touched by no robot link for {self.confirm_ticks} "
+            "consecutive ticks"
         )
 
 
@@ -90,11 +95,12 @@ class PPBoxJudge(Judge):
     """The box on the shelf."""
 
     def __init__(self, scene: Scene, rules: RuleSet):
-        """Bind box and decks."""
+        """Bind box, decks and robot."""
+        from arena_newton.scene import ROBOT
+
         self.rule: PPBoxAnyDeckRule | PPBoxOneDeckRule = rules.task("pp_box").success
         box, decks = bounding_box(scene, BOX), tuple(scene.marker(path) for path in DECKS)
         centre, half = BodyFrame(box.body_id, box.pos, IDENTITY), box.half[2]
-        centre = BodyFrame(box.body_id, box.pos, IDENTITY)
         placed = Condition("near", 0.0, (centre,), tuple(on_deck(deck, half) for deck in decks))
         super().__init__(
             scene,
@@ -111,18 +117,28 @@ class PPBoxJudge(Judge):
         self.box = self.boxes(box)
         self.box_qvel = scene.joint_qvel(BOX)
         self.decks = self.boxes(*decks)
+        self.box_geoms, self.robot_geoms = scene.geom_ids(BOX), scene.geom_ids(ROBOT)
         self.slow = self.counter()
+        self._bound: Physics | None = None
+
+    def bind(self, physics: Physics) -> None:
+        """See `Judge.bind`."""
+        if self._bound is not physics and isinstance(self.rule, PPBoxAnyDeckRule):
+            physics.watch_pair(self.robot_geoms, self.box_geoms)
+        self._bound = physics
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
         from arena_newton.kernels import success
 
+        self.bind(physics)
         common = {"box": self.box, "decks": self.decks, **self.outputs()}
         if isinstance(self.rule, PPBoxAnyDeckRule):
             success.launch_pp_box_paper(
                 physics.xpos,
                 physics.xquat,
                 physics.qvel,
+                physics.pair_force,
                 box_qvel_adr=self.box_qvel,
                 height_tolerance=self.rule.height_tolerance,
                 max_speed=self.rule.max_speed,
@@ -176,4 +192,5 @@ TASK = TaskSpec(
     judge=PPBoxJudge,
     predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
+    expert="arena_newton.policies.experts.pp_box:PPBoxExpert",
 )

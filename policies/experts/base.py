@@ -16,7 +16,6 @@ import warp as wp
 from torch import Tensor
 
 from arena_newton import tasks as task_registry
-from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Json, Mask, Policy, world_mask

@@ -1,4 +1,13 @@
-"""Boxing's expert: walk to the side of the right bag, crouch to the target's height, lead the nearer fist to it.
+"""Boxing's expert: look for the target, walk to its side of the bag, crouch to its height, lead the nearer fist to it.
+
+What its decisions are read from:
+- Bags and posts are in the first picture and always in the same place.
+- The target's position counts from the decision on at which the head camera has seen a third of it for `GLANCES`
+  decisions (`seen`, from `eyes`); 23 of the protocol's 60 first pictures do not show it. Until then the robot looks from
+  one place after the other, in a fixed order, so that a learner without memory can do the same: where it is in the
+  picture says where it goes next. From the start it sees the fronts of both bags; then it walks around them clockwise,
+  the waist turned to the bags, past the outer side and the back of bag 1 and the back of bag 2.
+- The palms, at the strike, are in the picture too.
 
 The palm must come within 13 cm of a target in the bag's surface, and the palm frame is behind the fingers: a hand that
 comes straight at the bag stops too far away. So the robot stands such that the target is on the bag's flank, in front
@@ -13,58 +22,89 @@ import torch
 from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
-from arena_newton.policies.experts.planning import Floor, plan, signed_distance
+from arena_newton.policies.experts.eyes import Eyes, silhouette
+from arena_newton.policies.experts.phases import Phases, select
+from arena_newton.policies.experts.planning import Floor, signed_distance
 from arena_newton.policies.experts.style import Style
+from arena_newton.policies.experts.walking import Walk
 from arena_newton.rotations import rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import PALMS, TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.kinematics import HAND_POINT
-from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
+from arena_newton.trackers.motions.navigate import NavigationLimits
 from arena_newton.usd_scenes.g1.links import PALM_OFFSET
 
 __all__ = ["BoxingExpert"]
 
 BAGS = ("/World/Bag_1", "/World/Bag_2")
+STRIPES = 8
+"""Upright stripes that the target's width is divided into ..."""
+ENOUGH = 3
+"""... and how many of them must be in view: at 2 m these are 8 pixels of a policy's picture."""
+GLANCES = 2
+"""Decisions at which the target was in view before it counts as seen: one picture may be a coincidence of a step."""
+PLACES = {
+    "beside 1": (0, 0.68, 0.25, -1.60),
+    "behind 1": (0, 0.75, -1.15, -2.40),
+    "behind 2": (1, -0.20, -1.15, 2.60),
+    "beside 2": (1, -1.00, 0.10, 1.40),
+    "before 2": (1, 0.20, 1.40, 0.00),
+}
+"""Phase → place to look from: number of the bag, x, y from its axis [m] and heading [rad]. They lead clockwise around both
+bags. The start and the first three see every azimuth of the target; the others are for a robot that missed it."""
+NEXT = dict(zip(PLACES, [*list(PLACES)[1:], next(iter(PLACES))], strict=True))
+"""Phase → where to look next."""
+PASSED = 0.40
+"""Distance to a place from which the robot goes on to the next one [m]: it need not stop to see."""
+GLANCE = -0.6
+"""Waist yaw while it searches [rad]: the bags are on its right. As far at most it turns to keep a target in view that it
+has seen, so that a learner without memory still sees on the way what the way is for."""
+LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "step up": 6.0, "strike": 3.5}
+"""Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the last steps, after which it
+strikes from where it is; one strike, after which the robot moves by the error of its palm."""
+
 FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
 """Bearing of the target from the bag's axis minus that of the robot [rad]: positive is on the robot's right."""
-BEST_FLANK = math.radians(60)
+BEST_FLANK = (math.radians(56), math.radians(68))
+"""The one preferred, drawn between these."""
+FAVOUR = 0.35
+"""Longest detour for the side that an episode favours [m]."""
 STAND = 0.45
 """Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
-READY = 0.70
-"""The same when the robot turns to the bag, before the last step [m]: its hands must not touch the bag."""
+READY = (0.66, 0.76)
+"""The same when the robot turns to the bag, before the last step, drawn between these [m]: its hands must not touch the
+bag."""
+PACE = (0.88, 1.0)
+"""Speed against the limits, drawn between these."""
+ASIDE = 0.12
+"""Places to look from are moved by up to this in x and y, drawn [m]."""
 OFF = 0.06
 """Distance of the palm from the target, away from the bag [m]: the hand arrives before it touches."""
 BELOW = 0.12
 """Height of the target above the pelvis [m]: the shoulder is then 17 cm above the target."""
 LOW, HIGH = 0.52, 0.74
 """Range of pelvis heights [m]."""
-PATIENCE = 3.5
-"""Time given to one strike before the robot moves by the error of its palm [s]."""
 SHIFTS = 2
-"""Number of such moves before it goes to another side of the target."""
+"""Number of moves by the palm's error before the robot goes to another side of the target."""
 CLOSER = 0.12
 """Longest such move [m]."""
 LEAN = 0.25
 """Waist pitch of a strike [rad]."""
-READY_WITHIN = (0.10, 0.15)
+READY_WITHIN = (0.14, 0.25)
 """Errors at the ready pose that do not matter [m, rad]."""
-STAND_WITHIN = (0.05, 0.10)
+STAND_WITHIN = (0.07, 0.14)
 """Errors in front of the bag that the arm compensates [m, rad]."""
-STEP_TIME = 6.0
-"""Time given to the last steps before the robot strikes from its present position [s]."""
 GAIN = 0.6
 """Integral gain on the palm's error [1/s]: trackers leave the hand 5-20 cm behind."""
 MOST = 0.15
 """Largest correction [m]."""
-
-WALK, STEP, STRIKE = 0, 1, 2
-PHASES = ("approach", "step up", "strike")
-"""Their names, in this order."""
+LIMITS = NavigationLimits(forward=0.8, backward=0.3, sideways=0.3, turn=1.1, position_gain=1.2, near=0.3, far=0.6)
+"""Fast enough that the last place is reached and the target struck within 900 ticks, the budget of `released`."""
 
 
 class BoxingExpert(Expert):
-    """Three phases per world: to the ready pose, up to the bag, strike; after a miss back to the first."""
+    """Looks from place to place until the target is seen, walks to it, steps up, strikes; after a miss again."""
 
     task = "boxing"
 
@@ -72,36 +112,120 @@ class BoxingExpert(Expert):
         """Find bags, target and palms."""
         super().__init__(sight)
         worlds, device = sight.worlds, sight.device
-        bags, boxes = [], []
+        bags, boxes, cylinders = [], [], []
         for bag in BAGS:
-            _, centre, half = sight.box(f"{bag}/Collider")
-            _, post, post_half = sight.box(f"{bag}/Post")
-            bags.append(centre[:2])
             zero = torch.zeros(1, device=device)
-            boxes.append(torch.cat([centre[:2], zero, half[:1], half[:1]]))
-            boxes.append(torch.cat([post[:2], zero, post_half[:2]]))
+            for part in ("Collider", "Post"):
+                _, centre, half = sight.box(f"{bag}/{part}")
+                wide = half[1:2] if part == "Post" else half[:1]
+                boxes.append(torch.cat([centre[:2], zero, half[:1], wide]))
+                cylinders.append(torch.cat([centre[:2], half[:1]]))
+                if part == "Collider":
+                    bags.append(centre[:2])
         self._bags = torch.stack(bags)
         self._boxes = torch.stack(boxes).expand(worlds, -1, 5)
+        self._cylinders = torch.stack(cylinders).expand(worlds, -1, 3)
         self._target = sight.frame(f"{TARGET}/Frame/Bounds")
+        self._radius = min(sight.scene.marker(f"{TARGET}/Frame/Bounds").half)
         self._palms = [sight.frame(name) for name in PALMS]
-        self.navigator = Navigator(worlds, device, NavigationLimits(forward=0.45))
-        self.phase = torch.zeros(worlds, dtype=torch.long, device=device)
-        """`WALK`, `STEP` or `STRIKE`, shape [worlds]."""
-        self._acting = self.phase
+        self._eyes = Eyes(sight)
+        self._phases = Phases(LONGEST, worlds, device)
+        self._acting: list[str] = ["look"] * worlds
+        self._walk = Walk(sight, LIMITS)
+        self.seen = torch.zeros(worlds, dtype=torch.bool, device=device)
+        """The head camera has seen the target in this episode, so that its position may be used, shape [worlds]."""
+        self._glances = torch.zeros(worlds, dtype=torch.long, device=device)
         self.right = torch.zeros(worlds, dtype=torch.bool, device=device)
         """The right hand strikes, shape [worlds]."""
-        self.ready = torch.zeros(worlds, 3, device=device)
         self.stand = torch.zeros(worlds, 3, device=device)
-        self._route = torch.zeros(0, device=device)
+        """Pose in front of the bag: x, y [m], yaw [rad], shape [worlds, 3]."""
         self._tries = torch.zeros(worlds, dtype=torch.long, device=device)
-        self._clock = torch.zeros(worlds, device=device)
         self._correction = torch.zeros(worlds, 3, device=device)
+        self._flank, self._favour, self._ready, self._pace = (torch.zeros(worlds, device=device) for _ in range(4))
+        self._aside = torch.zeros(worlds, 2, device=device)
 
     def begin(self, mask: Tensor, style: Style) -> None:
-        """Choose bag, stance and hand."""
+        """Forget the last episode; draw pace, side and stance."""
         self._tries = self._tries.masked_fill(mask, 0)
-        self.navigator.reset(mask)
-        self._approach(mask)
+        self._glances = self._glances.masked_fill(mask, 0)
+        self.seen = self.seen & ~mask
+        self._flank = select(mask, style.uniform("flank", *BEST_FLANK), self._flank)
+        self._favour = select(mask, style.uniform("favour", -FAVOUR, FAVOUR), self._favour)
+        self._ready = select(mask, style.uniform("ready", *READY), self._ready)
+        self._pace = select(mask, style.uniform("pace", *PACE), self._pace)
+        aside = torch.stack([style.uniform(f"aside {axis}", -ASIDE, ASIDE) for axis in "xy"], dim=1)
+        self._aside = select(mask, aside, self._aside)
+        self._walk.begin(mask)
+        self._go(next(iter(PLACES)), mask)
+        self._phases.begin(mask)
+
+    def command(self, mask: Tensor, dt: float) -> MotionCommand:
+        """Look, then decide where to go, then walk, step up or strike."""
+        self._look(mask)
+        looking = self._looking()
+        self._approach(mask & self.seen & looking)
+        self._search(mask & ~self.seen & looking)
+        self._try_again(mask & self._phases.at("strike") & self._phases.late)
+
+        striking, waiting = self._phases.at("strike"), self._phases.at("look")
+        answer = self._walk.command(mask & ~waiting, dt)
+        command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
+        pace = torch.stack([self._pace, self._pace, torch.ones_like(self._pace)], dim=1)
+        command.velocity = answer.velocity * pace * (~striking & ~waiting)[:, None]
+        command.hands = torch.ones_like(command.hands)
+        searching, going = self._phases.at(*PLACES), self._phases.at("approach", "step up")
+        command.waist[:, 0] = GLANCE * searching + self._gaze() * going
+        self._strike(command, striking, mask, dt)
+        self._acting = self._phases.names()
+
+        self._phases.advance(mask, dt)
+        approaching, stepping = self._phases.at("approach"), self._phases.at("step up")
+        near = torch.where(approaching, READY_WITHIN[0], STAND_WITHIN[0])
+        turn = torch.where(approaching, READY_WITHIN[1], STAND_WITHIN[1])
+        there = (answer.distance < near) & (answer.heading_error.abs() < turn)
+        onward = mask & (there | answer.arrived | self._phases.late)
+        self._step_up(onward & approaching, self.stand)
+        self._phases.enter("strike", onward & stepping)
+        return command
+
+    def phases(self) -> list[str]:
+        """`look`, the places of `PLACES` while it searches, `approach`, `step up`, `strike`."""
+        return self._acting
+
+    def _looking(self) -> Tensor:
+        """Worlds that have not yet gone for the target, bool, [worlds]."""
+        return self._phases.at("look", *PLACES)
+
+    def _look(self, mask: Tensor) -> None:
+        """Count the decisions at which enough of the target is in view."""
+        ball = silhouette(self._eyes.position, self._target(), self._radius, STRIPES)
+        glance = self._eyes.sees(ball, self._cylinders).sum(dim=1) >= ENOUGH
+        self._glances = self._glances + (mask & glance)
+        self.seen = self.seen | (self._glances >= GLANCES)
+
+    def _gaze(self) -> Tensor:
+        """Waist yaw that turns the head to the target [rad], [worlds]."""
+        way = (self._target() - self.sight.root_position)[:, :2]
+        return wrap_angle(torch.atan2(way[:, 1], way[:, 0]) - self.sight.pose[:, 2]).clamp(GLANCE, -GLANCE)
+
+    def _search(self, mask: Tensor) -> None:
+        """Go on to the next place where the last one has shown nothing."""
+        near = torch.linalg.vector_norm((self._walk.goal - self.sight.pose)[:, :2], dim=1) < PASSED
+        waiting, late = self._phases.at("look"), self._phases.late
+        passed = mask & ~waiting & (near | late)
+        self._phases.enter(next(iter(PLACES)), mask & waiting & late)
+        if passed.any():
+            at = {place: passed & self._phases.at(place) for place in PLACES}
+            for place, following in NEXT.items():
+                self._go(following, at[place])
+
+    def _go(self, place: str, mask: Tensor) -> None:
+        """Walk to a place to look from."""
+        bag, x, y, yaw = PLACES[place]
+        xy = self._bags[bag] + torch.tensor([x, y], device=self.sight.device) + self._aside
+        goal = torch.cat([xy, torch.full_like(xy[:, :1], yaw)], dim=1)
+        self._walk.to(mask, goal, Floor(self._boxes, *ROOM))
+        self._phases.enter(place, mask)
 
     def _bag(self) -> tuple[Tensor, Tensor]:
         """The target's bag [m], and the bearing of the target from its axis [rad]; [worlds, 2] and [worlds]."""
@@ -111,17 +235,19 @@ class BoxingExpert(Expert):
         return bag, torch.atan2(target[:, 1] - bag[:, 1], target[:, 0] - bag[:, 0])
 
     def _approach(self, mask: Tensor) -> None:
-        """Plan the path to the best stance; after a miss to the next best one."""
+        """Plan the path to the best stance; after misses to the next best one."""
+        if not mask.any():
+            return
         pose = self.sight.pose
         bag, bearing = self._bag()
         flank = torch.tensor(FLANKS, device=pose.device)
         side = bearing[:, None] - flank  # [W, C]: bearing of the robot from the bag
         out = torch.stack([torch.cos(side), torch.sin(side)], dim=2)
-        ready, stand = bag[:, None] + READY * out, bag[:, None] + STAND * out
+        ready, stand = bag[:, None] + self._ready[:, None, None] * out, bag[:, None] + STAND * out
         room = signed_distance(torch.cat([ready, stand], dim=1), self._boxes[:, 1::2])
         tight = (0.40 - room.view(len(pose), 2, -1).amin(dim=1)).clamp_min(0.0)
-        far = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
-        price = far + 20.0 * tight + 0.5 * (flank.abs() - BEST_FLANK).abs()
+        far = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2) + self._favour[:, None] * flank.sign()
+        price = far + 20.0 * tight + 0.5 * (flank.abs() - self._flank[:, None]).abs()
         order = price.argsort(dim=1)
         pick = torch.gather(order, 1, (self._tries // (SHIFTS + 1) % len(FLANKS))[:, None])
 
@@ -129,65 +255,30 @@ class BoxingExpert(Expert):
             xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
             return torch.cat([xy, wrap_angle(torch.gather(side, 1, pick) + math.pi)], dim=1)
 
-        goal = chosen(ready)
-        paths = plan(pose[:, :2], goal[:, :2], Floor(self._boxes, *ROOM))
-        row = mask[:, None]
-        self.ready = torch.where(row, goal, self.ready)
-        self.stand = torch.where(row, chosen(stand), self.stand)
+        self._walk.to(mask, chosen(ready), Floor(self._boxes, *ROOM))
+        self.stand = select(mask, chosen(stand), self.stand)
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
-        old = self._route if len(self._route) else paths.points
-        self._route = torch.where(mask[:, None, None], paths.points, old)
-        self._begin_phase(mask, WALK)
+        self._phases.enter("approach", mask)
 
-    def command(self, mask: Tensor, dt: float) -> MotionCommand:
-        """Walk, step up or strike."""
-        pose = self.sight.pose
-        stuck = mask & (self.phase == STRIKE) & (self._clock > PATIENCE)
-        if stuck.any():
-            self._tries = self._tries + stuck
-            again = stuck & (self._tries % (SHIFTS + 1) == 0)
-            self._shift(stuck & ~again)
-            self._approach(again)
-        self._acting = self.phase
-        walking, striking = self.phase == WALK, self.phase == STRIKE
-        goal = torch.where(walking[:, None], self.ready, self.stand)
-        route = torch.where(walking[:, None, None], self._route, pose[:, None, :2])
-        answer = self.navigator.command(pose, goal, dt, route=route, mask=mask)
-        self._clock = self._clock + dt * mask
-
-        command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
-        command.velocity = answer.velocity * (~striking)[:, None]
-        command.hands = torch.ones_like(command.hands)
-        self._strike(command, striking, mask, dt)
-
-        near = torch.where(walking, READY_WITHIN[0], STAND_WITHIN[0])
-        turn = torch.where(walking, READY_WITHIN[1], STAND_WITHIN[1])
-        there = (answer.distance < near) & (answer.heading_error.abs() < turn)
-        late = (self.phase == STEP) & (self._clock > STEP_TIME)
-        onward = mask & ~striking & (there | answer.arrived | late)
-        self.phase = self.phase + onward
-        self._clock = self._clock.masked_fill(onward, 0.0)
-        self.navigator.retarget(onward)
-        return command
-
-    def phases(self) -> list[str]:
-        """`approach`, `step up` or `strike`."""
-        return [PHASES[phase] for phase in self._acting.tolist()]
-
-    def _shift(self, mask: Tensor) -> None:
-        """Move the stance by what the palm missed: a crouch and a stretched arm push the robot back by centimetres."""
+    def _try_again(self, mask: Tensor) -> None:
+        """After a miss move by what the palm missed; when that did not help, go to another side."""
+        if not mask.any():
+            return
+        self._tries = self._tries + mask
+        elsewhere = self._tries % (SHIFTS + 1) == 0
+        # A crouch and a stretched arm push the robot back by centimetres.
         miss = (self._wanted() - self._palm())[:, :2]
         size = torch.linalg.vector_norm(miss, dim=1, keepdim=True).clamp_min(1e-6)
         moved = self.sight.pose[:, :2] + miss * (CLOSER / size).clamp_max(1.0)
-        stand = torch.cat([moved, self.stand[:, 2:]], dim=1)
-        self.stand = torch.where(mask[:, None], stand, self.stand)
-        self._begin_phase(mask, STEP)
+        self._step_up(mask & ~elsewhere, torch.cat([moved, self.stand[:, 2:]], dim=1))
+        self._approach(mask & elsewhere)
 
-    def _begin_phase(self, mask: Tensor, phase: int) -> None:
-        self.phase = self.phase.masked_fill(mask, phase)
-        self._clock = self._clock.masked_fill(mask, 0.0)
+    def _step_up(self, mask: Tensor, stand: Tensor) -> None:
+        """The last steps, straight to a pose in front of the bag."""
+        self.stand = select(mask, stand, self.stand)
+        self._walk.to(mask, self.stand)
         self._correction = self._correction.masked_fill(mask[:, None], 0.0)
-        self.navigator.retarget(mask)
+        self._phases.enter("step up", mask)
 
     def _wanted(self) -> Tensor:
         """Wanted position of the palm [m]: next to the target, [worlds, 3]."""
@@ -205,9 +296,9 @@ class BoxingExpert(Expert):
         """Fill in height, waist and hand point."""
         pose, wanted = self.sight.pose, self._wanted()
         error = self._local(wanted - self._palm(), pose)
-        settled = striking & mask & (self._clock > 1.0)
+        settled = striking & mask & (self._phases.clock > 1.0)
         correction = (self._correction + GAIN * dt * error).clamp(-MOST, MOST)
-        self._correction = torch.where(settled[:, None], correction, self._correction)
+        self._correction = select(settled, correction, self._correction)
 
         root = torch.cat([pose[:, :2], self.sight.height[:, None]], dim=1)
         point = self._local(wanted - root, pose) + self._correction
@@ -219,7 +310,7 @@ class BoxingExpert(Expert):
         command.height = torch.where(striking, height, command.height)
         turn = torch.where(self.right, 0.35, -0.35)
         waist = torch.stack([turn, torch.zeros_like(turn), torch.full_like(turn, LEAN)], dim=1)
-        command.waist = torch.where(striking[:, None], waist, command.waist)
+        command.waist = select(striking, waist, command.waist)
 
     @staticmethod
     def _local(vector: Tensor, pose: Tensor) -> Tensor:

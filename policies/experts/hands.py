@@ -35,7 +35,8 @@ class Palms:
             most: Largest correction in each direction [m].
         """
         self.sight, self.gain, self.most = sight, gain, most
-        self._bodies = [sight.scene.link(f"{side}_wrist_yaw_link") for side in SIDES]
+        self.bodies = [sight.scene.link(f"{side}_wrist_yaw_link") for side in SIDES]
+        """Left and right wrist yaw link."""
         self._ahead = torch.tensor([HAND_POINT, 0.0, 0.0], device=sight.device)
         self.correction = torch.zeros(sight.worlds, 2, 3, device=sight.device)
         """What is added to the command of left and right palm [m], pelvis' heading frame, shape [worlds, 2, 3]."""
@@ -46,7 +47,7 @@ class Palms:
 
     def measured(self) -> Tensor:
         """Left and right palm (`HAND_POINT` ahead of the wrist) in the world [m], shape [worlds, 2, 3]."""
-        return torch.stack([self.sight.point(body, self._ahead) for body in self._bodies], dim=1)
+        return torch.stack([self.sight.point(body, self._ahead) for body in self.bodies], dim=1)
 
     def local(self, points: Tensor) -> Tensor:
         """World points [m], shape [worlds, n, 3], in the pelvis' heading frame: the frame of `hand_point`."""

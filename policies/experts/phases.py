@@ -71,6 +71,11 @@ class Phases:
         """Worlds that have been in their phase for its longest time, bool, shape [worlds]."""
         return self.clock >= self._longest[self.phase]
 
+    @property
+    def fraction(self) -> Tensor:
+        """Time in the phase over its longest time, 0 to 1, shape [worlds]; 0 in a phase without end."""
+        return (self.clock / self._longest[self.phase]).clamp(0.0, 1.0)
+
     def names(self) -> list[str]:
         """Name of each world's phase."""
         return [self._names[phase] for phase in self.phase.tolist()]

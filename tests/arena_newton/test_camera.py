@@ -247,3 +247,29 @@ def test_bad_input_is_named(model):
         _camera(model, WorldLights.allocate(1, "cpu"))
     with pytest.raises(InputError, match="direction"):
         lights.set(0, SimpleNamespace(direction=(0, 0, 0), intensity=1.0, color=(1, 1, 1)))
+
+
+def test_each_pixel_names_its_shape(model):
+    """A pixel names what it shows: the box of its own world in the middle, no shape above the horizon."""
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    camera = _camera(model, lights)
+    camera.render(model.state())
+    shapes = camera.shapes()
+    assert shapes.shape == (WORLDS, 60, 80)
+    types, worlds = model.shape_type.numpy(), model.shape_world.numpy()
+    middle = shapes[:, 30, 40].tolist()
+    assert [types[shape] for shape in middle] == [int(newton.GeoType.BOX)] * WORLDS
+    assert [worlds[shape] for shape in middle] == list(range(WORLDS))
+    level = Camera(
+        model,
+        np.full(WORLDS, -1),
+        (0.0, 0.0, 30.0),
+        (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
+        width=8,
+        height=8,
+        focal_length=7.6,
+        horizontal_aperture=7.6,
+        lights=lights,
+    )
+    level.render(model.state())
+    assert (level.shapes()[:, :3] == -1).all() and (level.shapes()[:, -1] >= 0).all()

@@ -160,6 +160,10 @@ def test_pp_box():
     b.carry(data, b.palm(data), deck + [0.0, 0.0, 0.25])
     assert b.holding(data)[-3:] == ["contact", "transport", "place"]
     b.carry(data, b.palm(data), deck + [-1.0, -1.0, 0.25])
+    b.pressing = 0.1
+    held = [b.holding(data) for _ in range(10)]
+    assert held[-1][-1] == "release"
+    b.pressing = 0.0
     held = [b.holding(data) for _ in range(10)]
     assert held[0][-2:] == ["place", "release"] and held[-1][-1] == "hold"
 

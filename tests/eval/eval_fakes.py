@@ -114,9 +114,9 @@ class FakePolicy:
 
 
 def fake_tracker(spec, checkpoint):
-    """Knows the two that the tests name."""
-    if spec not in ("pd", "twist2"):
-        raise InputError(f"--tracker {spec}: unknown tracker; known are pd, twist2")
+    """Knows the three that come with the package."""
+    if spec not in ("pd", "twist2", "sonic"):
+        raise InputError(f"--tracker {spec}: unknown tracker; known are pd, twist2, sonic")
     return SimpleNamespace(name=spec, describe=lambda: {"name": spec, "drive": "none"})
 
 

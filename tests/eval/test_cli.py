@@ -10,28 +10,37 @@ from pathlib import Path
 import pytest
 from eval_fakes import factories
 
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.config import resolve
+from arena_newton.eval.options import RunOptions
 
 TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
+CELLS = [(tracker, mode) for tracker in ("twist2", "sonic") for mode in ("base", "visual")]
 SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "1", "--seeds", "0"]
 
 
 def test_default_run(tmp_path, capsys, monkeypatch):
-    """Without flags all seven tasks run, a table is printed and the report lies where the last line says."""
+    """Without flags the experts do their tasks through both trackers, with full budgets, film strips and a report."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
+    filmed = []
+    # These worlds have nothing to draw.
+    monkeypatch.setattr(run, "_recorder", lambda config, folder, tracker: filmed.append((config.flags.strip, tracker)))
     assert main(["--device", "cpu"], factories()) == 0
     output = capsys.readouterr().out
-    assert all(re.search(rf"^\| {task} ", output, re.M) for task in TASKS)
+    planned = [name for name in TASKS if tasks.get(name).expert is not None]
+    assert planned and all(re.search(rf"^\| {task} ", output, re.M) for task in planned)
     report = re.search(r"^report: (.*)$", output, re.M)[1]
     assert Path(report).is_file() and Path(report).parts[0] == "results"
     results = json.loads((Path(report).parent / "results.json").read_text())
-    assert [cell["task"] for cell in results["cells"]] == TASKS
-    assert [suite["suite"] for suite in results["suites"]] == ["HOI_AVG", "HSI_AVG", "ALL_AVG"]
-    (expert,) = json.loads((Path(report).parent / "expert" / "results.json").read_text())["cells"]
-    assert (expert["task"], expert["policy"], expert["episodes"]) == ("vis_navi", "expert", 1)
+    cells = [(cell["task"], cell["tracker"], cell["policy"]) for cell in results["cells"]]
+    assert cells == [(task, tracker, "expert") for task in planned for tracker in ("twist2", "sonic")]
+    assert filmed == [(True, tracker) for _ in planned for tracker in ("twist2", "sonic")]
+    lines = (Path(report).parent / "episodes.jsonl").read_text().splitlines()
+    budgets = {row["task"]: row["max_steps"] for row in map(json.loads, lines)}
+    assert budgets == {task: tasks.get(task).max_steps(rule_sets.get("paper")) for task in planned}
 
 
 def test_configuration_is_two_lines(tmp_path, capsys):
@@ -40,7 +49,7 @@ def test_configuration_is_two_lines(tmp_path, capsys):
     brief = capsys.readouterr().out.split("\n\n")[0].splitlines()
     assert len(brief) == 2
     assert re.match(
-        r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy stand, rules paper, ", brief[0]
+        r"configuration [0-9a-f]{12}: football, base, tracker twist2, policy expert, rules paper, ", brief[0]
     )
     assert "  1 episode, 1 world at once, at most 1,300 world-ticks (26 s simulated) -> " in brief[1]
     assert main(["resume", str(tmp_path / "a")], factories()) == 0
@@ -51,7 +60,7 @@ def test_configuration_is_two_lines(tmp_path, capsys):
     captured = capsys.readouterr()
     full = captured.out.split("\n\n")[0].splitlines()
     assert {"rules_hash", "code", "tracker_facts", "drive"} <= {line.split()[0] for line in full}
-    assert "  football base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
+    assert "  football twist2 base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
 
 
 def test_a_log_file_gets_lines(tmp_path):
@@ -62,7 +71,7 @@ def test_a_log_file_gets_lines(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, env=environment, check=True)
     assert b"\r" not in done.stderr and b"\r" not in done.stdout
     assert 1 <= done.stderr.count(b"\n") < 10
-    assert b"boxing base: 120 of 120 episodes, 100% of the tick budget" in done.stderr
+    assert b"boxing twist2 base: 120 of 120 episodes, 100% of the tick budget" in done.stderr
 
 
 def test_protocol_is_the_default_of_a_named_task(tmp_path):
@@ -79,6 +88,41 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
     assert set(keys.split()) <= set(first)
 
 
+def test_trackers_are_an_axis(tmp_path, capsys):
+    """Two trackers play the same episodes into one folder: one journal, a cell each, hashes of their own weights."""
+    out = tmp_path / "o"
+    flags = ["--task", "football", "boxing", "--tracker", "twist2", "sonic", "--mode", "base", "visual"]
+    assert main([*flags, "--engine", "mujoco", "--repeats", "2", "--out", str(out)], factories()) == 0
+    assert ", trackers twist2 sonic, policy expert, " in capsys.readouterr().out
+    rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    seeds = {(t, m): {r["episode_seed"] for r in rows if (r["tracker"], r["mode"]) == (t, m)} for t, m in CELLS}
+    assert len(rows) == 48 and len(set(map(frozenset, seeds.values()))) == 1
+    results = json.loads((out / "results.json").read_text())
+    assert [(c["tracker"], c["mode"]) for c in results["cells"]] == CELLS * 2
+    weights = {row["tracker"]: row["hashes"]["checkpoint"] for row in rows}
+    assert weights["twist2"] != weights["sonic"] and results["config"]["checkpoint"] == weights
+    assert set(results["config"]["tracker_facts"]) == {"twist2", "sonic"}
+    assert (out / "original" / "boxing__sonic__visual").is_dir()
+    assert re.search("--task boxing --mode visual --tracker sonic --seeds 2 ", (out / "report.html").read_text())
+    assert main(["resume", str(out)], factories()) == 0
+    line = json.dumps(rows[0] | {"tracker": "pd"})
+    (out / "episodes.jsonl").write_text("\n".join([line, *map(json.dumps, rows[1:])]) + "\n")
+    capsys.readouterr()
+    assert main(["report", str(out)], factories()) == 2
+    assert (
+        'tracker is "pd", this run\'s is "twist2 or sonic"; the journal was changed by hand' in capsys.readouterr().err
+    )
+
+
+def test_files_of_several_trackers_have_names_of_their_own(tmp_path):
+    """Recordings are named by the tracker where a run has several."""
+    one = resolve(RunOptions(task=("football",), tracker=("twist2",), engine="mujoco", strip=True))
+    two = resolve(RunOptions(task=("football",), tracker=("twist2", "sonic"), engine="mujoco", strip=True))
+    episode = two.episodes[-1]
+    assert run._recorder(one, tmp_path, "twist2").label(episode) == "football__base__seed2__repeat19"
+    assert run._recorder(two, tmp_path, "sonic").label(episode) == "sonic__football__base__seed2__repeat19"
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -92,6 +136,9 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
         (["--engine", "mujoco", "--device", "cuda:0"], "--device cuda:0"),
         (["--tracker", "nobody"], "--tracker nobody"),
         (["--checkpoint", "absent.onnx"], "--checkpoint absent.onnx: no such file"),
+        (["--checkpoint", "absent.onnx", "--tracker", "twist2", "sonic"], "--checkpoint absent.onnx: name the one"),
+        (["--tracker", "pd", "pd"], "--tracker pd: given twice"),
+        (["--tracker", "pd", "twist2", "--actions"], "--actions: name the one --tracker"),
         (["--policy", "replay:absent.npz"], "--policy absent.npz: no such file"),
         (["--variant", "absent.usda"], "--variant absent.usda: no such file"),
         (["--repeats", "0"], "--repeats 0"),

@@ -7,7 +7,8 @@ import pytest
 from rows import episodes, made
 
 from arena_newton.errors import InputError
-from arena_newton.eval.original_format import SUMMARY_COLUMNS, final_csv, label, write_original
+from arena_newton.eval.original_format import SUMMARY_COLUMNS, final_csv, write_original
+from arena_newton.files import file_label
 
 GYM = {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"}
 
@@ -69,7 +70,7 @@ def test_nothing_is_written_outside(tmp_path, key, value):
 
 def test_long_names_are_cut(tmp_path):
     """A policy with a long address gets file names that every file system takes, and its own."""
-    one, other = (label(f"remote:http://host/{'x' * 300}{end}") for end in "ab")
+    one, other = (file_label(f"remote:http://host/{'x' * 300}{end}") for end in "ab")
     assert len(one) == len(other) == 120 and one != other
     rows = [row | {"policy": f"remote:http://host/{'x' * 300}"} for row in episodes("football", (1, 0, 0))]
     assert len(list((written(tmp_path, rows) / "episodes").iterdir())) == 60

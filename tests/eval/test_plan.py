@@ -16,7 +16,7 @@ KEYS += ["max_steps"]
 
 def expand(*names: str, **changes):
     """A plan with the default tracker and policy."""
-    return plan.expand(names or ("all",), **({"tracker": "pd", "policy": "stand"} | changes))
+    return plan.expand(names or ("all",), **({"trackers": ("pd",), "policy": "stand"} | changes))
 
 
 def test_full_protocol():
@@ -27,6 +27,14 @@ def test_full_protocol():
     assert len({e.key for e in episodes}) == len(episodes)
     assert tuple(dict.fromkeys(e.task for e in episodes)) == tasks.names()
     assert all(len({e.episode_seed for e in episodes if e.task == t}) == 60 for t in tasks.names())
+
+
+def test_trackers_of_a_task_follow_each_other():
+    """Within a task the trackers, within a tracker the modes; each counts its episodes from 0."""
+    episodes = expand("football", "boxing", trackers=("a", "b"), modes=("base", "visual"), seeds=(0, 1), repeats=2)
+    cells = list(dict.fromkeys((e.task, e.tracker, e.mode) for e in episodes))
+    assert cells[:5] == [*(("football", t, m) for t in "ab" for m in ("base", "visual")), ("boxing", "a", "base")]
+    assert [e.index for e in episodes] == list(range(32)) and [e.rank for e in episodes] == [0, 1, 2, 3] * 8
 
 
 def test_one_seed_for_every_mode_and_rule_set():
@@ -80,6 +88,7 @@ def test_max_steps_caps_the_budget():
         (("boxing", "boxing"), {}, "--task boxing: given twice"),
         (("boxing",), {"modes": ("night",)}, "--mode night"),
         (("boxing",), {"modes": ()}, "--mode: nothing given"),
+        (("boxing",), {"trackers": ("pd", "pd")}, "--tracker pd: given twice"),
         (("boxing",), {"seeds": (1, 1)}, "--seeds 1: given twice"),
         (("boxing",), {"repeats": 0}, "--repeats 0"),
         (("boxing",), {"rules": "mine"}, "--rules mine"),
@@ -96,7 +105,7 @@ def test_planning_imports_no_heavy_package():
     """A plan needs NumPy alone."""
     code = (
         "import sys; from arena_newton.eval import plan;"
-        "[plan.listed(e) for e in plan.expand(['all'], tracker='pd', policy='stand', repeats=1)];"
+        "[plan.listed(e) for e in plan.expand(['all'], trackers=['pd'], policy='stand', repeats=1)];"
         "print([m for m in ('warp', 'torch', 'pxr', 'mujoco', 'newton', 'cv2') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
@@ -109,11 +118,11 @@ def test_weights_of_the_package_count():
 
     path = trackers.shipped_weights("twist2")
     assert path is not None
-    resolved = config.resolve(config.RunOptions(task=("football",), tracker="twist2"))
-    assert resolved.checkpoint is None and resolved.checkpoint_hash == config.hash_path(path)
-    named = config.resolve(config.RunOptions(task=("football",), tracker="twist2", checkpoint=str(path)))
-    assert named.checkpoint_hash == resolved.checkpoint_hash
-    assert config.resolve(config.RunOptions(task=("football",), tracker="pd")).checkpoint_hash is None
+    resolved = config.resolve(config.RunOptions(task=("football",), tracker=("twist2",)))
+    assert resolved.checkpoint is None and resolved.checkpoint_hashes == {"twist2": config.hash_path(path)}
+    named = config.resolve(config.RunOptions(task=("football",), tracker=("twist2",), checkpoint=str(path)))
+    assert named.checkpoint_hashes == resolved.checkpoint_hashes
+    assert config.resolve(config.RunOptions(task=("football",), tracker=("pd",))).checkpoint_hashes == {"pd": None}
 
 
 def test_two_files_and_folders_as_checkpoint(tmp_path):
@@ -125,7 +134,9 @@ def test_two_files_and_folders_as_checkpoint(tmp_path):
         (tmp_path / name).write_bytes(name.encode())
     pair = ",".join(str(tmp_path / n) for n in ("model_encoder.onnx", "model_decoder.onnx"))
     hashes = {
-        config.resolve(config.RunOptions(task=("football",), tracker="sonic", checkpoint=given)).checkpoint_hash
+        config.resolve(config.RunOptions(task=("football",), tracker=("sonic",), checkpoint=given)).checkpoint_hashes[
+            "sonic"
+        ]
         for given in (pair, str(tmp_path), str(tmp_path / "model_encoder.onnx"))
     }
     assert len(hashes) == 3

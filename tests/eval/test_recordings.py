@@ -36,7 +36,7 @@ def recorded(tmp_path_factory):
 def test_what_ran_stands_with_the_results(recorded):
     """Engine, physics rate, drive, start-up, tracker and what runs its network stand in config.json."""
     document = json.loads((recorded / "config.json").read_text())
-    facts = document["environments"]["boxing base"]
+    facts = document["environments"]["boxing twist2 base"]
     assert {"engine", "device", "physics_dt", "substeps", "drive", "startup_ticks", "history"} <= set(facts)
     assert facts["engine"] == "mujoco" and facts["startup_ticks"] == 50
     assert facts["tracker"]["name"] == "twist2" and facts["tracker"]["inference"]

@@ -166,11 +166,11 @@ class BreaksOnce(FakeEnv):
 @pytest.mark.parametrize(
     ("error", "says"),
     [
-        (RuntimeError("device lost"), "boxing base: RuntimeError: device lost; running were s0/r1 s0/r3 s1/r0"),
+        (RuntimeError("device lost"), "boxing twist2 base: RuntimeError: device lost; running were s0/r1 s0/r3 s1/r0"),
         (RuntimeError("CUDA out of memory"), "fewer --worlds"),
-        (SystemExit(0), "boxing base: SystemExit: 0; running were"),
+        (SystemExit(0), "boxing twist2 base: SystemExit: 0; running were"),
         (OSError(errno.ENOSPC, "No space left on device", "v.mp4.part"), "v.mp4.part: disk full"),
-        (ConnectionResetError("peer left"), "boxing base: ConnectionResetError: peer left"),
+        (ConnectionResetError("peer left"), "boxing twist2 base: ConnectionResetError: peer left"),
         (PolicyUnavailable("http://host:1 does not\x1b[2J answer"), "http://host:1 does not answer"),
     ],
 )
@@ -227,7 +227,7 @@ def test_an_environment_that_cannot_be_built_is_no_error_of_episodes(tmp_path, c
 
     folder = tmp_path / "d"
     assert main(["run", *FLAGS, "--skip-broken", "--out", str(folder)], factories(env=no_memory)) == 2
-    assert "football base: MemoryError: no room (fewer --worlds need less); trace in" in capsys.readouterr().err
+    assert "football twist2 base: MemoryError: no room (fewer --worlds need less); trace in" in capsys.readouterr().err
     assert "no_memory" in (folder / "break.txt").read_text()
     assert lines(folder) == 0
 
@@ -273,12 +273,14 @@ def test_partial_recordings_are_swept_away(tmp_path):
 def test_environments_stand_in_configuration_and_journal(uninterrupted):
     """What each task and mode was built with stands once in config.json; every journal line carries its hash."""
     document = json.loads((uninterrupted / "config.json").read_text())
-    assert list(document["environments"]) == [f"{t} {m}" for t in ("football", "boxing") for m in ("base", "execution")]
+    assert list(document["environments"]) == [
+        f"{t} twist2 {m}" for t in ("football", "boxing") for m in ("base", "execution")
+    ]
     facts = {"engine": "mujoco", "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
     assert all(value == facts for value in document["environments"].values())
-    assert document["config"]["tracker_facts"] == {"name": "twist2", "drive": "none"}
+    assert document["config"]["tracker_facts"] == {"twist2": {"name": "twist2", "drive": "none"}}
     facts = document["config"]["policy_facts"]
-    assert facts.pop("code") and facts == {"name": "stand"}
+    assert facts.pop("code") and facts == {"name": "expert"}
     hashes = [json.loads(line)["hashes"] for line in (uninterrupted / "episodes.jsonl").read_text().splitlines()]
     assert len({h["environment"] for h in hashes}) == len({h["versions"] for h in hashes}) == 1
 
@@ -314,7 +316,7 @@ def test_another_environment_is_refused(tmp_path, uninterrupted, capsys):
     assert (folder / "episodes.jsonl").read_text() == "".join(kept)
     other = factories(tracker=lambda *_: SimpleNamespace(describe=lambda: {"name": "twist2", "drive": "stiff"}))
     assert main(["resume", str(folder)], other) == 2
-    assert "tracker_facts.drive was none, now stiff" in capsys.readouterr().err
+    assert "tracker_facts.twist2.drive was none, now stiff" in capsys.readouterr().err
     assert main(["resume", str(folder)], factories()) == 0
     assert tables(folder) == tables(uninterrupted)
 
@@ -382,8 +384,11 @@ def test_a_run_has_a_status(tmp_path, uninterrupted, capsys):
     assert "The run was cancelled." in shown()
     Watched.stop = RuntimeError("device \x1b[2J lost")
     assert main(["resume", str(folder)], factories(env=Watched)) == 2
-    assert status(folder)["state"] == "error" and "football base: RuntimeError: device lost" in status(folder)["error"]
-    assert "The run ended with an error: football base: RuntimeError: device lost" in shown()
+    assert (
+        status(folder)["state"] == "error"
+        and "football twist2 base: RuntimeError: device lost" in status(folder)["error"]
+    )
+    assert "The run ended with an error: football twist2 base: RuntimeError: device lost" in shown()
     before = status(folder)
     Watched.stop = InputError("not that world")
     assert main(["resume", str(folder)], factories(env=Watched)) == 2

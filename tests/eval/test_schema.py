@@ -77,7 +77,7 @@ def test_a_journal_from_the_future_is_refused(tmp_path, capsys):
 
 def test_a_line_says_what_the_result_holds(tmp_path):
     """Phases, predicates, progress and events of a result are in its line and come back from it."""
-    (episode,) = expand(["boxing"], tracker="twist2", policy="expert", seeds=(0,), repeats=1)
+    (episode,) = expand(["boxing"], trackers=["twist2"], policy="expert", seeds=(0,), repeats=1)
     events = (EpisodeEvent("contact", 12, "left_palm"), EpisodeEvent("fall", 40, "tilt"))
     result = EpisodeResult(episode, "fall", "fall", 40, math.inf, phases=(("walk", 0), ("strike", 31)))
     result = dataclasses.replace(result, predicates={"approach": 30, "contact": None}, progress=0.5, events=events)

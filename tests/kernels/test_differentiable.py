@@ -150,7 +150,7 @@ def _cases(twin, device):
         "football released": (success.launch_football, football | {"rear_bound": False}, poses),
         "double_desk paper": (success.launch_double_desk, desk, (*poses, "xipos")),
         "double_desk released": (success.launch_double_desk, desk | {"min_z": -0.2}, (*poses, "xipos")),
-        "pp_box paper": (success.launch_pp_box_paper, box | paper_box, (*poses, "qvel")),
+        "pp_box paper": (success.launch_pp_box_paper, box | paper_box, (*poses, "qvel", "robot_force")),
         "pp_box released": (success.launch_pp_box_released, box | {"deck": 1, "plane_below": 0.15}, poses),
         "open_door paper": (success.launch_open_door_paper, door | root | STAND, (*poses, "qpos")),
         "open_door released": (
@@ -202,6 +202,7 @@ def test_margin_gradients(device, twin, case):
         "qvel": rng.normal(scale=0.3, size=(WORLDS, 6)),
         "contact_force": rng.uniform(0, 1, (WORLDS, 8)),
         "seat_force": rng.uniform(49.5, 50.5, WORLDS),
+        "robot_force": rng.uniform(1.0, 200.0, WORLDS),
     }
     tensors = [torch.tensor(draws[n], dtype=torch.float32, device=wp.device_to_torch(device)) for n in names]
 

@@ -34,7 +34,7 @@ class Solver:
             pelvis=up(np.zeros((worlds, 2))),
             joints=up(default),
             arms=up(default[:, [15, 16, 17, 18, 22, 23, 24, 25]]),
-            hands=up(np.zeros((worlds, 6))),
+            palms=up(np.zeros((worlds, 6))),
             com=up(np.zeros((worlds, 3))),
             error=up(np.zeros(worlds)),
         )
@@ -146,7 +146,7 @@ def test_hands_reach(device):
     hands = poses.position[:, wrist] + rotations.quat_apply(poses.quat[:, wrist], palm)
     root = np.concatenate([s.state.pelvis.numpy(), s.goal[:, ik.GOAL["height"]]], 1)
     np.testing.assert_allclose(hands.numpy() - root[:, None], points, atol=3e-3)
-    np.testing.assert_allclose(s.state.hands.numpy().reshape(-1, 2, 3), points, atol=3e-3)
+    np.testing.assert_allclose(s.state.palms.numpy().reshape(-1, 2, 3), points, atol=3e-3)
 
 
 def test_out_of_reach_stays_finite_and_comes_back(device):

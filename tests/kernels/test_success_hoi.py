@@ -140,6 +140,8 @@ def test_double_desk_released_has_a_floor(device, twin):
     np.testing.assert_allclose(margin, [-0.001, 0.001], atol=2e-6)
 
 
+FREE = np.zeros(WORLDS, np.float32)
+"""No robot touches the box."""
 PAPER_BOX = {
     "box_qvel_adr": 4,
     "height_tolerance": 0.06,
@@ -173,6 +175,7 @@ def test_pp_box_paper_random(device, twin):
         stage.xpos,
         stage.xquat,
         qvel,
+        FREE,
         box=_box(stage, twin),
         decks=stage.boxes(*decks),
         confirm_ticks=1,
@@ -224,6 +227,7 @@ def test_pp_box_paper_thresholds(device, twin, centre, speed, good):
             stage.xpos,
             stage.xquat,
             qvel,
+            FREE[:1],
             box=_box(stage, twin),
             decks=stage.boxes(*_decks(twin)),
             confirm_ticks=10,
@@ -246,6 +250,7 @@ def test_pp_box_paper_counter_restarts(device, twin):
             stage.xpos,
             stage.xquat,
             qvel,
+            FREE[:1],
             box=_box(stage, twin),
             decks=stage.boxes(*_decks(twin)),
             confirm_ticks=10,
@@ -253,6 +258,31 @@ def test_pp_box_paper_counter_restarts(device, twin):
             **PAPER_BOX,
         )
         assert not ok[0] and counter[0] == (t + 1 if t < 9 else t - 9)
+
+
+def test_pp_box_paper_asks_for_open_hands(device, twin):
+    """Any force of the robot on a box at rest restarts the count, and the margin says how far off letting go is."""
+    stage = twin.Stage(device, worlds=1)
+    stage.xpos[0, 3], stage.xpos[0, 5] = 0, (0.1, 0, 0.753)
+    counts = []
+    for t in range(21):
+        force = np.array([0.001 if t < 4 else 10.0 if t == 10 else 0.0], np.float32)
+        ok, margin, counter = stage.judge(
+            success.launch_pp_box_paper,
+            stage.xpos,
+            stage.xquat,
+            np.zeros((1, 10), np.float32),
+            force,
+            box=_box(stage, twin),
+            decks=stage.boxes(*_decks(twin)),
+            confirm_ticks=10,
+            outputs=("success", "margin", "counter"),
+            **PAPER_BOX,
+        )
+        counts.append(int(counter[0]))
+        assert ok[0] == (t == 20)
+        np.testing.assert_allclose(min(margin[0], 0.0), -force[0] / 500.0, atol=1e-9)
+    assert counts == [0] * 4 + list(range(1, 7)) + list(range(11))
 
 
 def test_pp_box_released_random(device, twin):
@@ -319,6 +349,7 @@ def test_pp_box_of_another_origin_and_turn(device, twin):
         stage.xpos,
         stage.xquat,
         np.zeros((WORLDS, 10), np.float32),
+        FREE,
         box=stage.boxes(box),
         decks=stage.boxes(*decks),
         confirm_ticks=1,

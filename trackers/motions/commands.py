@@ -146,7 +146,7 @@ class MotionCommand:
     it, the other one follows."""
     step_in_place: Tensor = _channel()
     """Whether to step without moving, bool, shape [worlds]."""
-    kick: Tensor = _channel()
+    kick: Tensor = _channel((), 0.0, 2.0)
     """0 none, 1 left foot, 2 right foot, int64, shape [worlds]; a change from 0 starts one kick."""
     hands: Tensor = _channel((2,))
     """Left and right hand: 1 closed, 0 open, shape [worlds, 2]."""

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.kernels.footwork import kick_seconds
 from arena_newton.robot import DEFAULT_POSE
 from arena_newton.trackers.motions.commands import CHANNELS, COLUMNS, COMMAND_WIDTH, MotionCommand, neutral_row
-from arena_newton.trackers.motions.footwork import kick_seconds
 
 __all__ = [
     "CARRY_ARMS",
@@ -275,7 +275,7 @@ def crouch_reach(
 def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
     """Shift to the other foot, wind up, swing at a foot speed [m/s], and recover."""
     foot = _sided(side) + 1
-    return script((kick_seconds(speed), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
+    return script((kick_seconds(float(speed)), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
 
 
 def punch(side: str = "right", *, height: float | None = None, speed: float = 10.0, times: int = 1) -> Script:

@@ -1,0 +1,208 @@
+"""What the checks of one certification share: what to measure, and evaluations that are resumed instead of repeated."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from arena_newton import seeding, tasks
+from arena_newton.doctor import versions
+from arena_newton.errors import InputError
+from arena_newton.eval import run
+from arena_newton.eval.certification.bodies import BODIES, Body
+from arena_newton.eval.config import resolve
+from arena_newton.eval.folder import ResultsFolder
+from arena_newton.eval.identity import PACKAGE, config_hash, hash_paths, package_files
+from arena_newton.eval.journal import EpisodeRecord, write_atomic
+from arena_newton.eval.options import CertifyOptions, RunOptions
+from arena_newton.eval.plan import PROTOCOL_REPEATS
+from arena_newton.eval.records import Json
+from arena_newton.eval.results import load_run
+from arena_newton.text import counted
+
+__all__ = ["CertifyCell", "Context", "with_expert"]
+
+QUICK_EPISODES = 4
+"""Episodes of each cell under --quick."""
+FULL_EPISODES = 60
+"""Episodes of each cell otherwise: the protocol's."""
+
+
+@dataclass(frozen=True)
+class CertifyCell:
+    """One evaluation: a task played many times in one way."""
+
+    task: str
+    tracker: str
+    rules: str = "paper"
+    mode: str = "base"
+    body: str = "robot"
+    """Name in `bodies.BODIES`."""
+    policy: str = "expert"
+    label: str = ""
+    """Name of the policy in the folder's name, where it is not the expert."""
+    checkpoint: str | None = None
+    """The tracker's weights; those that come with the package when None."""
+    engine: str | None = None
+    """Engine instead of the certification's."""
+    actions: bool = False
+    """Record the policy's actions."""
+    strip: bool = False
+    """Draw film strips."""
+
+    @property
+    def folder(self) -> str:
+        """Path below the certification's `runs`, unique among the cells of one certification."""
+        ways = [self.tracker, self.rules, self.mode]
+        ways += [self.body] * (self.body != "robot") + [self.label] * bool(self.label)
+        ways += ["weights"] * (self.checkpoint is not None) + [f"engine-{self.engine}"] * (self.engine is not None)
+        return f"{self.task}/{'_'.join(ways)}"
+
+
+@dataclass
+class Context:
+    """What the checks measure with."""
+
+    options: CertifyOptions
+    folder: Path
+    tasks: tuple[str, ...]
+    """Tasks with an expert, in the order of the registry."""
+    say: Callable[[str], None]
+    """Prints a line about what is going on."""
+    factories: run.Factories = field(default_factory=run.Factories)
+    bodies: Mapping[str, Body] = field(default_factory=lambda: BODIES)
+
+    @property
+    def episodes(self) -> int:
+        """Episodes of each cell."""
+        return self.options.episodes or (QUICK_EPISODES if self.options.quick else FULL_EPISODES)
+
+    @property
+    def trackers(self) -> tuple[str, ...]:
+        """Names of the trackers."""
+        return self.options.tracker
+
+    @property
+    def sample(self) -> tuple[str, ...]:
+        """Trackers of checks that compare experts with themselves: under --quick the first one stands for all."""
+        return self.trackers[:1] if self.options.quick else self.trackers
+
+    def plan(self) -> tuple[tuple[int, ...], int]:
+        """Group seeds and repeats: the protocol's 20 repeats of each seed where the episodes are a multiple of 20."""
+        groups, rest = divmod(self.episodes, PROTOCOL_REPEATS)
+        return ((0,), self.episodes) if rest else (tuple(range(groups)), PROTOCOL_REPEATS)
+
+    def seeds(self, task: str, count: int) -> list[int]:
+        """Episode seeds of a task's first episodes in the protocol: 20 repeats of each group seed."""
+        gym_id = tasks.get(task).gym_id
+        return [seeding.episode_seed(gym_id, *divmod(number, PROTOCOL_REPEATS)) for number in range(count)]
+
+    def path(self, cell: CertifyCell) -> Path:
+        """Results folder of a cell."""
+        return self.folder / "runs" / cell.folder
+
+    def evaluate(self, cell: CertifyCell) -> list[EpisodeRecord]:
+        """Episodes of a cell in plan order; played, or continued where its results folder has some of them.
+
+        Raises:
+            InputError: A flag is wrong, or the folder was begun with another configuration.
+            KeyboardInterrupt: The run was interrupted; what was played is kept.
+        """
+        seeds, repeats = self.plan()
+        config = resolve(
+            RunOptions(
+                task=(cell.task,),
+                tracker=(cell.tracker,),
+                checkpoint=cell.checkpoint,
+                policy=cell.policy,
+                mode=(cell.mode,),
+                rules=cell.rules,
+                seeds=seeds,
+                repeats=repeats,
+                worlds=min(self.options.worlds, self.episodes),
+                engine=cell.engine or self.options.engine,
+                device="cpu" if cell.engine == "mujoco" else self.options.device,
+                actions=cell.actions,
+                strip=cell.strip,
+                out=str(self.path(cell)),
+            )
+        )
+        folder = ResultsFolder(self.path(cell), config, versions())
+        stored = folder.check()
+        if stored is not None and "status" in stored and stored["status"]["state"] == "success":
+            return load_run(folder.path).records
+        body = self.bodies[cell.body]
+        self.say(f"{cell.folder.replace('/', ' ')}: {counted(self.episodes, 'episode')}")
+        with contextlib.redirect_stdout(io.StringIO()):  # its table is part of a larger one here
+            code = run.execute(folder, body.equip(self.factories))
+        if code == 130:
+            raise KeyboardInterrupt
+        return load_run(folder.path).records
+
+    def strips(
+        self, cell: CertifyCell, outcome: str | None = None, camera: str = "world"
+    ) -> list[tuple[EpisodeRecord, Path]]:
+        """Film strips of a cell's episodes, those with an outcome alone if one is named."""
+        folder, found = self.path(cell), []
+        for record in self.evaluate(cell):
+            name = record.media.get(f"{camera} strip") if record.media else None
+            if name is not None and outcome in (None, record.outcome) and (folder / name).is_file():
+                found.append((record, folder / name))
+        return found
+
+    def measured(
+        self, name: str, task: str, tracker: str, settings: Mapping[str, Json], measure: Callable[[], Json]
+    ) -> Json:
+        """What a measurement gave that is no evaluation; taken from the folder where the same was measured before.
+
+        Args:
+            name: Name of the measurement, unique for a task and tracker; it becomes a file's.
+            task: What it plays.
+            tracker: Through which tracker.
+            settings: What it depends on besides these, code, scenes, weights and engine.
+            measure: Measures; its answer is JSON.
+        """
+        known = config_hash([self._ground(task, tracker), dict(settings)])
+        name = f"{name}_{task}_{tracker}"
+        path = self.folder / "measured" / f"{name}.json"
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            stored = json.loads(path.read_text(encoding="utf-8"))
+            if stored["known_by"] == known:
+                value: Json = stored["value"]
+                return value
+        self.say(f"{name}: measuring")
+        value = json.loads(json.dumps(measure(), allow_nan=False))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps({"known_by": known, "value": value}, indent=1) + "\n")
+        return value
+
+    def _ground(self, task: str, tracker: str) -> Json:
+        """Code, scenes, weights and flags that a measurement of a task depends on."""
+        options = RunOptions(task=(task,), tracker=(tracker,), seeds=(0,), repeats=1)
+        options = replace(options, engine=self.options.engine, device=self.options.device)
+        folder = PACKAGE / "eval" / "certification"
+        checks = hash_paths(folder, [file for file in package_files(folder) if file.suffix == ".py"])
+        ground: Json = json.loads(json.dumps([dict(resolve(options).identity()), checks]))
+        return ground
+
+
+def with_expert(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Tasks that an expert can be measured on, and those that have none.
+
+    Args:
+        names: Task names; empty or `all`: every task.
+
+    Raises:
+        InputError: An unknown name, or one named twice.
+    """
+    chosen = tasks.names() if tuple(names) in ((), ("all",)) else tuple(names)
+    for name in chosen:
+        tasks.get(name)
+        if chosen.count(name) > 1:
+            raise InputError(f"--task {name}: given twice")
+    has = tuple(name for name in chosen if tasks.get(name).expert is not None)
+    return has, tuple(name for name in chosen if name not in has)

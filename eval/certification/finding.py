@@ -1,0 +1,119 @@
+"""What a check is and what it finds: records that the page, the JSON and the console say in their own ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from arena_newton.intervals import wilson
+
+if TYPE_CHECKING:
+    from arena_newton.eval.certification.context import Context
+    from arena_newton.eval.journal import EpisodeRecord
+
+__all__ = [
+    "Check",
+    "CheckFinding",
+    "Picture",
+    "Score",
+    "Sheet",
+    "Verdict",
+    "percent",
+    "pooled_score",
+    "score",
+    "skipped",
+]
+
+Verdict = Literal["pass", "fail", "note", "skip"]
+"""`note`: something that a reader must know and that no change of the benchmark repairs; `skip`: was not measured."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table of numbers."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture for the page."""
+
+    caption: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class CheckFinding:
+    """What a check measured and what follows from it."""
+
+    verdict: Verdict
+    summary: str
+    """What it measured, in one line."""
+    sheets: tuple[Sheet, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What a reader must know besides the numbers: causes, exceptions, limits."""
+    pictures: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True)
+class Check:
+    """One question that the benchmark answers about itself."""
+
+    name: str
+    """Name on the command line."""
+    question: str
+    run: Callable[[Context], CheckFinding]
+    """Measures; raises `InputError` only for input that a user can repair."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Successes of some episodes."""
+
+    successes: int
+    episodes: int
+    errors: int = 0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson interval of the rate."""
+        return wilson(self.successes, self.episodes)
+
+    @property
+    def rate(self) -> float:
+        """Success rate; 0 without episodes."""
+        return self.successes / self.episodes if self.episodes else 0.0
+
+    def cells(self) -> tuple[str, str]:
+        """Count and interval as a table shows them."""
+        low, high = self.interval
+        errors = f", {self.errors} errors" if self.errors else ""
+        return f"{self.successes}/{self.episodes}{errors}", f"{percent(low)} to {percent(high)}"
+
+
+def percent(fraction: float) -> str:
+    """A fraction in per cent."""
+    return f"{100.0 * fraction:.0f} %"
+
+
+def score(records: Sequence[EpisodeRecord]) -> Score:
+    """Successes among journal records; an error counts as an episode without success."""
+    outcomes = [record.outcome for record in records]
+    return Score(outcomes.count("success"), len(outcomes), outcomes.count("error"))
+
+
+def pooled_score(scores: Sequence[Score]) -> Score:
+    """All episodes together."""
+    return Score(
+        sum(one.successes for one in scores), sum(one.episodes for one in scores), sum(one.errors for one in scores)
+    )
+
+
+def skipped(reason: str) -> CheckFinding:
+    """A check that was not measured."""
+    return CheckFinding("skip", reason)

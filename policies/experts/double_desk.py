@@ -1,0 +1,372 @@
+"""DoubleDesk's expert: grasp the hammer at the right desk, step over the sill, let go of it above the crate.
+
+What each decision is read from: it looks before it walks. The robot turns towards a desk until what lies on it is
+within the head camera's view, and only then chooses where to stand; hammer, crate, desk edges and the sill are in the
+picture whenever they are used, and true positions stand in for what the picture shows. Whether the hammer is in the
+hand is read from its distance to the palm, which the camera sees as well.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from arena_newton.policies.experts.base import Expert, Sight
+from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
+from arena_newton.policies.experts.phases import Phases, select
+from arena_newton.policies.experts.style import Style
+from arena_newton.policies.experts.walking import Walk, along
+from arena_newton.rotations import heading, quat_apply, quat_from_yaw, quat_multiply, rotate_xy, turn, wrap_angle
+from arena_newton.tasks.double_desk import HAMMER, INSIDE, LEFT_DESK, RIGHT_DESK, SILL
+from arena_newton.trackers.motions.commands import MotionCommand
+from arena_newton.trackers.motions.kinematics import HAND_POINT
+from arena_newton.trackers.motions.navigate import NavigationCommand, NavigationLimits
+
+__all__ = ["DoubleDeskExpert"]
+
+LONGEST = {
+    "look": 5.0,
+    "approach": 12.0,
+    "step in": 5.0,
+    "hover": 3.5,
+    "lower": 1.7,
+    "close": 1.0,
+    "lift": 1.3,
+    "step back": 2.5,
+    "turn": 7.0,
+    "line up": 12.0,
+    "sill": 8.0,
+    "deliver": 10.0,
+    "over": 6.0,
+    "open": 2.0,
+    "rest": math.inf,
+}
+"""Phases in their usual order and their longest times [s]."""
+WALKS = ("look", "approach", "step in", "turn", "line up", "deliver")
+"""Phases that walk to a goal."""
+LIMITS = NavigationLimits(forward=0.6, turn=0.9, arrive_position=0.045, arrive_heading=0.06)
+"""Coarser stops than the navigator's own: the arm makes up for 5 cm, and each correction costs 2 s."""
+WITHIN = {"approach": (0.10, 0.15), "step in": (0.03, 0.10), "line up": (0.07, 0.08), "deliver": (0.05, 0.10)}
+"""Errors at the end of a walk that do not matter [m, rad]."""
+IN_VIEW = 0.75
+"""Bearing within which the head camera shows an object [rad]; half of its horizontal field of view is 0.92."""
+LOOK_RIGHT, LOOK_LEFT = -0.5 * math.pi, 0.5 * math.pi
+"""Headings that face the right and the left desk [rad]."""
+
+ALONG_HANDLE = 0.05
+"""Grasp point from the middle of the handle towards the head [m]: half way to the centre of mass."""
+GRASP = (0.6645, 0.6645, 0.2418, -0.2418)
+"""Orientation of the left hand, wxyz, when x points away across the handle and z up: palm down, fingers forward and
+40 deg down. Of the pitches tried, 30 to 45 deg close around a handle that lies on a bench."""
+WRIST = (-0.033, 0.0, 0.104)
+"""Wrist from the grasp point in the same axes [m]."""
+STAND = (0.32, 0.17)
+"""The grasp point in the heading frame of the standing robot [m]: within the arm's reach, in front of the shoulder."""
+EDGE = 0.16
+"""Nearest distance of the pelvis to the right desk's edge [m]: thighs and belly."""
+LEAN, LEAN_MORE = 0.25, 2.0
+"""Waist pitch of a grasp [rad], and more of it per metre that the edge keeps the robot away [rad/m]."""
+RAISE = 0.9
+"""Distance to the goal from which the forearms are raised [m]: hanging hands meet the edge from below."""
+LEFT_RAISED, RIGHT_RAISED = (0.24, 0.20, 0.25), (0.18, -0.25, 0.05)
+"""Palms of raised forearms [m], heading frame of the pelvis."""
+HOVER = 0.12
+"""Height of the hand above its grasp while it aligns [m]: fingers clear the head."""
+ALIGN = 1.5
+"""Least time to align [s]."""
+ALIGNED = (0.012, 0.07)
+"""Errors of palm and hand that are small enough to lower [m, rad]."""
+DESCENT, ASCENT = 0.12, 0.14
+"""Speeds of lowering and lifting [m/s]."""
+LIFTED = 0.15
+"""Height of the lift [m]: the hammer's predicate asks for 0.10 m."""
+HELD = 0.13
+"""Distance of palm and grasp point below which the hammer is in the hand [m]; 0.05 m when grasped."""
+BENCH_HEIGHT = 0.6
+"""A hammer that is not held is still on a desk above this height [m]."""
+
+STEP_BACK = (0.2, 0.25)
+"""Distance [m] and speed [m/s] of the walk back from the desk."""
+LEFT_CARRY, LEFT_HIGH = (0.27, 0.22, 0.16), (0.27, 0.22, 0.33)
+"""Left palm while carrying, and in front of the crate, where the hammer must pass over the rim [m]."""
+BESIDE = 0.13
+"""The crate's middle is this far to the robot's left [m]: the left arm does not cross over."""
+BEFORE_SILL = 0.30
+"""Distance of the pelvis from the sill's middle before it steps over [m]."""
+PAST_SILL = 0.14
+"""Both ankles must be this far beyond the sill's middle [m]: the heel reaches 6 cm back."""
+SILL_SPEED, SILL_STEP, SILL_HEIGHT, SILL_STAGGER = 0.385, 0.52, 0.74, 0.20
+"""Walk over the sill: speed [m/s], time of a step [s], pelvis [m], and a step's length by which the right foot
+lands next to the left one [m]: pairs of footprints 0.40 m apart, the sill between two of them."""
+NEAR_CRATE, NEAR_EDGE = 0.42, 0.09
+"""Pelvis from the crate's middle and at least from the left desk's edge [m]."""
+OVER_HEIGHT = 1.02
+"""Height of the hammer's centre of mass above the crate [m]; the rim is at 0.915 m."""
+AIM, ENOUGH = (0.20, 0.11), (0.24, 0.15)
+"""Half sizes of the rectangle in the crate where the centre of mass is led to, and where it is let go [m]."""
+OVER_LEAN, OVER_LEAN_MORE = 0.40, 0.04
+"""Waist pitch above the crate [rad], and how it grows while the hammer is not there yet [rad/s]."""
+
+STYLE = {
+    "pace": (0.92, 1.0),
+    "ready": (0.34, 0.44),
+    "aside": (-0.02, 0.02),
+    "swing": (0.165, 0.185),
+    "palm x": (-0.02, 0.02),
+    "palm y": (-0.02, 0.02),
+    "palm z": (-0.02, 0.02),
+}
+"""Ranges of what differs between episodes: fraction of the walking speed, distance of the ready place behind the stand
+[m], sideways offset of the stand [m], height of a step over the sill [m], offset of the left palm's postures [m]."""
+
+
+class DoubleDeskExpert(Expert):
+    """Look, approach, grasp and lift; turn, step over the sill, hold over the crate and let go."""
+
+    task = "double_desk"
+
+    def __init__(self, sight: Sight):
+        """Find hammer, crate, desks, sill and ankles."""
+        super().__init__(sight)
+        worlds, device = sight.worlds, sight.device
+        self._origin, self._mass = sight.frame(HAMMER), sight.com(HAMMER)
+        inside = sight.scene.marker(INSIDE)
+        self._crate, self._middle = inside.body_id, sight.frame(INSIDE)
+        _, centre, half = sight.box(f"{RIGHT_DESK}/Top")
+        self._right_edge = float(centre[1] + half[1])
+        _, centre, half = sight.box(f"{LEFT_DESK}/Top")
+        self._left_edge = float(centre[1] - half[1])
+        self._sill = float(sight.box(SILL)[1][1])
+        self._ankles = [sight.scene.link(f"{side}_ankle_roll_link") for side in ("left", "right")]
+        self._grasp_quat = torch.tensor(GRASP, device=device)
+        self._palm_offset = torch.tensor(WRIST, device=device) + HAND_POINT * quat_apply(
+            self._grasp_quat, torch.tensor([1.0, 0.0, 0.0], device=device)
+        )
+        self.machine = Phases(LONGEST, worlds, device)
+        """The phase of each world."""
+        self.palms, self.wrists = Palms(sight), Wrists(sight)
+        self.walk = Walk(sight, LIMITS)
+        self._acting: list[str] = []
+        self._style = {name: torch.zeros(worlds, device=device) for name in STYLE}
+        self._turns_left = torch.zeros(worlds, dtype=torch.bool, device=device)
+        self._grasp, self._hand_yaw = torch.zeros(worlds, 3, device=device), torch.zeros(worlds, device=device)
+        self._from = torch.zeros(worlds, 2, device=device)
+        self._error = torch.zeros(worlds, 2, device=device)
+        self._last = torch.zeros(worlds, 3, device=device)
+
+    def begin(self, mask: Tensor, style: Style) -> None:
+        """Draw the episode's style; look at the right desk."""
+        for name, (low, high) in STYLE.items():
+            self._style[name] = select(mask, style.uniform(name, low, high), self._style[name])
+        self._turns_left = select(mask, style.coin("turns left"), self._turns_left)
+        self.walk.begin(mask)
+        self.machine.begin(mask)
+        self._face(mask, LOOK_RIGHT)
+
+    def phases(self) -> list[str]:
+        """Names of `LONGEST`."""
+        return self._acting
+
+    def command(self, mask: Tensor, dt: float) -> MotionCommand:
+        """Move on where a phase is over, then act."""
+        self._aim(mask & self.machine.at("look", "approach", "step in", "hover"))
+        answer = self.walk.command(mask & self.machine.at(*WALKS), dt)
+        self._onward(mask, answer)
+        self._acting = self.machine.names()
+        command = self._act(mask, dt, answer)
+        self.machine.advance(mask, dt)
+        return command
+
+    # What it sees.
+
+    def _aim(self, mask: Tensor) -> None:
+        """Where to grasp the hammer, and the heading of the hand, in the worlds of `mask`."""
+        origin = self._origin()
+        handle = torch.nn.functional.normalize((self._mass() - origin)[:, :2], dim=1)
+        grasp = torch.cat([origin[:, :2] + ALONG_HANDLE * handle, origin[:, 2:]], dim=1)
+        # The hand lies across the handle on the side of the robot, whichever end the head is.
+        off = wrap_angle(torch.atan2(handle[:, 1], handle[:, 0]) - 0.5 * math.pi - LOOK_RIGHT)
+        off = torch.where(off.abs() > 0.5 * math.pi, wrap_angle(off + math.pi), off)
+        self._grasp = select(mask, grasp, self._grasp)
+        self._hand_yaw = select(mask, LOOK_RIGHT + off, self._hand_yaw)
+
+    def _held(self) -> Tensor:
+        """Whether the hammer is in the left hand, bool, [worlds]."""
+        origin = self._origin()
+        point = origin + ALONG_HANDLE * torch.nn.functional.normalize(self._mass() - origin, dim=1)
+        return torch.linalg.vector_norm(self.palms.measured()[:, 0] - point, dim=1) < HELD
+
+    def _in_view(self, point: Tensor) -> Tensor:
+        """Whether the head camera shows a point that is ahead, bool, [worlds]."""
+        pose = self.sight.pose
+        offset = point[:, :2] - pose[:, :2]
+        return wrap_angle(torch.atan2(offset[:, 1], offset[:, 0]) - pose[:, 2]).abs() < IN_VIEW
+
+    def _stand(self) -> tuple[Tensor, Tensor]:
+        """x, y [m] to grasp from, [worlds, 2], and how far the edge keeps the robot from the best distance [m]."""
+        nearest = self._right_edge + EDGE
+        y = self._grasp[:, 1] + STAND[0]
+        stand = torch.stack([self._grasp[:, 0] - STAND[1] + self._style["aside"], y.clamp_min(nearest)], dim=1)
+        return stand, (nearest - y).clamp_min(0.0)
+
+    def _crossing(self) -> Tensor:
+        """X [m] on which it walks to the crate, [worlds]."""
+        return self._middle()[:, 0] + BESIDE
+
+    def _past_sill(self) -> Tensor:
+        """Whether both ankles are beyond the sill, bool, [worlds]."""
+        y = torch.stack([self.sight.body(ankle)[0][:, 1] for ankle in self._ankles], dim=1)
+        return y.amin(dim=1) > self._sill + PAST_SILL
+
+    def _over(self) -> tuple[Tensor, Tensor]:
+        """Where the centre of mass must go above the crate [m], [worlds, 3], and whether it may be let go."""
+        mass, middle = self._mass(), self._middle()
+        yaw = heading(self.sight.body(self._crate)[1])
+        local = rotate_xy(-yaw, mass[:, :2] - middle[:, :2])
+        aim, enough = (torch.tensor(half, device=mass.device) for half in (AIM, ENOUGH))
+        goal = middle[:, :2] + rotate_xy(yaw, torch.minimum(torch.maximum(local, -aim), aim))
+        return torch.cat([goal, torch.full_like(goal[:, :1], OVER_HEIGHT)], dim=1), (local.abs() < enough).all(dim=1)
+
+    # What comes next.
+
+    def _face(self, mask: Tensor, yaw: float) -> None:
+        pose = self.sight.pose
+        self.walk.to(mask, torch.cat([pose[:, :2], torch.full_like(pose[:, 2:], yaw)], dim=1))
+
+    def _go(self, mask: Tensor, xy: Tensor, yaw: float) -> None:
+        self.walk.to(mask, torch.cat([xy, torch.full_like(xy[:, :1], yaw)], dim=1))
+
+    def _onward(self, mask: Tensor, answer: NavigationCommand) -> None:
+        """Enter the next phase where one is over."""
+        machine, pose, held = self.machine, self.sight.pose, self._held()
+        arrived = {
+            name: answer.arrived | ((answer.distance < near) & (answer.heading_error.abs() < straight))
+            for name, (near, straight) in WITHIN.items()
+        }
+        back = torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1)
+        over = arrived | {
+            "look": self._in_view(self._origin()),
+            "hover": (machine.clock > ALIGN) & (self._error[:, 0] < ALIGNED[0]) & (self._error[:, 1] < ALIGNED[1]),
+            "step back": back > STEP_BACK[0],
+            "turn": self._in_view(self._middle()),
+            "sill": self._past_sill(),
+            "over": self._over()[1] & (machine.clock > 0.5),
+        }
+        late = machine.late
+        done = {name: mask & machine.at(name) & (late | over.get(name, torch.zeros_like(late))) for name in LONGEST}
+        # A hammer that fell onto the desk is grasped again; one on the floor is out of reach.
+        lost = mask & machine.at("step back", "turn", "line up", "sill", "deliver", "over") & ~held
+        again = lost & (self._origin()[:, 2] > BENCH_HEIGHT) & (pose[:, 1] < self._sill)
+        missed = done["lift"] & ~held
+
+        stand, _ = self._stand()
+        ready = stand + torch.stack([torch.zeros_like(stand[:, 0]), self._style["ready"]], dim=1)
+        self._from = select(done["lift"], pose[:, :2], self._from)
+        for name, following in zip(LONGEST, list(LONGEST)[1:], strict=False):
+            machine.enter(following, done[name])
+        machine.enter("step in", missed)
+        machine.enter("look", again)
+        machine.enter("rest", lost & ~again)
+
+        self._face(again, LOOK_RIGHT)
+        self._go(done["look"], ready, LOOK_RIGHT)
+        self._go(done["approach"] | missed, stand, LOOK_RIGHT)
+        self._face(done["step back"], LOOK_LEFT)
+        crossing, crate = self._crossing(), self._middle()
+        self._go(
+            done["turn"], torch.stack([crossing, torch.full_like(crossing, self._sill - BEFORE_SILL)], 1), LOOK_LEFT
+        )
+        near = (crate[:, 1] - NEAR_CRATE).clamp_max(self._left_edge - NEAR_EDGE)
+        self._go(done["sill"], torch.stack([crossing, near], dim=1), LOOK_LEFT)
+        restart = done["step in"] | done["lift"]
+        self.palms.reset(restart)
+        self.wrists.reset(restart)
+
+    # What it does.
+
+    def _act(self, mask: Tensor, dt: float, answer: NavigationCommand) -> MotionCommand:
+        """The command of the present phase."""
+        at, clock = self.machine.at, self.machine.clock
+        command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
+        command.velocity = self._velocity(answer.velocity)
+        working = at("hover", "lower", "close", "lift")
+        raised = ~at("look") & (~at("approach") | (answer.distance < RAISE))
+
+        _, short = self._stand()
+        lean = torch.where(working | at("step in"), LEAN + LEAN_MORE * short, 0.0)
+        lean = torch.where(at("over"), OVER_LEAN + OVER_LEAN_MORE * clock, lean)
+        lean = torch.where(at("open"), OVER_LEAN + OVER_LEAN_MORE * LONGEST["over"], lean)
+        command.waist[:, 2] = lean
+
+        crossing = at("sill")
+        command.swing_height = torch.where(crossing, self._style["swing"], command.swing_height)
+        command.step_time = torch.where(crossing, SILL_STEP, command.step_time)
+        command.height = torch.where(crossing, SILL_HEIGHT, command.height)
+        command.stagger = torch.where(crossing, SILL_STAGGER, command.stagger)
+
+        command.reach = raised[:, None].expand(-1, 2).to(command.reach.dtype)
+        self._lead_hands(command, mask, dt, raised)
+        command.hands[:, 0] = at("close", "lift", "step back", "turn", "line up", "sill", "deliver", "over").float()
+        return command
+
+    def _velocity(self, walking: Tensor) -> Tensor:
+        """vx, vy [m/s] and yaw rate [rad/s] in every phase, [worlds, 3]."""
+        at, pose = self.machine.at, self.sight.pose
+        pace = torch.where(at("approach", "line up"), self._style["pace"], 1.0)
+        velocity = walking * pace[:, None] * at(*WALKS)[:, None]
+        # A half turn may go either way.
+        spin = torch.where(self._turns_left, 1.0, -1.0) * velocity[:, 2].abs()
+        far = at("turn") & (wrap_angle(LOOK_LEFT - pose[:, 2]).abs() > 0.6 * math.pi)
+        velocity = torch.cat([velocity[:, :2], torch.where(far, spin, velocity[:, 2])[:, None]], dim=1)
+        back = torch.zeros_like(velocity)
+        back[:, 0] = -STEP_BACK[1]
+        velocity = select(at("step back"), back, velocity)
+        crossing = self._crossing()
+        line = torch.stack([crossing, torch.full_like(crossing, self._sill)], dim=1)
+        north, speed = torch.full_like(crossing, LOOK_LEFT), torch.full_like(crossing, SILL_SPEED)
+        return select(at("sill"), along(pose, line, north, speed, side=0.05, turn=0.3), velocity)
+
+    def _lead_hands(self, command: MotionCommand, mask: Tensor, dt: float, raised: Tensor) -> None:
+        """Fill in hand points and the left wrist."""
+        at, clock, yaw = self.machine.at, self.machine.clock, self.sight.pose[:, 2]
+        working = at("hover", "lower", "close", "lift")
+        heading_of_hand = torch.where(working, self._hand_yaw, yaw)
+        hand = quat_multiply(quat_from_yaw(heading_of_hand), self._grasp_quat.expand(len(yaw), 4))
+        above = torch.where(at("hover"), HOVER, 0.0) + torch.where(
+            at("lower"), (HOVER - DESCENT * clock).clamp_min(0.0), 0.0
+        )
+        above = above + torch.where(at("lift"), (ASCENT * clock).clamp_max(LIFTED), 0.0)
+        offset = quat_apply(quat_from_yaw(self._hand_yaw), self._palm_offset.expand(len(yaw), 3))
+        grasping = self._grasp + offset
+        grasping = torch.cat([grasping[:, :2], (grasping[:, 2] + above)[:, None]], dim=1)
+
+        palms = self.palms.measured()
+        posture = torch.tensor([LEFT_RAISED, LEFT_CARRY, LEFT_HIGH, RIGHT_RAISED], device=yaw.device)
+        style = torch.stack([self._style[f"palm {axis}"] for axis in "xyz"], dim=1)
+        left = select(at("deliver"), posture[2] + style, posture[1] + style)
+        left = select(at("look", "approach", "step in"), posture[0] + style, left)
+        over = self.palms.local((palms[:, 0] + self._over()[0] - self._mass())[:, None])[:, 0]
+        left = select(at("over"), over, left)
+        left = select(working, self.palms.local(grasping[:, None])[:, 0], left)
+        left = select(at("open", "rest"), self._last, left)
+        self._last = select(mask, left, self._last)
+        both = torch.stack([left, posture[3].expand_as(left)], dim=1)
+
+        learn = mask & at("hover", "lower", "step back", "turn", "line up", "sill", "deliver", "over")
+        wanted = self._root()[:, None] + turn(yaw[:, None], both)
+        command.hand_point = self.palms.lead(wanted, torch.stack([learn, torch.zeros_like(learn)], dim=1), dt)
+        twist = mask & at("hover", "lower")
+        angles = self.wrists.lead(
+            torch.stack([hand, hand], dim=1), torch.stack([twist, torch.zeros_like(twist)], 1), dt
+        )
+        columns = WRISTS[0].to(yaw.device)
+        command.arms[:, columns] = torch.where(raised[:, None], angles[:, 0], command.arms[:, columns])
+
+        miss = torch.linalg.vector_norm(grasping - palms[:, 0], dim=1)
+        cosine = (self.sight.body(self.palms.bodies[0])[1] * hand).sum(dim=1).abs().clamp_max(1.0)
+        self._error = select(mask, torch.stack([miss, 2.0 * torch.acos(cosine)], dim=1), self._error)
+
+    def _root(self) -> Tensor:
+        return self.sight.root_position
