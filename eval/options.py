@@ -22,7 +22,7 @@ __all__ = [
 
 QUICK_SEEDS = (0,)
 """Group seeds of the default run."""
-QUICK_REPEATS = 4
+QUICK_REPEATS = 3
 """Episodes per task and tracker of the default run, sized to end within four minutes on two CPU cores."""
 QUICK_TRACKERS = ("twist2", "sonic")
 """Trackers of the default run: those whose weights come with the package."""
@@ -71,7 +71,7 @@ class RunOptions:
     video: bool = False
     """Write ego and world videos (H.264 MP4), one pair per episode."""
     strip: bool = False
-    """Write the 10-frame picture strip of each episode; the default run always does."""
+    """Write the 10-frame picture strip of each episode; the default run always does, and follows the robot."""
     video_episodes: int | None = None
     """Videos of only the first so many episodes of each task, tracker and mode; of all when not given."""
     video_size: str | None = None
