@@ -41,6 +41,8 @@ def test_default_run(tmp_path, capsys, monkeypatch):
     lines = (Path(report).parent / "episodes.jsonl").read_text().splitlines()
     budgets = {row["task"]: row["max_steps"] for row in map(json.loads, lines)}
     assert budgets == {task: tasks.get(task).max_steps(rule_sets.get("paper")) for task in planned}
+    assert main(["resume", str(Path(report).parent)], factories()) == 0
+    assert f"{len(lines)} episodes, all finished" in capsys.readouterr().out
 
 
 def test_configuration_is_two_lines(tmp_path, capsys):
