@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification import agreement, axes, certificate, legs, solvable, swap, visible
 from arena_newton.eval.certification.bodies import BODIES, Body
 from arena_newton.eval.certification.context import Context, with_expert
-from arena_newton.eval.certification.finding import Check, Finding
+from arena_newton.eval.certification.finding import Check, CheckFinding
 from arena_newton.eval.config import plain_facts
 from arena_newton.eval.identity import code_hash
 from arena_newton.eval.options import CertifyOptions
@@ -69,7 +69,7 @@ def run(
     if options.quick:
         print(f"--quick: {context.episodes} episodes of each cell, so the intervals are wide")
     quiet_warp()
-    findings: dict[str, Finding] = {}
+    findings: dict[str, CheckFinding] = {}
     for check in chosen:
         started = time.perf_counter()
         finding = check.run(context)

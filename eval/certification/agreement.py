@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from arena_newton.devices import resolve_engine
-from arena_newton.eval.certification.context import Cell, Context
-from arena_newton.eval.certification.finding import Check, Finding, Sheet, pooled_score, score, skipped
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, pooled_score, score, skipped
 from arena_newton.eval.certification.solvable import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
 from arena_newton.eval.engines import fisher
@@ -22,7 +22,7 @@ BATCHED_TASKS = 2
 """Tasks whose episodes are compared under --quick."""
 
 
-def engines(context: Context) -> Finding:
+def engines(context: Context) -> CheckFinding:
     """Play the experts on the other engine and compare success and falls by Fisher's exact test."""
     other = "warp" if context.options.engine == "mujoco" else "mujoco"
     _, device = resolve_engine(other, None if other == "warp" else "cpu")
@@ -33,7 +33,7 @@ def engines(context: Context) -> Finding:
         for task in context.tasks:
             records = [
                 context.evaluate(recorded(context, task, tracker)),
-                context.evaluate(Cell(task, tracker, engine=other)),
+                context.evaluate(CertifyCell(task, tracker, engine=other)),
             ]
             a, b = map(score, records)
             falls = [sum(record.outcome == "fall" for record in found) for found in records]
@@ -59,10 +59,12 @@ def engines(context: Context) -> Finding:
     notes: tuple[str, ...] = (f"Engines differ where p is below {level:.2g}: {DIFFERENT} over {2 * len(pairs)} tests.",)
     notes += tuple(f"{which}: the engines differ" for which in apart)
     summary = f"{this} and {other} on {device}: smallest p of {2 * len(pairs)} tests is {least:.3f}"
-    return Finding("fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes)
+    return CheckFinding(
+        "fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes
+    )
 
 
-def batches(context: Context) -> Finding:
+def batches(context: Context) -> CheckFinding:
     """Play the same episodes in batches of different size and order and compare every bit."""
     if context.options.engine != "mujoco":
         return skipped("bits are promised on engine mujoco alone")
@@ -82,7 +84,7 @@ def batches(context: Context) -> Finding:
     head = ("task", "tracker", "ticks compared", "first tick that differs")
     sheet = Sheet(f"{BATCHED} episodes in one world, in {BATCHED} worlds, and in the reverse order", head, tuple(rows))
     summary = f"{len(rows) - len(broken)} of {len(rows)} groups of episodes have the same bits in every batch and order"
-    return Finding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
+    return CheckFinding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
 
 
 def _compare_batches(context: Context, task: str, tracker: str, ticks: int) -> JsonObject:
@@ -100,7 +102,7 @@ def _compare_batches(context: Context, task: str, tracker: str, ticks: int) -> J
     }
 
 
-def official(context: Context) -> Finding:
+def official(context: Context) -> CheckFinding:
     """Play the experts through the official TWIST2 weights and compare with those that come with the package."""
     given = context.options.twist2_checkpoint
     if given is None:
@@ -108,7 +110,7 @@ def official(context: Context) -> Finding:
     rows, ours, theirs = [], [], []
     for task in context.tasks:
         ours.append(score(context.evaluate(recorded(context, task, "twist2"))))
-        theirs.append(score(context.evaluate(Cell(task, "twist2", checkpoint=given))))
+        theirs.append(score(context.evaluate(CertifyCell(task, "twist2", checkpoint=given))))
         p = fisher(ours[-1].successes, ours[-1].episodes, theirs[-1].successes, theirs[-1].episodes)
         rows.append((task, *ours[-1].cells(), *theirs[-1].cells(), f"{p:.3f}"))
     a, b = pooled_score(ours), pooled_score(theirs)
@@ -120,7 +122,7 @@ def official(context: Context) -> Finding:
     summary += f"in {b.successes} with the official ones (p = {p:.2g})"
     worse = p < DIFFERENT and a.rate < b.rate
     better = p < DIFFERENT and a.rate > b.rate
-    return Finding("fail" if worse else "note" if better else "pass", summary, (sheet,))
+    return CheckFinding("fail" if worse else "note" if better else "pass", summary, (sheet,))
 
 
 CHECKS = (

@@ -11,8 +11,8 @@ from PIL import Image
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.certification.context import Cell, Context
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Score, Sheet, score, skipped
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, Sheet, score, skipped
 from arena_newton.eval.certification.solvable import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
 from arena_newton.eval.records import JsonObject
@@ -36,7 +36,7 @@ SEMANTIC_LOSS = (3, 60)
 """So many successes of so many episodes may semantic mode cost or give."""
 
 
-def visual(context: Context) -> Finding:
+def visual(context: Context) -> CheckFinding:
     """Play the same episodes in both modes and compare every bit of the physics, and the first pictures."""
     if context.options.engine != "mujoco":
         return skipped("bits are promised on engine mujoco alone")
@@ -67,7 +67,7 @@ def visual(context: Context) -> Finding:
     if not broken:
         all_ticks = sum(int(row[2].replace(",", "")) for row in rows)
         summary = f"every bit of {all_ticks:,} ticks is the same, every first picture differs"
-    return Finding("fail" if broken else "pass", summary, (sheet,), tuple(broken), tuple(pictures))
+    return CheckFinding("fail" if broken else "pass", summary, (sheet,), tuple(broken), tuple(pictures))
 
 
 def _compare_modes(
@@ -101,14 +101,14 @@ def allowed_difference(episodes: int) -> int:
     return math.ceil(most * episodes / of)
 
 
-def semantic(context: Context) -> Finding:
+def semantic(context: Context) -> CheckFinding:
     """Play the semantic variants with the experts."""
     rows, outside, worst = [], [], 0
     allowed = allowed_difference(context.episodes)
     for tracker in context.sample:
         for task in context.tasks:
             base: Score = score(context.evaluate(recorded(context, task, tracker)))
-            other = score(context.evaluate(Cell(task, tracker, mode="semantic")))
+            other = score(context.evaluate(CertifyCell(task, tracker, mode="semantic")))
             gap = other.successes - base.successes
             worst = max(worst, abs(gap))
             rows.append((task, tracker, base.cells()[0], *other.cells(), f"{gap:+d}"))
@@ -119,7 +119,7 @@ def semantic(context: Context) -> Finding:
     head = ("task", "tracker", "base", "semantic", "95 % interval", "difference")
     summary = f"semantic variants change the experts' successes by at most {worst} of {context.episodes} episodes"
     sheet = Sheet(f"Semantic against base mode; {allowed} of {context.episodes} are allowed", head, tuple(rows))
-    return Finding("fail" if outside else "pass", summary, (sheet,), tuple(outside))
+    return CheckFinding("fail" if outside else "pass", summary, (sheet,), tuple(outside))
 
 
 def named_coordinates(rule: ObjectRule) -> set[str]:
@@ -154,7 +154,7 @@ def moved_coordinates(task: str, mode: str, rules: str, seeds: Iterable[int]) ->
     return {key: values[key] for key in values if key in moved}
 
 
-def execution(context: Context) -> Finding:
+def execution(context: Context) -> CheckFinding:
     """Compare draws of all modes with the rules' ranges, and worlds after their reset."""
     rows, broken = [], []
     for rules in rule_sets.names():
@@ -196,7 +196,7 @@ def execution(context: Context) -> Finding:
     summary = f"execution mode moves {len(rows)} coordinates, the rules name these and no other"
     if broken:
         summary = f"{len(broken)} deviations from what the rules name"
-    return Finding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
+    return CheckFinding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
 
 
 def _range(bounds: tuple[float, float] | None) -> str:

@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -129,7 +129,7 @@ class HeldLegs(Tracker):
         targets[:, list(LEGS)] = self._held
         return targets
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """See `Tracker.describe`."""
         return self.inner.describe() | {"legs": "held in the standing posture"}
 

@@ -13,7 +13,7 @@ from typing import TypedDict
 
 import jinja2
 
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.wording import plain
@@ -50,7 +50,7 @@ class Facts(TypedDict):
     versions: JsonObject
 
 
-def write(folder: Path, facts: Facts, findings: Mapping[Check, Finding]) -> None:
+def write(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) -> None:
     """Write certify.json, certify.md and certify.html into a folder.
 
     Args:
@@ -63,10 +63,10 @@ def write(folder: Path, facts: Facts, findings: Mapping[Check, Finding]) -> None
     write_atomic(folder / "certify.html", html(facts, findings))
 
 
-def document(folder: Path, facts: Facts, findings: Mapping[Check, Finding]) -> JsonObject:
+def document(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) -> JsonObject:
     """The certificate as JSON; pictures by their path in the folder."""
 
-    def entry(check: Check, finding: Finding) -> JsonObject:
+    def entry(check: Check, finding: CheckFinding) -> JsonObject:
         return {
             "question": check.question,
             "verdict": finding.verdict,
@@ -104,7 +104,7 @@ def _said(facts: Facts) -> list[tuple[str, str]]:
     return said
 
 
-def _warnings(facts: Facts, findings: Mapping[Check, Finding]) -> list[str]:
+def _warnings(facts: Facts, findings: Mapping[Check, CheckFinding]) -> list[str]:
     """What limits the certificate as a whole."""
     found = []
     if facts["quick"]:
@@ -115,7 +115,7 @@ def _warnings(facts: Facts, findings: Mapping[Check, Finding]) -> list[str]:
     return found
 
 
-def markdown(facts: Facts, findings: Mapping[Check, Finding]) -> str:
+def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as Markdown, without pictures."""
     lines = ["# Certificate", ""]
     lines += [f"- {name}: {_escaped(text)}" for name, text in _said(facts)] + [""]
@@ -151,7 +151,7 @@ def _template() -> jinja2.Template:
     return environment.get_template("certify.html")
 
 
-def html(facts: Facts, findings: Mapping[Check, Finding]) -> str:
+def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as one page that needs no other file."""
     style = (PAGE / "report.css").read_text(encoding="utf-8") + (PAGE / "certify.css").read_text(encoding="utf-8")
     known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()

@@ -24,7 +24,7 @@ from arena_newton.eval.records import Json
 from arena_newton.eval.results import load_run
 from arena_newton.text import counted
 
-__all__ = ["Cell", "Context", "with_expert"]
+__all__ = ["CertifyCell", "Context", "with_expert"]
 
 QUICK_EPISODES = 4
 """Episodes of each cell under --quick."""
@@ -33,7 +33,7 @@ FULL_EPISODES = 60
 
 
 @dataclass(frozen=True)
-class Cell:
+class CertifyCell:
     """One evaluation: a task played many times in one way."""
 
     task: str
@@ -101,11 +101,11 @@ class Context:
         gym_id = tasks.get(task).gym_id
         return [seeding.episode_seed(gym_id, *divmod(number, PROTOCOL_REPEATS)) for number in range(count)]
 
-    def path(self, cell: Cell) -> Path:
+    def path(self, cell: CertifyCell) -> Path:
         """Results folder of a cell."""
         return self.folder / "runs" / cell.folder
 
-    def evaluate(self, cell: Cell) -> list[EpisodeRecord]:
+    def evaluate(self, cell: CertifyCell) -> list[EpisodeRecord]:
         """Episodes of a cell in plan order; played, or continued where its results folder has some of them.
 
         Raises:
@@ -143,7 +143,9 @@ class Context:
             raise KeyboardInterrupt
         return load_run(folder.path).records
 
-    def strips(self, cell: Cell, outcome: str | None = None, camera: str = "world") -> list[tuple[EpisodeRecord, Path]]:
+    def strips(
+        self, cell: CertifyCell, outcome: str | None = None, camera: str = "world"
+    ) -> list[tuple[EpisodeRecord, Path]]:
         """Film strips of a cell's episodes, those with an outcome alone if one is named."""
         folder, found = self.path(cell), []
         for record in self.evaluate(cell):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from arena_newton.eval.certification.context import Cell, Context
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Sheet, Verdict, pooled_score, score
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet, Verdict, pooled_score, score
 from arena_newton.eval.certification.solvable import recorded
 
 __all__ = ["CHECKS", "GLIDES"]
@@ -31,7 +31,7 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, t
     rows, pictures, found = [], [], {}
     for tracker in context.sample:
         for task in context.tasks:
-            cell = Cell(task, tracker, body=body, strip=True)
+            cell = CertifyCell(task, tracker, body=body, strip=True)
             whole, records = score(context.evaluate(recorded(context, task, tracker))), context.evaluate(cell)
             one = score(records)
             found[task] = found.get(task, 0) + one.successes
@@ -45,17 +45,17 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, t
     return found, Sheet(f"Experts with {context.bodies[body].title}", head, tuple(rows)), tuple(pictures)
 
 
-def frozen(context: Context) -> Finding:
+def frozen(context: Context) -> CheckFinding:
     """Play every task with legs that only stand."""
     found, sheet, pictures = _without_legs(context, "frozen")
     solved = {task: count for task, count in found.items() if count}
     total = len(context.sample) * len(context.tasks) * context.episodes
     summary = f"{sum(found.values())} successes in {total} episodes with the legs frozen in the standing posture"
     notes = tuple(f"{task}: {count} successes with frozen legs, see the pictures" for task, count in solved.items())
-    return Finding("fail" if solved else "pass", summary, (sheet,), notes, pictures)
+    return CheckFinding("fail" if solved else "pass", summary, (sheet,), notes, pictures)
 
 
-def gliding(context: Context) -> Finding:
+def gliding(context: Context) -> CheckFinding:
     """Play every task with a base that glides."""
     found, sheet, pictures = _without_legs(context, "gliding")
     whole = pooled_score(
@@ -69,7 +69,7 @@ def gliding(context: Context) -> Finding:
     notes = [f"{task}, {count} successes: {GLIDES[task]}." for task, count in solved.items() if task in GLIDES]
     notes += [f"{task}, {solved[task]} successes: no reason is known, see the pictures." for task in unknown]
     verdict: Verdict = "fail" if unknown else "note" if solved else "pass"
-    return Finding(verdict, summary, (sheet,), tuple(notes), pictures)
+    return CheckFinding(verdict, summary, (sheet,), tuple(notes), pictures)
 
 
 CHECKS = (

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 
-from arena_newton.eval.certification.context import Cell, Context
+from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import (
     Check,
-    Finding,
+    CheckFinding,
     Score,
     Sheet,
     Verdict,
@@ -32,7 +32,7 @@ def retention(own: Score, other: Score) -> str:
     return percent(other.rate / own.rate) if own.successes else "-"
 
 
-def swap(context: Context) -> Finding:
+def swap(context: Context) -> CheckFinding:
     """Replay the experts' recordings open loop through every other tracker and, as a control, through their own."""
     if len(context.trackers) < 2:
         return skipped("needs two trackers: --tracker twist2 sonic")
@@ -48,7 +48,7 @@ def swap(context: Context) -> Finding:
                 notes.append(f"{task} through {source}: nothing was recorded")
                 continue
             actions = context.path(episodes) / "actions"
-            replay = Cell(task, target, policy=f"replay:{actions}", label=f"replay-of-{source}")
+            replay = CertifyCell(task, target, policy=f"replay:{actions}", label=f"replay-of-{source}")
             own.append(score(records))
             other.append(score(context.evaluate(replay)))
             falls = sum(record.outcome == "fall" for record in context.evaluate(replay))
@@ -75,7 +75,7 @@ def swap(context: Context) -> Finding:
             f"A loss shows from p = {SHOWN_BY} on; fewer than {ENOUGH} episodes of a direction cannot rule it out."
         )
     verdict: Verdict = "pass" if all(shown) else "note" if few else "fail"
-    return Finding(verdict, "; ".join(kept), (sheet,), tuple(notes))
+    return CheckFinding(verdict, "; ".join(kept), (sheet,), tuple(notes))
 
 
 CHECKS = (Check("swap", "Do recorded actions lose their success through the other tracker, without any policy?", swap),)

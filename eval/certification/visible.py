@@ -11,7 +11,7 @@ from PIL import Image
 
 from arena_newton import policies
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.certification.traces import world_of
 from arena_newton.eval.records import JsonObject
 from arena_newton.interfaces import World
@@ -40,7 +40,7 @@ TINT = np.array([255.0, 0.0, 255.0])
 """Colour of the target's pixels in the page's pictures, RGB."""
 
 
-def visible(context: Context) -> Finding:
+def visible(context: Context) -> CheckFinding:
     """Let the experts act and look for their targets in the pictures that a policy would see."""
     rows, missing, late, pictures = [], [], [], []
     tracker, shown, total = context.trackers[0], 0, 0
@@ -84,7 +84,7 @@ def visible(context: Context) -> Finding:
     summary = f"the target is in the first picture of {shown} of {total} episodes"
     summary += "" if missing else ", and is seen in all of them"
     notes = (*missing, *late, f"Seen means {SEEN} pixels or more of the 224 x 168 that the lens fills.")
-    return Finding("fail" if missing else "note" if late else "pass", summary, (sheet,), notes, tuple(pictures))
+    return CheckFinding("fail" if missing else "note" if late else "pass", summary, (sheet,), notes, tuple(pictures))
 
 
 def _look(context: Context, task: str, tracker: str, picture: Path) -> JsonObject:

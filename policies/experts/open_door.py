@@ -34,7 +34,7 @@ PHASES = {
     "raise": 1.4,
     "step in": 5.0,
     "align": 2.5,
-    "press": 3.2,
+    "press": 4.0,
     "retreat": 4.0,
     "push": 12.0,
     "through": math.inf,
@@ -44,11 +44,11 @@ ON_LEVER = 0.10
 """Distance of the pressed point from the lever's pivot [m]: 2.5 N·m/rad to 20° are 9 N there."""
 SIDE = 0.17
 """The robot stands this far to the left of that point [m]: the point is in front of the right shoulder."""
-STAND = 0.41
+STAND = 0.38
 """Pelvis before the lever when pressing [m]; from 0.47 m one tracker's fist stops 5 cm short and presses air."""
 ABOVE = 0.13
 """Height of the fist over the lever before it presses [m]."""
-LOWER, BELOW = 0.15, 0.26
+LOWER, BELOW = 0.15, 0.32
 """Speed of the pressing command [m/s], and how far below the lever it goes [m]: the arm is soft, and with 14 cm the
 lever stopped at 17°."""
 RELEASED, AJAR = math.radians(20.0), math.radians(4.0)
@@ -67,7 +67,7 @@ OPENED = math.radians(63.0)
 """Angle of a leaf that is open under either rule set [rad]."""
 INSIDE, FAR_INSIDE = 0.45, 1.1
 """Pelvis past the door's plane [m] at which the robot stops when the leaf is open, and in any case."""
-STEPPED = (0.05, 0.08)
+STEPPED = (0.03, 0.06)
 """Errors at the door that the arm makes up for [m, rad]."""
 LEARN, MOST_LEARNED = 0.6, 0.06
 """Fraction of the palm's miss by which the stance is moved after a missed lever, and the largest such move [m]."""
