@@ -1,4 +1,4 @@
-"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|list] ...``."""
+"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|certify|list] ...``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ import tyro
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.eval.options import BenchOptions, EngineOptions, ReportOptions, RunOptions
+from arena_newton.eval.options import (
+    BenchOptions,
+    CertifyOptions,
+    EngineOptions,
+    FilmOptions,
+    ReportOptions,
+    RunOptions,
+)
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -29,10 +36,12 @@ PROG = "python -m arena_newton.eval"
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
-  {PROG} report <out>            write tables and report again from the journal
+  {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
+  {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
+  {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
 """
 
 
@@ -101,6 +110,17 @@ def _folder(arguments: list[str], command: str) -> Path:
     return Path(arguments.pop(0)).expanduser()
 
 
+def _folders(arguments: list[str], command: str) -> list[Path]:
+    """One results folder or several, each once."""
+    folders = [_folder(arguments, command)]
+    while arguments and not arguments[0].startswith("-"):
+        folders.append(_folder(arguments, command))
+    for number, folder in enumerate(folders):
+        if folder.resolve() in [other.resolve() for other in folders[:number]]:
+            raise InputError(f"{command} {folder}: is named twice")
+    return folders
+
+
 def _wants_help(arguments: Sequence[str]) -> bool:
     return any(argument in ("-h", "--help") for argument in arguments)
 
@@ -141,12 +161,18 @@ def _resume(arguments: list[str], factories: Factories | None) -> int:
 
 def _report(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
-        _parse(ReportOptions, ["--help"], "report <out>")
-    folder = _folder(arguments, "report")
+        _parse(ReportOptions, ["--help"], "report <out> [<out> ...]")
+    folders = _folders(arguments, "report")
     options = _parse(ReportOptions, arguments, "report")
-    from arena_newton.eval import report
+    from arena_newton.eval import report, tables
     from arena_newton.eval.results import load_run
 
+    if options.table or len(folders) > 1:
+        if options.json:
+            raise InputError("--json: is of one folder, without --table")
+        print(tables.joint_table([load_run(folder) for folder in folders]), end="")
+        return 0
+    (folder,) = folders
     run = load_run(folder)
     results = report.write_reports(run)
     if options.json:
@@ -156,6 +182,19 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
     for note in report.notes(run, results):
         print(note)
     print(f"report: {folder / 'report.html'}")
+    return 0
+
+
+def _film(arguments: list[str], factories: Factories | None) -> int:
+    if _wants_help(arguments):
+        _parse(FilmOptions, ["--help"], "film <out> [<out> ...]")
+    folders = _folders(arguments, "film")
+    options = _parse(FilmOptions, arguments, "film")
+    from arena_newton.eval import success_film
+    from arena_newton.eval.results import load_run
+
+    for line in success_film.write([load_run(folder) for folder in folders], options):
+        print(line)
     return 0
 
 
@@ -198,7 +237,23 @@ def _engines(arguments: list[str], factories: Factories | None) -> int:
     return engines.run(options)
 
 
-_COMMANDS = {"run": _run, "resume": _resume, "report": _report, "bench": _bench, "engines": _engines, "list": _list}
+def _certify(arguments: list[str], factories: Factories | None) -> int:
+    options = _parse(CertifyOptions, arguments, "certify")
+    from arena_newton.eval import certify
+
+    return certify.run(options, factories)
+
+
+_COMMANDS = {
+    "run": _run,
+    "resume": _resume,
+    "report": _report,
+    "film": _film,
+    "bench": _bench,
+    "engines": _engines,
+    "certify": _certify,
+    "list": _list,
+}
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
-from arena_newton.files import file_label
 from arena_newton.pictures.settings import CameraConfig, video_sizes
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
@@ -189,6 +188,7 @@ def resolve(options: RunOptions) -> RunConfig:
         seeds=tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS),
         repeats=repeats,
         strip=options.strip or quick,
+        follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,
         policy=f"{scheme}:{policy_path}" if policy_path else options.policy,
@@ -203,10 +203,6 @@ def resolve(options: RunOptions) -> RunConfig:
         repeats=repeats,
         max_steps=flags.max_steps,
     )
-    if len(set(map(file_label, flags.tracker))) < len(flags.tracker):
-        raise InputError(
-            f"--tracker {' '.join(flags.tracker)}: two have the same name in names of files; run them apart"
-        )
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     policy_hash = hash_path(policy_path) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None

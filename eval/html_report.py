@@ -117,6 +117,7 @@ def page(
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
+    opening = _opening(records)
     # The policy's number of worlds is in the configuration only where its answers depend on it.
     command = functools.partial(replay_command, document["options"], worlds=document["config"].get("worlds"))
     return _template().render(
@@ -132,6 +133,7 @@ def page(
         ticks=TICKS,
         cells=_bars(results["cells"]),
         reasons=reasons,
+        opening=[(_Episode(record), strip) for record, strip in opening],
         shown=[_Episode(record) for record in shown],
         folded=[_Episode(record) for record in folded],
         episodes=[_Episode(record, command(record=record)) for record in records],
@@ -220,6 +222,18 @@ def _bar(title: str, cell: ResultCell) -> dict[str, object]:
     }
 
 
+def _opening(records: Sequence[EpisodeRecord]) -> list[tuple[EpisodeRecord, dict[str, str]]]:
+    """One film strip per task, that of its first success from outside; where none succeeded, of its first episode."""
+    found: dict[str, tuple[EpisodeRecord, dict[str, str]]] = {}
+    for record in records:
+        strips = _Episode(record).strips
+        task = plain(record.task)
+        better = task not in found or (record.outcome == "success" and found[task][0].outcome != "success")
+        if strips and better:
+            found[task] = (record, strips[-1])
+    return list(found.values())
+
+
 def _strips(records: Sequence[EpisodeRecord]) -> tuple[list[EpisodeRecord], list[EpisodeRecord]]:
     """Episodes whose film strips are shown, failures first, and those that are folded."""
     filmed = [r for r in records if any(name.endswith("strip") for name in media_of(r))]
@@ -256,6 +270,11 @@ class _Episode:
         r = self.record
         cell = " ".join(map(plain, (r.task, r.tracker, r.mode)))
         return f"{cell}, seed {plain(r.group_seed)} repeat {plain(r.repeat)}"
+
+    @property
+    def short_title(self) -> str:
+        """Task and tracker."""
+        return f"{plain(self.record.task)}, {plain(self.record.tracker)}"
 
     @property
     def length(self) -> str:

@@ -12,7 +12,9 @@ __all__ = [
     "QUICK_SEEDS",
     "QUICK_TRACKERS",
     "BenchOptions",
+    "CertifyOptions",
     "EngineOptions",
+    "FilmOptions",
     "ReportOptions",
     "RunOptions",
     "is_quick",
@@ -20,7 +22,7 @@ __all__ = [
 
 QUICK_SEEDS = (0,)
 """Group seeds of the default run."""
-QUICK_REPEATS = 4
+QUICK_REPEATS = 3
 """Episodes per task and tracker of the default run, sized to end within four minutes on two CPU cores."""
 QUICK_TRACKERS = ("twist2", "sonic")
 """Trackers of the default run: those whose weights come with the package."""
@@ -69,7 +71,7 @@ class RunOptions:
     video: bool = False
     """Write ego and world videos (H.264 MP4), one pair per episode."""
     strip: bool = False
-    """Write the 10-frame picture strip of each episode; the default run always does."""
+    """Write the 10-frame picture strip of each episode; the default run always does, and follows the robot."""
     video_episodes: int | None = None
     """Videos of only the first so many episodes of each task, tracker and mode; of all when not given."""
     video_size: str | None = None
@@ -108,10 +110,27 @@ def is_quick(options: RunOptions) -> bool:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Write tables and reports of a results folder again from its journal."""
+    """Write tables and reports of a results folder again from its journal; of several folders print one table."""
 
+    table: bool = False
+    """Print a table of successes per task, tracker and mode as Markdown, and write nothing."""
     json: bool = False
     """Print results.json instead of the table."""
+
+
+@dataclass(frozen=True)
+class FilmOptions:
+    """Show one success per task of one or several results folders in a single film or picture."""
+
+    out: str = "film.webp"
+    """File to write: .webp, .gif or .mp4 is a film of the world videos side by side (run --video), .jpg or .png the
+    world strips one below the other (run --strip)."""
+    seconds: float = 12.0
+    """Length of the film [s]; every episode is played from its start to its end in it."""
+    width: int = 960
+    """Width of the film or picture [px]."""
+    max_mb: float = 3.0
+    """Largest size of a .webp film [MB]; its quality is lowered until it fits."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +138,7 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: help tick throughput camera pictures episodes tests, or `all` (everything but tests)."""
+    """What to measure: help tick generator throughput camera pictures episodes tests, or `all` (all but tests)."""
     checkpoint: str | None = None
     """Weights of TWIST2; those that come with the package when none are named."""
     worlds: int = 20
@@ -164,3 +183,35 @@ class EngineOptions:
     """JSON file of an earlier call, possibly on another machine, to compare with."""
     out: str | None = None
     """Write the rates to this JSON file."""
+
+
+@dataclass(frozen=True)
+class CertifyOptions:
+    """Prove the benchmark: solvable tasks that need legs, clean axes, agreeing engines, the price of a swapped tracker.
+
+    Every check plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
+    """
+
+    out: str = "results/certify"
+    """Folder of the certificate and of the evaluations behind it."""
+    quick: bool = False
+    """A few episodes of everything: minutes instead of hours, and wide intervals."""
+    task: tuple[str, ...] = ()
+    """Tasks; all that have an expert when none is named."""
+    tracker: tuple[str, ...] = ("twist2", "sonic")
+    """Trackers, with the weights they come with; the first one alone where one is enough."""
+    checks: tuple[str, ...] = ()
+    """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official swap
+    visible; all when none is named."""
+    episodes: int | None = None
+    """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "mujoco"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    twist2_checkpoint: str | None = None
+    """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
+    resume: bool = False
+    """Continue a certification in its folder; what was played is kept."""

@@ -102,7 +102,7 @@ class Progress:
         return (self.budget - self.done) * self._stepping / gained if gained > 0 else None
 
     def group(self, name: str) -> None:
-        """The coming episodes belong to this task and mode; worlds are built first, whose time no speed counts."""
+        """The coming episodes belong to this group; worlds are built first, whose time no speed counts."""
         self._name, self._last = name, None
         self._describe()
 

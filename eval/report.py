@@ -5,14 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import json
-import re
 
 from arena_newton.eval import html_report
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.original_format import write_original
 from arena_newton.eval.results import Results, RunRecord, results_json
 from arena_newton.eval.stats import ResultCell, Suite, error_reasons, outside_suites
-from arena_newton.eval.wording import environment_facts, media_of, plain, rules_that_ran, tasks_of
+from arena_newton.eval.wording import (
+    environment_facts,
+    escaped,
+    markdown_table,
+    media_of,
+    plain,
+    rules_that_ran,
+    tasks_of,
+)
 from arena_newton.robot import TICK
 from arena_newton.text import counted
 
@@ -66,15 +73,7 @@ def _rows(results: Results) -> list[list[str]]:
 
 def table(results: Results) -> str:
     """The result table as Markdown with aligned columns; it is also what the command line prints."""
-    rows = [_HEAD, *([_escaped(text) for text in row] for row in _rows(results))]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
-
-    def line(row: list[str]) -> str:
-        cells = [row[i].ljust(widths[i]) if i < 4 else row[i].rjust(widths[i]) for i in range(len(row))]
-        return "| " + " | ".join(cells) + " |"
-
-    rule = "|" + "|".join("-" * (w + 2) if i < 4 else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([line(_HEAD), rule, *(line(row) for row in rows[1:])]) + "\n"
+    return markdown_table(_HEAD, _rows(results), left=4)
 
 
 def table_csv(results: Results) -> str:
@@ -118,20 +117,15 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     return found
 
 
-def _escaped(text: object) -> str:
-    """Text of a results folder as Markdown that stays text."""
-    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
-
-
 def _code(text: object) -> str:
     """The same as code."""
     return f"`{plain(text).replace('`', "'")}`"
 
 
 def _markdown(run: RunRecord, results: Results) -> str:
-    lines = [f"# HumanoidArena results {_escaped(results['config_hash'])}", ""]
-    lines += [f"> {_escaped(note)}" for note in notes(run, results)]
-    lines += [f"> The scene is a variant: {_escaped(text)}" for text in run.document.get("variant_changes", [])]
+    lines = [f"# HumanoidArena results {escaped(results['config_hash'])}", ""]
+    lines += [f"> {escaped(note)}" for note in notes(run, results)]
+    lines += [f"> The scene is a variant: {escaped(text)}" for text in run.document.get("variant_changes", [])]
     lines += ["", table(results)]
     lines += [
         "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
@@ -142,27 +136,27 @@ def _markdown(run: RunRecord, results: Results) -> str:
     reasons = error_reasons(run.records)
     if reasons:
         lines += ["## Errors", "", "| reason | message | episodes |", "|---|---|---:|"]
-        lines += [f"| {_escaped(r['reason'])} | {_escaped(r['message'])} | {r['count']} |" for r in reasons]
+        lines += [f"| {escaped(r['reason'])} | {escaped(r['message'])} | {r['count']} |" for r in reasons]
         lines += ["", "Run them again, in this folder: `python -m arena_newton.eval resume . --retry-errors`", ""]
     strips = [(r, media_of(r)) for r in run.records if media_of(r)]
     if strips:
         lines += ["## Recordings", ""]
         strips.sort(key=lambda entry: entry[0].outcome == "success")
         lines += [
-            f"- {_escaped(r.task)} {_escaped(r.mode)} seed {_escaped(r.group_seed)} repeat "
-            f"{_escaped(r.repeat)} ({_escaped(r.outcome)}): "
+            f"- {escaped(r.task)} {escaped(r.mode)} seed {escaped(r.group_seed)} repeat "
+            f"{escaped(r.repeat)} ({escaped(r.outcome)}): "
             + ", ".join(f"[{name}]({path})" for name, path in media.items())
             for r, media in strips
         ]
         lines += [""]
     for name, facts in run.document.get("environments", {}).items():
-        lines += [f"## What ran: {_escaped(name)}", ""]
-        lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in environment_facts(facts)] + [""]
+        lines += [f"## What ran: {escaped(name)}", ""]
+        lines += [f"- {escaped(key)}: {_code(value)}" for key, value in environment_facts(facts)] + [""]
     lines += ["## Configuration", ""]
-    lines += [f"- {_escaped(key)}: {_code(value)}" for key, value in run.config.items()]
+    lines += [f"- {escaped(key)}: {_code(value)}" for key, value in run.config.items()]
     tasks = tasks_of(run.config, run.records)
     lines += ["", f"## Rule set {_code(run.config['rules'])}", ""]
-    lines += [f"- {_escaped(item)}: {_code(text)}" for item, text in rules_that_ran(run.document["rule_set"], tasks)]
+    lines += [f"- {escaped(item)}: {_code(text)}" for item, text in rules_that_ran(run.document["rule_set"], tasks)]
     return "\n".join(lines) + "\n"
 
 

@@ -21,6 +21,8 @@ from arena_newton.text import plain_text
 __all__ = [
     "MEDIA",
     "environment_facts",
+    "escaped",
+    "markdown_table",
     "media_of",
     "plain",
     "replay_command",
@@ -43,6 +45,24 @@ _PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
 def plain(value: object) -> str:
     """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
     return plain_text(value, None, mark="\ufffd")
+
+
+def escaped(text: object) -> str:
+    """Text of a results folder as Markdown that stays text."""
+    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A Markdown table with aligned columns, the first `left` of them flush left; cells are texts and stay so."""
+    lines = [list(head), *([escaped(text) for text in row] for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
+
+    def row(cells: Sequence[str]) -> str:
+        padded = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
+        return f"| {' | '.join(padded)} |"
+
+    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
+    return "\n".join([row(head), rule, *map(row, lines[1:])]) + "\n"
 
 
 def safe_media(path: object) -> str | None:

@@ -286,14 +286,19 @@ def approach(x: float, rate: float, target: float, top: float, acceleration: flo
     away = target - x
     size = wp.abs(away)
     brake = 0.5 * tick * acceleration
-    speed = wp.min(wp.sqrt(BRAKING * acceleration * size + brake * brake) - brake, size / tick)
-    wanted = wp.min(speed, top)
+    speed = wp.min(wp.sqrt(BRAKING * acceleration * size + brake * brake) - brake, top)
+    arrives = size / tick <= speed
+    wanted = wp.where(arrives, size / tick, speed)
     if away < 0.0:
         wanted = -wanted
-    if away == 0.0:
-        wanted = 0.0
     change = acceleration * tick
-    rate = rate + wp.max(wp.min(wanted - rate, change), -change)
+    if wp.abs(wanted - rate) > change:
+        rate = rate + wp.where(wanted > rate, change, -change)
+    elif arrives:
+        # Exactly: a reach that ends at 1e-12 instead of 0 would keep its hand from resting.
+        return wp.vec2(target, wanted)
+    else:
+        rate = wanted
     return wp.vec2(x + rate * tick, rate)
 
 
@@ -335,7 +340,7 @@ def step_seconds(m: GaitModel, s: GaitState, w: int) -> float:
     """Time of a step [s]: shorter in a fast walk, whose steps would be too long."""
     v = velocity_of(m, s, w)
     speed = wp.max(wp.sqrt(v[0] * v[0] + v[1] * v[1]), SLOWEST)
-    longest = wp.min(STRIDE / speed, SIDE_STRIDE / wp.max(wp.abs(v[1]), SLOWEST))
+    longest = wp.min(STRIDE * (1.0 / speed), SIDE_STRIDE * (1.0 / wp.max(wp.abs(v[1]), SLOWEST)))
     return wp.max(wp.min(s.channels[w, m.at.step_time], longest), m.shortest_step)
 
 
@@ -380,7 +385,7 @@ def advance_phase(m: GaitModel, s: GaitState, w: int, moving: bool, free: bool, 
     other = 1 - side
     phase = s.phase[w]
     if stepping:
-        phase = phase + m.tick / step_time
+        phase = phase + m.tick * (1.0 / step_time)
     over = stepping and phase >= 1.0 + wp.where(s.final[w], LEAD_IN, 0.0)
     go_on = over and (not still or beyond(errors[LEFT], PLACED) or beyond(errors[RIGHT], PLACED))
     start = not stepping and free and (moving or beyond(errors[LEFT], MISPLACED) or beyond(errors[RIGHT], MISPLACED))

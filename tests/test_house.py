@@ -49,6 +49,7 @@ STEMS = {
     "base": "the base class of a room's kind of thing",
     "build": "every scene has its builder",
     "boxing": "a task and its expert",
+    "sit_sofa": "a task and its expert",
     "vis_navi": "a task and its expert",
     "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",
     "canonical": "the layout, and its kernels",

@@ -151,17 +151,21 @@ class VideoWriter:
             self.discard()
 
 
-def caption(frame: Picture, text: str, colour: tuple[int, int, int] = (255, 255, 255)) -> np.ndarray:
-    """A copy of a frame with a line of text at the lower left, as large as suits its height.
+def caption(
+    frame: Picture, text: str, colour: tuple[int, int, int] = (255, 255, 255), *, at_top: bool = False
+) -> np.ndarray:
+    """A copy of a frame with a line of text at the lower or upper left, as large as suits its height.
 
     Args:
         frame: uint8 [H, W, 3].
         text: ASCII.
         colour: RGB of the text; a dark edge keeps it readable on any ground.
+        at_top: Whether it is at the upper left.
     """
     picture = _rgb(frame).copy()
     scale = max(0.35, picture.shape[0] / 600)
-    at = (round(10 * scale) + 2, picture.shape[0] - round(12 * scale) - 2)
+    margin = round(12 * scale) + 2
+    at = (round(10 * scale) + 2, margin + round(22 * scale) if at_top else picture.shape[0] - margin)
     for line, thickness in (((16, 16, 16), 3 * max(1, round(scale))), (colour, max(1, round(scale)))):
         cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, line, thickness, cv2.LINE_AA)
     return picture

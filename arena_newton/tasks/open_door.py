@@ -141,4 +141,5 @@ TASK = TaskSpec(
     success=ByRules(paper=DoorPassedRule(), released=DoorOpenRule()),
     judge=OpenDoorJudge,
     predicates=PREDICATES,
+    expert="arena_newton.policies.experts.open_door:OpenDoorExpert",
 )

@@ -192,4 +192,5 @@ TASK = TaskSpec(
     judge=PPBoxJudge,
     predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
+    expert="arena_newton.policies.experts.pp_box:PPBoxExpert",
 )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from arena_newton.devices import resolve_engine
-from arena_newton.eval.certification.context import Cell, Context
-from arena_newton.eval.certification.finding import Check, Finding, Sheet, pooled_score, score, skipped
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, pooled_score, score, skipped
 from arena_newton.eval.certification.solvable import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
 from arena_newton.eval.engines import fisher
@@ -22,7 +22,7 @@ BATCHED_TASKS = 2
 """Tasks whose episodes are compared under --quick."""
 
 
-def engines(context: Context) -> Finding:
+def engines(context: Context) -> CheckFinding:
     """Play the experts on the other engine and compare success and falls by Fisher's exact test."""
     other = "warp" if context.options.engine == "mujoco" else "mujoco"
     _, device = resolve_engine(other, None if other == "warp" else "cpu")
@@ -31,7 +31,10 @@ def engines(context: Context) -> Finding:
     rows, pairs = [], []
     for tracker in context.trackers:
         for task in context.tasks:
-            records = [context.evaluate(recorded(context, task, tracker)), context.evaluate(Cell(task, tracker, engine=other))]
+            records = [
+                context.evaluate(recorded(context, task, tracker)),
+                context.evaluate(CertifyCell(task, tracker, engine=other)),
+            ]
             a, b = map(score, records)
             falls = [sum(record.outcome == "fall" for record in found) for found in records]
             p = fisher(a.successes, a.episodes, b.successes, b.episodes)
@@ -42,14 +45,26 @@ def engines(context: Context) -> Finding:
     apart = [f"{task} through {tracker}" for task, tracker, p, q in pairs if min(p, q) < level]
     least = min((min(p, q) for _, _, p, q in pairs), default=1.0)
     this = context.options.engine
-    head = ("task", "tracker", this, "95 % interval", f"{other} on {device}", "95 % interval", "p", "falls", "p of falls")
-    notes = (f"Engines differ where p is below {level:.2g}: {DIFFERENT} over {2 * len(pairs)} tests.",)
+    head = (
+        "task",
+        "tracker",
+        this,
+        "95 % interval",
+        f"{other} on {device}",
+        "95 % interval",
+        "p",
+        "falls",
+        "p of falls",
+    )
+    notes: tuple[str, ...] = (f"Engines differ where p is below {level:.2g}: {DIFFERENT} over {2 * len(pairs)} tests.",)
     notes += tuple(f"{which}: the engines differ" for which in apart)
     summary = f"{this} and {other} on {device}: smallest p of {2 * len(pairs)} tests is {least:.3f}"
-    return Finding("fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes)
+    return CheckFinding(
+        "fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes
+    )
 
 
-def batches(context: Context) -> Finding:
+def batches(context: Context) -> CheckFinding:
     """Play the same episodes in batches of different size and order and compare every bit."""
     if context.options.engine != "mujoco":
         return skipped("bits are promised on engine mujoco alone")
@@ -61,7 +76,7 @@ def batches(context: Context) -> Finding:
             def measure(task: str = task, tracker: str = tracker) -> JsonObject:
                 return _compare_batches(context, task, tracker, ticks)
 
-            found = context.measured(f"batches_{task}_{tracker}", {"ticks": ticks}, measure)
+            found = context.measured("batches", task, tracker, {"ticks": ticks}, measure)
             assert isinstance(found, dict)
             differs = found["differs"]
             rows.append((task, tracker, f"{int(found['ticks']):,}", "none" if differs is None else str(differs)))
@@ -69,12 +84,12 @@ def batches(context: Context) -> Finding:
     head = ("task", "tracker", "ticks compared", "first tick that differs")
     sheet = Sheet(f"{BATCHED} episodes in one world, in {BATCHED} worlds, and in the reverse order", head, tuple(rows))
     summary = f"{len(rows) - len(broken)} of {len(rows)} groups of episodes have the same bits in every batch and order"
-    return Finding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
+    return CheckFinding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
 
 
 def _compare_batches(context: Context, task: str, tracker: str, ticks: int) -> JsonObject:
     """Ticks compared, and the first at which an episode depends on its batch."""
-    seeds = (context.seeds(task) * BATCHED)[:BATCHED] if context.episodes < BATCHED else context.seeds(task)[:BATCHED]
+    seeds = context.seeds(task, BATCHED)
     traces = []
     for worlds, order in ((1, seeds), (BATCHED, seeds), (BATCHED, seeds[::-1])):
         env = world_of(context, task, tracker, worlds=worlds)
@@ -87,7 +102,7 @@ def _compare_batches(context: Context, task: str, tracker: str, ticks: int) -> J
     }
 
 
-def official(context: Context) -> Finding:
+def official(context: Context) -> CheckFinding:
     """Play the experts through the official TWIST2 weights and compare with those that come with the package."""
     given = context.options.twist2_checkpoint
     if given is None:
@@ -95,7 +110,7 @@ def official(context: Context) -> Finding:
     rows, ours, theirs = [], [], []
     for task in context.tasks:
         ours.append(score(context.evaluate(recorded(context, task, "twist2"))))
-        theirs.append(score(context.evaluate(Cell(task, "twist2", checkpoint=given))))
+        theirs.append(score(context.evaluate(CertifyCell(task, "twist2", checkpoint=given))))
         p = fisher(ours[-1].successes, ours[-1].episodes, theirs[-1].successes, theirs[-1].episodes)
         rows.append((task, *ours[-1].cells(), *theirs[-1].cells(), f"{p:.3f}"))
     a, b = pooled_score(ours), pooled_score(theirs)
@@ -103,10 +118,11 @@ def official(context: Context) -> Finding:
     rows.append(("all", *a.cells(), *b.cells(), f"{p:.3f}"))
     head = ("task", "our weights", "95 % interval", "official weights", "95 % interval", "p")
     sheet = Sheet("Experts through our TWIST2 weights and through the official ones", head, tuple(rows))
-    summary = f"experts succeed in {a.successes} of {a.episodes} with our weights, {b.successes} with the official (p = {p:.2g})"
+    summary = f"experts succeed in {a.successes} of {a.episodes} episodes with our weights, "
+    summary += f"in {b.successes} with the official ones (p = {p:.2g})"
     worse = p < DIFFERENT and a.rate < b.rate
     better = p < DIFFERENT and a.rate > b.rate
-    return Finding("fail" if worse else "note" if better else "pass", summary, (sheet,))
+    return CheckFinding("fail" if worse else "note" if better else "pass", summary, (sheet,))
 
 
 CHECKS = (

@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,9 +20,16 @@ from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK
-from arena_newton.rotations import heading, quat_conjugate, quat_from_yaw, quat_multiply, rotate_xy
-from arena_newton.rotations import rotation_vector, wrap_angle
+from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK, DriveGains
+from arena_newton.rotations import (
+    heading,
+    quat_conjugate,
+    quat_from_yaw,
+    quat_multiply,
+    rotate_xy,
+    rotation_vector,
+    wrap_angle,
+)
 from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:
@@ -48,6 +55,13 @@ LEASH = 0.10
 """The base's target runs ahead of it by so much at most [m], so that it does not wind up where it is blocked."""
 TURN_LEASH = 0.3
 """The same for its yaw [rad]."""
+STIFF_LEG = (2000.0, 2000.0, 2000.0, 2000.0, 600.0, 600.0)
+"""Stiffness of the joints of a held leg, hip to ankle [N·m/rad]: what blocks the base bends the leg by centimetres, so
+that a foot does not slip over a sill. Softer at the ankle, whose inertia is small for a step of 5 ms."""
+STIFF_DAMPING = 0.05
+"""Their damping, as a fraction of the stiffness [s]."""
+STIFF_EFFORT = 2000.0
+"""Their torque limit [N·m]."""
 GRAVITY = 9.81
 """[m/s²]."""
 
@@ -88,15 +102,29 @@ class FrozenLegsEnv(ArenaEnv):
         return super().describe() | {"body": "legs frozen in the standing posture"}
 
 
+def stiffened(drive: DriveGains) -> DriveGains:
+    """A drive whose legs are as stiff as a column; waist, arms and fingers keep their gains."""
+    legs = STIFF_LEG * 2
+    damping = tuple(STIFF_DAMPING * stiffness for stiffness in legs)
+    return dataclasses.replace(
+        drive,
+        name=f"{drive.name}, stiff legs",
+        kp=(*legs, *drive.kp[len(LEGS) :]),
+        kd=(*damping, *drive.kd[len(LEGS) :]),
+        effort=(*(STIFF_EFFORT,) * len(LEGS), *drive.effort[len(LEGS) :]),
+    )
+
+
 class HeldLegs(Tracker):
-    """A tracker whose legs hold the standing posture, whatever its network says; waist and arms are its own."""
+    """A tracker whose legs hold the standing posture stiffly, whatever its network says; waist and arms are its own."""
 
     def __init__(self, inner: Tracker):
         """Take a tracker that is bound to no worlds yet."""
         self.inner = inner
         self.name, self.joints = inner.name, inner.joints
         self.checkpoint, self.checkpoint_hash = inner.checkpoint, inner.checkpoint_hash
-        self.drive, self.original_drive = inner.drive, inner.original_drive
+        self.drive = stiffened(inner.drive)
+        self.original_drive = None if inner.original_drive is None else stiffened(inner.original_drive)
         self.physics_rate, self.fast_physics_rate = inner.physics_rate, inner.fast_physics_rate
         self.ignores, self.max_root_delta_deg = inner.ignores, inner.max_root_delta_deg
         self._takes_mask = "mask" in inspect.signature(inner.step).parameters
@@ -122,7 +150,7 @@ class HeldLegs(Tracker):
         targets[:, list(LEGS)] = self._held
         return targets
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """See `Tracker.describe`."""
         return self.inner.describe() | {"legs": "held in the standing posture"}
 

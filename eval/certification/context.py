@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from arena_newton import seeding, tasks, trackers
+from arena_newton import seeding, tasks
 from arena_newton.doctor import versions
 from arena_newton.errors import InputError
 from arena_newton.eval import run
 from arena_newton.eval.certification.bodies import BODIES, Body
 from arena_newton.eval.config import resolve
 from arena_newton.eval.folder import ResultsFolder
-from arena_newton.eval.identity import PACKAGE, config_hash, hash_path
+from arena_newton.eval.identity import PACKAGE, config_hash, hash_paths, package_files
 from arena_newton.eval.journal import EpisodeRecord, write_atomic
 from arena_newton.eval.options import CertifyOptions, RunOptions
 from arena_newton.eval.plan import PROTOCOL_REPEATS
@@ -25,7 +24,7 @@ from arena_newton.eval.records import Json
 from arena_newton.eval.results import load_run
 from arena_newton.text import counted
 
-__all__ = ["Cell", "Context"]
+__all__ = ["CertifyCell", "Context", "with_expert"]
 
 QUICK_EPISODES = 4
 """Episodes of each cell under --quick."""
@@ -34,7 +33,7 @@ FULL_EPISODES = 60
 
 
 @dataclass(frozen=True)
-class Cell:
+class CertifyCell:
     """One evaluation: a task played many times in one way."""
 
     task: str
@@ -87,22 +86,26 @@ class Context:
         """Names of the trackers."""
         return self.options.tracker
 
+    @property
+    def sample(self) -> tuple[str, ...]:
+        """Trackers of checks that compare experts with themselves: under --quick the first one stands for all."""
+        return self.trackers[:1] if self.options.quick else self.trackers
+
     def plan(self) -> tuple[tuple[int, ...], int]:
         """Group seeds and repeats: the protocol's 20 repeats of each seed where the episodes are a multiple of 20."""
         groups, rest = divmod(self.episodes, PROTOCOL_REPEATS)
         return ((0,), self.episodes) if rest else (tuple(range(groups)), PROTOCOL_REPEATS)
 
-    def seeds(self, task: str) -> list[int]:
-        """Episode seeds of a cell."""
-        groups, repeats = self.plan()
+    def seeds(self, task: str, count: int) -> list[int]:
+        """Episode seeds of a task's first episodes in the protocol: 20 repeats of each group seed."""
         gym_id = tasks.get(task).gym_id
-        return [seeding.episode_seed(gym_id, group, repeat) for group in groups for repeat in range(repeats)]
+        return [seeding.episode_seed(gym_id, *divmod(number, PROTOCOL_REPEATS)) for number in range(count)]
 
-    def path(self, cell: Cell) -> Path:
+    def path(self, cell: CertifyCell) -> Path:
         """Results folder of a cell."""
         return self.folder / "runs" / cell.folder
 
-    def evaluate(self, cell: Cell) -> list[EpisodeRecord]:
+    def evaluate(self, cell: CertifyCell) -> list[EpisodeRecord]:
         """Episodes of a cell in plan order; played, or continued where its results folder has some of them.
 
         Raises:
@@ -113,7 +116,7 @@ class Context:
         config = resolve(
             RunOptions(
                 task=(cell.task,),
-                tracker=cell.tracker,
+                tracker=(cell.tracker,),
                 checkpoint=cell.checkpoint,
                 policy=cell.policy,
                 mode=(cell.mode,),
@@ -140,7 +143,9 @@ class Context:
             raise KeyboardInterrupt
         return load_run(folder.path).records
 
-    def strips(self, cell: Cell, outcome: str | None = None, camera: str = "world") -> list[tuple[EpisodeRecord, Path]]:
+    def strips(
+        self, cell: CertifyCell, outcome: str | None = None, camera: str = "world"
+    ) -> list[tuple[EpisodeRecord, Path]]:
         """Film strips of a cell's episodes, those with an outcome alone if one is named."""
         folder, found = self.path(cell), []
         for record in self.evaluate(cell):
@@ -149,15 +154,20 @@ class Context:
                 found.append((record, folder / name))
         return found
 
-    def measured(self, name: str, settings: Mapping[str, Json], measure: Callable[[], Json]) -> Json:
+    def measured(
+        self, name: str, task: str, tracker: str, settings: Mapping[str, Json], measure: Callable[[], Json]
+    ) -> Json:
         """What a measurement gave that is no evaluation; taken from the folder where the same was measured before.
 
         Args:
-            name: Unique name, which becomes a file's.
-            settings: What the measurement depends on besides code, scenes, engine and number of episodes.
+            name: Name of the measurement, unique for a task and tracker; it becomes a file's.
+            task: What it plays.
+            tracker: Through which tracker.
+            settings: What it depends on besides these, code, scenes, weights and engine.
             measure: Measures; its answer is JSON.
         """
-        known = config_hash([self._ground(), dict(settings)])
+        known = config_hash([self._ground(task, tracker), dict(settings)])
+        name = f"{name}_{task}_{tracker}"
         path = self.folder / "measured" / f"{name}.json"
         with contextlib.suppress(OSError, ValueError, KeyError):
             stored = json.loads(path.read_text(encoding="utf-8"))
@@ -170,20 +180,14 @@ class Context:
         write_atomic(path, json.dumps({"known_by": known, "value": value}, indent=1) + "\n")
         return value
 
-    def _ground(self) -> Json:
-        """Code, scenes and flags that every measurement depends on."""
-        seeds, repeats = self.plan()
-        options = RunOptions(
-            task=self.tasks, seeds=seeds, repeats=repeats, engine=self.options.engine, device=self.options.device
-        )
-        weights = [shipped and hash_path(shipped) for shipped in map(trackers.shipped_weights, self.trackers)]
-        checks = hash_path(PACKAGE / "eval" / "certification")
-        identity: Json = json.loads(json.dumps([dict(resolve(options).identity()), weights, checks]))
-        return identity
-
-    def first_tracker(self) -> str:
-        """The tracker of checks that need only one."""
-        return self.trackers[0]
+    def _ground(self, task: str, tracker: str) -> Json:
+        """Code, scenes, weights and flags that a measurement of a task depends on."""
+        options = RunOptions(task=(task,), tracker=(tracker,), seeds=(0,), repeats=1)
+        options = replace(options, engine=self.options.engine, device=self.options.device)
+        folder = PACKAGE / "eval" / "certification"
+        checks = hash_paths(folder, [file for file in package_files(folder) if file.suffix == ".py"])
+        ground: Json = json.loads(json.dumps([dict(resolve(options).identity()), checks]))
+        return ground
 
 
 def with_expert(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -202,8 +206,3 @@ def with_expert(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
             raise InputError(f"--task {name}: given twice")
     has = tuple(name for name in chosen if tasks.get(name).expert is not None)
     return has, tuple(name for name in chosen if name not in has)
-
-
-def narrowed(context: Context, **changes: object) -> Context:
-    """The context with other options."""
-    return dataclasses.replace(context, options=dataclasses.replace(context.options, **changes))  # type: ignore[arg-type]

@@ -13,7 +13,18 @@ if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
     from arena_newton.eval.journal import EpisodeRecord
 
-__all__ = ["Check", "Finding", "Picture", "Score", "Sheet", "Verdict", "percent", "pooled_score", "score", "skipped"]
+__all__ = [
+    "Check",
+    "CheckFinding",
+    "Picture",
+    "Score",
+    "Sheet",
+    "Verdict",
+    "percent",
+    "pooled_score",
+    "score",
+    "skipped",
+]
 
 Verdict = Literal["pass", "fail", "note", "skip"]
 """`note`: something that a reader must know and that no change of the benchmark repairs; `skip`: was not measured."""
@@ -37,7 +48,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckFinding:
     """What a check measured and what follows from it."""
 
     verdict: Verdict
@@ -56,7 +67,7 @@ class Check:
     name: str
     """Name on the command line."""
     question: str
-    run: Callable[[Context], Finding]
+    run: Callable[[Context], CheckFinding]
     """Measures; raises `InputError` only for input that a user can repair."""
 
 
@@ -103,6 +114,6 @@ def pooled_score(scores: Sequence[Score]) -> Score:
     )
 
 
-def skipped(reason: str) -> Finding:
+def skipped(reason: str) -> CheckFinding:
     """A check that was not measured."""
-    return Finding("skip", reason)
+    return CheckFinding("skip", reason)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from arena_newton.eval.certification.context import Cell, Context
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Sheet, pooled_score, score
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet, Verdict, pooled_score, score
 from arena_newton.eval.certification.solvable import recorded
 
 __all__ = ["CHECKS", "GLIDES"]
@@ -17,7 +17,7 @@ GLIDES: Mapping[str, str] = {
     ),
     "vis_navi": (
         "the rule asks for both ankle links inside the area's box and an upright robot; legs that hang still from a "
-        "gliding base are carried over the floor into it. It tests navigation, and feet only through what they bump into"
+        "gliding base are carried over the floor into it. It tests navigation; feet only by what they bump into"
     ),
 }
 """Task that a gliding base can solve → why. A base on wheels is not what the rules forbid: they read where hands, feet
@@ -29,14 +29,14 @@ SHOWN = 2
 def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, tuple[Picture, ...]]:
     """Successes of the experts with a body by task, the table of them, and pictures of those successes."""
     rows, pictures, found = [], [], {}
-    for tracker in context.trackers:
+    for tracker in context.sample:
         for task in context.tasks:
-            cell = Cell(task, tracker, body=body, strip=True)
+            cell = CertifyCell(task, tracker, body=body, strip=True)
             whole, records = score(context.evaluate(recorded(context, task, tracker))), context.evaluate(cell)
             one = score(records)
             found[task] = found.get(task, 0) + one.successes
             falls = sum(record.outcome == "fall" for record in records)
-            reached = sum(record.progress for record in records) / max(len(records), 1)
+            reached = sum(record.progress or 0.0 for record in records) / max(len(records), 1)
             rows.append((task, tracker, *one.cells(), str(falls), f"{reached:.2f}", whole.cells()[0]))
             for record, path in context.strips(cell, "success")[:SHOWN]:
                 which = f"{task} through {tracker}, seed {record.group_seed} repeat {record.repeat}"
@@ -45,21 +45,21 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, t
     return found, Sheet(f"Experts with {context.bodies[body].title}", head, tuple(rows)), tuple(pictures)
 
 
-def frozen(context: Context) -> Finding:
+def frozen(context: Context) -> CheckFinding:
     """Play every task with legs that only stand."""
     found, sheet, pictures = _without_legs(context, "frozen")
     solved = {task: count for task, count in found.items() if count}
-    total = len(context.trackers) * len(context.tasks) * context.episodes
+    total = len(context.sample) * len(context.tasks) * context.episodes
     summary = f"{sum(found.values())} successes in {total} episodes with the legs frozen in the standing posture"
     notes = tuple(f"{task}: {count} successes with frozen legs, see the pictures" for task, count in solved.items())
-    return Finding("fail" if solved else "pass", summary, (sheet,), notes, pictures)
+    return CheckFinding("fail" if solved else "pass", summary, (sheet,), notes, pictures)
 
 
-def gliding(context: Context) -> Finding:
+def gliding(context: Context) -> CheckFinding:
     """Play every task with a base that glides."""
     found, sheet, pictures = _without_legs(context, "gliding")
     whole = pooled_score(
-        [score(context.evaluate(recorded(context, task, tracker))) for tracker in context.trackers for task in found]
+        [score(context.evaluate(recorded(context, task, tracker))) for tracker in context.sample for task in found]
     )
     solved = {task: count for task, count in found.items() if count}
     unknown = [task for task in solved if task not in GLIDES]
@@ -68,8 +68,8 @@ def gliding(context: Context) -> Finding:
     summary += " ".join(needed) or "none"
     notes = [f"{task}, {count} successes: {GLIDES[task]}." for task, count in solved.items() if task in GLIDES]
     notes += [f"{task}, {solved[task]} successes: no reason is known, see the pictures." for task in unknown]
-    verdict = "fail" if unknown else "note" if solved else "pass"
-    return Finding(verdict, summary, (sheet,), tuple(notes), pictures)
+    verdict: Verdict = "fail" if unknown else "note" if solved else "pass"
+    return CheckFinding(verdict, summary, (sheet,), tuple(notes), pictures)
 
 
 CHECKS = (

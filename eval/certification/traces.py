@@ -1,4 +1,4 @@
-"""Every bit of an episode as text: what tells whether two episodes are the same, and from which tick on they are not."""
+"""Every bit of an episode as text: what tells whether two episodes are the same, and from which tick they are not."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["StateTrace", "first_difference", "play", "world_of"]
 
 
 class StateTrace(Recorder):
-    """Hashes positions, velocities and actuator targets of each episode at each tick, start-up included."""
+    """Hashes positions, velocities, actuator targets and body poses of each episode at each tick, start-up included."""
 
     def __init__(self) -> None:
         """Know no episode yet."""
@@ -35,7 +35,9 @@ class StateTrace(Recorder):
 
     def tick(self, env: World) -> None:
         """See `Recorder.tick`."""
-        arrays = [array.numpy() for array in (env.physics.qpos, env.physics.qvel, env.physics.ctrl)]
+        p = env.physics
+        # The poses of fixtures, which no joint moves, are in those of the bodies.
+        arrays = [array.numpy() for array in (p.qpos, p.qvel, p.ctrl, p.xpos, p.xquat)]
         for world in np.flatnonzero(env.active).tolist():
             state = b"".join(array[world].tobytes() for array in arrays)
             self.traces[self._running[world]].append(hashlib.blake2b(state, digest_size=8).hexdigest())

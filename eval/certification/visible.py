@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from arena_newton import policies, tasks
+from arena_newton import policies
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, Finding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.certification.traces import world_of
 from arena_newton.eval.records import JsonObject
 from arena_newton.interfaces import World
@@ -40,10 +40,10 @@ TINT = np.array([255.0, 0.0, 255.0])
 """Colour of the target's pixels in the page's pictures, RGB."""
 
 
-def visible(context: Context) -> Finding:
+def visible(context: Context) -> CheckFinding:
     """Let the experts act and look for their targets in the pictures that a policy would see."""
     rows, missing, late, pictures = [], [], [], []
-    tracker, shown, total = context.first_tracker(), 0, 0
+    tracker, shown, total = context.trackers[0], 0, 0
     for task in context.tasks:
         if task not in TARGETS:
             missing.append(f"{task}: no target is named for it")
@@ -53,7 +53,7 @@ def visible(context: Context) -> Finding:
         def measure(task: str = task, picture: Path = picture) -> JsonObject:
             return _look(context, task, tracker, picture)
 
-        found = context.measured(f"visible_{task}", {"tracker": tracker, "seen": SEEN, "every": EVERY}, measure)
+        found = context.measured("visible", task, tracker, {"episodes": context.episodes}, measure)
         assert isinstance(found, dict)
         sights, pixels = list(found["first"]), list(found["pixels"])
         seen = sorted(int(tick) for tick in sights if tick is not None)
@@ -69,17 +69,27 @@ def visible(context: Context) -> Finding:
         missing += [f"{task}: never seen in {never} of {len(sights)} episodes"] * bool(never)
         if picture.is_file():
             pictures.append(Picture(f"{task}: {TARGETS[task]} when it is seen first, with its pixels marked", picture))
-    head = ("task", "target", "in the first picture", "its pixels there, median", "seen at tick, median", "latest", "never")
-    sheet = Sheet(f"The head camera's picture of the expert's episodes, looked at every {EVERY} ticks", head, tuple(rows))
+    head = (
+        "task",
+        "target",
+        "in the first picture",
+        "its pixels there, median",
+        "seen at tick, median",
+        "latest",
+        "never",
+    )
+    sheet = Sheet(
+        f"The head camera's picture of the expert's episodes, looked at every {EVERY} ticks", head, tuple(rows)
+    )
     summary = f"the target is in the first picture of {shown} of {total} episodes"
     summary += "" if missing else ", and is seen in all of them"
     notes = (*missing, *late, f"Seen means {SEEN} pixels or more of the 224 x 168 that the lens fills.")
-    return Finding("fail" if missing else "note" if late else "pass", summary, (sheet,), notes, tuple(pictures))
+    return CheckFinding("fail" if missing else "note" if late else "pass", summary, (sheet,), notes, tuple(pictures))
 
 
 def _look(context: Context, task: str, tracker: str, picture: Path) -> JsonObject:
     """First sights of a task's episodes."""
-    seeds = context.seeds(task)[: context.options.worlds]
+    seeds = context.seeds(task, min(context.episodes, context.options.worlds))
     env = world_of(context, task, tracker, worlds=len(seeds), camera=CameraConfig())
     first, pixels, image = first_sights(env, seeds, TARGETS[task])
     env.close()

@@ -16,7 +16,6 @@ import warp as wp
 from torch import Tensor
 
 from arena_newton import tasks as task_registry
-from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Json, Mask, Policy, world_mask
@@ -137,6 +136,9 @@ class Expert:
 
     task: str = ""
     """Name of the task that it solves."""
+    reference: ReferenceGenerator
+    """The generator that makes its actions, known from `attach` on: an expert that must place its feet reads the
+    phase of the gait there."""
 
     def __init__(self, sight: Sight):
         """Look up what the task needs in the scene.
@@ -205,7 +207,7 @@ class ExpertPolicy(Policy):
         expert = expert_class(env.spec.name)
         self.sight = Sight(env)
         self.expert = expert(self.sight)
-        self.generator = ReferenceGenerator(env.worlds, env.torch_device)
+        self.generator = self.expert.reference = ReferenceGenerator(env.worlds, env.torch_device)
         self.style = Style(env.worlds, env.torch_device)
         self._begins = np.ones(env.worlds, dtype=bool)
         self._asked = np.zeros(env.worlds, dtype=np.int64)

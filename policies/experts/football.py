@@ -28,8 +28,13 @@ __all__ = ["FootballExpert"]
 
 DISTRACTOR = "/World/Distractor"
 """The second ball; only in the semantic scene of the rule set `released`."""
-PHASES = {"approach": 12.0, "kick": 5.0, "follow": 0.4, "watch": 8.0}
-"""Longest times [s]: the farthest ball is 4 m away; the line is 0.9 m long; a step after the touch; 4 m at 0.5 m/s."""
+PHASES = {"approach": 12.0, "kick": 5.0, "follow": 2.0, "watch": 8.0}
+"""Longest times [s]: the farthest ball is 4 m away; the line is 0.9 m long; four steps for a weak touch; 4 m at
+0.5 m/s."""
+STEP = 0.4
+"""Time that the robot walks on after a touch [s]: the step that it is in."""
+WEAK = 0.5
+"""A ball slower than this [m/s] is touched again: the robot that walks on overtakes it."""
 LANE = 0.115
 """The foot that kicks is this far beside the pelvis [m]: half of a walking stance."""
 AIM_BEHIND = 0.37
@@ -41,6 +46,12 @@ AIM_WITHIN = 0.8
 """Largest distance of the aim from the goal's middle [m]; the posts are at 2.5 m."""
 CLEAR = 0.36
 """Distance that the ball's path should keep from the other ball [m]: two radii and an error of 5° over 1.5 m."""
+FROM_POST = 0.5
+"""Distance from a post that an aim past the other ball keeps [m]."""
+AIMS = 25
+"""Number of aims that are compared."""
+COLLISION = 30.0
+"""What a lack of that distance costs against a shift of the aim [m per m]."""
 ON_LINE = (0.09, 0.12)
 """Errors behind the ball with which the kick begins [m, rad]; the walk along the line takes what is left."""
 SLOW_DOWN = (6.0, 0.15)
@@ -49,8 +60,10 @@ TOUCHED = 0.15
 """Change of the ball's velocity during a kick that tells a touch [m/s]."""
 PASSED = 0.20
 """A pelvis this far past the ball has missed it [m]."""
-ROLLED = 0.10
+ROLLED = 0.03
 """A ball that rolled this far since the path was planned requires a new one [m]."""
+CAUGHT = 0.6
+"""A slower ball is walked after: its velocity is added to the robot's [m/s]."""
 SLOW = 0.08
 """A ball slower than this counts as at rest [m/s]."""
 LONGEST_ROLL = 8.0
@@ -58,7 +71,7 @@ LONGEST_ROLL = 8.0
 
 
 class FootballExpert(Expert):
-    """`approach` a pose behind the ball, `kick` by walking through it, `follow` for one step, `watch` it roll."""
+    """`approach` a pose behind the ball, `kick` by walking through, `follow` until it rolls well, `watch` it roll."""
 
     task = "football"
 
@@ -107,10 +120,14 @@ class FootballExpert(Expert):
         kicking = mask & states.at("kick")
         touched = kicking & (torch.linalg.vector_norm(velocity - self._before, dim=1) > TOUCHED)
         states.enter("follow", touched)
-        states.enter("watch", mask & states.at("follow") & states.late)
-        kicking = kicking & ~touched
-        self.lane = select(kicking, self._line(ball), self.lane)  # a ball that still rolls takes its line with it
-        missed = kicking & ((self._ahead(pose)[:, 0] > PASSED) | states.late)
+        following = mask & states.at("follow")
+        kicked = following & (states.clock >= STEP) & (speed > WEAK)
+        states.enter("watch", kicked | following & states.late)
+        kicking = mask & states.at("kick", "follow")
+        # A ball that rolls takes its line with it; once kicked well, the step is ended on the old one.
+        self.lane = select(kicking & (speed < WEAK), self._line(ball), self.lane)
+        missed = kicking & (speed < WEAK) & (self._ahead(pose)[:, 0] > PASSED)
+        missed = missed | mask & states.at("kick") & states.late
         over = mask & states.at("watch") & ((speed < SLOW) | self._hopeless(ball, velocity) | states.late)
         states.enter("approach", missed | over)
         away = torch.linalg.vector_norm(ball - self._aimed, dim=1) > ROLLED
@@ -127,9 +144,11 @@ class FootballExpert(Expert):
         off, (steep, least) = self._ahead(pose)[:, 1].abs(), SLOW_DOWN
         forward = self._speed * (1.0 - steep * off).clamp_min(least)
         through = along(pose, self.lane[:, :2], self.lane[:, 2], forward)
+        drift = rotate_xy(-pose[:, 2], velocity) * ((speed > SLOW) & (speed < CAUGHT))[:, None]
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         command.velocity = select(states.at("approach"), answer.velocity, command.velocity)
         command.velocity = select(states.at("kick", "follow"), through, command.velocity)
+        command.velocity[:, :2] += drift * states.at("approach", "kick")[:, None]
         command.step_time = self._step_time
         command.arms = self._arms
         self._shown = select(mask, states.phase, self._shown)
@@ -179,17 +198,19 @@ class FootballExpert(Expert):
         middle = goal[:, 0]
         x = middle + (AIM_SHARE * (ball[:, 0] - middle)).clamp(-AIM_WITHIN, AIM_WITHIN)
         for body in self._others:
-            x = self._past(self.sight.body(body)[0][:, :2], ball, x, line)
+            other = self.sight.body(body)[0][:, :2]
+            x = self._past(other, ball, x, line, middle)
         return torch.stack([x, line], dim=1)
 
-    @staticmethod
-    def _past(other: Tensor, ball: Tensor, x: Tensor, line: Tensor) -> Tensor:
+    def _past(self, other: Tensor, ball: Tensor, x: Tensor, line: Tensor, middle: Tensor) -> Tensor:
         """The x of the aim nearest to a wanted one with which the ball's path clears another ball [m]."""
-        shifts = torch.linspace(-1.6, 1.6, 17, device=x.device)
-        aim = torch.stack(torch.broadcast_tensors(x[:, None] + shifts, line[:, None]), dim=2)
-        path = aim - ball[:, None]
+        wide = self._goal_half[0] - FROM_POST
+        aims = middle[:, None] + torch.linspace(-wide, wide, AIMS, device=x.device)
+        path = torch.stack([aims, line[:, None].expand_as(aims)], dim=2) - ball[:, None]
         offset = (other - ball)[:, None]
         fraction = ((offset * path).sum(2) / path.square().sum(2)).clamp(0.0, 1.0)
         gap = torch.linalg.vector_norm(offset - fraction[..., None] * path, dim=2)
-        price = shifts.abs() + 10.0 * (CLEAR - gap).clamp_min(0.0)
-        return x + shifts[price.argmin(dim=1)]
+        price = (aims - x[:, None]).abs() + COLLISION * (CLEAR - gap).clamp_min(0.0)
+        nearest = torch.gather(aims, 1, price.argmin(dim=1, keepdim=True))[:, 0]
+        blocked = ((aims - x[:, None]).abs() < wide / AIMS) & (gap < CLEAR)
+        return torch.where(blocked.any(dim=1), nearest, x)

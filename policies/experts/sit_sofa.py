@@ -1,11 +1,11 @@
 """SitSofa's expert: around the cartons to the open end of the gap in front of the sofa, sideways in, back, down.
 
-The gap between coffee table and sofa is 0.59 m wide: a robot that turns in it hits one of the two. So it turns its back
-to the sofa at the gate, next to the gap, and goes in sideways.
+The gap between coffee table and sofa is 0.59 m wide, and a robot that turns in it hits one of the two. So it turns its
+back to the sofa at a gate next to the gap, and goes in sideways.
 
-What decisions are read from: sofa, table and cartons are in the head camera's picture from the start on. Later the
-sofa is behind the robot, and its true pose is a stand-in for what the robot remembers of it: the sofa never moves.
-The end of the way back and down is judged by the robot's own pose and by time, not by a contact force.
+What decisions are read from: sofa, table and both cartons are in the head camera's picture from the start on. Later
+the sofa is behind the robot, and its true pose is a stand-in for what the robot remembers: it never moves. How far back
+and down the robot is follows from its own pose and from time, not from a contact force.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.phases import Phases, select
-from arena_newton.policies.experts.planning import Floor, footprint, signed_distance
+from arena_newton.policies.experts.planning import CLEARANCES, Floor, footprint, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk
 from arena_newton.rotations import heading, rotate_xy, wrap_angle
@@ -27,48 +27,57 @@ from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.navigate import NavigationLimits
 from arena_newton.trackers.motions.primitives import FORWARD_ARMS
 
-__all__ = ["SitSofaExpert"]
+__all__ = ["LONGEST", "SitSofaExpert"]
 
 SOFA, TABLE = "/World/Sofa", "/World/CoffeeTable"
 SHOULDER_PITCHES, ELBOWS = [0, 7], [3, 10]
 """Among the 14 columns of `MotionCommand.arms`."""
 
-GATE_ASIDE = (0.26, 0.36, 0.46, 0.56, 0.66)
-"""How far beyond the end of the seat the robot may turn its back to the sofa [m]: the nearest one that is free. The
-armrest ends 0.10 m beyond the seat."""
-GATE_AHEAD = (0.36, 0.30, 0.24)
-"""How far in front of the seat's edge it may do so [m]; the table is 0.59 m in front of it."""
-GATE_CLEARANCE = 0.36
-"""Distance that a gate should keep from everything [m]: a turning robot with its arms."""
+LIMITS = NavigationLimits(forward=0.58, turn=0.9, sideways=0.28)
+"""Of the walk to the gate: faster than the navigator's own, for the step budget of `paper` is short."""
+GATE_ASIDE = (0.26, 0.34, 0.42, 0.50, 0.60, 0.70)
+"""How far beyond the end of the seat the robot may turn its back to the sofa [m]. The armrest ends 0.10 m beyond it."""
+GATE_AHEAD = (0.36, 0.26, 0.16, 0.06, -0.04, -0.14, -0.24)
+"""How far in front of the seat's edge it may do so [m], negative next to the armrest. The best gate is the first one
+of both lists; a carton in front of the gap moves it."""
+GATE_CLEARANCE = CLEARANCES[-1] + 0.01
+"""Distance of a gate from all obstacles [m]: with less no path leads to it."""
 GATE_WITHIN = (0.12, 0.20)
 """Errors at the gate that the way sideways takes up [m, rad]."""
 MOVED = 0.06
 """A carton that moved farther than this since the path was planned requires a new one [m]."""
-SEAT_ASIDE = (-0.50, -0.42)
-"""Where to sit, from the end of the seat [m], range of the style: shoulder and arm fit next to the armrest from -0.32 on,
-and farther in the back points at the middle of the seat within 45° (the task's predicate `turn`)."""
-INSIDE_AHEAD = (0.28, 0.33)
-"""How far in front of the edge the robot goes sideways [m], range of the style: half of the gap."""
-PACE = (0.92, 1.0)
-"""Fraction of the navigator's speed on the way to the gate, range of the style: the step budget allows no less."""
-ARMS_UP, ELBOWS_OUT = 0.15, 0.20
-"""Shoulders' pitch and elbows differ by up to this from `FORWARD_ARMS` while the robot sits down [rad]: style."""
-SEAT_AHEAD = 0.12
-"""Pelvis in front of the edge at the end of the way back [m]: the calves are about to touch the sofa."""
-SIDEWAYS, BACKWARD, TURN = 0.30, 0.22, 0.6
+
+SIDEWAYS, BACKWARD, TURN = 0.34, 0.22, 0.6
 """Largest speeds in the gap [m/s, m/s, rad/s]."""
 GAIN, HEADING_GAIN = 1.5, 1.5
 """Speed for a distance, yaw rate for a heading error [1/s]."""
 CRAWL = 0.06
-"""Smallest speed on the way sideways or back [m/s]; without it the last centimetres take seconds."""
-BESIDE = 0.08
+"""Smallest speed sideways and back [m/s]; without it the last centimetres take seconds."""
+ASIDE_WITHIN = 0.15
 """Distance sideways at which the way back begins [m]: it takes up the rest."""
+IN_FRONT = -0.25
+"""Nearer to the end of the seat than this there is no sitting down next to the armrest [m]."""
+SEAT_AHEAD = 0.12
+"""Pelvis in front of the edge at the end of the way back [m]: at 0.16 m the robot sits on the edge alone, at 0.08 m the
+seat holds its pelvis 3 cm higher."""
 BACKED = 0.02
 """Distance to the end of the way back that is good enough [m]."""
+NEARER = 0.04
+"""A missed seat is tried again this much nearer to the edge [m]."""
+
+LOWER_HEIGHT, LOWER_BACK = 0.55, 0.22
+"""Pelvis above the floor, and behind its position over the feet, when it touches a seat of 0.42 m [m]."""
+PRESS_HEIGHT, PRESS_BACK = 0.51, 0.34
+"""The same at the end [m]: into the cushion, since a tracker keeps the weight over the feet as far as it can."""
+LEAN = 0.20
+"""Forward lean of pelvis and of waist on the way down [rad]."""
+RISE_HEIGHT, RISE_LEAN = 0.59, (0.45, 0.35)
+"""Pelvis above the floor [m] and leans [rad] until the weight is over the feet again: leaving the seat earlier, the
+robot falls back (as in `primitives.rise`)."""
 
 LONGEST = {
-    "approach": 14.0,
-    "sideways": 6.0,
+    "approach": 16.0,
+    "sideways": 7.0,
     "back": 4.0,
     "stand": 0.8,
     "lower": 2.2,
@@ -78,27 +87,24 @@ LONGEST = {
     "straighten": 1.2,
     "forward": 2.0,
 }
-"""Phase → longest time [s]. `stand` to `sit` and `rise` take just this time; `sit` ends only when the seat was missed,
-since success ends the episode."""
-
-LOWER_HEIGHT, LOWER_BACK = 0.55, 0.22
-"""Pelvis above the floor and behind its position over the feet when it touches the seat of 0.42 m [m]."""
-PRESS_HEIGHT, PRESS_BACK = 0.51, 0.34
-"""The same at the end [m]: commanded into the cushion, since a tracker keeps the weight over the feet as it can."""
-LEAN = 0.20
-"""Forward lean of pelvis and of waist on the way down [rad]."""
+"""Phase → longest time [s]. `stand` to `straighten` take just this time. Success ends the episode: `sit` ends only
+where the seat was missed. A walk that is late is planned again."""
 NEXT = dict(zip(LONGEST, [*list(LONGEST)[1:], "back"], strict=True))
-"""Phase → the one after it; the last one goes back to the edge."""
-RISE_LEAN = (0.45, 0.35)
-"""The same on the way up, when the weight must come over the feet before the seat is left [rad]."""
-RISE_HEIGHT = 0.59
-"""Pelvis above the floor until its weight is over the feet [m]."""
-RISE_BEHIND = 0.04
-"""A missed seat is tried again this much nearer to the edge [m]."""
+"""Phase → the one after it; the last one leads back to the edge."""
+
+SEAT_ASIDE = (-0.50, -0.42)
+"""Style: where to sit, from the end of the seat [m]. Shoulder and arm fit next to the armrest from -0.32 on; from -0.41
+on the back points at the middle of the seat within 45° (the task's predicate `turn`)."""
+GAP_AHEAD = (0.28, 0.33)
+"""Style: distance from the edge on the way sideways [m]: half of the gap."""
+PACE = (0.92, 1.0)
+"""Style: fraction of the navigator's speed; the step budget allows no less."""
+ARMS_UP, ELBOWS_OUT = 0.15, 0.20
+"""Style: largest difference of shoulder pitch and elbow from `FORWARD_ARMS` on the way down [rad]."""
 
 
 class SitSofaExpert(Expert):
-    """To the gate, sideways in front of the seat, back to its edge, down; up and once more where the seat was missed."""
+    """To the gate, sideways in front of the seat, back to its edge, down; where the seat was missed, up and again."""
 
     task = "sit_sofa"
 
@@ -106,40 +112,39 @@ class SitSofaExpert(Expert):
         """Find sofa, table and cartons."""
         super().__init__(sight)
         worlds, device, scene = sight.worlds, sight.device, sight.scene
-        self._seat = scene.marker(SEAT)
-        self._edge = sight.frame(SEAT)
-        solids = [scene.geom_labels[geom] for prim in (SOFA, TABLE) for geom in scene.geom_ids(prim)]
-        self._solids = [sight.box(solid) for solid in solids]
+        self._seat, self._centre = scene.marker(SEAT), sight.frame(SEAT)
+        self._half = torch.tensor(self._seat.half[:2], dtype=torch.float32, device=device)
+        self._turned = heading(torch.tensor([self._seat.quat], dtype=torch.float32, device=device))
+        self._sofa, self._table = (
+            [sight.box(scene.geom_labels[geom]) for geom in scene.geom_ids(prim)] for prim in (SOFA, TABLE)
+        )
         self._cartons = [sight.box(carton) for carton in CARTONS]
-        self._half = torch.tensor(self._seat.half, dtype=torch.float32, device=device)
-        self._forward_arms = torch.tensor(FORWARD_ARMS, dtype=torch.float32, device=device)
-        limits = NavigationLimits(forward=0.55, turn=0.9, sideways=0.28, arrive_position=0.045, arrive_heading=0.06)
-        self.walk = Walk(sight, limits)
+        self.walk = Walk(sight, LIMITS)
         self.phase = Phases(LONGEST, worlds, device)
         """Where each world is in the task."""
-        self._named: list[str] = []
+        self._named = self.phase.names()
+        self._most = torch.tensor([BACKWARD, SIDEWAYS], device=device)
         self._seen = torch.zeros(worlds, len(CARTONS), 5, device=device)
-        self._seat_aside = torch.zeros(worlds, device=device)
         self._nearer = torch.zeros(worlds, device=device)
-        self._inside_ahead = torch.zeros(worlds, device=device)
+        self._seat_aside = torch.zeros(worlds, device=device)
+        self._gap_ahead = torch.zeros(worlds, device=device)
         self._pace = torch.ones(worlds, device=device)
-        self._arms = self._forward_arms.repeat(worlds, 1)
+        self._arms = torch.tensor(FORWARD_ARMS, dtype=torch.float32, device=device).repeat(worlds, 1)
 
     def begin(self, mask: Tensor, style: Style) -> None:
-        """Draw the style, plan from the robot's position."""
+        """Draw the style; the first command plans."""
         self.phase.begin(mask)
         self.walk.begin(mask)
-        self._seat_aside = select(mask, style.uniform("seat aside", *SEAT_ASIDE), self._seat_aside)
-        self._inside_ahead = select(mask, style.uniform("inside ahead", *INSIDE_AHEAD), self._inside_ahead)
-        self._pace = select(mask, style.uniform("pace", *PACE), self._pace)
-        arms = self._forward_arms.repeat(self.sight.worlds, 1)
-        arms[:, SHOULDER_PITCHES] += style.uniform("arms up", -ARMS_UP, ARMS_UP)[:, None]
-        arms[:, ELBOWS] += style.uniform("elbows", -ELBOWS_OUT, ELBOWS_OUT)[:, None]
-        self._arms = select(mask, arms, self._arms)
         self._nearer = self._nearer.masked_fill(mask, 0.0)
-        self._plan(mask, self._boxes(self._cartons))
+        self._seat_aside = select(mask, style.uniform("seat aside", *SEAT_ASIDE), self._seat_aside)
+        self._gap_ahead = select(mask, style.uniform("gap ahead", *GAP_AHEAD), self._gap_ahead)
+        self._pace = select(mask, style.uniform("pace", *PACE), self._pace)
+        arms = torch.tensor(FORWARD_ARMS, dtype=torch.float32, device=self._arms.device).repeat(len(mask), 1)
+        arms[:, SHOULDER_PITCHES] += style.uniform("arms up", -ARMS_UP, ARMS_UP)[:, None]
+        arms[:, ELBOWS] += style.uniform("elbows out", -ELBOWS_OUT, ELBOWS_OUT)[:, None]
+        self._arms = select(mask, arms, self._arms)
 
-    def _boxes(self, boxes: list[tuple[int, Tensor, Tensor]]) -> Tensor:
+    def _rectangles(self, boxes: list[tuple[int, Tensor, Tensor]]) -> Tensor:
         """Boxes as rectangles on the floor, shape [worlds, boxes, 5]."""
         found = []
         for body, offset, half in boxes:
@@ -148,100 +153,110 @@ class SitSofaExpert(Expert):
         return torch.stack(found, dim=1)
 
     def _frame(self) -> tuple[Tensor, Tensor]:
-        """Middle of the seat [m] and its heading [rad], in which y points where a sitter looks."""
+        """Middle of the seat [m] and the heading of its x axis [rad]; a sitter looks along y."""
         quat = self.sight.body(self._seat.body_id)[1]
-        own = torch.tensor(self._seat.quat, dtype=torch.float32, device=quat.device)
-        return self._edge()[:, :2], wrap_angle(heading(quat) + heading(own[None]))
+        return self._centre()[:, :2], wrap_angle(heading(quat) + self._turned)
 
-    def _world(self, aside: Tensor, ahead: Tensor) -> Tensor:
-        """Points [m] given from the end of the seat outwards and from its edge to the front; [W, n] to [W, n, 2]."""
-        middle, yaw = self._frame()
-        local = torch.stack([self._half[0] + aside, self._half[1] + ahead], dim=-1)
-        return middle[:, None] + rotate_xy(yaw[:, None].expand(aside.shape), local)
-
-    def _place(self) -> Tensor:
-        """Robots from the end of the seat and its edge [m], and headings away from straight out [rad]; [W, 3]."""
-        pose = self.sight.pose
-        middle, yaw = self._frame()
-        local = rotate_xy(-yaw, pose[:, :2] - middle) - self._half[:2]
-        return torch.cat([local, wrap_angle(pose[:, 2] - yaw - math.pi / 2)[:, None]], dim=1)
+    def _offset(self) -> Tensor:
+        """The robot beyond the end of the seat, ahead of its edge [m], and off the sitter's heading [rad]; [W, 3]."""
+        pose, (middle, yaw) = self.sight.pose, self._frame()
+        local = rotate_xy(-yaw, pose[:, :2] - middle) - self._half
+        return torch.cat([local, wrap_angle(pose[:, 2] - yaw - 0.5 * math.pi)[:, None]], dim=1)
 
     def _plan(self, mask: Tensor, cartons: Tensor) -> None:
         """Choose the gate and the path to it."""
-        worlds, device = len(cartons), cartons.device
-        boxes = torch.cat([self._boxes(self._solids), cartons], dim=1)
-        aside, ahead = torch.cartesian_prod(
-            torch.tensor(GATE_ASIDE, device=device), torch.tensor(GATE_AHEAD, device=device)
-        ).unbind(1)
-        gates = self._world(aside.expand(worlds, -1), ahead.expand(worlds, -1))
-        lack = (GATE_CLEARANCE - signed_distance(gates, boxes)).clamp_min(0.0)
-        price = 3.0 * lack + (aside - GATE_ASIDE[0]) + 0.5 * (GATE_AHEAD[0] - ahead)
-        gate = gates[torch.arange(worlds, device=device), price.argmin(dim=1)]
-        back_turned = self._frame()[1] + math.pi / 2
-        self.walk.to(mask, torch.cat([gate, back_turned[:, None]], dim=1), Floor(boxes, *ROOM))
+        middle, yaw = self._frame()
+        boxes = torch.cat(
+            [_cover(self._rectangles(self._sofa), yaw)[:, None], self._rectangles(self._table), cartons], dim=1
+        )
+        aside, ahead = (torch.tensor(offsets, device=boxes.device) for offsets in (GATE_ASIDE, GATE_AHEAD))
+        grid = torch.cartesian_prod(aside, ahead)
+        gates = middle[:, None] + rotate_xy(
+            yaw[:, None].expand(-1, len(grid)), (grid + self._half).expand(len(boxes), -1, 2)
+        )
+        grown = torch.cat([boxes[..., :3], boxes[..., 3:] + GATE_CLEARANCE], dim=2)
+        lack = (-signed_distance(gates, grown)).clamp_min(0.0)
+        # Walking is faster than going sideways, and a gate in a corner costs turns.
+        price = 10.0 * lack + grid[:, 0] + 0.5 * (GATE_AHEAD[0] - grid[:, 1])
+        gate = gates[torch.arange(len(gates), device=gates.device), price.argmin(dim=1)]
+        goal = torch.cat([gate, (yaw + 0.5 * math.pi)[:, None]], dim=1)
+        self.walk.to(mask, goal, Floor(boxes, *ROOM))
         self._seen = select(mask, cartons, self._seen)
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
-        """Advance the state machine, then command its phase."""
-        cartons = self._boxes(self._cartons)
+        """Command the phase, then see whether it ends."""
+        walking = mask & self.phase.at("approach")
+        cartons = self._rectangles(self._cartons)
         moved = (cartons - self._seen)[..., :2].abs().amax(dim=(1, 2)) > MOVED
-        again = mask & moved & self.phase.at("approach")
+        again = walking & (moved | (self.phase.clock == 0.0))
         if again.any():
             self._plan(again, cartons)
-        walk = self.walk.command(mask & self.phase.at("approach"), dt)
+        walk = self.walk.command(walking, dt)
         self.phase.advance(mask, dt)
-        place = self._place()
         self._named = self.phase.names()
-        command = self._act(walk.velocity, place)
+        offset = self._offset()
+        command = self._act(walk.velocity, offset)
+
+        late = self.phase.late
+        lost = mask & late & (self.phase.at("approach") | (self.phase.at("sideways") & (offset[:, 0] > IN_FRONT)))
         early = {
             "approach": (walk.distance < GATE_WITHIN[0]) & (walk.heading_error.abs() < GATE_WITHIN[1]),
-            "sideways": (place[:, 0] - self._seat_aside).abs() < BESIDE,
-            "back": place[:, 1] < SEAT_AHEAD - self._nearer + BACKED,
-            "forward": place[:, 1] > self._inside_ahead,
+            "sideways": (offset[:, 0] - self._seat_aside).abs() < ASIDE_WITHIN,
+            "back": offset[:, 1] < SEAT_AHEAD - self._nearer + BACKED,
+            "forward": offset[:, 1] > self._gap_ahead,
         }
-        late = self.phase.late
-        never = torch.zeros_like(late)
-        leaving = {name: mask & self.phase.at(name) & (late | early.get(name, never)) for name in NEXT}
-        self._nearer = self._nearer + RISE_BEHIND * leaving["sit"]
+        done = {name: late | early[name] if name in early else late for name in NEXT}
+        leaving = {name: mask & ~lost & self.phase.at(name) & ended for name, ended in done.items()}
+        self._nearer = self._nearer + NEARER * leaving["sit"]
         for name, following in NEXT.items():
             self.phase.enter(following, leaving[name])
+        self.phase.enter("approach", lost)
         return command
 
     def phases(self) -> list[str]:
-        """Names in `LONGEST`."""
+        """Names of `LONGEST`."""
         return self._named
 
-    def _act(self, approach: Tensor, place: Tensor) -> MotionCommand:
+    def _act(self, approach: Tensor, offset: Tensor) -> MotionCommand:
         """The command of each world's phase."""
         at = self.phase.at
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
-        gap = at("sideways", "back", "forward")
-        velocity = approach * (self._pace * at("approach"))[:, None]
-        command.velocity = torch.where(gap[:, None], self._drift(place), velocity)
+        walking = approach * (self._pace * at("approach"))[:, None]
+        command.velocity = torch.where(at("sideways", "back", "forward")[:, None], self._drift(offset), walking)
 
         lowering, pressing, rising = at("lower"), at("press", "sit"), at("rise")
         fraction = torch.where(at("sit"), 1.0, self.phase.fraction)
-        down = (command.height, LOWER_HEIGHT, PRESS_HEIGHT, RISE_HEIGHT)
-        back = (torch.zeros_like(fraction), LOWER_BACK, PRESS_BACK, 0.0)
-        for name, (start, touch, end, up) in {"height": down, "pelvis_back": back}.items():
+
+        def course(start: Tensor, touch: float, end: float, up: float) -> Tensor:
+            """From `start` to the touch, to the end, and up again."""
             value = torch.where(lowering, start + fraction * (touch - start), start)
             value = torch.where(pressing, touch + fraction * (end - touch), value)
-            setattr(command, name, torch.where(rising, up, value))
+            return value.masked_fill(rising, up)
+
+        command.height = course(command.height, LOWER_HEIGHT, PRESS_HEIGHT, RISE_HEIGHT)
+        command.pelvis_back = course(command.pelvis_back, LOWER_BACK, PRESS_BACK, 0.0)
         bent = lowering | pressing
         command.pitch = LEAN * bent + RISE_LEAN[0] * rising
         command.waist[:, 2] = LEAN * bent + RISE_LEAN[1] * rising
         command.arms = select(bent | rising | at("stand"), self._arms, command.arms)
         return command
 
-    def _drift(self, place: Tensor) -> Tensor:
-        """Velocity in the gap: sideways, back or forward with the back to the sofa, shape [worlds, 3]."""
-        backwards = self.phase.at("back")
-        ahead = torch.where(backwards, SEAT_AHEAD - self._nearer, self._inside_ahead) - place[:, 1]
-        left = place[:, 0] - self._seat_aside
-        wanted = GAIN * torch.stack([ahead, left], dim=1)
-        most = torch.tensor([BACKWARD, SIDEWAYS], device=place.device)
-        moving = torch.stack([backwards, self.phase.at("sideways")], dim=1)
-        crawling = torch.where(moving & (wanted.abs() < CRAWL), CRAWL * wanted.sign(), wanted)
-        planar = rotate_xy(-place[:, 2], crawling.clamp(-most, most))
-        turn = (-HEADING_GAIN * place[:, 2]).clamp(-TURN, TURN)
-        return torch.cat([planar, turn[:, None]], dim=1)
+    def _drift(self, offset: Tensor) -> Tensor:
+        """Velocity in the gap, the back to the sofa: sideways, back or forward, shape [worlds, 3]."""
+        sideways, backward = self.phase.at("sideways"), self.phase.at("back")
+        ahead = torch.where(backward, SEAT_AHEAD - self._nearer, self._gap_ahead) - offset[:, 1]
+        wanted = GAIN * torch.stack([ahead, offset[:, 0] - self._seat_aside], dim=1)
+        main = torch.stack([backward, sideways], dim=1)
+        wanted = torch.where(main & (wanted.abs() < CRAWL), CRAWL * wanted.sign(), wanted)
+        turn = (-HEADING_GAIN * offset[:, 2]).clamp(-TURN, TURN)
+        return torch.cat([rotate_xy(-offset[:, 2], wanted.clamp(-self._most, self._most)), turn[:, None]], dim=1)
+
+
+def _cover(boxes: Tensor, yaw: Tensor) -> Tensor:
+    """The rectangle with this heading [rad] around several: [W, B, 5] and [W] to [W, 5]."""
+    signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]], device=boxes.device)
+    turned = boxes[..., 2, None].expand(*boxes.shape[:2], 4)
+    corners = (boxes[:, :, None, :2] + rotate_xy(turned, signs * boxes[:, :, None, 3:])).flatten(1, 2)
+    local = rotate_xy(-yaw[:, None].expand(corners.shape[:2]), corners)
+    low, high = local.amin(dim=1), local.amax(dim=1)
+    return torch.cat([rotate_xy(yaw, 0.5 * (low + high)), yaw[:, None], 0.5 * (high - low)], dim=1)

@@ -1,5 +1,6 @@
 """The command line: defaults, one-line answers to bad input, exit codes, quick help."""
 
+import dataclasses
 import json
 import os
 import re
@@ -14,8 +15,12 @@ from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.config import resolve
+from arena_newton.eval.options import RunOptions
+from arena_newton.tasks import football
 
 TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
+CELLS = [(tracker, mode) for tracker in ("twist2", "sonic") for mode in ("base", "visual")]
 SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "1", "--seeds", "0"]
 
 
@@ -38,6 +43,8 @@ def test_default_run(tmp_path, capsys, monkeypatch):
     lines = (Path(report).parent / "episodes.jsonl").read_text().splitlines()
     budgets = {row["task"]: row["max_steps"] for row in map(json.loads, lines)}
     assert budgets == {task: tasks.get(task).max_steps(rule_sets.get("paper")) for task in planned}
+    assert main(["resume", str(Path(report).parent)], factories()) == 0
+    assert f"{len(lines)} episodes, all finished" in capsys.readouterr().out
 
 
 def test_configuration_is_two_lines(tmp_path, capsys):
@@ -83,6 +90,41 @@ def test_protocol_is_the_default_of_a_named_task(tmp_path):
     keys = """task tracker policy mode rules engine group_seed repeat episode_seed outcome steps margin durations hashes
     reason startup_fall overflow error"""
     assert set(keys.split()) <= set(first)
+
+
+def test_trackers_are_an_axis(tmp_path, capsys):
+    """Two trackers play the same episodes into one folder: one journal, a cell each, hashes of their own weights."""
+    out = tmp_path / "o"
+    flags = ["--task", "football", "boxing", "--tracker", "twist2", "sonic", "--mode", "base", "visual"]
+    assert main([*flags, "--engine", "mujoco", "--repeats", "2", "--out", str(out)], factories()) == 0
+    assert ", trackers twist2 sonic, policy expert, " in capsys.readouterr().out
+    rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    seeds = {(t, m): {r["episode_seed"] for r in rows if (r["tracker"], r["mode"]) == (t, m)} for t, m in CELLS}
+    assert len(rows) == 48 and len(set(map(frozenset, seeds.values()))) == 1
+    results = json.loads((out / "results.json").read_text())
+    assert [(c["tracker"], c["mode"]) for c in results["cells"]] == CELLS * 2
+    weights = {row["tracker"]: row["hashes"]["checkpoint"] for row in rows}
+    assert weights["twist2"] != weights["sonic"] and results["config"]["checkpoint"] == weights
+    assert set(results["config"]["tracker_facts"]) == {"twist2", "sonic"}
+    assert (out / "original" / "boxing__sonic__visual").is_dir()
+    assert re.search("--task boxing --mode visual --tracker sonic --seeds 2 ", (out / "report.html").read_text())
+    assert main(["resume", str(out)], factories()) == 0
+    line = json.dumps(rows[0] | {"tracker": "pd"})
+    (out / "episodes.jsonl").write_text("\n".join([line, *map(json.dumps, rows[1:])]) + "\n")
+    capsys.readouterr()
+    assert main(["report", str(out)], factories()) == 2
+    assert (
+        'tracker is "pd", this run\'s is "twist2 or sonic"; the journal was changed by hand' in capsys.readouterr().err
+    )
+
+
+def test_files_of_several_trackers_have_names_of_their_own(tmp_path):
+    """Recordings are named by the tracker where a run has several."""
+    one = resolve(RunOptions(task=("football",), tracker=("twist2",), engine="mujoco", strip=True))
+    two = resolve(RunOptions(task=("football",), tracker=("twist2", "sonic"), engine="mujoco", strip=True))
+    episode = two.episodes[-1]
+    assert run._recorder(one, tmp_path, "twist2").label(episode) == "football__base__seed2__repeat19"
+    assert run._recorder(two, tmp_path, "sonic").label(episode) == "sonic__football__base__seed2__repeat19"
 
 
 @pytest.mark.parametrize(
@@ -289,10 +331,23 @@ def test_identity_covers_scenes_and_code():
     assert identity["scenes"] != other["scenes"] and identity["code"] == other["code"]
 
 
-def test_task_without_an_expert_is_refused_first(tmp_path, capsys):
+@pytest.fixture
+def without_an_expert(monkeypatch):
+    """Football as a task that somebody added without an expert."""
+    monkeypatch.setattr(football, "TASK", dataclasses.replace(football.TASK, expert=None))
+
+
+def test_task_without_an_expert_is_refused_first(tmp_path, capsys, without_an_expert):
     """A policy that cannot do one of the tasks is refused before the first episode of any."""
     out = tmp_path / "out"
     assert main(["--task", "vis_navi", "football", "--policy", "expert", "--tracker", "pd", "--out", str(out)]) == 2
     message = capsys.readouterr().err
-    assert "football" in message and "boxing, vis_navi" in message and message.count("\n") == 1
+    assert "task football" in message and "sit_sofa, vis_navi" in message and message.count("\n") == 1
     assert not out.exists()
+
+
+def test_default_run_leaves_out_a_task_without_an_expert(without_an_expert):
+    """Without flags the tasks that have an expert run; another policy gets all of them, as `--task all` does."""
+    assert resolve(RunOptions(engine="mujoco")).flags.task == tuple(TASKS[1:])
+    assert resolve(RunOptions(engine="mujoco", policy="stand")).flags.task == tuple(TASKS)
+    assert resolve(RunOptions(engine="mujoco", task=("all",))).flags.task == tuple(TASKS)

@@ -29,6 +29,14 @@ def test_full_protocol():
     assert all(len({e.episode_seed for e in episodes if e.task == t}) == 60 for t in tasks.names())
 
 
+def test_trackers_of_a_task_follow_each_other():
+    """Within a task the trackers, within a tracker the modes; each counts its episodes from 0."""
+    episodes = expand("football", "boxing", trackers=("a", "b"), modes=("base", "visual"), seeds=(0, 1), repeats=2)
+    cells = list(dict.fromkeys((e.task, e.tracker, e.mode) for e in episodes))
+    assert cells[:5] == [*(("football", t, m) for t in "ab" for m in ("base", "visual")), ("boxing", "a", "base")]
+    assert [e.index for e in episodes] == list(range(32)) and [e.rank for e in episodes] == [0, 1, 2, 3] * 8
+
+
 def test_one_seed_for_every_mode_and_rule_set():
     """Seeds depend on task, group seed and repeat only."""
     base = expand("boxing", seeds=(0,), repeats=2)
@@ -80,6 +88,7 @@ def test_max_steps_caps_the_budget():
         (("boxing", "boxing"), {}, "--task boxing: given twice"),
         (("boxing",), {"modes": ("night",)}, "--mode night"),
         (("boxing",), {"modes": ()}, "--mode: nothing given"),
+        (("boxing",), {"trackers": ("pd", "pd")}, "--tracker pd: given twice"),
         (("boxing",), {"seeds": (1, 1)}, "--seeds 1: given twice"),
         (("boxing",), {"repeats": 0}, "--repeats 0"),
         (("boxing",), {"rules": "mine"}, "--rules mine"),

@@ -151,7 +151,7 @@ def test_page_opens_with_table_and_bars(tmp_path):
     low, high = wilson(32, 60)
     assert tree.find("line", x1=f"{100 * low:.2f}%", x2=f"{100 * high:.2f}%", y1="25")
     assert len(tree.find("circle", **{"class": "seed"})) == 3 + 1  # and one in the legend
-    assert all(given["loading"] == "lazy" for given in tree.find("img"))
+    assert [given["loading"] for given in tree.find("img")] == ["eager"] + ["lazy"] * 120
     assert len([1 for tag, given in tree.elements if tag == "tr" and "data-outcome" in given]) == 60
     folded = text[text.index(">Episodes<") :]
     assert '<details><summary class="head">Configuration' in folded
@@ -161,10 +161,31 @@ def test_failures_come_first_and_the_rest_is_folded(tmp_path):
     """Strips of falls, then of timeouts, then a few successes are shown; nothing is left out."""
     rows = [recorded(row, "ego strip") for row in episodes("football", (12, 12, 12), falls=4)]
     folder = folder_with(tmp_path / "a", rows, 60)
-    shown = [given["alt"].rsplit(": ", 1)[1].split(",")[0] for given in html(folder).find("img")]
-    assert len(shown) == 60
+    opening, *shown = [given["alt"].rsplit(": ", 1)[1].split(",")[0] for given in html(folder).find("img")]
+    assert opening == "success" and len(shown) == 60
     assert shown[:12] == ["fall"] * 4 + ["timeout"] * 5 + ["success"] * 3
     assert "48 more episodes" in (folder / "report.html").read_text()
+
+
+def test_page_opens_with_a_strip_of_each_task(tmp_path):
+    """Before the table one strip per task: its first success from outside, or its first episode where there is none."""
+    rows = episodes("football", (2, 0, 0)) + episodes("boxing", (0, 0, 0), falls=60, index=60)
+    rows[0]["outcome"] = "timeout"
+    rows[1]["tracker"] = rows[61]["tracker"] = "u"
+    rows = [recorded(row, "ego strip", "world strip") for row in rows]
+    folder = folder_with(tmp_path / "a", rows, 120, tracker=["t", "u"])
+    html(folder)
+    text = (folder / "report.html").read_text()
+    opening = text[text.index('<section id="opening">') : text.index("<h2>Results</h2>")]
+    images = Tree(opening).find("img")
+    stems = [given["src"] for given in images]
+    assert stems == [
+        "strips/football__base__seed0__repeat1__world.jpg",
+        "strips/boxing__base__seed0__repeat0__world.jpg",
+    ]
+    captions = re.findall(r"<figcaption>(.*)</figcaption>", opening)
+    said = [re.sub("<[^>]*>", "", caption) for caption in captions]
+    assert said == ["success football, u, 101 steps, 2.0 s", "fall boxing, t, 100 steps, 2.0 s"]
 
 
 def test_strips_of_every_cell_come_before_a_second_one(tmp_path):
@@ -172,7 +193,7 @@ def test_strips_of_every_cell_come_before_a_second_one(tmp_path):
     names = ("football", "boxing", "vis_navi", "open_door")
     rows = [recorded(row, "ego strip") for i, n in enumerate(names) for row in episodes(n, (9, 9, 9), index=60 * i)]
     folder = folder_with(tmp_path / "a", rows, 240)
-    shown = [given["alt"].split()[0] for given in html(folder).find("img")][:12]
+    shown = [given["alt"].split()[0] for given in html(folder).find("img")][len(names) :][:12]
     assert {name: shown[:9].count(name) for name in names} == {
         "football": 3,
         "boxing": 2,

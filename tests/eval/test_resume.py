@@ -280,7 +280,7 @@ def test_environments_stand_in_configuration_and_journal(uninterrupted):
     assert all(value == facts for value in document["environments"].values())
     assert document["config"]["tracker_facts"] == {"twist2": {"name": "twist2", "drive": "none"}}
     facts = document["config"]["policy_facts"]
-    assert facts.pop("code") and facts == {"name": "stand"}
+    assert facts.pop("code") and facts == {"name": "expert"}
     hashes = [json.loads(line)["hashes"] for line in (uninterrupted / "episodes.jsonl").read_text().splitlines()]
     assert len({h["environment"] for h in hashes}) == len({h["versions"] for h in hashes}) == 1
 

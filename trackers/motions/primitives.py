@@ -275,7 +275,7 @@ def crouch_reach(
 def kick(side: str = "right", speed: float = 2.5, *, pause: float = 0.5) -> Script:
     """Shift to the other foot, wind up, swing at a foot speed [m/s], and recover."""
     foot = _sided(side) + 1
-    return script((kick_seconds(speed), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
+    return script((kick_seconds(float(speed)), {"kick": foot, "kick_speed": speed}), (0.1 + pause, {}))
 
 
 def punch(side: str = "right", *, height: float | None = None, speed: float = 10.0, times: int = 1) -> Script:

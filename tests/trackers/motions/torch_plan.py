@@ -90,66 +90,37 @@ CAREFUL_COM_AHEAD = SOLE_CENTRE
 
 @dataclass
 class TorchGait:
-    """What the generator remembers; rows are worlds. Ground and world are those of the odometry."""
+    """`kernels.footwork.GaitState` as tensors; feet have shape [worlds, 2, 5], a course or a position [worlds, 3]."""
 
     body: Tensor
-    """Course of the body: x, y [m], yaw [rad], shape [worlds, 3]."""
     channels: Tensor
-    """Rate-limited channels, columns `commands.LIMITED_COLUMNS`, shape [worlds, `commands.LIMITED_WIDTH`]."""
     rates: Tensor
-    """Their rates [unit/s], same shape."""
     feet: Tensor
-    """Left and right ankle: x, y, z [m], yaw, pitch [rad], shape [worlds, 2, 5]."""
     lift_off: Tensor
-    """Where the moving foot left the ground: x, y [m], yaw [rad], shape [worlds, 3]."""
     landing: Tensor
-    """Where it will land, same shape."""
     stepping: Tensor
-    """Whether a step is under way, bool, shape [worlds]."""
     side: Tensor
-    """Foot of the present or last step, 0 left, 1 right, int64, shape [worlds]."""
     phase: Tensor
-    """Phase of the step, 0 to 1; below 0 leads into the first, above 1 out of the last one, shape [worlds]."""
     first: Tensor
-    """Whether the step is the first of a walk, bool, shape [worlds]."""
     final: Tensor
-    """Whether it is the last of a walk, bool, shape [worlds]."""
     gait: Tensor
-    """From 0 standing to 1 walking, and its rate [1/s], shape [worlds, 2]."""
     ground: Tensor
-    """Commanded height of the ground ahead [m], shape [worlds]."""
     floor: Tensor
-    """Height of the ground under each foot, of a moving one where it will land [m], shape [worlds, 2]."""
     lift_off_floor: Tensor
-    """Height of the ground that the moving foot left [m], shape [worlds]."""
     base: Tensor
-    """Height of the ground that carries the pelvis [m], and its rate [m/s], shape [worlds, 2]."""
     kick_side: Tensor
-    """Present kick: 0 none, 1 left, 2 right, int64, shape [worlds]."""
     kick_pending: Tensor
-    """Kick that waits for the end of a walk, same values."""
     kick_command: Tensor
-    """Kick of the last command, same values: a change from 0 starts a kick."""
     kick_time: Tensor
-    """Time since the start of the kick [s], shape [worlds]."""
     kick_weight: Tensor
-    """Weight of the standing foot of a kick in where the centre of mass must be, 0 to 1, shape [worlds]."""
     kick_length: Tensor
-    """Length of the present or last kick [s], shape [worlds]."""
     kick_swing: Tensor
-    """Time of its swing [s], shape [worlds]."""
     support: Tensor
-    """Feet on the ground, bool, shape [worlds, 2]."""
     euler: Tensor
-    """Yaw, pitch, roll of the pelvis [rad], shape [worlds, 3]."""
     root: Tensor
-    """Pelvis [m], shape [worlds, 3]."""
     previous_root: Tensor
-    """Pelvis one tick earlier [m], shape [worlds, 3]."""
     start_yaw: Tensor
-    """Heading at the reset [rad], shape [worlds]."""
     hands: Tensor
-    """Left and right hand, 1 closed, 0 open, shape [worlds, 2]."""
 
     def channel(self, name: str) -> Tensor:
         """A rate-limited channel, shape [worlds, columns]."""
@@ -180,21 +151,17 @@ def approach(x: Tensor, rate: Tensor, target: Tensor, top: Tensor, acceleration:
     away = target - x
     size = away.abs()
     brake = 0.5 * TICK * acceleration
-    speed = torch.minimum(torch.sqrt(BRAKING * acceleration * size + brake * brake) - brake, size / TICK)
-    wanted = torch.sign(away) * torch.minimum(speed, top)
+    speed = torch.minimum(torch.sqrt(BRAKING * acceleration * size + brake * brake) - brake, top)
+    arrives = size / TICK <= speed
+    wanted = torch.sign(away) * torch.where(arrives, size / TICK, speed)
     change = acceleration * TICK
+    arrives &= (wanted - rate).abs() <= change
     rate = rate + torch.maximum(torch.minimum(wanted - rate, change), -change)
-    return x + rate * TICK, rate
+    return torch.where(arrives, target, x + rate * TICK), rate
 
 
 def walk(s: TorchGait, moving: Tensor, free: Tensor) -> None:
-    """Starts, advances and ends steps; moves the swing foot.
-
-    Args:
-        s: State, whose body and channels are those of this tick.
-        moving: Worlds whose command is to walk or to step, bool, shape [worlds].
-        free: Worlds that neither kick nor sit, bool, shape [worlds].
-    """
+    """Starts, advances and ends steps; moves the swing foot."""
     step_time = _step_time(s)
     begin = _advance_phase(s, moving, free, step_time)
     swing = ((s.phase - 0.5 * DOUBLE_SUPPORT) / (1.0 - DOUBLE_SUPPORT)).clamp(0.0, 1.0)
@@ -313,12 +280,7 @@ def sway(s: TorchGait) -> Tensor:
 
 
 def kick(s: TorchGait, kick_speed: Tensor) -> None:
-    """Starts, advances and ends kicks; moves the kicking foot.
-
-    Args:
-        s: State, after `walk`.
-        kick_speed: Commanded speed of the foot [m/s], shape [worlds].
-    """
+    """Starts, advances and ends kicks; moves the kicking foot."""
     still = ~s.stepping & (s.channel("velocity").abs() < STANDSTILL).all(1) & (s.gait[:, 0] < KICK_GAIT)
     start = (s.kick_pending > 0) & (s.kick_side == 0) & still
     swing_seconds = PEAK_OF_SMOOTH * (KICK_BACK + KICK_FRONT) / kick_speed
@@ -440,13 +402,7 @@ class TorchGenerator:
         )
 
     def reset(self, mask: Tensor | None = None, *, root_xy: Tensor | None = None, yaw: Tensor | None = None) -> None:
-        """Stand in the default pose, at rest.
-
-        Args:
-            mask: Worlds to reset (all without one), bool, shape [worlds].
-            root_xy: Position of the pelvis [m], shape [worlds, 2]; the origin without it.
-            yaw: Heading [rad], shape [worlds]; zero without it.
-        """
+        """Stand in the default pose, at rest."""
         yaw = self._zeros() if yaw is None else yaw.to(self.device, torch.float32)
         root = self._zeros(2) if root_xy is None else root_xy.to(self.device, torch.float32)
         standing = self._standing(root, yaw)
@@ -466,16 +422,14 @@ class TorchGenerator:
             memory.copy_(merged(mask, value, memory))
         self._publish()
 
+    def remember(self, solved: dict[str, Tensor]) -> None:
+        """Take another solver's memory over; the next tick starts from it."""
+        memory = {"pelvis": self._pelvis, "joints": self._joints, "arms": self._arms, "palms": self._palms}
+        for name, value in (memory | {"com": self._com}).items():
+            value.copy_(solved[name])
+
     def step(self, command: MotionCommand, mask: Tensor | None = None) -> Frames:
-        """One 50 Hz tick.
-
-        Args:
-            command: What to do.
-            mask: Worlds that advance (all without one), bool, shape [worlds]; the others keep frame and state.
-
-        Returns:
-            The frame of the tick.
-        """
+        """One 50 Hz tick."""
         old = self._s
         new = copy.copy(old)
         row = torch.maximum(torch.minimum(command.pack(), self._high), self._low)
@@ -599,7 +553,7 @@ class TorchGenerator:
         self.frames = Frames(s.root, quat_from_euler(s.euler), self._joints.clone(), s.hands)
 
     def action(self) -> Tensor:
-        """Canonical action of the last tick, orientation relative to the yaw at reset, float32, shape [worlds, 40]."""
+        """Canonical action of the last tick, shape [worlds, 40]."""
         s = self._s
         yaw, pitch, roll = s.euler.unbind(1)
         cp, sp, cr, sr = torch.cos(pitch), torch.sin(pitch), torch.cos(roll), torch.sin(roll)
@@ -615,12 +569,7 @@ class TorchGenerator:
         return torch.cat([torch.stack([dx, dy], dim=1), s.root[:, 2:], rot, joints, s.hands], dim=1)
 
     def realign(self, yaw: Tensor, weight: float | Tensor = 1.0) -> None:
-        """Turns the odometry about the pelvis towards a measured heading.
-
-        Args:
-            yaw: Measured heading [rad], shape [worlds].
-            weight: Fraction of the difference to take up.
-        """
+        """Turns the odometry about the pelvis towards a measured heading."""
         s = self._s
         turn = weight * wrap_by_remainder(yaw.to(self.device) - s.body[:, 2])
         centre = s.root[:, :2]

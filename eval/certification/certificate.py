@@ -1,0 +1,180 @@
+"""The certificate: what was found as JSON, as Markdown and as one page with its pictures inside."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypedDict
+
+import jinja2
+
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.journal import write_atomic
+from arena_newton.eval.records import JsonObject
+from arena_newton.eval.wording import plain
+
+__all__ = ["FILE", "Facts", "document", "html", "markdown", "write"]
+
+FILE = "certify.json"
+PAGE = Path(__file__).resolve().parents[1] / "page"
+MEANING = {
+    "pass": "holds",
+    "fail": "does not hold",
+    "note": "holds with what the notes say",
+    "skip": "was not measured",
+}
+"""Verdict → what it says."""
+
+
+class Facts(TypedDict):
+    """What was certified."""
+
+    tasks: list[str]
+    without_expert: list[str]
+    """Tasks that no check could play."""
+    trackers: list[str]
+    episodes: int
+    """Episodes of each cell."""
+    quick: bool
+    engine: str
+    device: str
+    code: str
+    """Hash of the code that moves and judges."""
+    planned: list[str]
+    """Checks that were asked for; those that have not run yet are in no table."""
+    versions: JsonObject
+
+
+def write(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) -> None:
+    """Write certify.json, certify.md and certify.html into a folder.
+
+    Args:
+        folder: The certification's.
+        facts: What was certified.
+        findings: What was found so far.
+    """
+    write_atomic(folder / FILE, json.dumps(document(folder, facts, findings), indent=2) + "\n")
+    write_atomic(folder / "certify.md", markdown(facts, findings))
+    write_atomic(folder / "certify.html", html(facts, findings))
+
+
+def document(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) -> JsonObject:
+    """The certificate as JSON; pictures by their path in the folder."""
+
+    def entry(check: Check, finding: CheckFinding) -> JsonObject:
+        return {
+            "question": check.question,
+            "verdict": finding.verdict,
+            "summary": finding.summary,
+            "tables": [_sheet(sheet) for sheet in finding.sheets],
+            "notes": list(finding.notes),
+            "pictures": [
+                {"caption": picture.caption, "path": picture.path.relative_to(folder).as_posix()}
+                for picture in finding.pictures
+            ],
+        }
+
+    failed = [check.name for check, finding in findings.items() if finding.verdict == "fail"]
+    complete = len(findings) == len(facts["planned"])
+    certified: JsonObject = json.loads(json.dumps(facts))
+    checks: JsonObject = {check.name: entry(check, finding) for check, finding in findings.items()}
+    return {"certified": certified, "complete": complete, "failed": list(failed), "checks": checks}
+
+
+def _sheet(sheet: Sheet) -> JsonObject:
+    return {"title": sheet.title, "head": list(sheet.head), "rows": [list(row) for row in sheet.rows]}
+
+
+def _said(facts: Facts) -> list[tuple[str, str]]:
+    """The facts as name and text."""
+    said = [
+        ("tasks", " ".join(facts["tasks"])),
+        ("trackers", " ".join(facts["trackers"])),
+        ("episodes of each cell", str(facts["episodes"])),
+        ("engine", f"{facts['engine']} on {facts['device']}"),
+        ("code", facts["code"]),
+    ]
+    if facts["without_expert"]:
+        said.insert(1, ("without an expert, not checked", " ".join(facts["without_expert"])))
+    return said
+
+
+def _warnings(facts: Facts, findings: Mapping[Check, CheckFinding]) -> list[str]:
+    """What limits the certificate as a whole."""
+    found = []
+    if facts["quick"]:
+        found.append(f"--quick: {facts['episodes']} episodes of each cell, so the intervals are wide.")
+    left = len(facts["planned"]) - len(findings)
+    if left:
+        found.append(f"Not finished: {left} of {len(facts['planned'])} checks have not run.")
+    return found
+
+
+def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
+    """The certificate as Markdown, without pictures."""
+    lines = ["# Certificate", ""]
+    lines += [f"- {name}: {_escaped(text)}" for name, text in _said(facts)] + [""]
+    lines += [f"> {_escaped(text)}" for text in _warnings(facts, findings)] + [""]
+    lines += ["| check | verdict | measured |", "|---|---|---|"]
+    for check, finding in findings.items():
+        lines.append(f"| {check.name} | {finding.verdict} | {_escaped(finding.summary)} |")
+    for check, finding in findings.items():
+        lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", _escaped(finding.summary), ""]
+        for sheet in finding.sheets:
+            lines += [f"{_escaped(sheet.title)}:", "", "| " + " | ".join(map(_escaped, sheet.head)) + " |"]
+            lines.append("|" + "---|" * len(sheet.head))
+            lines += ["| " + " | ".join(map(_escaped, row)) + " |" for row in sheet.rows] + [""]
+        lines += [f"- {_escaped(note)}" for note in finding.notes]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _escaped(text: object) -> str:
+    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
+
+
+@functools.cache
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(PAGE),
+        autoescape=True,
+        finalize=lambda value: value if hasattr(value, "__html__") else plain(value),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template("certify.html")
+
+
+def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
+    """The certificate as one page that needs no other file."""
+    style = (PAGE / "report.css").read_text(encoding="utf-8") + (PAGE / "certify.css").read_text(encoding="utf-8")
+    known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    return _template().render(
+        policy=f"default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
+        style=style,
+        facts=_said(facts),
+        warnings=_warnings(facts, findings),
+        meaning=MEANING,
+        versions=facts["versions"].items(),
+        checks=[
+            {
+                "name": check.name,
+                "question": check.question,
+                "finding": finding,
+                "pictures": [(picture.caption, _embedded(picture)) for picture in finding.pictures],
+            }
+            for check, finding in findings.items()
+        ],
+    )
+
+
+def _embedded(picture: Picture) -> str:
+    """A picture's file as an address that holds it."""
+    kind = {".jpg": "jpeg", ".png": "png"}[picture.path.suffix]
+    return f"data:image/{kind};base64,{base64.b64encode(picture.path.read_bytes()).decode()}"

@@ -1,0 +1,152 @@
+"""``python -m arena_newton.eval certify``: the benchmark proves itself, in one command with one page and one exit code.
+
+Each check is a question with a measurement (`eval.certification`). Evaluations are ordinary results folders under
+`<out>/runs`, so that a certification that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from arena_newton import trackers
+from arena_newton.devices import resolve_engine
+from arena_newton.doctor import versions
+from arena_newton.errors import InputError
+from arena_newton.eval.certification import agreement, axes, certificate, legs, solvable, swap, visible
+from arena_newton.eval.certification.bodies import BODIES, Body
+from arena_newton.eval.certification.context import Context, with_expert
+from arena_newton.eval.certification.finding import Check, CheckFinding
+from arena_newton.eval.config import plain_facts
+from arena_newton.eval.identity import code_hash
+from arena_newton.eval.options import CertifyOptions
+from arena_newton.eval.plan import MAX_EPISODES
+from arena_newton.eval.progress import duration
+from arena_newton.eval.run import Factories
+from arena_newton.quiet import quiet_warp
+
+__all__ = ["CHECKS", "run"]
+
+CHECKS: tuple[Check, ...] = (
+    *solvable.CHECKS,
+    *legs.CHECKS,
+    *axes.CHECKS,
+    *agreement.CHECKS,
+    *swap.CHECKS,
+    *visible.CHECKS,
+)
+"""All checks, in the order in which they run."""
+
+
+def run(
+    options: CertifyOptions,
+    factories: Factories | None = None,
+    *,
+    bodies: Mapping[str, Body] = BODIES,
+    checks: Sequence[Check] = CHECKS,
+) -> int:
+    """Run the checks, print a line for each, and write certify.json, certify.md and certify.html.
+
+    Args:
+        options: The flags.
+        factories: What evaluations are built with; the real parts by default.
+        bodies: Robots for the checks of legs.
+        checks: What is checked, of which `options.checks` may choose.
+
+    Returns:
+        Exit code: 0 no check fails, 1 one fails.
+
+    Raises:
+        InputError: A flag is wrong, or the folder holds something else; raised before the first check.
+    """
+    began, chosen = time.perf_counter(), _chosen(options, checks)
+    context = _context(options, factories or Factories(), bodies)
+    left_out = tuple(name for name in with_expert(options.task)[1])
+    for name in left_out:
+        print(f"{name}: has no expert, nothing of it is checked")
+    if options.quick:
+        print(f"--quick: {context.episodes} episodes of each cell, so the intervals are wide")
+    quiet_warp()
+    findings: dict[str, CheckFinding] = {}
+    for check in chosen:
+        started = time.perf_counter()
+        finding = check.run(context)
+        findings[check.name] = finding
+        spent = duration(time.perf_counter() - started)
+        print(f"{finding.verdict:<4}  {check.name:<12}  {finding.summary}  ({spent})", flush=True)
+        facts = _facts(context, left_out, planned=[one.name for one in chosen])
+        certificate.write(context.folder, facts, {one: findings[one.name] for one in chosen if one.name in findings})
+    failed = [name for name, finding in findings.items() if finding.verdict == "fail"]
+    result = f"{len(failed)} of {len(findings)} checks failed: {' '.join(failed)}" if failed else "no check failed"
+    print(
+        f"{result}; this took {duration(time.perf_counter() - began)}\ncertificate: {context.folder / 'certify.html'}"
+    )
+    return 1 if failed else 0
+
+
+def _chosen(options: CertifyOptions, checks: Sequence[Check]) -> list[Check]:
+    """The checks that the flags ask for."""
+    known = [check.name for check in checks]
+    for name in options.checks:
+        if name not in known:
+            raise InputError(f"--checks {name}: unknown, choose from {' '.join(known)}")
+    return [check for check in checks if not options.checks or check.name in options.checks]
+
+
+def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str, Body]) -> Context:
+    """Check the flags and open the folder."""
+    names, without = with_expert(options.task)
+    if not names:
+        raise InputError(f"--task {' '.join(without)}: no expert, and every check plays one")
+    for position, tracker in enumerate(options.tracker):
+        trackers.check_spec(tracker)
+        if tracker in options.tracker[:position]:
+            raise InputError(f"--tracker {tracker}: given twice")
+    if not options.tracker:
+        raise InputError("--tracker: nothing given, at least one is needed")
+    if options.episodes is not None and not 1 <= options.episodes <= MAX_EPISODES:
+        raise InputError(f"--episodes {options.episodes}: expected 1 to {MAX_EPISODES:,}")
+    if options.worlds < 1:
+        raise InputError(f"--worlds {options.worlds}: expected at least 1")
+    if options.twist2_checkpoint is not None and not Path(options.twist2_checkpoint).expanduser().is_file():
+        raise InputError(f"--twist2-checkpoint {options.twist2_checkpoint}: no such file")
+    if not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
+    resolve_engine(options.engine, options.device)
+    folder = Path(options.out).expanduser()
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file")
+    if folder.exists() and any(folder.iterdir()):
+        if not (folder / "runs").is_dir() and not (folder / certificate.FILE).is_file():
+            raise InputError(f"--out {folder}: is not empty and holds no certification; choose another folder")
+        if not options.resume:
+            raise InputError(
+                f"--out {folder}: holds a certification; go on with it by --resume or choose another folder"
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "runs").mkdir(exist_ok=True)
+    return Context(options, folder, names, _say, factories, bodies)
+
+
+def _say(text: str) -> None:
+    print(f"  {text}", file=sys.stderr, flush=True)
+
+
+def _facts(context: Context, left_out: Sequence[str], planned: Sequence[str]) -> certificate.Facts:
+    """What was certified."""
+    options = context.options
+    engine, device = resolve_engine(options.engine, options.device)
+    return {
+        "tasks": list(context.tasks),
+        "without_expert": list(left_out),
+        "trackers": list(context.trackers),
+        "episodes": context.episodes,
+        "quick": options.quick,
+        "engine": engine,
+        "device": device,
+        "code": code_hash(),
+        "planned": list(planned),
+        "versions": plain_facts(versions()),
+    }

@@ -1,0 +1,237 @@
+"""`eval certify` as a command: verdicts become lines, a page and an exit code, and a stopped one goes on."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories
+
+from arena_newton.errors import InputError
+from arena_newton.eval import certify
+from arena_newton.eval import run as runs
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.certification import certificate, legs, solvable, swap
+from arena_newton.eval.certification.bodies import Body
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.options import CertifyOptions
+from arena_newton.kernels import tick as codes
+
+
+class SolvedEnv(FakeEnv):
+    """Every episode succeeds after five ticks, but not under a replay through another tracker than the recording's."""
+
+    built = 0
+    lost = False
+
+    def __init__(self, task, **options):
+        super().__init__(task, **options)
+        type(self).built += 1
+
+    def step(self, action, worlds=None):
+        leapt = (self.tick // LEAP + 1) * LEAP
+        self.tick[self.active] = np.where(self.tick < SLOW, self.tick + 1, leapt)[self.active]
+        over = self.active & (self.tick > 5) & (not self.lost)
+        return np.where(over, codes.SUCCESS, codes.RUNNING).astype(np.int32)
+
+
+class StuckEnv(SolvedEnv):
+    """No episode succeeds."""
+
+    lost = True
+
+
+class SwappedPolicy(FakePolicy):
+    """Tells the world whether it replays what was recorded through another tracker."""
+
+    def attach(self, env):
+        recorded = re.search(r"replay:.*/(\w+?)_paper", self.name)
+        env.lost = env.lost or recorded is not None and recorded[1] != env.tracker.name
+
+
+def bodies(**envs):
+    """Robots of the checks of legs, by the worlds that stand in for them."""
+    equip = {name: lambda given, env=env: factories(env=env, policy=given.policy) for name, env in envs.items()}
+    return {name: Body(name, name, equip.get(name, lambda given: given)) for name in ("robot", "frozen", "gliding")}
+
+
+PARTS = {"env": SolvedEnv, "policy": SwappedPolicy}
+LEGS = bodies(frozen=StuckEnv, gliding=StuckEnv)
+CHECKS = (*solvable.CHECKS, *legs.CHECKS, *swap.CHECKS)
+
+
+@pytest.fixture(autouse=True)
+def without_pictures(monkeypatch):
+    """These worlds have nothing to draw."""
+    monkeypatch.setattr(runs, "_recorder", lambda *_: None)
+
+
+def options(folder, **changes):
+    """Flags of a small certification."""
+    given = {"out": str(folder), "task": ("boxing", "vis_navi"), "quick": True, "episodes": 30}
+    return CertifyOptions(**(given | changes))
+
+
+def read(folder):
+    """The certificate's verdicts and tables."""
+    return json.loads((folder / "certify.json").read_text())["checks"]
+
+
+def test_a_sound_benchmark_passes(tmp_path, capsys):
+    """Solvable tasks that need legs and a swap that costs success: a line each, three files, exit code 0."""
+    assert certify.run(options(tmp_path / "o"), factories(**PARTS), bodies=LEGS, checks=CHECKS) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name in ("solvable", "frozen-legs", "gliding-base", "swap"):
+        assert any(re.match(rf"pass  {name} ", line) for line in lines), name
+    assert lines[0].startswith("--quick: 30 episodes") and "intervals are wide" in lines[0]
+    checks = read(tmp_path / "o")
+    assert [row[:4] for row in checks["solvable"]["tables"][0]["rows"]] == [
+        [task, tracker, rules, "30/30"]
+        for tracker, rules in (("twist2", "paper"), ("twist2", "released"), ("sonic", "paper"))
+        for task in ("boxing", "vis_navi")
+    ]
+    swapped = {tuple(row[:3]): row[3:] for row in checks["swap"]["tables"][0]["rows"]}
+    assert swapped["all", "twist2", "sonic"] == ["60/60", "0/60", "0 % to 6 %", "", "-100", "0 %"]
+    for name in ("certify.html", "certify.md"):
+        assert "gliding-base" in (tmp_path / "o" / name).read_text()
+
+
+@pytest.mark.parametrize(
+    ("envs", "name", "verdict", "said"),
+    [
+        ({"frozen": SolvedEnv, "gliding": StuckEnv}, "frozen-legs", "fail", "boxing: 30 successes with frozen legs"),
+        ({"frozen": StuckEnv, "gliding": SolvedEnv}, "gliding-base", "note", "the arms alone reach down to it"),
+    ],
+)
+def test_tasks_that_need_no_legs_are_named(tmp_path, envs, name, verdict, said):
+    """Success with frozen legs fails the benchmark; of a gliding base the reason is said where it is known."""
+    code = certify.run(options(tmp_path), factories(**PARTS), bodies=bodies(**envs), checks=legs.CHECKS)
+    assert code == (verdict == "fail")
+    found = read(tmp_path)[name]
+    assert found["verdict"] == verdict and any(said in note for note in found["notes"])
+
+
+def test_a_gliding_base_without_a_known_reason_fails(tmp_path, monkeypatch):
+    """A task that a gliding base solves and that no sentence explains fails the benchmark."""
+    monkeypatch.setattr(legs, "GLIDES", {})
+    given = options(tmp_path, checks=("gliding-base",))
+    assert certify.run(given, factories(**PARTS), bodies=bodies(gliding=SolvedEnv), checks=CHECKS) == 1
+    assert "no reason is known" in read(tmp_path)["gliding-base"]["notes"][0]
+
+
+def test_unsolved_tasks_fail(tmp_path, capsys):
+    """An expert that is significantly below nine of ten fails the benchmark, and the line names it."""
+    given = options(tmp_path, checks=("solvable",), task=("boxing",), tracker=("twist2",))
+    assert certify.run(given, factories(), checks=CHECKS) == 1
+    assert "1 of 1 checks failed: solvable" in capsys.readouterr().out
+    assert "below that are boxing through twist2" in read(tmp_path)["solvable"]["notes"][0]
+
+
+def test_a_swap_that_costs_nothing_is_told_apart_from_one_with_few_episodes(tmp_path):
+    """Replays that succeed fail the check if there were enough episodes; with few of them it is a note."""
+    parts = {"env": SolvedEnv}  # a policy that does not tell: replays succeed as recordings do
+    few, many = options(tmp_path / "a", episodes=2), options(tmp_path / "b")
+    assert certify.run(few, factories(**parts), checks=swap.CHECKS) == 0
+    assert read(tmp_path / "a")["swap"]["verdict"] == "note"
+    assert certify.run(many, factories(**parts), checks=swap.CHECKS) == 1
+
+
+def test_the_control_of_the_swap(tmp_path):
+    """Without --quick each recording is replayed through its own tracker too; one that ends otherwise is a failure."""
+    given = {"quick": False, "task": ("boxing",), "checks": ("swap",), "episodes": 20}
+
+    class Forgetful(SwappedPolicy):
+        def attach(self, env):
+            env.lost = env.lost or self.name.startswith("replay:")
+
+    assert certify.run(options(tmp_path / "a", **given), factories(**PARTS), checks=CHECKS) == 0
+    rows = {tuple(row[:3]): row[3:5] for row in read(tmp_path / "a")["swap"]["tables"][0]["rows"]}
+    assert rows["boxing", "twist2", "twist2"] == rows["boxing", "sonic", "sonic"] == ["20/20", "20/20"]
+    assert rows["boxing", "twist2", "sonic"] == ["20/20", "0/20"]
+    parts = PARTS | {"policy": Forgetful}
+    assert certify.run(options(tmp_path / "b", **given), factories(**parts), checks=CHECKS) == 1
+    assert "twist2: a replay through the tracker of the recording" in read(tmp_path / "b")["swap"]["notes"][0]
+
+
+def test_it_goes_on_where_it_was(tmp_path, capsys):
+    """Nothing that was played is played again; without --resume a folder is not touched."""
+    given = options(tmp_path, checks=("solvable",))
+    assert certify.run(given, factories(**PARTS), checks=CHECKS) == 0
+    before, built = (tmp_path / "certify.json").read_text(), SolvedEnv.built
+    with pytest.raises(InputError, match="go on with it by --resume"):
+        certify.run(given, factories(**PARTS), checks=CHECKS)
+    assert certify.run(options(tmp_path, checks=("solvable",), resume=True), factories(**PARTS), checks=CHECKS) == 0
+    assert SolvedEnv.built == built and (tmp_path / "certify.json").read_text() == before
+    with pytest.raises(InputError, match="another configuration: repeats was 30, now 29"):
+        certify.run(options(tmp_path, episodes=29, resume=True), factories(**PARTS), checks=CHECKS)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--task", "golf"], "task golf"),
+        (["--task", "boxing", "boxing"], "--task boxing: given twice"),
+        (["--tracker", "nobody"], "--tracker nobody"),
+        (["--tracker", "twist2", "twist2"], "--tracker twist2: given twice"),
+        (["--checks", "everything"], "--checks everything: unknown, choose from solvable"),
+        (["--episodes", "0"], "--episodes 0"),
+        (["--worlds", "0"], "--worlds 0"),
+        (["--engine", "bullet"], "--engine bullet"),
+        (["--twist2-checkpoint", "absent.onnx"], "--twist2-checkpoint absent.onnx: no such file"),
+        (["--out", ""], "--out: is empty"),
+        (["--out", "full"], "--out full: is not empty and holds no certification"),
+        (["--quik"], "--quik: unknown argument, did you mean --quick"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, flags, message):
+    """Wrong input ends with code 2 and one line before anything is measured."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "diary.txt").write_text("mine")
+    assert main(["certify", *flags]) == 2
+    assert re.fullmatch(rf"error: .*{re.escape(message)}.*\n", capsys.readouterr().err)
+    assert not (tmp_path / "results").exists()
+
+
+def test_the_page_needs_no_other_file(tmp_path):
+    """Pictures are inside, texts stay texts, and what is missing is said."""
+    picture = tmp_path / "strip.png"
+    picture.write_bytes(b"\x89PNG")
+    check = Check("legs", "Are <legs> needed?", lambda context: found)
+    found = CheckFinding(
+        "note",
+        "three of four",
+        (Sheet("A table", ("task",), (("<script>alert(1)</script>",),)),),
+        ("a | note",),
+        (Picture('a "picture"', picture),),
+    )
+    facts = {
+        "tasks": ["boxing"],
+        "without_expert": [],
+        "trackers": ["twist2"],
+        "episodes": 4,
+        "quick": True,
+        "engine": "mujoco",
+        "device": "cpu",
+        "code": "0" * 12,
+        "planned": ["legs", "swap"],
+        "versions": {"python": "3.12"},
+    }
+    certificate.write(tmp_path, facts, {check: found})
+    page = (tmp_path / "certify.html").read_text()
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert all(address.startswith(("#", "data:image/png;base64,")) for address in addresses)
+    assert "data:image/png;base64," in page and "<script>" not in page and "&lt;script&gt;" in page
+    assert "1 of 2 checks have not run" in page and "intervals are wide" in page
+    text = (tmp_path / "certify.md").read_text()
+    assert r"a \| note" in text and "data:" not in text
+    stored = json.loads((tmp_path / "certify.json").read_text())
+    assert not stored["complete"] and stored["checks"]["legs"]["pictures"][0]["path"] == "strip.png"
+
+
+def test_names_in_the_help_are_the_checks():
+    """The flag's text lists every check, in their order."""
+    text = Path(certify.__file__).with_name("options.py").read_text()
+    named = re.search(r"Names of checks to run: ([\w\s-]+?); all", text)[1].split()
+    assert named == [check.name for check in certify.CHECKS]

@@ -1,0 +1,192 @@
+"""What the checks of a certification measure: on real worlds where it is about bodies, bits and pictures."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import rule_sets, seeding, tasks, trackers
+from arena_newton.canonical import ACTION, STAND_ACTION
+from arena_newton.eval import certify
+from arena_newton.eval.certification import axes, visible
+from arena_newton.eval.certification.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
+from arena_newton.eval.certification.finding import Score
+from arena_newton.eval.certification.swap import retention
+from arena_newton.eval.certification.traces import first_difference, play
+from arena_newton.eval.options import CertifyOptions
+from arena_newton.eval.run import Factories
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
+
+SEEDS = [seeding.episode_seed(tasks.get("boxing").gym_id, 0, repeat) for repeat in range(300)]
+
+
+def test_frozen_legs_keep_the_upper_body():
+    """Legs and root are those of the standing action; waist, arms and hands stay the policy's; no row is written."""
+    action = torch.rand(3, 40)
+    given = action.clone()
+    frozen = freeze_legs(None, action).numpy()
+    legs = [i for i, name in enumerate(CANONICAL_JOINTS) if any(w in name for w in ("hip", "knee", "ankle"))]
+    columns = [*range(9), *(9 + i for i in legs)]
+    assert len(legs) == 12
+    assert (frozen[:, columns] == STAND_ACTION[columns]).all()
+    others = np.setdiff1d(np.arange(40), columns)
+    assert (frozen[:, others] == given.numpy()[:, others]).all()
+    assert (action == given).all()
+
+
+def test_held_legs_pass_on_all_but_the_legs():
+    """The tracker's waist and arms go through, its legs are the default pose, and a mask reaches it."""
+
+    class Counting(trackers.Tracker):
+        asked = ()
+
+        def step(self, command, state, mask=None):
+            self.asked = (*self.asked, mask)
+            return torch.full((2, 29), 7.0)
+
+    inner = Counting()
+    held = HeldLegs(inner)
+    held.bind(2)
+    mask = torch.tensor([True, False])
+    held.step(None, None)
+    targets = held.step(None, None, mask)
+    assert inner.asked == (None, mask)
+    assert (targets[:, list(LEGS)] == torch.tensor([DEFAULT_POSE[i] for i in LEGS])).all()
+    assert (targets[:, len(LEGS) :] == 7.0).all()
+    assert held.describe()["legs"].startswith("held")
+
+
+@pytest.fixture(scope="module")
+def gliding():
+    """Two worlds of boxing whose robots have a gliding base."""
+    parts = BODIES["gliding"].equip(Factories())
+    return parts.env("boxing", tracker=parts.tracker("twist2", None), worlds=2, engine="mujoco")
+
+
+def test_a_gliding_base_follows_the_command_and_nothing_else(gliding):
+    """Commanded to roll and turn it does, upright and at its height; without a command it stays where it is."""
+    env, root = gliding, gliding.scene.robot.root_qpos
+    env.reset(SEEDS[:2])
+    action = np.tile(STAND_ACTION, (2, 1))
+    while env.tick.min() < 0:
+        env.step(action)
+    before = env.physics.qpos.numpy()[:, root : root + 7].copy()
+    ticks = 75
+    for tick in range(ticks):
+        yaw = 0.5 * TICK * (tick + 1)
+        action[0, ACTION["root_xy_delta"]] = (0.3 * TICK, 0.0)
+        action[0, ACTION["root_z"]] = 0.5  # it cannot crouch
+        action[0, ACTION["root_rot6d"]] = (np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw), 0.0, 0.0)
+        env.step(action)
+    after = env.physics.qpos.numpy()[:, root : root + 7]
+    moved = np.linalg.norm(after[:, :2] - before[:, :2], axis=1)
+    # An arc of 0.45 m and 0.75 rad has a chord of 0.44 m.
+    assert moved[0] == pytest.approx(0.44, abs=0.04) and moved[1] < 0.01
+    heights = after[:, 2]
+    assert heights == pytest.approx([GLIDE_HEIGHT] * 2, abs=0.01)
+    up = 1.0 - 2.0 * (after[:, 4] ** 2 + after[:, 5] ** 2)
+    assert up.min() > np.cos(np.radians(3.0))
+    w = np.abs((after[:, 3:] * before[:, 3:]).sum(axis=1))
+    turned = 2.0 * np.arccos(np.clip(w, 0.0, 1.0))
+    assert turned == pytest.approx([0.75, 0.0], abs=0.08)
+
+
+def test_worlds_that_wait_keep_their_base(gliding):
+    """A world outside the mask keeps every bit while the other one glides."""
+    env = gliding
+    env.reset(SEEDS[:2])
+    action = np.tile(STAND_ACTION, (2, 1))
+    for _ in range(3):
+        env.step(action)
+    before = (env.physics.qpos.numpy()[1].copy(), env.physics.qvel.numpy()[1].copy())
+    env.step(action, np.array([True, False]))
+    assert (env.physics.qpos.numpy()[1] == before[0]).all() and (env.physics.qvel.numpy()[1] == before[1]).all()
+    env.step(action)
+    root = env.scene.robot.root_qpos
+    assert env.physics.qpos.numpy()[1, root : root + 7] == pytest.approx(before[0][root : root + 7], abs=0.01)
+
+
+def test_traces_tell_another_bit(gliding):
+    """The same episode has the same trace in another world and order; another episode differs from its first tick."""
+    one = play(gliding, SEEDS[:2], 5)
+    other = play(gliding, SEEDS[1::-1], 5)
+    assert one == other and len(one) == 2
+    first, second = one.values()
+    assert first_difference(first, second) == 0 and first_difference(first, first) is None
+    assert first_difference(first, [*first[:-1], "0"]) == len(first) - 1
+    assert first_difference(first, first[:-1]) == len(first) - 1
+
+
+def test_targets_are_counted_in_the_picture():
+    """A target in the first picture is seen at tick 0 with its pixels; one behind the bag only later, or not at all."""
+    env = Factories().env(
+        "boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", camera=CameraConfig(), rules="released"
+    )
+    first, pixels, picture = visible.first_sights(env, [SEEDS[0], SEEDS[1]], "/World/Target")
+    assert all((tick == 0) == (count >= visible.SEEN) for tick, count in zip(first, pixels, strict=True))
+    assert any(tick == 0 for tick in first)
+    tinted = (picture.astype(int)[..., 0] > 120) & (picture.astype(int)[..., 2] > 120) & (picture[..., 1] < 140)
+    assert picture.shape == (224, 224, 3) and tinted.sum() >= visible.SEEN
+    nothing, pixels, picture = visible.first_sights(env, [SEEDS[0]] * 2, "/World/Nothing")
+    assert nothing == [None, None] and pixels == [0, 0] and picture is None
+
+
+def test_every_task_has_a_target_in_its_scene():
+    """The table of targets names every task, and prims that the task's scene must have."""
+    assert set(visible.TARGETS) == set(tasks.names())
+    for task, prim in visible.TARGETS.items():
+        required = [r.path for r in tasks.get(task).requires]
+        assert any(path == prim or path.startswith(f"{prim}/") for path in required), task
+
+
+@pytest.mark.parametrize("rules", rule_sets.names())
+def test_modes_move_what_the_rules_name(rules):
+    """In every task execution mode moves exactly the coordinates with another range; the other modes move none."""
+    for task in tasks.names():
+        own = rule_sets.get(rules).task(task)
+        named = {(rule.record, axis) for rule in own.objects for axis in axes.named_coordinates(rule)}
+        assert set(axes.moved_coordinates(task, "execution", rules, SEEDS[:50])) == named
+        assert not axes.moved_coordinates(task, "visual", rules, SEEDS[:50])
+
+
+def test_a_mode_that_moves_more_is_found(tmp_path, monkeypatch):
+    """An object that another mode shifts, or that execution mode shifts beyond its range, fails the check."""
+    honest = tasks.get("boxing")
+
+    def shifted(seed, mode, rules):
+        sampled = honest.sample(seed, mode, rules)
+        if mode == "semantic":
+            sampled["boxing_target"]["x"] += 0.01
+        if mode == "execution":
+            sampled["boxing_target"]["z"] += 0.5
+        return sampled
+
+    given = tasks.get
+    false = dataclasses.replace(honest, sample=shifted)
+    lookup = SimpleNamespace(get=lambda name: false if name == "boxing" else given(name))
+    monkeypatch.setattr(axes, "tasks", lookup)
+    monkeypatch.setattr(axes, "_reset_faults", lambda context, task: [])
+    options = CertifyOptions(out=str(tmp_path), task=("boxing",), checks=("execution",), quick=True)
+    assert certify.run(options) == 1
+    text = (tmp_path / "certify.md").read_text()
+    assert "boxing under paper: mode semantic moves boxing\\_target" in text.replace("boxing_target", "boxing\\_target")
+    assert "z is drawn from 1." in text
+
+
+def test_numbers_of_the_protocol():
+    """Semantic mode may cost 3 of 60; the swap's Ret is the quotient of the rates."""
+    assert [axes.allowed_difference(n) for n in (4, 20, 40, 60)] == [1, 1, 2, 3]
+    assert retention(Score(40, 60), Score(10, 60)) == "25 %" and retention(Score(0, 60), Score(0, 60)) == "-"
+
+
+def test_a_tiny_real_certification(tmp_path, capsys):
+    """One task and tracker, one episode: the expert solves it, frozen legs do not, and the strips are on the page."""
+    flags = {"task": ("boxing",), "tracker": ("twist2",), "episodes": 1, "quick": True, "worlds": 1}
+    options = CertifyOptions(out=str(tmp_path), checks=("gliding-base",), **flags)
+    assert certify.run(options) == 0
+    page = (tmp_path / "certify.html").read_text()
+    assert "success at step" in page and "data:image/jpeg;base64," in page
+    assert (tmp_path / "runs" / "boxing" / "twist2_paper_base_gliding" / "episodes.jsonl").is_file()

@@ -1,0 +1,86 @@
+"""One table of several runs: what it counts, what it says of them, and which runs it does not mix."""
+
+import pytest
+from rows import episodes, record
+from test_report import document_of, folder_with
+
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.results import RunRecord, load_run
+from arena_newton.eval.stats import wilson
+from arena_newton.eval.tables import joint_table
+
+
+def run_of(tmp_path, name, rows, **config):
+    """A run of these journal lines, without files."""
+    return RunRecord(tmp_path / name, document_of(len(rows), **config), [record(row) for row in rows])
+
+
+def cells(table):
+    """Cells of the table's rows by the texts of their first two columns."""
+    lines = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("|")]
+    return {(line[0].strip(), line[1].strip()): [text.strip() for text in line[2:]] for line in lines}
+
+
+def said(won, played):
+    """What a cell says."""
+    low, high = wilson(won, played)
+    return f"{won}/{played} ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def test_two_runs_make_one_table(tmp_path):
+    """Rows are tasks and trackers, columns modes in their order, and `all` counts the episodes of all tasks."""
+    base = episodes("football", (4, 5, 7), falls=3) + episodes("boxing", (20, 20, 20))
+    moved = [row | {"tracker": "u", "mode": "visual"} for row in episodes("boxing", (20, 20, 19))]
+    runs = [run_of(tmp_path, "a", base), run_of(tmp_path, "b", moved, engine="warp")]
+    text = joint_table(runs)
+    found = cells(text)
+    assert found["task", "tracker"] == ["base", "visual"]
+    assert found["football", "t"] == [said(16, 60), "–"] and found["boxing", "t"] == [said(60, 60), "–"]
+    assert found["boxing", "u"] == ["–", said(59, 60)]
+    assert found["all", "t"] == [said(76, 120), "–"] and found["all", "u"] == ["–", said(59, 60)]
+    assert ("football", "u") not in found
+    assert list(found)[2] == ("football", "t")  # after head and rule, in the order of the tasks
+    assert "policy p, rules paper, engine warp" in text and "3 episodes of 180 ended in a fall." in text
+
+
+def test_what_is_missing_is_said(tmp_path):
+    """A run that is not complete, and episodes with errors, are named under the table."""
+    rows = episodes("football", (4, 5, 7))[:50]
+    rows[9] |= {"outcome": "error"}
+    run = run_of(tmp_path, "a", rows)
+    run.document["planned"] = 60
+    text = joint_table([run])
+    assert "a is incomplete: 50 of 60 episodes." in text and "1 episode of 50 ended with an error." in text
+
+
+@pytest.mark.parametrize(
+    ("change", "config", "message"),
+    [
+        ({}, {}, "b: episode football t p base seed 0 repeat 0 is in .*a too"),
+        ({"mode": "visual"}, {"rules": "released"}, "b: rules is released, in .*a paper"),
+        ({"mode": "visual"}, {"max_steps": 50}, "b: max_steps is 50, in .*a null"),
+        ({"mode": "visual", "hashes": {"checkpoint": "bb"}}, {}, "b: weights of t are bb, elsewhere aa"),
+    ],
+)
+def test_runs_that_one_table_must_not_mix(tmp_path, change, config, message):
+    """The same episode twice, other judges, other budgets and other weights of one name are refused."""
+    rows = [row | {"hashes": {"checkpoint": "aa"}} for row in episodes("football", (1, 1, 1))]
+    other = [row | change for row in rows]
+    with pytest.raises(InputError, match=message):
+        joint_table([run_of(tmp_path, "a", rows), run_of(tmp_path, "b", other, **config)])
+
+
+def test_report_of_several_folders(tmp_path, capsys):
+    """`report A B` prints the table and writes nothing; a folder twice is one line with code 2."""
+    for name, mode in (("a", "base"), ("b", "visual")):
+        folder_with(tmp_path / name, [row | {"mode": mode} for row in episodes("boxing", (20, 20, 20))], 60)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    output = capsys.readouterr().out
+    assert cells(output)["boxing", "t"] == [said(60, 60)] * 2 and sorted(tmp_path.rglob("*")) == before
+    assert main(["report", str(tmp_path / "a"), "--table"]) == 0
+    assert capsys.readouterr().out == joint_table([load_run(tmp_path / "a")])
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "a" / ".")]) == 2
+    assert "named twice" in capsys.readouterr().err
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 2
