@@ -93,7 +93,7 @@ def test_eyes_agree_with_pictures(env):
         if exact:
             assert ((pixels > 0) == (stripes > 0)).all() and (pixels == 0).sum() == 23
         agree = ((pixels > 0) == (stripes > 0)).float().mean()
-        assert agree >= 0.93  # the rest is cut by the picture's border, or behind the robot's own arm
+        assert agree >= 0.93  # the rest is cut by the picture's border, or the robot is in a wall
         assert (pixels[stripes >= 3] >= 5).float().mean() > 0.96
 
 
