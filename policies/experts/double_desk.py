@@ -97,14 +97,14 @@ BESIDE = 0.13
 """The crate's middle is this far to the robot's left [m]: the left arm does not cross over."""
 BEFORE_SILL = 0.85
 """Distance of the pelvis from the sill's middle when it stops to line up [m]: two or three strides."""
-LAST_PAIR = 0.21
+LAST_PAIR = 0.23
 """Distance of the pelvis from the sill's middle when the feet are side by side for the last time before it [m]: the
 ankles are then 5 cm further on, so that a stride of 0.40 m leaves as much room for toes before as for heels behind."""
 PAST_SILL = 0.14
 """Both ankles must be this far beyond the sill's middle [m]: the heel reaches 6 cm back."""
-SILL_SPEED, SILL_STEP, SILL_HEIGHT = 0.44, 0.52, 0.74
+SILL_SPEED, SILL_STEP, SILL_HEIGHT = 0.46, 0.52, 0.74
 """Walk over the sill: speed [m/s], time of a step [s], pelvis [m]."""
-PACE_STAGGER, SILL_STAGGER = 0.17, 0.23
+PACE_STAGGER, SILL_STAGGER = 0.17, 0.25
 """Lead of the left foot by the length of a step on the way to the sill and over it [m]: the right foot lands next to
 it, and the pairs of footprints are 0.3 and 0.4 m apart."""
 PACES = (0.10, 0.48)
@@ -124,6 +124,8 @@ RIM = 0.93
 AIM, CLOSE, ENOUGH = (0.18, 0.09), 0.01, (0.24, 0.15)
 """Half sizes of the rectangle in the crate where the centre of mass is led to, how near to it is enough, and half
 sizes of the larger one in which it is let go when the arm does not reach farther [m]."""
+CLOSER = 0.10
+"""Longest step by what the hammer lacks when it did not come over the crate [m]."""
 HURRY = 3.0
 """Time above the crate after which the larger rectangle counts [s]."""
 OVER_LEAN, OVER_LEAN_MORE = 0.40, 0.04
@@ -133,7 +135,7 @@ STYLE = {
     "pace": (0.92, 1.0),
     "ready": (0.34, 0.44),
     "aside": (-0.02, 0.02),
-    "swing": (0.17, 0.19),
+    "swing": (0.18, 0.20),
     "palm x": (-0.02, 0.02),
     "palm y": (-0.02, 0.02),
     "palm z": (-0.02, 0.02),
@@ -281,7 +283,7 @@ class DoubleDeskExpert(Expert):
             for name, (near, straight) in WITHIN.items()
         }
         back = torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1)
-        over_crate = self._over()[1]
+        wanted, over_crate = self._over()
         over = arrived | {
             "look": self._in_view(self._origin()),
             "hover": (machine.clock > ALIGN) & (self._error[:, 0] < ALIGNED[0]) & (self._error[:, 1] < ALIGNED[1]),
@@ -299,6 +301,7 @@ class DoubleDeskExpert(Expert):
         lost = mask & machine.at("step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over") & ~held
         again = lost & (self._origin()[:, 2] > BENCH_HEIGHT) & (pose[:, 1] < self._sill)
         missed = done["lift"] & ~held
+        short = done["over"] & ~over_crate[:, 1]
 
         stand, _ = self._stand()
         ready = stand + torch.stack([torch.zeros_like(stand[:, 0]), self._style["ready"]], dim=1)
@@ -306,6 +309,7 @@ class DoubleDeskExpert(Expert):
         for name, following in zip(LONGEST, list(LONGEST)[1:], strict=False):
             machine.enter(following, done[name])
         machine.enter("step in", missed)
+        machine.enter("deliver", short)
         machine.enter("back off", done["pace"] & ((pace - USUAL_PACE) * time < -TOO_FAR))
         machine.enter("pace", done["line up"])
         machine.enter("look", again)
@@ -321,6 +325,9 @@ class DoubleDeskExpert(Expert):
         )
         near = (crate[:, 1] - NEAR_CRATE).clamp_max(self._left_edge - NEAR_EDGE)
         self._go(done["sill"], torch.stack([crossing, near], dim=1), LOOK_LEFT)
+        closer = pose[:, :2] + (wanted - self._mass())[:, :2].clamp(-CLOSER, CLOSER)
+        closer = torch.stack([closer[:, 0], closer[:, 1].clamp_max(self._left_edge - NEAR_EDGE)], dim=1)
+        self._go(short, closer, LOOK_LEFT)
         restart = done["step in"] | done["lift"]
         self.palms.reset(restart)
         self.wrists.reset(restart)

@@ -1,0 +1,131 @@
+"""DoubleDesk's expert: it grasps, carries over the sill and lets go in the crate, and its worlds are independent."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import policies, seeding, trackers
+from arena_newton.env import ArenaEnv
+from arena_newton.policies.experts.base import Sight
+from arena_newton.policies.experts.double_desk import LONGEST, SILL_STEP, DoubleDeskExpert
+from arena_newton.policies.experts.style import Style
+from arena_newton.rollout import Rollout
+
+SEED, EPISODES = 904, (0, 1)
+"""Two episodes that no number of the expert was tuned on."""
+ORDER = [phase for phase in LONGEST if phase not in ("look", "back off", "rest")]
+"""Phases of an episode without a second attempt; the hammer may be in view from the start."""
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Two worlds through our TWIST2 weights."""
+    return ArenaEnv("double_desk", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", threads=2)
+
+
+def episodes(env, numbers=EPISODES):
+    """Episodes of the protocol by their numbers."""
+    return [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, SEED, i)) for i in numbers]
+
+
+class Actions:
+    """Recorder of the canonical actions of each episode."""
+
+    wants_observation = False
+
+    def __init__(self):
+        """Nothing recorded."""
+        self.of, self._seed = {}, {}
+
+    def start(self, env, world, episode):
+        """An episode begins."""
+        self._seed[world] = episode.episode_seed
+        self.of[episode.episode_seed] = []
+
+    def before_physics(self, env, observation, action):
+        """Keep a tick's actions."""
+        for world, seed in self._seed.items():
+            self.of[seed].append(action[world].numpy().copy())
+
+    def tick(self, env):
+        """Nothing to do."""
+
+    def finish(self, env, world, result):
+        """The episode has ended."""
+        del self._seed[world]
+
+
+def test_two_episodes_end_in_the_crate(env):
+    """The hammer is carried into the crate within the budget, phase by phase, and the sill is not stood on."""
+    sill = env.scene.geom_ids("/World/Sill")[0]
+    touched = np.zeros(env.worlds, dtype=int)
+
+    def count(active):
+        for world, data in enumerate(env.physics._data):
+            pairs = data.contact.geom[data.contact.dist < 0.0]
+            touched[world] += bool((pairs == sill).any())
+
+    results = Rollout(env, policies.get("expert"), episodes(env), on_tick=count).run()
+    assert [r.outcome for r in results] == ["success", "success"]
+    for result in results:
+        assert [name for name, _ in result.phases if name != "look"] == ORDER
+    assert (touched < 25).all(), "a foot that lands on the sill bears on it for half a second"
+
+
+def test_worlds_are_independent(env):
+    """An episode's actions are the same bits in either world, next to either episode."""
+    first, second = Actions(), Actions()
+    Rollout(env, policies.get("expert"), episodes(env), recorder=[first], max_steps=250).run()
+    Rollout(env, policies.get("expert"), episodes(env, (5, *EPISODES[:1])), recorder=[second], max_steps=250).run()
+    (shared,) = set(first.of) & set(second.of)
+    assert np.array_equal(first.of[shared], second.of[shared])
+    assert not np.array_equal(*first.of.values())
+
+
+@pytest.fixture
+def expert(env):
+    """An expert of worlds that have just been reset, with a reference that stands still."""
+    env.reset([episode.episode_seed for episode in episodes(env)])
+    found = DoubleDeskExpert(Sight(env))
+    found.reference = SimpleNamespace(phase=torch.zeros(env.worlds))
+    found.begin(torch.ones(env.worlds, dtype=torch.bool), Style(env.worlds))
+    return found
+
+
+def test_pace_ends_with_the_feet_together(expert):
+    """Walked at the pace that it asks for, the robot is at its place when the right foot lands."""
+    root = expert.sight._root
+    for distance in (0.45, 0.70, 0.95):
+        for phase in (0.0, 0.3, 0.6, 0.9):
+            root[:, 1] = expert._sill - distance
+            expert.reference.phase = torch.full((2,), phase)
+            speed, time = expert._pace()
+            landings = time / (2.0 * SILL_STEP) + phase
+            assert torch.allclose(landings, landings.round(), atol=1e-4)
+            assert (speed <= 0.38).all(), "a walk this fast would come short"
+            root[:, 1] += speed * time
+            expert.reference.phase = torch.zeros(2)
+            assert torch.allclose(expert._pace()[0], torch.zeros(2), atol=1e-3)
+
+
+def test_a_lift_without_the_hammer_is_repeated(expert):
+    """When the hand comes up empty, the hand opens and the robot steps in again; rows outside the mask stay."""
+    machine, everyone = expert.machine, torch.ones(2, dtype=torch.bool)
+    machine.enter("lift", everyone)
+    machine.advance(everyone, LONGEST["lift"])
+    only = torch.tensor([True, False])
+    command = expert.command(only, 0.1)
+    assert expert.phases() == ["step in", "lift"]
+    assert command.hands[:, 0].tolist() == [0.0, 1.0]
+
+
+def test_a_hammer_on_the_floor_ends_the_attempt(expert):
+    """A hammer dropped out of reach is not looked for; one dropped onto the desk is."""
+    everyone = torch.ones(2, dtype=torch.bool)
+    body = expert.sight.scene.body_id("/World/Hammer")
+    expert.sight._xpos[0, body, 2] = 0.02
+    expert.machine.enter("turn", everyone)
+    expert.command(everyone, 0.1)
+    assert expert.phases() == ["rest", "look"]
