@@ -52,8 +52,8 @@ against what blocks it."""
 TURN_ACCELERATION = 60.0
 """Largest angular acceleration of the base about the vertical [rad/s²]: 46 N·m."""
 TIP_ACCELERATION = 300.0
-"""The same against tipping [rad/s²]: 1200 N·m, five times what its push on a foot gives. Blocked by a sill it stands, and
-does not tip over it."""
+"""The same against tipping [rad/s²]: 1200 N·m, five times what its push on a foot gives. Blocked by a sill it stops,
+and does not tip over it."""
 LEASH = 0.10
 """The base's target runs ahead of it by so much at most [m], so that it does not wind up where it is blocked."""
 TURN_LEASH = 0.3
