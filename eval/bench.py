@@ -32,6 +32,8 @@ from arena_newton.pictures.settings import CameraConfig
 from arena_newton.quiet import quiet_warp
 from arena_newton.robot import PhysicsRate
 from arena_newton.rollout import Rollout
+from arena_newton.trackers.motions.commands import MotionCommand
+from arena_newton.trackers.motions.generator import ReferenceGenerator
 
 __all__ = ["BenchFigure", "run"]
 
@@ -280,6 +282,37 @@ def _episodes(options: BenchOptions) -> Iterator[BenchFigure]:
     yield BenchFigure(name, 120, "s", True, wall, detail)
 
 
+GENERATOR_WORLDS = (1, 20, 64)
+"""Worlds of the reference generator that are measured: one, those of an evaluation, and many."""
+
+
+def _generator_tick(worlds: int, rounds: int) -> float:
+    """Median seconds of a tick on the CPU: `realign`, `step` with packed commands, `action`; a walk, hands reach."""
+    generator, ahead = ReferenceGenerator(worlds), torch.zeros(worlds)
+    command = MotionCommand.neutral(worlds)
+    command.velocity[:, 0], command.reach[:] = 0.4, 1.0
+    command.hand_point[:, :, 0] += 0.1
+    table = command.pack()
+
+    def ticks(count: int) -> float:
+        began = time.perf_counter()
+        for _ in range(count):
+            generator.realign(ahead, 0.05)
+            generator.step(table)
+            generator.action()
+        return (time.perf_counter() - began) / count
+
+    ticks(100)
+    return statistics.median(ticks(50) for _ in range(rounds))
+
+
+def _generator(options: BenchOptions) -> Iterator[BenchFigure]:
+    for worlds in GENERATOR_WORLDS:
+        with _cores(1):
+            seconds = _generator_tick(worlds, options.rounds)
+        yield BenchFigure(f"reference generator, tick on the CPU, {worlds} worlds", 1.0, "ms", True, 1e3 * seconds)
+
+
 def _help(options: BenchOptions) -> Iterator[BenchFigure]:
     times = []
     for _ in range(5):
@@ -308,6 +341,7 @@ def _tests(options: BenchOptions) -> Iterator[BenchFigure]:
 _ITEMS: dict[str, Callable[[BenchOptions], Iterator[BenchFigure]]] = {
     "help": _help,
     "tick": _tick,
+    "generator": _generator,
     "throughput": _throughput,
     "camera": _camera,
     "pictures": _pictures,

@@ -138,7 +138,7 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: help tick throughput camera pictures episodes tests, or `all` (everything but tests)."""
+    """What to measure: help tick generator throughput camera pictures episodes tests, or `all` (all but tests)."""
     checkpoint: str | None = None
     """Weights of TWIST2; those that come with the package when none are named."""
     worlds: int = 20

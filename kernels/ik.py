@@ -102,6 +102,8 @@ RESTART_ROUNDS = wp.constant(16)
 """Gauss-Newton steps of a leg that starts again."""
 STEP = wp.constant(0.4)
 """Largest change of a joint in one Gauss-Newton step [rad]."""
+SETTLED = wp.constant(1.0e-6)
+"""A limb whose joints change by less than this in a step has arrived [rad]: more steps would change its last bits."""
 ARM_SPEED = wp.constant(0.12)
 """Largest change of an arm joint by IK per tick [rad]: 6 rad/s."""
 SEAT_SOFTNESS = wp.constant(0.02)
@@ -175,28 +177,29 @@ def link_quat(m: Model, link: int, parent: wp.quat, angle: float) -> wp.quat:
 def solve_spd(a: mat66, b: vec6f, n: int) -> vec6f:
     """Solution of a positive definite system of the first n rows by Cholesky."""
     low = mat66()
+    inverse = vec6f()  # of the diagonal: a division takes as long as five products
     for i in range(n):
         for j in range(i + 1):
             s = a[i, j]
             for k in range(j):
                 s = s - low[i, k] * low[j, k]
             if i == j:
-                low[i, i] = wp.sqrt(wp.max(s, 1.0e-12))
+                inverse[i] = 1.0 / wp.sqrt(wp.max(s, 1.0e-12))
             else:
-                low[i, j] = s / low[j, j]
+                low[i, j] = s * inverse[j]
     y = vec6f()
     for i in range(n):
         s = b[i]
         for k in range(i):
             s = s - low[i, k] * y[k]
-        y[i] = s / low[i, i]
+        y[i] = s * inverse[i]
     x = vec6f()
     for r in range(n):
         i = n - 1 - r
         s = y[i]
         for k in range(i + 1, n):
             s = s - low[k, i] * x[k]
-        x[i] = s / low[i, i]
+        x[i] = s * inverse[i]
     return x
 
 
@@ -251,9 +254,15 @@ def solve_leg(
             normal[i, i] = normal[i, i] + LEG_DAMPING + LEG_CARE * wp.dot(away, away)
         rhs = wp.transpose(jac) * vec6f(away[0], away[1], away[2], spin[0], spin[1], spin[2])
         step = solve_spd(normal, rhs, 6)
+        largest = float(0.0)
         for i in range(6):
             link = first + i
-            joints[w, link - 1] = settle_joint(m, link, joints[w, link - 1] + wp.clamp(step[i], -STEP, STEP))
+            before = joints[w, link - 1]
+            angle = settle_joint(m, link, before + wp.clamp(step[i], -STEP, STEP))
+            joints[w, link - 1] = angle
+            largest = wp.max(largest, wp.abs(angle - before))
+        if largest < SETTLED:
+            break
     return residual
 
 
@@ -366,10 +375,15 @@ def step_arm(
                 normal[i, j] = s
             normal[i, i] = normal[i, i] + ARM_DAMPING + ARM_PULL
         step = solve_spd(normal, rhs, 4)
+        largest = float(0.0)
         for i in range(4):
             link = first + i
-            angle = joints[w, link - 1] + wp.clamp(step[i], -STEP, STEP)
-            joints[w, link - 1] = settle_joint(m, link, angle)
+            before = joints[w, link - 1]
+            angle = settle_joint(m, link, before + wp.clamp(step[i], -STEP, STEP))
+            joints[w, link - 1] = angle
+            largest = wp.max(largest, wp.abs(angle - before))
+        if largest < SETTLED:
+            break
     return wp.length(goal - palm(m, w, first, base_p, base_q, joints))
 
 

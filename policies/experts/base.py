@@ -136,6 +136,9 @@ class Expert:
 
     task: str = ""
     """Name of the task that it solves."""
+    reference: ReferenceGenerator
+    """The generator that makes its actions, known from `attach` on: an expert that must place its feet reads the
+    phase of the gait there."""
 
     def __init__(self, sight: Sight):
         """Look up what the task needs in the scene.
@@ -204,7 +207,7 @@ class ExpertPolicy(Policy):
         expert = expert_class(env.spec.name)
         self.sight = Sight(env)
         self.expert = expert(self.sight)
-        self.generator = ReferenceGenerator(env.worlds, env.torch_device)
+        self.generator = self.expert.reference = ReferenceGenerator(env.worlds, env.torch_device)
         self.style = Style(env.worlds, env.torch_device)
         self._begins = np.ones(env.worlds, dtype=bool)
         self._asked = np.zeros(env.worlds, dtype=np.int64)

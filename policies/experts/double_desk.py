@@ -37,7 +37,9 @@ LONGEST = {
     "step back": 2.5,
     "turn": 7.0,
     "line up": 12.0,
-    "sill": 8.0,
+    "back off": 4.0,
+    "pace": 5.0,
+    "sill": 6.0,
     "deliver": 10.0,
     "over": 6.0,
     "open": 2.0,
@@ -93,19 +95,37 @@ LEFT_CARRY, LEFT_HIGH = (0.27, 0.22, 0.16), (0.27, 0.22, 0.33)
 """Left palm while carrying, and in front of the crate, where the hammer must pass over the rim [m]."""
 BESIDE = 0.13
 """The crate's middle is this far to the robot's left [m]: the left arm does not cross over."""
-BEFORE_SILL = 0.30
-"""Distance of the pelvis from the sill's middle before it steps over [m]."""
+BEFORE_SILL = 0.85
+"""Distance of the pelvis from the sill's middle when it stops to line up [m]: two or three strides."""
+LAST_PAIR = 0.21
+"""Distance of the pelvis from the sill's middle when the feet are side by side for the last time before it [m]: the
+ankles are then 5 cm further on, so that a stride of 0.40 m leaves as much room for toes before as for heels behind."""
 PAST_SILL = 0.14
 """Both ankles must be this far beyond the sill's middle [m]: the heel reaches 6 cm back."""
-SILL_SPEED, SILL_STEP, SILL_HEIGHT, SILL_STAGGER = 0.385, 0.52, 0.74, 0.20
-"""Walk over the sill: speed [m/s], time of a step [s], pelvis [m], and a step's length by which the right foot
-lands next to the left one [m]: pairs of footprints 0.40 m apart, the sill between two of them."""
-NEAR_CRATE, NEAR_EDGE = 0.42, 0.09
+SILL_SPEED, SILL_STEP, SILL_HEIGHT = 0.44, 0.52, 0.74
+"""Walk over the sill: speed [m/s], time of a step [s], pelvis [m]."""
+PACE_STAGGER, SILL_STAGGER = 0.17, 0.23
+"""Lead of the left foot by the length of a step on the way to the sill and over it [m]: the right foot lands next to
+it, and the pairs of footprints are 0.3 and 0.4 m apart."""
+PACES = (0.10, 0.48)
+"""Speeds by which the footprints are moved to where they must be [m/s]."""
+BRISK = 0.38
+"""A pace that is faster than this would come short [m/s]: one more pair of footprints is made instead."""
+COMMITTED = 0.30
+"""Time before the feet are side by side from which the landing is fixed [s]."""
+USUAL_PACE, TOO_FAR = 0.35, 0.06
+"""Speed at the last pair [m/s], and how far beyond its place it may be [m]: else the robot goes back to try again."""
+NEAR_CRATE, NEAR_EDGE = 0.38, 0.09
 """Pelvis from the crate's middle and at least from the left desk's edge [m]."""
 OVER_HEIGHT = 1.02
 """Height of the hammer's centre of mass above the crate [m]; the rim is at 0.915 m."""
-AIM, ENOUGH = (0.20, 0.11), (0.24, 0.15)
-"""Half sizes of the rectangle in the crate where the centre of mass is led to, and where it is let go [m]."""
+RIM = 0.93
+"""Least height of the centre of mass above the crate [m]."""
+AIM, CLOSE, ENOUGH = (0.18, 0.09), 0.01, (0.24, 0.15)
+"""Half sizes of the rectangle in the crate where the centre of mass is led to, how near to it is enough, and half
+sizes of the larger one in which it is let go when the arm does not reach farther [m]."""
+HURRY = 3.0
+"""Time above the crate after which the larger rectangle counts [s]."""
 OVER_LEAN, OVER_LEAN_MORE = 0.40, 0.04
 """Waist pitch above the crate [rad], and how it grows while the hammer is not there yet [rad/s]."""
 
@@ -113,7 +133,7 @@ STYLE = {
     "pace": (0.92, 1.0),
     "ready": (0.34, 0.44),
     "aside": (-0.02, 0.02),
-    "swing": (0.165, 0.185),
+    "swing": (0.17, 0.19),
     "palm x": (-0.02, 0.02),
     "palm y": (-0.02, 0.02),
     "palm z": (-0.02, 0.02),
@@ -154,6 +174,7 @@ class DoubleDeskExpert(Expert):
         self._grasp, self._hand_yaw = torch.zeros(worlds, 3, device=device), torch.zeros(worlds, device=device)
         self._from = torch.zeros(worlds, 2, device=device)
         self._error = torch.zeros(worlds, 2, device=device)
+        self._pairs = torch.arange(3, device=device)
         self._last = torch.zeros(worlds, 3, device=device)
 
     def begin(self, mask: Tensor, style: Style) -> None:
@@ -220,14 +241,28 @@ class DoubleDeskExpert(Expert):
         y = torch.stack([self.sight.body(ankle)[0][:, 1] for ankle in self._ankles], dim=1)
         return y.amin(dim=1) > self._sill + PAST_SILL
 
+    def _pace(self) -> tuple[Tensor, Tensor]:
+        """Speed [m/s] that brings the feet side by side before the sill, and the time until they are [s], [worlds].
+
+        They are whenever the right foot lands. Of the next landings the first one is taken that is not too near in
+        time.
+        """
+        times = (1.0 - self.reference.phase[:, None] + self._pairs) * (2.0 * SILL_STEP)
+        speeds = (self._sill - LAST_PAIR - self.sight.pose[:, 1:2]) / times.clamp_min(0.1)
+        soon = (speeds > BRISK).sum(dim=1, keepdim=True).clamp_max(times.shape[1] - 1)
+        return torch.gather(speeds, 1, soon)[:, 0], torch.gather(times, 1, soon)[:, 0]
+
     def _over(self) -> tuple[Tensor, Tensor]:
-        """Where the centre of mass must go above the crate [m], [worlds, 3], and whether it may be let go."""
+        """Where the centre of mass must go above the crate [m], [worlds, 3]; is it there, is it at least inside."""
         mass, middle = self._mass(), self._middle()
         yaw = heading(self.sight.body(self._crate)[1])
         local = rotate_xy(-yaw, mass[:, :2] - middle[:, :2])
         aim, enough = (torch.tensor(half, device=mass.device) for half in (AIM, ENOUGH))
         goal = middle[:, :2] + rotate_xy(yaw, torch.minimum(torch.maximum(local, -aim), aim))
-        return torch.cat([goal, torch.full_like(goal[:, :1], OVER_HEIGHT)], dim=1), (local.abs() < enough).all(dim=1)
+        high = mass[:, 2] > RIM
+        deep, inside = ((local.abs() < half).all(dim=1) & high for half in (aim + CLOSE, enough))
+        over = torch.cat([goal, torch.full_like(goal[:, :1], OVER_HEIGHT)], dim=1)
+        return over, torch.stack([deep, inside], dim=1)
 
     # What comes next.
 
@@ -246,18 +281,22 @@ class DoubleDeskExpert(Expert):
             for name, (near, straight) in WITHIN.items()
         }
         back = torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1)
+        over_crate = self._over()[1]
         over = arrived | {
             "look": self._in_view(self._origin()),
             "hover": (machine.clock > ALIGN) & (self._error[:, 0] < ALIGNED[0]) & (self._error[:, 1] < ALIGNED[1]),
             "step back": back > STEP_BACK[0],
             "turn": self._in_view(self._middle()),
             "sill": self._past_sill(),
-            "over": self._over()[1] & (machine.clock > 0.5),
+            "over": over_crate[:, 0] | (over_crate[:, 1] & (machine.clock > HURRY)),
         }
+        pace, time = self._pace()
+        over["pace"] = time < COMMITTED
+        over["back off"] = pose[:, 1] < self._sill - BEFORE_SILL
         late = machine.late
         done = {name: mask & machine.at(name) & (late | over.get(name, torch.zeros_like(late))) for name in LONGEST}
         # A hammer that fell onto the desk is grasped again; one on the floor is out of reach.
-        lost = mask & machine.at("step back", "turn", "line up", "sill", "deliver", "over") & ~held
+        lost = mask & machine.at("step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over") & ~held
         again = lost & (self._origin()[:, 2] > BENCH_HEIGHT) & (pose[:, 1] < self._sill)
         missed = done["lift"] & ~held
 
@@ -267,6 +306,8 @@ class DoubleDeskExpert(Expert):
         for name, following in zip(LONGEST, list(LONGEST)[1:], strict=False):
             machine.enter(following, done[name])
         machine.enter("step in", missed)
+        machine.enter("back off", done["pace"] & ((pace - USUAL_PACE) * time < -TOO_FAR))
+        machine.enter("pace", done["line up"])
         machine.enter("look", again)
         machine.enter("rest", lost & ~again)
 
@@ -300,15 +341,18 @@ class DoubleDeskExpert(Expert):
         lean = torch.where(at("open"), OVER_LEAN + OVER_LEAN_MORE * LONGEST["over"], lean)
         command.waist[:, 2] = lean
 
-        crossing = at("sill")
+        crossing = at("pace", "sill")
         command.swing_height = torch.where(crossing, self._style["swing"], command.swing_height)
         command.step_time = torch.where(crossing, SILL_STEP, command.step_time)
         command.height = torch.where(crossing, SILL_HEIGHT, command.height)
-        command.stagger = torch.where(crossing, SILL_STAGGER, command.stagger)
+        command.stagger = torch.where(at("pace"), PACE_STAGGER, command.stagger)
+        command.stagger = torch.where(at("sill"), SILL_STAGGER, command.stagger)
 
         command.reach = raised[:, None].expand(-1, 2).to(command.reach.dtype)
         self._lead_hands(command, mask, dt, raised)
-        command.hands[:, 0] = at("close", "lift", "step back", "turn", "line up", "sill", "deliver", "over").float()
+        command.hands[:, 0] = at(
+            "close", "lift", "step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over"
+        ).float()
         return command
 
     def _velocity(self, walking: Tensor) -> Tensor:
@@ -322,11 +366,12 @@ class DoubleDeskExpert(Expert):
         velocity = torch.cat([velocity[:, :2], torch.where(far, spin, velocity[:, 2])[:, None]], dim=1)
         back = torch.zeros_like(velocity)
         back[:, 0] = -STEP_BACK[1]
-        velocity = select(at("step back"), back, velocity)
+        velocity = select(at("step back", "back off"), back, velocity)
         crossing = self._crossing()
         line = torch.stack([crossing, torch.full_like(crossing, self._sill)], dim=1)
-        north, speed = torch.full_like(crossing, LOOK_LEFT), torch.full_like(crossing, SILL_SPEED)
-        return select(at("sill"), along(pose, line, north, speed, side=0.05, turn=0.3), velocity)
+        north = torch.full_like(crossing, LOOK_LEFT)
+        speed = torch.where(at("pace"), self._pace()[0].clamp(*PACES), SILL_SPEED)
+        return select(at("pace", "sill"), along(pose, line, north, speed, side=0.05, turn=0.3), velocity)
 
     def _lead_hands(self, command: MotionCommand, mask: Tensor, dt: float, raised: Tensor) -> None:
         """Fill in hand points and the left wrist."""
@@ -354,7 +399,9 @@ class DoubleDeskExpert(Expert):
         self._last = select(mask, left, self._last)
         both = torch.stack([left, posture[3].expand_as(left)], dim=1)
 
-        learn = mask & at("hover", "lower", "step back", "turn", "line up", "sill", "deliver", "over")
+        learn = mask & at(
+            "hover", "lower", "step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over"
+        )
         wanted = self._root()[:, None] + turn(yaw[:, None], both)
         command.hand_point = self.palms.lead(wanted, torch.stack([learn, torch.zeros_like(learn)], dim=1), dt)
         twist = mask & at("hover", "lower")
