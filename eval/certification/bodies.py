@@ -50,7 +50,10 @@ GLIDE_ACCELERATION = 10.0
 """Largest acceleration of the base [m/s²]: 340 N on the whole robot, as much as its own weight. So hard does it push
 against what blocks it."""
 TURN_ACCELERATION = 60.0
-"""Largest angular acceleration of the base [rad/s²]: about 50 N·m around the vertical, 200 N·m against tipping."""
+"""Largest angular acceleration of the base about the vertical [rad/s²]: 46 N·m."""
+TIP_ACCELERATION = 300.0
+"""The same against tipping [rad/s²]: 1200 N·m, five times what its push on a foot gives. Blocked by a sill it stops,
+and does not tip over it."""
 LEASH = 0.10
 """The base's target runs ahead of it by so much at most [m], so that it does not wind up where it is blocked."""
 TURN_LEASH = 0.3
@@ -175,8 +178,8 @@ class GlidingBase:
         self._force = wp.to_torch(env.physics.external_force)[:, robot.root_body]
         self._weight = float(env.scene.mj_model.body_subtreemass[robot.root_body]) * GRAVITY
         self._anchor = wp.to_torch(env.loop.reference.heading)
-        most = [GLIDE_ACCELERATION * TICK] * 3 + [TURN_ACCELERATION * TICK] * 3
-        self._most = torch.tensor(most, device=env.torch_device)
+        most = [GLIDE_ACCELERATION] * 3 + [TIP_ACCELERATION] * 2 + [TURN_ACCELERATION]
+        self._most = TICK * torch.tensor(most, device=env.torch_device)
         self.target = torch.zeros(env.worlds, 3, device=env.torch_device)
         """Where the base is to be: x, y [m] and yaw [rad], shape [worlds, 3]."""
 
