@@ -24,7 +24,7 @@ from arena_newton.pictures.video import VideoWriter, caption
 from arena_newton.robot import TICK
 from arena_newton.text import counted
 
-__all__ = ["write"]
+__all__ = ["tiled", "write"]
 
 FILMS = (".webp", ".gif", ".mp4")
 PICTURES = (".jpg", ".png")
@@ -99,7 +99,7 @@ def _film(chosen: Sequence[tuple[EpisodeRecord, Path]], target: Path, options: F
     count, columns = round(options.seconds * FPS), min(COLUMNS, len(chosen))
     width = (options.width - (columns - 1) * GAP) // columns // 2 * 2
     clips = [_clip(path, count, width, plain(record.task)) for record, path in chosen]
-    frames = [_tiled([clip[k] for clip in clips], columns) for k in range(count)]
+    frames = [tiled([clip[k] for clip in clips], columns) for k in range(count)]
     if target.suffix == ".mp4":
         with VideoWriter(target, frames[0].shape[1], frames[0].shape[0], FPS) as video:
             for frame in frames:
@@ -145,7 +145,7 @@ def _clip(path: Path, count: int, width: int, name: str) -> list[np.ndarray]:
     return [caption(small[k], name, at_top=True) for k in picks]
 
 
-def _tiled(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
+def tiled(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
     """Pictures of one width in rows, the last row in the middle; uint8 [H, W, 3], sides even."""
     height, width = max(tile.shape[0] for tile in tiles), tiles[0].shape[1]
     rows = math.ceil(len(tiles) / columns)

@@ -48,8 +48,7 @@ MOST_LINES = 600
 STEMS = {
     "base": "the base class of a room's kind of thing",
     "build": "every scene has its builder",
-    "boxing": "a task and its expert",
-    "vis_navi": "a task and its expert",
+    **dict.fromkeys(tasks.names(), "a task and its expert"),
     "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",
     "canonical": "the layout, and its kernels",
 }

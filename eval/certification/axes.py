@@ -156,7 +156,7 @@ def moved_coordinates(task: str, mode: str, rules: str, seeds: Iterable[int]) ->
 
 def execution(context: Context) -> CheckFinding:
     """Compare draws of all modes with the rules' ranges, and worlds after their reset."""
-    rows, broken = [], []
+    rows, broken, notes = [], [], []
     for rules in rule_sets.names():
         for task in context.tasks:
             rule_set = rule_sets.get(rules)
@@ -170,6 +170,10 @@ def execution(context: Context) -> CheckFinding:
             named = {
                 (rule.record, axis): rule for rule in rule_set.task(task).objects for axis in named_coordinates(rule)
             }
+            void = [
+                o.record for o in tasks.get(task).objects if o.execution_void and o.rule(rules).placement == "scaled"
+            ]
+            notes += [f"{where}: the original scales what {record} is drawn to almost nothing" for record in void]
             broken += [f"{where}: moves {' '.join(key)}, which no rule names" for key in moved.keys() - named.keys()]
             broken += [f"{where}: does not move {' '.join(key)}" for key in named.keys() - moved.keys()]
             for key in sorted(named.keys() & moved.keys()):
@@ -196,7 +200,7 @@ def execution(context: Context) -> CheckFinding:
     summary = f"execution mode moves {len(rows)} coordinates, the rules name these and no other"
     if broken:
         summary = f"{len(broken)} deviations from what the rules name"
-    return CheckFinding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
+    return CheckFinding("fail" if broken else "pass", summary, (sheet,), (*broken, *notes))
 
 
 def _range(bounds: tuple[float, float] | None) -> str:

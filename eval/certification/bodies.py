@@ -20,7 +20,7 @@ from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK
+from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK, DriveGains
 from arena_newton.rotations import (
     heading,
     quat_conjugate,
@@ -50,11 +50,21 @@ GLIDE_ACCELERATION = 10.0
 """Largest acceleration of the base [m/s²]: 340 N on the whole robot, as much as its own weight. So hard does it push
 against what blocks it."""
 TURN_ACCELERATION = 60.0
-"""Largest angular acceleration of the base [rad/s²]: about 50 N·m around the vertical, 200 N·m against tipping."""
+"""Largest angular acceleration of the base about the vertical [rad/s²]: 46 N·m."""
+TIP_ACCELERATION = 300.0
+"""The same against tipping [rad/s²]: 1200 N·m, five times what its push on a foot gives. Blocked by a sill it stops,
+and does not tip over it."""
 LEASH = 0.10
 """The base's target runs ahead of it by so much at most [m], so that it does not wind up where it is blocked."""
 TURN_LEASH = 0.3
 """The same for its yaw [rad]."""
+STIFF_LEG = (2000.0, 2000.0, 2000.0, 2000.0, 600.0, 600.0)
+"""Stiffness of the joints of a held leg, hip to ankle [N·m/rad]: what blocks the base bends the leg by centimetres, so
+that a foot does not slip over a sill. Softer at the ankle, whose inertia is small for a step of 5 ms."""
+STIFF_DAMPING = 0.05
+"""Their damping, as a fraction of the stiffness [s]."""
+STIFF_EFFORT = 2000.0
+"""Their torque limit [N·m]."""
 GRAVITY = 9.81
 """[m/s²]."""
 
@@ -95,15 +105,29 @@ class FrozenLegsEnv(ArenaEnv):
         return super().describe() | {"body": "legs frozen in the standing posture"}
 
 
+def stiffened(drive: DriveGains) -> DriveGains:
+    """A drive whose legs are as stiff as a column; waist, arms and fingers keep their gains."""
+    legs = STIFF_LEG * 2
+    damping = tuple(STIFF_DAMPING * stiffness for stiffness in legs)
+    return dataclasses.replace(
+        drive,
+        name=f"{drive.name}, stiff legs",
+        kp=(*legs, *drive.kp[len(LEGS) :]),
+        kd=(*damping, *drive.kd[len(LEGS) :]),
+        effort=(*(STIFF_EFFORT,) * len(LEGS), *drive.effort[len(LEGS) :]),
+    )
+
+
 class HeldLegs(Tracker):
-    """A tracker whose legs hold the standing posture, whatever its network says; waist and arms are its own."""
+    """A tracker whose legs hold the standing posture stiffly, whatever its network says; waist and arms are its own."""
 
     def __init__(self, inner: Tracker):
         """Take a tracker that is bound to no worlds yet."""
         self.inner = inner
         self.name, self.joints = inner.name, inner.joints
         self.checkpoint, self.checkpoint_hash = inner.checkpoint, inner.checkpoint_hash
-        self.drive, self.original_drive = inner.drive, inner.original_drive
+        self.drive = stiffened(inner.drive)
+        self.original_drive = None if inner.original_drive is None else stiffened(inner.original_drive)
         self.physics_rate, self.fast_physics_rate = inner.physics_rate, inner.fast_physics_rate
         self.ignores, self.max_root_delta_deg = inner.ignores, inner.max_root_delta_deg
         self._takes_mask = "mask" in inspect.signature(inner.step).parameters
@@ -154,8 +178,8 @@ class GlidingBase:
         self._force = wp.to_torch(env.physics.external_force)[:, robot.root_body]
         self._weight = float(env.scene.mj_model.body_subtreemass[robot.root_body]) * GRAVITY
         self._anchor = wp.to_torch(env.loop.reference.heading)
-        most = [GLIDE_ACCELERATION * TICK] * 3 + [TURN_ACCELERATION * TICK] * 3
-        self._most = torch.tensor(most, device=env.torch_device)
+        most = [GLIDE_ACCELERATION] * 3 + [TIP_ACCELERATION] * 2 + [TURN_ACCELERATION]
+        self._most = TICK * torch.tensor(most, device=env.torch_device)
         self.target = torch.zeros(env.worlds, 3, device=env.torch_device)
         """Where the base is to be: x, y [m] and yaw [rad], shape [worlds, 3]."""
 

@@ -11,6 +11,14 @@ from arena_newton.eval.certification.solvable import recorded
 __all__ = ["CHECKS", "GLIDES"]
 
 GLIDES: Mapping[str, str] = {
+    "football": (
+        "the rule asks where the ball goes, not how: the feet that hang from the gliding base meet it as a bumper "
+        "would, and push it into the goal at the speed of the base. Only a kick is a matter of legs"
+    ),
+    "open_door": (
+        "lever, leaf and doorway are met by hands and body: a base that rolls presses, leans and drives through, and "
+        "the doorway has no sill"
+    ),
     "boxing": (
         "the target's centre is 0.75 to 0.85 m high and counts from 0.13 m away, and a pelvis that glides at 0.8 m has "
         "its shoulders 0.3 m above that: the arms alone reach down to it, from wherever the base rolls"

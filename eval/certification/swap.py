@@ -36,7 +36,7 @@ def swap(context: Context) -> CheckFinding:
     """Replay the experts' recordings open loop through every other tracker and, as a control, through their own."""
     if len(context.trackers) < 2:
         return skipped("needs two trackers: --tracker twist2 sonic")
-    rows, notes, kept, shown, few = [], [], [], [], False
+    rows, notes, kept, shown, unlike, few = [], [], [], [], [], False
     for source, target in itertools.product(context.trackers, repeat=2):
         if source == target and context.options.quick:
             continue
@@ -60,6 +60,10 @@ def swap(context: Context) -> CheckFinding:
         delta = 100.0 * (b.rate - a.rate)
         rows.append(("all", source, target, a.cells()[0], *b.cells(), "", f"{delta:+.0f}", retention(a, b)))
         if source == target:
+            if context.options.engine == "mujoco" and [one.successes for one in own] != [
+                one.successes for one in other
+            ]:
+                unlike.append(f"{source}: a replay through the tracker of the recording ends otherwise than it did")
             continue
         shown.append(b.rate < a.rate and p <= SHOWN_BY)
         few = few or a.episodes < ENOUGH
@@ -74,8 +78,8 @@ def swap(context: Context) -> CheckFinding:
         notes.append(
             f"A loss shows from p = {SHOWN_BY} on; fewer than {ENOUGH} episodes of a direction cannot rule it out."
         )
-    verdict: Verdict = "pass" if all(shown) else "note" if few else "fail"
-    return CheckFinding(verdict, "; ".join(kept), (sheet,), tuple(notes))
+    verdict: Verdict = "fail" if unlike else "pass" if all(shown) else "note" if few else "fail"
+    return CheckFinding(verdict, "; ".join(kept), (sheet,), (*unlike, *notes))
 
 
 CHECKS = (Check("swap", "Do recorded actions lose their success through the other tracker, without any policy?", swap),)

@@ -93,6 +93,8 @@ class OpenDoorExpert(Expert):
         self._ready, self._lane, self._forward = (torch.zeros(worlds, device=device) for _ in range(3))
         self._raised = torch.zeros(worlds, 3, device=device)
         self._arms = MotionCommand.neutral(worlds, device).arms
+        self._pushing = torch.tensor(PUSHING, device=device).expand(worlds, 2, 3)
+        self._from_pivot = torch.tensor([0.0, ON_LEVER], device=device).expand(worlds, 2)
 
     def begin(self, mask: Tensor, style: Style) -> None:
         """Walk to a pose in front of the lever."""
@@ -145,8 +147,7 @@ class OpenDoorExpert(Expert):
     def _lever(self) -> Tensor:
         """The point of the lever that is pressed, as long as lever and leaf are at rest [m], shape [worlds, 3]."""
         pivot = self.sight.body(self._handle)[0]
-        left = rotate_xy(self._yaw(), torch.tensor([0.0, ON_LEVER], device=pivot.device).expand(len(pivot), 2))
-        return torch.cat([pivot[:, :2] + left, pivot[:, 2:]], dim=1)
+        return torch.cat([pivot[:, :2] + rotate_xy(self._yaw(), self._from_pivot), pivot[:, 2:]], dim=1)
 
     def _before(self, distance: Tensor) -> Tensor:
         """Pose in front of the lever, this far from it [m]: x, y [m], yaw [rad], shape [worlds, 3]."""
@@ -221,7 +222,6 @@ class OpenDoorExpert(Expert):
         point = self._doorway()[:, :2] + rotate_xy(yaw, right_of_middle)
         velocity = along(self.sight.pose, point, yaw, self._forward)
         command.velocity = select(pushing, velocity, command.velocity)
-        hands = torch.tensor(PUSHING, device=yaw.device).expand(len(yaw), 2, 3)
-        command.hand_point = select(pushing, hands, command.hand_point)
+        command.hand_point = select(pushing, self._pushing, command.hand_point)
         command.reach = select(pushing, torch.ones_like(command.reach), command.reach)
         command.foot_offset = PUSH_OFFSET * pushing

@@ -31,13 +31,13 @@ __all__ = ["PPBoxExpert"]
 
 DECK = 1
 """The deck at 0.67 m, the only empty one, at hip height: no bend is needed. `released` accepts no other."""
-MOST_TURN = 0.35
+MOST_TURN = 0.5
 """The robot faces one of the box's sides if that is turned by less than this from its own side of the table [rad]; a
-box turned farther is squeezed across its corners' direction less this."""
+box turned farther is squeezed across its corners, and comes to lie flat between the fists."""
 STAND_OFF = 0.75
 """Distance of pelvis and box centre from which the robot steps straight ahead to the box [m]."""
 STAND = 0.30
-"""The same when it steps up to grasp [m]: stretching the arms ahead and the last steps move the pelvis back by 6-9 cm."""
+"""The same when it steps up to grasp [m]: stretching the arms and the last steps move the pelvis back by 6-9 cm."""
 EDGE = 0.14
 """Least distance of the pelvis from the table when it steps up [m]."""
 REACH = 0.42
@@ -65,8 +65,13 @@ CLOSING = 0.15
 OVERLAP = 0.09
 """How much deeper than it gets each palm is commanded into the box [m]: about 100 N/m times this, 10-12 N a side.
 Below 8 N weak arms drop the box in the carry."""
-SERVO = 3.0
-"""Gain of the squeeze [1/s]: speed of a hand for what the overlap lacks."""
+TURNED = 0.15
+"""How much deeper into a box that stands turned between the fists [m/rad]: they slide on its faces, and press less."""
+SERVO, HOLD = 3.0, 1.0
+"""Gain of the squeeze when the hands close and lift, and afterwards [1/s]: speed of a hand for what the overlap lacks.
+A turned box comes to lie flat between the fists only when they press, and is then narrower."""
+SQUEEZED = 1.2
+"""Least time of the squeeze [s]."""
 DEEPEST = 0.17
 """Most that a palm is commanded into the box [m]."""
 LIFT = 0.12
@@ -91,19 +96,25 @@ FACING = 0.9
 BEFORE = (0.50, 0.70)
 """Least and largest distance of pelvis and front edge of the deck from which the robot walks straight to the shelf
 [m]."""
-AT_SHELF = 0.18
+AT_SHELF = 0.17
 """The same when it places the box [m]."""
 SIDE = 0.55
 """Largest distance of the spot from the deck's middle [m]: the opening hands clear the uprights."""
-INSIDE = 0.18
-"""Distance of the placed box's centre from the front edge [m]: 7.5 cm more than half of it."""
-STRETCH = 0.24
-"""Most that the hands move ahead for it [m]."""
+INSIDE = 0.20
+"""Distance of the placed box's centre from the front edge [m]: 9.5 cm more than half of it."""
+DEPTH_GAIN = 2.0
+"""Gain of the hands' way ahead on that distance [1/s]."""
+FARTHEST = 0.52
+"""Largest distance ahead of the pelvis to which the palms are commanded at the shelf [m]."""
+BEND = 0.15
+"""Waist pitch at the shelf [rad]."""
+SETTLED = 1.2
+"""Time in which a walk ends: the pelvis rises, and moves back by 6 cm [s]."""
 SINKING = 0.05
 """Speed of the box from the lift to the height in which it is carried over the deck [m/s]."""
 LOWERING = 0.08
 """Speed of the box on its way down [m/s]."""
-SUNK = 0.10
+SUNK = 0.06
 """How much farther than to the deck the hands are commanded down [m]: arms that follow roughly get there too."""
 DOWN = 0.008
 """Height above the deck at which the box counts as put down [m]."""
@@ -111,6 +122,8 @@ TURNING = 0.6
 """Yaw rate of the turn to the shelf [rad/s]."""
 OPENING = 0.5
 """Speed of each hand when it lets go [m/s]."""
+LET_GO = 0.8
+"""Least time of that: fists still on the box would drag it along [s]."""
 OPEN = 0.12
 """Way of each hand off the box [m]."""
 LEAVE = 0.25
@@ -135,8 +148,8 @@ LONGEST = {
     "carry": 14.0,
     "step in": 5.0,
     "reach": 3.0,
-    "lower": 3.0,
-    "open": 0.6,
+    "lower": 2.5,
+    "open": 1.0,
     "leave": 3.0,
     "retreat": 3.0,
     "stand": math.inf,
@@ -187,7 +200,7 @@ class PPBoxExpert(Expert):
         self.underside = zero
         """Wanted height of the box's underside [m], shape [worlds]."""
         self._raised = self._level = self._table = zero
-        self._lean = zero
+        self._lean = self._deep = zero
         self._angles = torch.zeros(worlds, 2, 3, device=device)
         self._stand = self._spot = torch.zeros(worlds, 3, device=device)
         self._off = self._near = self._inside = self._aside = self._pace = zero
@@ -227,6 +240,7 @@ class PPBoxExpert(Expert):
         command.reach = active[:, None].expand(-1, 2).to(command.reach.dtype)
         command.hands = command.reach
         lean = torch.where(state.at("align", "close", "lift"), self._lean, 0.0)
+        lean = torch.where(state.at("reach", "lower", "open"), BEND, lean)
         command.waist = torch.stack([torch.zeros_like(lean), torch.zeros_like(lean), lean], dim=1)
         arms = command.arms.clone()
         arms[:, self._columns] = self._angles
@@ -270,6 +284,7 @@ class PPBoxExpert(Expert):
         facing, box = turned.clamp(-MOST_TURN, MOST_TURN), self._centre()[:, :2]
         gap = ((box[:, 0] - self._edge + EDGE) / torch.cos(facing)).clamp(min=STAND)
         self._stand = select(mask, pose_before(box, facing, gap), self._stand)
+        self._deep = select(mask, OVERLAP + TURNED * (turned - facing).abs(), self._deep)
         self.walk.to(mask, pose_before(box, facing, self._off))
         self.palms.reset(mask)
         self.wrists.reset(mask)
@@ -288,8 +303,10 @@ class PPBoxExpert(Expert):
         self.haul.to(mask, pose_before(edge, facing, (-here[:, 1]).clamp(*BEFORE)))
 
     def _go_on(self, mask: Tensor, walk: NavigationCommand, haul: NavigationCommand) -> None:
-        """Enter the next phase where the present one is done or has lasted too long; from the last to the first, so
-        that a world advances by one phase at the most."""
+        """Enter the next phase where the present one is done or has lasted too long.
+
+        From the last phase to the first, so that a world advances by one at the most.
+        """
         state, pose = self.state, self.sight.pose
         late, clock = state.late, state.clock
         deck = self._depth(self._centre()[:, :2])[:, 1]
@@ -310,10 +327,11 @@ class PPBoxExpert(Expert):
         off = torch.linalg.vector_norm(pose[:, :2] - self._spot[:, :2], dim=1)
         self._approach(done("retreat", away > BACK))
         enter("leave", "stand", off > BACK)
-        enter("open", "leave", self.half >= self._opened())
+        enter("open", "leave", (self.half >= self._opened()) & (clock > LET_GO))
         flat = self._deck_top() + self._box_half[2] + DOWN
-        enter("lower", "open", self._centre()[:, 2] < flat)
-        enter("reach", "lower", (deck >= self._inside) | (self.grip[:, 0] >= self._near + STRETCH))
+        sunk = self.underside < self._deck_top() - SUNK + 0.005
+        enter("lower", "open", (self._centre()[:, 2] < flat) | sunk)
+        enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - 0.01) | (self.grip[:, 0] >= FARTHEST)))
         enter("step in", "reach", near(haul, AT_PLACE))
         self.haul.to(enter("carry", "step in", near(haul, PASSING)), self._spot)
         self._choose_spot(enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING))
@@ -322,7 +340,7 @@ class PPBoxExpert(Expert):
         held = self._underside() > self._table + SLIPPED
         state.enter("back", lifted & held)
         state.enter("retreat", lifted & ~held)
-        enter("close", "lift", (self._overlap() > OVERLAP - 0.01) & (clock > 1.0))
+        enter("close", "lift", (self._overlap() > self._deep - 0.01) & (clock > SQUEEZED))
         error = self._missing()
         enter("align", "close", (clock > 1.0) & (error < ALIGNED))
         enter("step up", "align", near(walk, AT_PLACE))
@@ -388,9 +406,10 @@ class PPBoxExpert(Expert):
         angles = self.wrists.lead(level, learn, dt)
         self._angles = select(mask & (before | aligning), angles, self._angles)
 
-        closing = dt * (SERVO * (OVERLAP - self._overlap())).clamp(-CLOSING, CLOSING)
-        deepest = self._wide() + FIST - DEEPEST
-        self.half = select(mask & state.at("close"), torch.maximum(self.half - closing, deepest), self.half)
+        gain = torch.where(state.at("close", "lift"), SERVO, HOLD)
+        closing = dt * (gain * (self._deep - self._overlap())).clamp(-CLOSING, CLOSING)
+        squeezed = torch.maximum(self.half - closing, self._box_half[:2].amin() + FIST - DEEPEST)
+        self.half = select(mask & state.at("close", *HELD), squeezed, self.half)
         opening = torch.minimum(self.half + OPENING * dt, self._opened())
         self.half = select(mask & state.at("open", "retreat"), opening, self.half)
 
@@ -407,9 +426,11 @@ class PPBoxExpert(Expert):
         learn = carried & ~state.at("lower")
         self._raised = select(learn, lacking.clamp(-MOST_RAISED, MOST_RAISED), self._raised)
 
-        ahead = torch.where(state.at("reach"), self._near + STRETCH, self._near)
         x, step = self.grip[:, 0], DRAWING * dt
-        x = torch.where(state.at("lift", "lower"), x, x + (ahead - x).clamp(-step, step))
+        depth = self._depth(self._centre()[:, :2])[:, 1]
+        placing = (DEPTH_GAIN * dt * (self._inside - depth)).clamp(-step, step)
+        drawn = torch.where(state.at("reach", "lower"), placing, (self._near - x).clamp(-step, step))
+        x = torch.where(state.at("lift"), x, (x + drawn).clamp(max=FARTHEST))
         z = self._level + self.underside - self._table + self._raised
         grip = torch.stack([x, self.grip[:, 1], z], dim=1)
         self.grip = select(carried, grip, self.grip)

@@ -123,6 +123,7 @@ class SitSofaExpert(Expert):
         self.phase = Phases(LONGEST, worlds, device)
         """Where each world is in the task."""
         self._named = self.phase.names()
+        self._most = torch.tensor([BACKWARD, SIDEWAYS], device=device)
         self._seen = torch.zeros(worlds, len(CARTONS), 5, device=device)
         self._nearer = torch.zeros(worlds, device=device)
         self._seat_aside = torch.zeros(worlds, device=device)
@@ -247,9 +248,8 @@ class SitSofaExpert(Expert):
         wanted = GAIN * torch.stack([ahead, offset[:, 0] - self._seat_aside], dim=1)
         main = torch.stack([backward, sideways], dim=1)
         wanted = torch.where(main & (wanted.abs() < CRAWL), CRAWL * wanted.sign(), wanted)
-        most = torch.tensor([BACKWARD, SIDEWAYS], device=wanted.device)
         turn = (-HEADING_GAIN * offset[:, 2]).clamp(-TURN, TURN)
-        return torch.cat([rotate_xy(-offset[:, 2], wanted.clamp(-most, most)), turn[:, None]], dim=1)
+        return torch.cat([rotate_xy(-offset[:, 2], wanted.clamp(-self._most, self._most)), turn[:, None]], dim=1)
 
 
 def _cover(boxes: Tensor, yaw: Tensor) -> Tensor:

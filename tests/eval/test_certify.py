@@ -137,6 +137,23 @@ def test_a_swap_that_costs_nothing_is_told_apart_from_one_with_few_episodes(tmp_
     assert certify.run(many, factories(**parts), checks=swap.CHECKS) == 1
 
 
+def test_the_control_of_the_swap(tmp_path):
+    """Without --quick each recording is replayed through its own tracker too; one that ends otherwise is a failure."""
+    given = {"quick": False, "task": ("boxing",), "checks": ("swap",), "episodes": 20}
+
+    class Forgetful(SwappedPolicy):
+        def attach(self, env):
+            env.lost = env.lost or self.name.startswith("replay:")
+
+    assert certify.run(options(tmp_path / "a", **given), factories(**PARTS), checks=CHECKS) == 0
+    rows = {tuple(row[:3]): row[3:5] for row in read(tmp_path / "a")["swap"]["tables"][0]["rows"]}
+    assert rows["boxing", "twist2", "twist2"] == rows["boxing", "sonic", "sonic"] == ["20/20", "20/20"]
+    assert rows["boxing", "twist2", "sonic"] == ["20/20", "0/20"]
+    parts = PARTS | {"policy": Forgetful}
+    assert certify.run(options(tmp_path / "b", **given), factories(**parts), checks=CHECKS) == 1
+    assert "twist2: a replay through the tracker of the recording" in read(tmp_path / "b")["swap"]["notes"][0]
+
+
 def test_it_goes_on_where_it_was(tmp_path, capsys):
     """Nothing that was played is played again; without --resume a folder is not touched."""
     given = options(tmp_path, checks=("solvable",))

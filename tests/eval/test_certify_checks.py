@@ -94,6 +94,21 @@ def test_a_gliding_base_follows_the_command_and_nothing_else(gliding):
     assert turned == pytest.approx([0.75, 0.0], abs=0.08)
 
 
+def test_a_sill_stops_a_gliding_base():
+    """Driven at DoubleDesk's sill the base stays in front of it, upright: it neither steps nor tips over it."""
+    parts = BODIES["gliding"].equip(Factories())
+    env = parts.env("double_desk", tracker=parts.tracker("twist2", None), worlds=1, engine="mujoco")
+    facing_sill = (-2.55, -2.1, GLIDE_HEIGHT), (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    env.reset([1], spawn=lambda seed: facing_sill)
+    action = STAND_ACTION[None].copy()
+    action[0, ACTION["root_xy_delta"]] = (0.4 * TICK, 0.0)
+    while env.tick[0] < 150:
+        env.step(action)
+    x, y, z, qw, qx, qy, qz = env.physics.qpos.numpy()[0, env.scene.robot.root_qpos :][:7]
+    assert -1.8 < y < -1.5
+    assert 1.0 - 2.0 * (qx**2 + qy**2) > np.cos(np.radians(10.0)) and z == pytest.approx(GLIDE_HEIGHT, abs=0.02)
+
+
 def test_worlds_that_wait_keep_their_base(gliding):
     """A world outside the mask keeps every bit while the other one glides."""
     env = gliding

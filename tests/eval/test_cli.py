@@ -1,5 +1,6 @@
 """The command line: defaults, one-line answers to bad input, exit codes, quick help."""
 
+import dataclasses
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.config import resolve
 from arena_newton.eval.options import RunOptions
+from arena_newton.tasks import football
 
 TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
 CELLS = [(tracker, mode) for tracker in ("twist2", "sonic") for mode in ("base", "visual")]
@@ -41,6 +43,8 @@ def test_default_run(tmp_path, capsys, monkeypatch):
     lines = (Path(report).parent / "episodes.jsonl").read_text().splitlines()
     budgets = {row["task"]: row["max_steps"] for row in map(json.loads, lines)}
     assert budgets == {task: tasks.get(task).max_steps(rule_sets.get("paper")) for task in planned}
+    assert main(["resume", str(Path(report).parent)], factories()) == 0
+    assert f"{len(lines)} episodes, all finished" in capsys.readouterr().out
 
 
 def test_configuration_is_two_lines(tmp_path, capsys):
@@ -327,10 +331,23 @@ def test_identity_covers_scenes_and_code():
     assert identity["scenes"] != other["scenes"] and identity["code"] == other["code"]
 
 
-def test_task_without_an_expert_is_refused_first(tmp_path, capsys):
+@pytest.fixture
+def without_an_expert(monkeypatch):
+    """Football as a task that somebody added without an expert."""
+    monkeypatch.setattr(football, "TASK", dataclasses.replace(football.TASK, expert=None))
+
+
+def test_task_without_an_expert_is_refused_first(tmp_path, capsys, without_an_expert):
     """A policy that cannot do one of the tasks is refused before the first episode of any."""
     out = tmp_path / "out"
     assert main(["--task", "vis_navi", "football", "--policy", "expert", "--tracker", "pd", "--out", str(out)]) == 2
     message = capsys.readouterr().err
-    assert "football" in message and "boxing, vis_navi" in message and message.count("\n") == 1
+    assert "task football" in message and "sit_sofa, vis_navi" in message and message.count("\n") == 1
     assert not out.exists()
+
+
+def test_default_run_leaves_out_a_task_without_an_expert(without_an_expert):
+    """Without flags the tasks that have an expert run; another policy gets all of them, as `--task all` does."""
+    assert resolve(RunOptions(engine="mujoco")).flags.task == tuple(TASKS[1:])
+    assert resolve(RunOptions(engine="mujoco", policy="stand")).flags.task == tuple(TASKS)
+    assert resolve(RunOptions(engine="mujoco", task=("all",))).flags.task == tuple(TASKS)

@@ -7,6 +7,7 @@ from PIL import Image
 from rows import episodes
 from test_report import folder_with, recorded
 
+from arena_newton.eval import success_film
 from arena_newton.eval.__main__ import main
 from arena_newton.pictures.video import VideoWriter, film_strip
 
@@ -76,6 +77,20 @@ def test_strips_as_one_picture(folder, tmp_path):
     for number in range(3):
         rows = pixels[26 + number * (26 + height) :][:height, 20:80]
         assert np.abs(rows.astype(int) - 40).max() < 12
+
+
+def test_tiles_are_in_rows():
+    """Seven tiles make rows of four and three, the second in the middle under the first, and sides are even."""
+    tiles = [np.full((9, 20, 3), 10 * number, np.uint8) for number in range(7)]
+    picture = success_film.tiled(tiles, 4)
+    gap = success_film.GAP
+    assert picture.shape == (2 * 9 + gap, 4 * 20 + 3 * gap, 3)
+    for number in range(4):
+        assert (picture[:9, number * (20 + gap) :][:, :20] == 10 * number).all()
+    left = (20 + gap) // 2
+    for number in range(3):
+        assert (picture[9 + gap :, left + number * (20 + gap) :][:, :20] == 40 + 10 * number).all()
+    assert (picture[9 + gap :, :left] == success_film.GROUND).all()
 
 
 @pytest.mark.parametrize(

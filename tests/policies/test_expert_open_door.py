@@ -1,0 +1,186 @@
+"""OpenDoor's expert: where it stands, its phases with and without a missed lever, doors passed through a tracker."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import policies, seeding, trackers
+from arena_newton.env import ArenaEnv
+from arena_newton.policies.experts.open_door import LEARN, ON_LEVER, SIDE, STAND, OpenDoorExpert
+from arena_newton.policies.experts.style import Style
+from arena_newton.rollout import Rollout
+from arena_newton.rotations import rotate_xy
+from arena_newton.tasks.open_door import DOORWAY, HANDLE, LEAF
+
+PIVOT = (0.43, -0.065)
+"""The lever's pivot in the door's frame [m], at height 0.95 m."""
+HANDS, FRAME, LEVER = (0, 1), 2, 3
+"""Bodies of the door without physics."""
+
+
+class Door:
+    """A `Sight` without physics: robot, door and hands are where a test puts them."""
+
+    def __init__(self, doors):
+        self.doors = torch.tensor(doors, dtype=torch.float32)
+        """Frame x, y [m], yaw [rad], shape [worlds, 3]."""
+        self.worlds, self.device = len(doors), torch.device("cpu")
+        self.pose = torch.tensor([[-1.6, 0.2, math.pi / 2]]).repeat(self.worlds, 1)
+        self.angles = {"leaf": torch.zeros(self.worlds), "lever": torch.zeros(self.worlds)}
+        self.hands = torch.zeros(self.worlds, 2, 3)
+        self.scene = SimpleNamespace(
+            link=lambda name: HANDS[name.startswith("right")],
+            body_id=lambda prim: {HANDLE: LEVER}[prim],
+            marker=lambda prim: SimpleNamespace(body_id=FRAME),
+        )
+
+    @property
+    def root_position(self):
+        return torch.cat([self.pose[:, :2], torch.full((self.worlds, 1), 0.75)], dim=1)
+
+    def at(self, local, height):
+        """A point of the door's frame, shape [worlds, 3]."""
+        turned = rotate_xy(self.doors[:, 2], torch.tensor(local).expand(self.worlds, 2))
+        return torch.cat([self.doors[:, :2] + turned, torch.full((self.worlds, 1), height)], dim=1)
+
+    def body(self, body):
+        half, zero = self.doors[:, 2] / 2, torch.zeros(self.worlds)
+        quat = torch.stack([half.cos(), zero, zero, half.sin()], dim=1)
+        return (self.at(PIVOT, 0.95) if body == LEVER else self.at((0.0, 0.0), 0.0)), quat
+
+    def frame(self, prim):
+        assert prim == DOORWAY
+        return lambda: self.at((0.0, 0.0), 1.07)
+
+    def joint(self, prim):
+        name = "leaf" if prim == LEAF else "lever"
+        return lambda: self.angles[name]
+
+    def point(self, body, offset):
+        return self.hands[:, body]
+
+
+DOORS = [[-1.6, 2.3, 0.0], [-2.0, 1.6, 0.3]]
+
+
+@pytest.fixture
+def door():
+    """Two doors, one of them turned, and an expert whose episodes have begun."""
+    sight = Door(DOORS)
+    expert, style, every = OpenDoorExpert(sight), Style(2), np.ones(2, bool)
+    style.begin(every, [3, 4])
+    expert.begin(torch.from_numpy(every), style)
+    return sight, expert
+
+
+def after(expert, seconds, worlds=2):
+    """Phases after so many seconds of decisions for the first worlds."""
+    mask = torch.arange(2) < worlds
+    for _ in range(math.ceil(seconds / 0.1 - 1e-6)):
+        expert.command(mask, 0.1)
+    return expert.phases()
+
+
+def at_the_lever(sight, expert):
+    """Lead the expert to `align`, with the robot where it wants to be."""
+    for walk, wait in (("approach", "raise"), ("step in", "align")):
+        assert after(expert, 0.1) == [walk] * 2 or expert.phases() == [wait] * 2
+        sight.pose = expert.walk.goal.clone()
+        expert.walk.to(torch.ones(2, dtype=torch.bool), expert.walk.goal)  # a robot that jumps has left its path
+        assert after(expert, 0.2) == [wait] * 2
+        if wait == "raise":
+            assert after(expert, 1.4) == ["step in"] * 2
+
+
+def test_the_lever_is_in_front_of_the_right_shoulder(door):
+    """When it presses, the robot faces the door, and the point to press is `STAND` ahead and `SIDE` to its right."""
+    sight, expert = door
+    at_the_lever(sight, expert)
+    pressed = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 0.95)
+    local = rotate_xy(-sight.pose[:, 2], pressed[:, :2] - sight.pose[:, :2])
+    assert torch.allclose(local, torch.tensor([STAND, -SIDE]).expand(2, 2), atol=1e-5)
+    assert torch.allclose(sight.pose[:, 2], sight.doors[:, 2] + math.pi / 2, atol=1e-5)
+
+
+def test_a_released_latch_is_pushed_and_passed(door):
+    """A lever at 20° leads to the push, a robot inside with the leaf open to the end; without the leaf it goes on."""
+    sight, expert = door
+    at_the_lever(sight, expert)
+    sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 1.08)
+    assert after(expert, 2.6) == ["press"] * 2
+    sight.angles["lever"] = torch.tensor([-0.30, -0.36])
+    assert after(expert, 0.1) == ["press", "push"]
+    sight.angles["lever"] = torch.full((2,), -0.36)
+    assert after(expert, 0.1) == ["push"] * 2
+    sight.pose = torch.cat([sight.at((0.1, 0.6), 0.0)[:, :2], sight.pose[:, 2:]], dim=1)
+    sight.angles["leaf"] = torch.tensor([1.2, 0.7])
+    assert after(expert, 0.1) == ["through", "push"]
+
+
+def test_a_missed_lever_is_tried_again_from_a_better_stance(door):
+    """A palm that is below a closed latch leads back to `raise`, and the stance moves by part of what it missed."""
+    sight, expert = door
+    at_the_lever(sight, expert)
+    before = sight.pose.clone()
+    sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1] - 0.05), 1.08)  # 5 cm short
+    assert after(expert, 2.6) == ["press"] * 2
+    sight.hands[:, 1, 2] = 0.85
+    assert after(expert, 0.1) == ["retreat"] * 2
+    sight.pose = expert.walk.goal.clone()
+    assert after(expert, 0.2) == ["raise"] * 2
+    assert after(expert, 1.4) == ["step in"] * 2
+    moved = rotate_xy(-before[:, 2], expert.walk.goal[:, :2] - before[:, :2])
+    assert torch.allclose(moved, torch.tensor([0.05 * LEARN, 0.0]).expand(2, 2), atol=1e-5)
+
+
+def test_phases_end_without_progress(door):
+    """A robot that never moves and a hand that never arrives keep no phase longer than its longest time."""
+    sight, expert = door
+    sight.hands = sight.hands + 1.2
+    seen = set()
+    for _ in range(70):
+        expert.command(torch.ones(2, dtype=torch.bool), 0.5)
+        seen |= set(expert.phases())
+    assert seen == {"approach", "raise", "step in", "align", "press", "retreat"}
+
+
+def test_worlds_outside_the_mask_keep_their_state(door):
+    """Decisions for the first world alone leave the phase, clock, goal and palm of the other as they were."""
+    sight, expert = door
+    at_the_lever(sight, expert)
+    sight.hands = sight.hands + 1.2
+    before = [expert.states.clock.clone(), expert.walk.goal.clone(), expert.palms.correction.clone()]
+    assert after(expert, 2.6, worlds=1) == ["press", "align"]
+    assert torch.equal(expert.states.clock[1], before[0][1]) and torch.equal(expert.walk.goal[1], before[1][1])
+    assert torch.equal(expert.palms.correction[1], before[2][1])
+    assert not torch.equal(expert.palms.correction[0], before[2][0])
+
+
+def test_doors_through_twist2_whatever_runs_beside():
+    """Both robots pass the door at their first try; alone an episode has the same actions bit for bit."""
+    env = ArenaEnv("open_door", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", threads=2)
+    episodes = [
+        SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, *who)) for who in ((900, 5), (900, 1))
+    ]
+    kept = []
+    for batch, ticks in ((episodes, 900), (episodes[:1], 300)):
+        policy, actions = policies.get("expert"), []
+        act = policy.act
+
+        def noted(observation, act=act, actions=actions):
+            chunk = act(observation)
+            if observation.mask[0]:
+                actions.append(chunk.actions[0].clone())
+            return chunk
+
+        policy.act = noted
+        results = Rollout(env, policy, batch, max_steps=ticks).run()
+        if len(batch) == 2:
+            assert [r.outcome for r in results] == ["success", "success"]
+            order = ["approach", "raise", "step in", "align", "press", "push"]
+            assert all([name for name, _ in r.phases] == order for r in results)
+        kept.append(torch.stack(actions)[:300])
+    assert len(kept[1]) == 300 and torch.equal(kept[0], kept[1])
