@@ -299,8 +299,10 @@ class DoubleDeskExpert(Expert):
         done = {name: mask & machine.at(name) & (late | over.get(name, torch.zeros_like(late))) for name in LONGEST}
         # A hammer that fell onto the desk is grasped again; one on the floor is out of reach.
         lost = mask & machine.at("step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over") & ~held
-        again = lost & (self._origin()[:, 2] > BENCH_HEIGHT) & (pose[:, 1] < self._sill)
+        on_desk = self._origin()[:, 2] > BENCH_HEIGHT
         missed = done["lift"] & ~held
+        self._aim(missed)
+        again = lost & on_desk & (pose[:, 1] < self._sill)
         short = done["over"] & ~over_crate[:, 1]
 
         stand, _ = self._stand()
@@ -313,7 +315,7 @@ class DoubleDeskExpert(Expert):
         machine.enter("back off", done["pace"] & ((pace - USUAL_PACE) * time < -TOO_FAR))
         machine.enter("pace", done["line up"])
         machine.enter("look", again)
-        machine.enter("rest", lost & ~again)
+        machine.enter("rest", (lost & ~again) | (missed & ~on_desk))
 
         self._face(again, LOOK_RIGHT)
         self._go(done["look"], ready, LOOK_RIGHT)
