@@ -128,6 +128,7 @@ class Context:
                 device="cpu" if cell.engine == "mujoco" else self.options.device,
                 actions=cell.actions,
                 strip=cell.strip,
+                follow=cell.strip,
                 out=str(self.path(cell)),
             )
         )
