@@ -31,15 +31,16 @@ __all__ = ["PPBoxExpert"]
 
 DECK = 1
 """The deck at 0.67 m, the only empty one, at hip height: no bend is needed. `released` accepts no other."""
-MOST_TURN = 0.5
+MOST_TURN = 0.4
 """The robot faces one of the box's sides if that is turned by less than this from its own side of the table [rad]; a
 box turned farther is squeezed across its corners, and comes to lie flat between the fists."""
 STAND_OFF = 0.75
 """Distance of pelvis and box centre from which the robot steps straight ahead to the box [m]."""
 STAND = 0.30
 """The same when it steps up to grasp [m]: stretching the arms and the last steps move the pelvis back by 6-9 cm."""
-EDGE = 0.14
-"""Least distance of the pelvis from the table when it steps up [m]."""
+EDGE = 0.07
+"""Least distance of the pelvis from the table when it steps up [m]; it ends 6-9 cm farther off. With twice as much the
+arms do not reach the middle of a box far in on the table, which tips out of the hands."""
 REACH = 0.42
 """Farthest that the arms bring the palms ahead of the pelvis [m]; a box farther off is held nearer to its front."""
 UPRIGHT = 0.36
@@ -69,12 +70,11 @@ CLOSING = 0.15
 OVERLAP = 0.09
 """How much deeper than it gets each palm is commanded into the box [m]: about 100 N/m times this, 10-12 N a side.
 Below 8 N weak arms drop the box in the carry."""
-TURNED = 0.15
+TURNED = 0.08
 """How much deeper into a box that stands turned between the fists [m/rad]: they slide on its faces, and press less."""
 SERVO = 3.0
-"""Gain of the squeeze [1/s]: speed of a hand for what the overlap lacks. It ends with the lift, since a turned box comes
-to lie flat between the fists only when they press, and is then narrower. Held in the carry, where the fists are nearer
-to the body and press more at the same overlap, it buckled SONIC's arms."""
+"""Gain of the squeeze [1/s]: speed of a hand for what the overlap lacks. It ends with the lift, since a turned box
+comes to lie flat between the fists only when they press, and is then narrower."""
 SQUEEZED = 1.2
 """Least time of the squeeze [s]."""
 DEEPEST = 0.17
