@@ -31,15 +31,16 @@ __all__ = ["PPBoxExpert"]
 
 DECK = 1
 """The deck at 0.67 m, the only empty one, at hip height: no bend is needed. `released` accepts no other."""
-MOST_TURN = 0.5
+MOST_TURN = 0.4
 """The robot faces one of the box's sides if that is turned by less than this from its own side of the table [rad]; a
 box turned farther is squeezed across its corners, and comes to lie flat between the fists."""
 STAND_OFF = 0.75
 """Distance of pelvis and box centre from which the robot steps straight ahead to the box [m]."""
 STAND = 0.30
 """The same when it steps up to grasp [m]: stretching the arms and the last steps move the pelvis back by 6-9 cm."""
-EDGE = 0.14
-"""Least distance of the pelvis from the table when it steps up [m]."""
+EDGE = 0.07
+"""Least distance of the pelvis from the table when it steps up [m]; it ends 6-9 cm farther off. With twice as much the
+arms do not reach the middle of a box far in on the table, which tips out of the hands."""
 REACH = 0.42
 """Farthest that the arms bring the palms ahead of the pelvis [m]; a box farther off is held nearer to its front."""
 UPRIGHT = 0.36
@@ -56,6 +57,10 @@ AT_PLACE = (0.045, 0.06)
 """Errors in front of box and shelf that the arms compensate [m, rad]."""
 ALIGN_GAIN = 1.5
 """Integral gain on palms and wrists while they align [1/s]."""
+LEARNING = 0.4
+"""Time in which the hands get near the box before that begins [s]."""
+SOONEST = 1.0
+"""Least time of aligning [s]."""
 ALIGNED = 0.025
 """Error of the palms that is good enough [m]."""
 ASIDE = 0.107
@@ -65,17 +70,19 @@ CLOSING = 0.15
 OVERLAP = 0.09
 """How much deeper than it gets each palm is commanded into the box [m]: about 100 N/m times this, 10-12 N a side.
 Below 8 N weak arms drop the box in the carry."""
-TURNED = 0.15
+TURNED = 0.08
 """How much deeper into a box that stands turned between the fists [m/rad]: they slide on its faces, and press less."""
-SERVO, HOLD = 3.0, 1.0
-"""Gain of the squeeze when the hands close and lift, and afterwards [1/s]: speed of a hand for what the overlap lacks.
-A turned box comes to lie flat between the fists only when they press, and is then narrower."""
+SERVO = 3.0
+"""Gain of the squeeze [1/s]: speed of a hand for what the overlap lacks. It ends with the lift, since a turned box
+comes to lie flat between the fists only when they press, and is then narrower."""
 SQUEEZED = 1.2
 """Least time of the squeeze [s]."""
 DEEPEST = 0.17
 """Most that a palm is commanded into the box [m]."""
 LIFT = 0.12
 """Height to which the box is lifted above the table [m]."""
+LIFTED = 0.07
+"""Height from which the robot steps back while the box still rises [m]."""
 LIFTING = 0.10
 """Speed of that [m/s]."""
 BACK = 0.45
@@ -104,6 +111,8 @@ INSIDE = 0.20
 """Distance of the placed box's centre from the front edge [m]: 9.5 cm more than half of it."""
 DEPTH_GAIN = 2.0
 """Gain of the hands' way ahead on that distance [1/s]."""
+SHORT = 0.01
+"""Lack of depth, and of overlap, that does not matter [m]."""
 FARTHEST = 0.52
 """Largest distance ahead of the pelvis to which the palms are commanded at the shelf [m]."""
 BEND = 0.15
@@ -188,6 +197,8 @@ class PPBoxExpert(Expert):
         self._deck_body, self._deck_half = deck.body_id, deck.half
         self._deck = sight.frame(DECKS[DECK])
         self._sides, self._columns = SIDES.to(device), WRISTS.to(device)
+        self._ready = torch.tensor([READY, 0.0], device=device).expand(worlds, 2)
+        self._turning = torch.tensor([0.0, 0.0, TURNING], device=device).expand(worlds, 3)
         self.state = Phases(LONGEST, worlds, device)
         """Phase of each world."""
         self.walk, self.haul = Walk(sight, BRISK), Walk(sight, LADEN)
@@ -248,7 +259,7 @@ class PPBoxExpert(Expert):
         return command
 
     def phases(self) -> list[str]:
-        """Names in `LONGEST`."""
+        """Names in `LONGEST`; a world that slipped starts over after `retreat`."""
         return self.state.names()
 
     def _centre(self) -> Tensor:
@@ -329,20 +340,19 @@ class PPBoxExpert(Expert):
         enter("leave", "stand", off > BACK)
         enter("open", "leave", (self.half >= self._opened()) & (clock > LET_GO))
         flat = self._deck_top() + self._box_half[2] + DOWN
-        sunk = self.underside < self._deck_top() - SUNK + 0.005
+        sunk = self.underside < self._deck_top() - SUNK + DOWN
         enter("lower", "open", (self._centre()[:, 2] < flat) | sunk)
-        enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - 0.01) | (self.grip[:, 0] >= FARTHEST)))
+        enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - SHORT) | (self.grip[:, 0] >= FARTHEST)))
         enter("step in", "reach", near(haul, AT_PLACE))
         self.haul.to(enter("carry", "step in", near(haul, PASSING)), self._spot)
         self._choose_spot(enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING))
         enter("back", "turn", away > BACK)
-        lifted = done("lift", self._underside() > self._table + SLIPPED + 0.02)
+        lifted = done("lift", self._underside() > self._table + LIFTED)
         held = self._underside() > self._table + SLIPPED
         state.enter("back", lifted & held)
         state.enter("retreat", lifted & ~held)
-        enter("close", "lift", (self._overlap() > self._deep - 0.01) & (clock > SQUEEZED))
-        error = self._missing()
-        enter("align", "close", (clock > 1.0) & (error < ALIGNED))
+        enter("close", "lift", (self._overlap() > self._deep - SHORT) & (clock > SQUEEZED))
+        enter("align", "close", (clock > SOONEST) & (self._missing() < ALIGNED))
         enter("step up", "align", near(walk, AT_PLACE))
         self.walk.to(enter("approach", "step up", near(walk, PASSING)), self._stand)
 
@@ -391,25 +401,24 @@ class PPBoxExpert(Expert):
 
     def _squeeze(self, mask: Tensor, dt: float) -> None:
         """Palms beside the box, fists level; then together until they are commanded `OVERLAP` deeper than they get."""
-        state, device = self.state, self.sight.device
+        state = self.state
         before, aligning = state.at("approach", "step up"), state.at("align")
         middle = self._grasp()
-        ready = torch.cat([torch.tensor([READY, 0.0], device=device).expand(len(middle), 2), middle[:, 2:]], dim=1)
+        ready = torch.cat([self._ready, middle[:, 2:]], dim=1)
         self.grip = select(mask & before, ready, select(mask & aligning, middle, self.grip))
         self._level = select(mask & (before | aligning), middle[:, 2], self._level)
         self.half = select(mask & (before | aligning), self._wide() + FIST + ASIDE, self.half)
         lean = (LEAN * (self._reached()[:, 0] - UPRIGHT)).clamp(0.0, MOST_LEAN)
         self._lean = select(mask & aligning, lean, self._lean.masked_fill(mask & before, 0.0))
-        learn = (mask & aligning & (state.clock > 0.4))[:, None].expand(-1, 2)
+        learn = (mask & aligning & (state.clock > LEARNING))[:, None].expand(-1, 2)
         self.palms.lead(self._wanted(), learn, dt)
         level = quat_from_yaw(self.sight.pose[:, 2])[:, None].expand(-1, 2, 4)
         angles = self.wrists.lead(level, learn, dt)
         self._angles = select(mask & (before | aligning), angles, self._angles)
 
-        gain = torch.where(state.at("close", "lift"), SERVO, HOLD)
-        closing = dt * (gain * (self._deep - self._overlap())).clamp(-CLOSING, CLOSING)
+        closing = dt * (SERVO * (self._deep - self._overlap())).clamp(-CLOSING, CLOSING)
         squeezed = torch.maximum(self.half - closing, self._box_half[:2].amin() + FIST - DEEPEST)
-        self.half = select(mask & state.at("close", *HELD), squeezed, self.half)
+        self.half = select(mask & state.at("close", "lift"), squeezed, self.half)
         opening = torch.minimum(self.half + OPENING * dt, self._opened())
         self.half = select(mask & state.at("open", "retreat"), opening, self.half)
 
@@ -447,8 +456,7 @@ class PPBoxExpert(Expert):
         velocity = select(state.at("carry", "step in"), haul * pace, velocity)
         velocity = select(state.at("back", "retreat"), backward, velocity)
         velocity = select(state.at("leave"), leave, velocity)
-        turning = torch.tensor([0.0, 0.0, TURNING], device=velocity.device).expand_as(velocity)
-        return select(state.at("turn"), turning, velocity)
+        return select(state.at("turn"), self._turning, velocity)
 
 
 def pose_before(point: Tensor, yaw: Tensor, distance: Tensor) -> Tensor:
