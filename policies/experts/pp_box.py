@@ -319,11 +319,11 @@ class PPBoxExpert(Expert):
         From the last phase to the first, so that a world advances by one at the most.
         """
         state, pose = self.state, self.sight.pose
-        late, clock = state.late, state.clock
+        clock = state.clock
         deck = self._depth(self._centre()[:, :2])[:, 1]
 
         def done(phase: str, condition: Tensor) -> Tensor:
-            return mask & state.at(phase) & (condition | late)
+            return mask & state.at(phase) & (condition | state.late)
 
         def enter(phase: str, following: str, condition: Tensor) -> Tensor:
             entering = done(phase, condition)
@@ -354,7 +354,7 @@ class PPBoxExpert(Expert):
         enter("close", "lift", (self._overlap() > self._deep - SHORT) & (clock > SQUEEZED))
         enter("align", "close", (clock > SOONEST) & (self._missing() < ALIGNED))
         enter("step up", "align", near(walk, AT_PLACE))
-        self.walk.to(enter("approach", "step up", near(walk, PASSING)), self._stand)
+        self.walk.to(enter("approach", "step up", near(walk, PASSING) & (state.clock > 0)), self._stand)
 
     def _watch(self, mask: Tensor) -> None:
         """Leave the usual order where the box rests somewhere else than between the hands."""

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import warp as wp
 
 from arena_newton import policies, seeding, trackers
 from arena_newton.env import ArenaEnv
@@ -16,7 +15,6 @@ from arena_newton.policies.experts.pp_box import LONGEST, PPBoxExpert, pose_befo
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot import TICK
 from arena_newton.rollout import Rollout
-from arena_newton.scene import ROBOT
 from arena_newton.tasks.pp_box import BOX
 
 STILL = 6
@@ -158,26 +156,24 @@ def test_only_masked_worlds_change(still):
     assert (now[1][mask] != kept[1][mask]).all()
 
 
-def test_a_hand_at_the_box_is_noticed_on_both_engines():
-    """A fist in the box's side gives the judge's force on either engine, and a robot elsewhere none."""
-    forces = {}
-    for engine in ("mujoco", "warp"):
-        env = ArenaEnv("pp_box", tracker=trackers.get("pd"), worlds=2, engine=engine, device="cpu")
-        env.reset([seeding.episode_seed(env.spec.gym_id, 900, i) for i in range(2)])
-        env.judge.bind(env.physics)
-        address, hand = env.scene.joint_qpos(BOX), env.scene.link("right_wrist_yaw_link")
-        qpos = env.physics.qpos.numpy()
-        palm = env.physics.xpos.numpy()[0, hand]
-        qpos[0, address : address + 3] = palm + [0.15, 0.0, -0.105]
-        if engine == "mujoco":
-            env.physics.data[0].qpos[:] = qpos[0]
-        else:
-            env.physics.qpos.assign(qpos)
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_box_on_a_hand_is_noticed(engine):
+    """A box that falls onto a hand gives the judge's force on either engine, a robot elsewhere none."""
+    env = ArenaEnv("pp_box", tracker=trackers.get("pd"), worlds=2, engine=engine, device="cpu")
+    env.reset([seeding.episode_seed(env.spec.gym_id, 900, i) for i in range(2)])
+    env.judge.bind(env.physics)
+    address, hand = env.scene.joint_qpos(BOX), env.scene.link("right_wrist_yaw_link")
+    qpos = env.physics.qpos.numpy()
+    qpos[0, address : address + 3] = env.physics.xpos.numpy()[0, hand] + [0.05, 0.0, 0.06]
+    if engine == "mujoco":
+        env.physics.data[0].qpos[:] = qpos[0]
+    else:
+        env.physics.qpos.assign(qpos)
+    most = np.zeros(2)
+    for _ in range(15):
         env.physics.step()
-        forces[engine] = wp.to_torch(env.physics.pair_force).clone()
-        assert any(label.startswith(ROBOT) for label in env.scene.geom_labels)
-    for force in forces.values():
-        assert force[0] > 1.0 and force[1] == 0.0
+        most = np.maximum(most, env.physics.pair_force.numpy())
+    assert most[0] > 0.1 and most[1] == 0.0
 
 
 class Actions(Recorder):
