@@ -19,6 +19,7 @@ from arena_newton.eval.certification import agreement, axes, certificate, legs, 
 from arena_newton.eval.certification.bodies import BODIES, Body
 from arena_newton.eval.certification.context import Context, with_expert
 from arena_newton.eval.certification.finding import Check, CheckFinding
+from arena_newton.eval.certification.jobs import play_ahead
 from arena_newton.eval.config import plain_facts
 from arena_newton.eval.identity import code_hash
 from arena_newton.eval.options import CertifyOptions
@@ -69,6 +70,8 @@ def run(
     if options.quick:
         print(f"--quick: {context.episodes} episodes of each cell, so the intervals are wide")
     quiet_warp()
+    if options.jobs > 1:
+        play_ahead(options, context.tasks, [check.name for check in chosen], _say)
     findings: dict[str, CheckFinding] = {}
     for check in chosen:
         started = time.perf_counter()
@@ -76,6 +79,8 @@ def run(
         findings[check.name] = finding
         spent = duration(time.perf_counter() - started)
         print(f"{finding.verdict:<4}  {check.name:<12}  {finding.summary}  ({spent})", flush=True)
+        if options.jobs == 0:
+            continue
         facts = _facts(context, left_out, planned=[one.name for one in chosen])
         certificate.write(context.folder, facts, {one: findings[one.name] for one in chosen if one.name in findings})
     failed = [name for name, finding in findings.items() if finding.verdict == "fail"]
@@ -108,6 +113,8 @@ def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str,
         raise InputError("--tracker: nothing given, at least one is needed")
     if options.episodes is not None and not 1 <= options.episodes <= MAX_EPISODES:
         raise InputError(f"--episodes {options.episodes}: expected 1 to {MAX_EPISODES:,}")
+    if options.jobs < 0:
+        raise InputError(f"--jobs {options.jobs}: expected 0 or more")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
     if options.twist2_checkpoint is not None and not Path(options.twist2_checkpoint).expanduser().is_file():

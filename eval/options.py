@@ -213,5 +213,8 @@ class CertifyOptions:
     """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
     twist2_checkpoint: str | None = None
     """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
+    jobs: int = 1
+    """Processes that play at once, each on cores of its own; 0 only plays and writes no page (what such a process
+    does)."""
     resume: bool = False
     """Continue a certification in its folder; what was played is kept."""

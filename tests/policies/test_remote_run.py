@@ -75,7 +75,7 @@ def test_flags_of_the_remote_policy_belong_to_it(tmp_path, monkeypatch, capsys, 
     """A flag that would do nothing is refused by name."""
     monkeypatch.chdir(tmp_path)
     assert main([*SHORT, *flags], factories()) == 2
-    assert capsys.readouterr().err == f"error: {flags[0]}: belongs to --policy remote:<url>, not stand\n"
+    assert capsys.readouterr().err == f"error: {flags[0]}: belongs to --policy remote:<url>, not expert\n"
 
 
 def test_flags_reach_the_policy(tmp_path):

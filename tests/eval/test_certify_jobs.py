@@ -1,0 +1,51 @@
+"""Certification by several processes: what each is asked for, in which order, and that a broken one stops nothing."""
+
+import tyro
+
+from arena_newton.eval.certification import jobs
+from arena_newton.eval.options import CertifyOptions
+
+
+def stand_in(tmp_path, monkeypatch, code=0):
+    """Make processes write down their arguments instead of playing; returns the file."""
+    log, program = tmp_path / "log", tmp_path / "python"
+    program.write_text(f'#!/bin/sh\necho "$@" >> {log}\necho "error: broken" >&2\nexit {code}\n')
+    program.chmod(0o755)
+    monkeypatch.setattr(jobs.sys, "executable", str(program))
+    return log
+
+
+def test_each_process_plays_one_check_of_one_task(tmp_path, monkeypatch):
+    """Recordings come first, one process per task and tracker; every other check has one per task; flags are kept."""
+    log, said = stand_in(tmp_path, monkeypatch), []
+    options = CertifyOptions(out=str(tmp_path / "out"), jobs=2, episodes=7, worlds=3, twist2_checkpoint="a b.onnx")
+    jobs.play_ahead(options, ["football", "boxing"], ["solvable", "swap", "visible"], said.append)
+    lines = log.read_text().splitlines()
+    asked = [(line.split("--checks ")[1].split()[0], line.split("--task ")[1].split()[0]) for line in lines]
+    assert sorted(asked[:4]) == sorted([("solvable", "football"), ("solvable", "boxing")] * 2)
+    assert sorted(asked[4:]) == [
+        ("swap", "boxing"),
+        ("swap", "football"),
+        ("visible", "boxing"),
+        ("visible", "football"),
+    ]
+    assert all("--jobs 0" in line and "--episodes 7" in line and "--resume" in line for line in lines)
+    assert len(said) == 8 and all(text.endswith("played") for text in said)
+
+
+def test_a_broken_process_is_named_and_the_others_go_on(tmp_path, monkeypatch):
+    """A process that is refused leaves its piece to the end, with its reason, and the rest is played."""
+    log, said = stand_in(tmp_path, monkeypatch, code=2), []
+    jobs.play_ahead(CertifyOptions(out="x", jobs=3, quick=True), ["football"], ["solvable", "swap"], said.append)
+    assert len(log.read_text().splitlines()) == 2
+    assert said == [f"{name} football twist2 sonic: left to the end: error: broken" for name in ("solvable", "swap")]
+
+
+def test_a_process_understands_its_flags():
+    """The command line of a piece is one that the command reads back as the same options."""
+    options = CertifyOptions(out="some folder", jobs=4, quick=True, engine="warp", device="cuda", episodes=2)
+    flags = jobs.flags(options, "swap", "boxing", ("sonic",))
+    read = tyro.cli(CertifyOptions, args=flags)
+    assert (read.task, read.tracker, read.checks, read.jobs) == (("boxing",), ("sonic",), ("swap",), 0)
+    assert (read.out, read.quick, read.engine, read.device, read.episodes) == ("some folder", True, "warp", "cuda", 2)
+    assert read.resume
