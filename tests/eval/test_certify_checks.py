@@ -205,3 +205,27 @@ def test_a_tiny_real_certification(tmp_path, capsys):
     page = (tmp_path / "certify.html").read_text()
     assert "success at step" in page and "data:image/jpeg;base64," in page
     assert (tmp_path / "runs" / "boxing" / "twist2_paper_base_gliding" / "episodes.jsonl").is_file()
+
+
+def test_touches_of_the_sill_are_counted_per_episode():
+    """Every tick with a force counts for the episode that its world runs, ticks of worlds at rest for none."""
+    from arena_newton.eval.certification.sill import Treads
+
+    force = np.zeros(2)
+    model = SimpleNamespace(geom_bodyid=np.array([0, 1, 2]))
+    watched = []
+    physics = SimpleNamespace(
+        pair_force=SimpleNamespace(numpy=lambda: force), watch_pair=lambda a, b: watched.append((a, b))
+    )
+    scene = SimpleNamespace(mj_model=model, robot=SimpleNamespace(bodies=(1, 2)), geom_ids=lambda prim: [0])
+    env = SimpleNamespace(physics=physics, scene=scene, active=np.array([True, True]))
+    treads = Treads()
+    for world, seed in enumerate((11, 12)):
+        treads.start(env, world, SimpleNamespace(episode_seed=seed))
+    for pair in ((0.0, 3.0), (0.0, 40.0), (5.0, 0.0)):
+        force[:] = pair
+        treads.tick(env)
+    env.active[0], force[:] = False, 9.0
+    treads.tick(env)
+    assert treads.ticks == {11: 1, 12: 3} and treads.highest == {11: 5.0, 12: 40.0}
+    assert watched[0] == ([1, 2], [0])
