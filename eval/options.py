@@ -23,7 +23,7 @@ __all__ = [
 QUICK_SEEDS = (0,)
 """Group seeds of the default run."""
 QUICK_REPEATS = 3
-"""Episodes per task and tracker of the default run, sized to end within four minutes on two CPU cores."""
+"""Episodes per task and tracker of the default run, which takes about two minutes on two CPU cores."""
 QUICK_TRACKERS = ("twist2", "sonic")
 """Trackers of the default run: those whose weights come with the package."""
 
@@ -214,7 +214,6 @@ class CertifyOptions:
     twist2_checkpoint: str | None = None
     """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
     jobs: int = 1
-    """Processes that play at once, each on cores of its own; 0 only plays and writes no page (what such a process
-    does)."""
+    """Processes that play at once, each on cores of its own (0: only play and write no page, as each of them does)."""
     resume: bool = False
     """Continue a certification in its folder; what was played is kept."""

@@ -60,8 +60,8 @@ class PPBoxAnyDeckRule(SuccessRule):
         """See `SuccessRule.sentence`."""
         return (
             f"box centre above any shelf deck within its span, bottom within {num(self.height_tolerance)} m of the "
-            f"deck, slower than {num(self.max_speed)} m/s and touched by no robot link for {self.confirm_ticks} "
-            "consecutive ticks"
+            f"deck, slower than {num(self.max_speed)} m/s and touched by no robot link at the end of "
+            f"{self.confirm_ticks} consecutive ticks"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import subprocess
@@ -18,6 +19,8 @@ Piece = tuple[str, str, tuple[str, ...]]
 
 FIRST = "solvable"
 """The check whose evaluations others compare with: it is played before them."""
+COMPARING = (FIRST, "frozen-legs", "gliding-base", "semantic", "engines", "official", "swap")
+"""It, and the checks that compare with its evaluations."""
 
 
 def play_ahead(
@@ -35,7 +38,8 @@ def play_ahead(
     """
     trackers = [options.tracker] if options.quick else [(tracker,) for tracker in options.tracker]
     recorded = [(FIRST, task, some) for task in tasks for some in trackers]
-    _work(options, recorded, say)
+    if set(checks) & set(COMPARING):
+        _work(options, recorded, say)
     _work(options, [(check, task, options.tracker) for check in checks if check != FIRST for task in tasks], say)
 
 
@@ -45,28 +49,43 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
     for piece in pieces:
         waiting.put(piece)
     cores = sorted(os.sched_getaffinity(0))
+    running: set[subprocess.Popen[bytes]] = set()
+    stopped = threading.Event()
 
     def work(slot: int) -> None:
         own = cores[slot :: options.jobs] or cores[slot % len(cores) :][:1]
         environment = {**os.environ, "OMP_NUM_THREADS": str(len(own))}
-        while True:
+        while not stopped.is_set():
             try:
                 check, task, trackers = waiting.get_nowait()
             except queue.Empty:
                 return
             command = [sys.executable, "-m", "arena_newton.eval", "certify", *flags(options, check, task, trackers)]
             process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-            os.sched_setaffinity(process.pid, own)
+            running.add(process)
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(process.pid, own)
             _, complaint = process.communicate()
+            running.discard(process)
             last = complaint.decode(errors="replace").strip().splitlines()[-1:]
             ended = "played" if process.returncode in (0, 1) else f"left to the end: {''.join(last)}"
-            say(f"{check} {task} {' '.join(trackers)}: {ended}")
+            if not stopped.is_set():
+                say(f"{check} {task} {' '.join(trackers)}: {ended}")
 
     threads = [threading.Thread(target=work, args=(slot,)) for slot in range(min(options.jobs, len(pieces)))]
     for thread in threads:
         thread.start()
-    for thread in threads:
-        thread.join()
+    try:
+        for thread in threads:
+            thread.join()
+    except BaseException:
+        # What was asked to stop keeps what it played; nobody takes another piece.
+        stopped.set()
+        for process in list(running):
+            process.terminate()
+        for thread in threads:
+            thread.join()
+        raise
 
 
 def flags(options: CertifyOptions, check: str, task: str, trackers: Sequence[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
 from arena_newton.eval.certification.context import CertifyCell, Context
@@ -53,14 +54,27 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, t
     return found, Sheet(f"Experts with {context.bodies[body].title}", head, tuple(rows)), tuple(pictures)
 
 
+def _broken(context: Context, body: str) -> tuple[str, ...]:
+    """Why zero successes would say nothing: episodes ended as errors, or nobody solves the task with legs either."""
+    said = []
+    for tracker, task in itertools.product(context.sample, context.tasks):
+        records = context.evaluate(CertifyCell(task, tracker, body=body, strip=True))
+        errors = sum(record.outcome == "error" for record in records)
+        said += [f"{task} through {tracker}: {errors} episodes ended as errors"] * bool(errors)
+        if not score(context.evaluate(recorded(context, task, tracker))).successes:
+            said.append(f"{task} through {tracker}: the expert does not solve it with legs either")
+    return tuple(said)
+
+
 def frozen(context: Context) -> CheckFinding:
     """Play every task with legs that only stand."""
     found, sheet, pictures = _without_legs(context, "frozen")
     solved = {task: count for task, count in found.items() if count}
+    broken = _broken(context, "frozen")
     total = len(context.sample) * len(context.tasks) * context.episodes
     summary = f"{sum(found.values())} successes in {total} episodes with the legs frozen in the standing posture"
     notes = tuple(f"{task}: {count} successes with frozen legs, see the pictures" for task, count in solved.items())
-    return CheckFinding("fail" if solved else "pass", summary, (sheet,), notes, pictures)
+    return CheckFinding("fail" if solved or broken else "pass", summary, (sheet,), (*broken, *notes), pictures)
 
 
 def gliding(context: Context) -> CheckFinding:
@@ -76,7 +90,9 @@ def gliding(context: Context) -> CheckFinding:
     summary += " ".join(needed) or "none"
     notes = [f"{task}, {count} successes: {GLIDES[task]}." for task, count in solved.items() if task in GLIDES]
     notes += [f"{task}, {solved[task]} successes: no reason is known, see the pictures." for task in unknown]
-    verdict: Verdict = "fail" if unknown else "note" if solved else "pass"
+    broken = _broken(context, "gliding")
+    notes += broken
+    verdict: Verdict = "fail" if unknown or broken else "note" if solved else "pass"
     return CheckFinding(verdict, summary, (sheet,), tuple(notes), pictures)
 
 

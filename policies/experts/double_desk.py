@@ -115,6 +115,9 @@ COMMITTED = 0.30
 """Time before the feet are side by side from which the landing is fixed [s]."""
 USUAL_PACE, TOO_FAR = 0.35, 0.06
 """Speed at the last pair [m/s], and how far beyond its place it may be [m]: else the robot goes back to try again."""
+NO_TIME = 27.0
+"""Time of an episode from which it does not back off any more but steps over as it comes [s]: the way back costs 6 s,
+and what follows takes 10 s of the 40."""
 NEAR_CRATE, NEAR_EDGE = 0.38, 0.09
 """Pelvis from the crate's middle and at least from the left desk's edge [m]."""
 OVER_HEIGHT = 1.02
@@ -178,6 +181,7 @@ class DoubleDeskExpert(Expert):
         self._error = torch.zeros(worlds, 2, device=device)
         self._pairs = torch.arange(3, device=device)
         self._last = torch.zeros(worlds, 3, device=device)
+        self._elapsed = torch.zeros(worlds, device=device)
 
     def begin(self, mask: Tensor, style: Style) -> None:
         """Draw the episode's style; look at the right desk."""
@@ -186,6 +190,7 @@ class DoubleDeskExpert(Expert):
         self._turns_left = select(mask, style.coin("turns left"), self._turns_left)
         self.walk.begin(mask)
         self.machine.begin(mask)
+        self._elapsed = self._elapsed.masked_fill(mask, 0.0)
         self._face(mask, LOOK_RIGHT)
 
     def phases(self) -> list[str]:
@@ -200,6 +205,7 @@ class DoubleDeskExpert(Expert):
         self._acting = self.machine.names()
         command = self._act(mask, dt, answer)
         self.machine.advance(mask, dt)
+        self._elapsed = self._elapsed + dt * mask
         return command
 
     # What it sees.
@@ -312,7 +318,8 @@ class DoubleDeskExpert(Expert):
             machine.enter(following, done[name])
         machine.enter("step in", missed)
         machine.enter("deliver", short)
-        machine.enter("back off", done["pace"] & ((pace - USUAL_PACE) * time < -TOO_FAR))
+        again_paced = ((pace - USUAL_PACE) * time < -TOO_FAR) & (self._elapsed < NO_TIME)
+        machine.enter("back off", done["pace"] & again_paced)
         machine.enter("pace", done["line up"])
         machine.enter("look", again)
         machine.enter("rest", (lost & ~again) | (missed & ~on_desk))

@@ -68,7 +68,10 @@ class Phases:
 
     @property
     def late(self) -> Tensor:
-        """Worlds that have been in their phase for its longest time, bool, shape [worlds]."""
+        """Worlds that have been in their phase for its longest time, bool, shape [worlds].
+
+        An expert decides every 0.1 s and counts in single precision, so that a phase may last one decision longer.
+        """
         return self.clock >= self._longest[self.phase]
 
     @property

@@ -28,7 +28,7 @@ class Style:
         self._seeds[mask] = np.asarray(seeds, np.uint64)[mask]
 
     def uniform(self, name: str, low: float, high: float) -> Tensor:
-        """A number in [low, high) for each world's episode, float32, shape [worlds]."""
+        """A number from low to high for each world's episode, float32, shape [worlds]."""
         with np.errstate(over="ignore"):
             z = self._seeds + np.uint64(zlib.crc32(name.encode()) + 1) * _STEP
             z = (z ^ (z >> np.uint64(30))) * _MIX_A

@@ -1,5 +1,10 @@
 """Certification by several processes: what each is asked for, in which order, and that a broken one stops nothing."""
 
+import signal
+import threading
+import time
+
+import pytest
 import tyro
 
 from arena_newton.eval.certification import jobs
@@ -49,3 +54,24 @@ def test_a_process_understands_its_flags():
     assert (read.task, read.tracker, read.checks, read.jobs) == (("boxing",), ("sonic",), ("swap",), 0)
     assert (read.out, read.quick, read.engine, read.device, read.episodes) == ("some folder", True, "warp", "cuda", 2)
     assert read.resume
+
+
+def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
+    """Ctrl-C ends the processes that play and starts no other one."""
+    log = stand_in(tmp_path, monkeypatch)
+    program = tmp_path / "python"
+    program.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexec sleep 60\n')
+    began = time.monotonic()
+    timer = threading.Timer(2.0, lambda: signal.raise_signal(signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["football", "boxing"], ["solvable"], lambda text: None)
+    timer.join()
+    assert time.monotonic() - began < 30.0 and len(log.read_text().splitlines()) == 2
+
+
+def test_recordings_are_played_for_checks_that_compare_with_them(tmp_path, monkeypatch):
+    """A check that needs none of the experts' episodes does not make them."""
+    log = stand_in(tmp_path, monkeypatch)
+    jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing"], ["execution"], lambda text: None)
+    assert [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()] == ["execution"]
