@@ -120,7 +120,9 @@ def semantic(context: Context) -> CheckFinding:
     summary = f"semantic variants change the experts' successes by at most {worst} of {context.episodes} episodes"
     sheet = Sheet(f"Semantic against base mode; {allowed} of {context.episodes} are allowed", head, tuple(rows))
     outside += [f"{row[0]} through {row[1]}: solved in neither mode" for row in rows if row[2].startswith("0/")]
-    note = "An expert does not look: equal numbers say that variants change looks alone, not that a policy copes with them."
+    note = (
+        "An expert does not look: equal numbers say that variants change looks alone, not that policies cope with them."
+    )
     return CheckFinding("fail" if outside else "pass", summary, (sheet,), (*outside, note))
 
 

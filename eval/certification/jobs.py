@@ -8,6 +8,7 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 
 from arena_newton.eval.options import CertifyOptions
@@ -76,8 +77,8 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
     for thread in threads:
         thread.start()
     try:
-        for thread in threads:
-            thread.join()
+        while any(thread.is_alive() for thread in threads):
+            time.sleep(0.1)  # an interrupt gets through here, but not through a join
     except BaseException:
         # What was asked to stop keeps what it played; nobody takes another piece.
         stopped.set()
