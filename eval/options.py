@@ -33,7 +33,7 @@ class RunOptions:
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
     Without --task, --mode, --seeds, --repeats and --max-steps the experts solve all seven tasks through both trackers,
-    a few episodes each (about four minutes on two CPU cores), and the report opens with film strips. As soon as one of
+    a few episodes each (about two minutes on two CPU cores), and the report opens with film strips. As soon as one of
     them is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
