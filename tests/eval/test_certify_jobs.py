@@ -74,4 +74,21 @@ def test_recordings_are_played_for_checks_that_compare_with_them(tmp_path, monke
     """A check that needs none of the experts' episodes does not make them."""
     log = stand_in(tmp_path, monkeypatch)
     jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing"], ["execution"], lambda text: None)
+    assert "--checks solvable" not in log.read_text()
+
+
+def test_engines_is_left_to_the_check_unless_it_was_named(tmp_path, monkeypatch):
+    """Without a CUDA device it is skipped unless a user names it; a process of --jobs must not name it for him."""
+    log = stand_in(tmp_path, monkeypatch)
+    for named in ((), ("engines",)):
+        options = CertifyOptions(out="x", jobs=2, quick=True, checks=named)
+        jobs.play_ahead(options, ["boxing"], ["engines", "execution"], lambda text: None)
+    asked = [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()]
+    assert sorted(asked) == ["engines", "execution", "execution", "solvable", "solvable"]
+
+
+def test_a_check_without_recordings_asks_for_itself_alone(tmp_path, monkeypatch):
+    """One process plays the one check of the one task."""
+    log = stand_in(tmp_path, monkeypatch)
+    jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing"], ["execution"], lambda text: None)
     assert [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()] == ["execution"]
