@@ -70,13 +70,6 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     assert time.monotonic() - began < 30.0 and len(log.read_text().splitlines()) == 2
 
 
-def test_recordings_are_played_for_checks_that_compare_with_them(tmp_path, monkeypatch):
-    """A check that needs none of the experts' episodes does not make them."""
-    log = stand_in(tmp_path, monkeypatch)
-    jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing"], ["execution"], lambda text: None)
-    assert "--checks solvable" not in log.read_text()
-
-
 def test_engines_is_left_to_the_check_unless_it_was_named(tmp_path, monkeypatch):
     """Without a CUDA device it is skipped unless a user names it; a process of --jobs must not name it for him."""
     log = stand_in(tmp_path, monkeypatch)
