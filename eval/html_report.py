@@ -32,9 +32,10 @@ from arena_newton.eval.wording import (
 )
 from arena_newton.robot import TICK
 
-__all__ = ["page"]
+__all__ = ["FOLDER", "page", "page_template"]
 
 FOLDER = Path(__file__).resolve().parent / "page"
+"""Templates and style sheets of pages."""
 OUTCOMES = ("success", "timeout", "fall", "error")
 """Outcomes in the order of the bars."""
 FAILURES_FIRST = ("fall", "timeout", "error", "success")
@@ -69,7 +70,8 @@ COLUMNS = (
 
 
 @functools.cache
-def _template() -> jinja2.Template:
+def page_template(name: str) -> jinja2.Template:
+    """A page of the folder `page` by its file name; what it shows is escaped, undefined names are errors."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(FOLDER),
         autoescape=True,
@@ -79,7 +81,7 @@ def _template() -> jinja2.Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return environment.get_template("report.html")
+    return environment.get_template(name)
 
 
 @functools.cache
@@ -120,7 +122,7 @@ def page(
     opening = _opening(records)
     # The policy's number of worlds is in the configuration only where its answers depend on it.
     command = functools.partial(replay_command, document["options"], worlds=document["config"].get("worlds"))
-    return _template().render(
+    return page_template("report.html").render(
         policy=_policy(),
         style=_source("report.css"),
         script=_source("report.js"),

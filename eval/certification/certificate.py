@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import functools
 import hashlib
 import json
 import re
@@ -11,9 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TypedDict
 
-import jinja2
-
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.html_report import FOLDER, page_template
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.wording import plain
@@ -21,7 +19,6 @@ from arena_newton.eval.wording import plain
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "write"]
 
 FILE = "certify.json"
-PAGE = Path(__file__).resolve().parents[1] / "page"
 MEANING = {
     "pass": "holds",
     "fail": "does not hold",
@@ -137,25 +134,11 @@ def _escaped(text: object) -> str:
     return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
 
 
-@functools.cache
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(PAGE),
-        autoescape=True,
-        finalize=lambda value: value if hasattr(value, "__html__") else plain(value),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template("certify.html")
-
-
 def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as one page that needs no other file."""
-    style = (PAGE / "report.css").read_text(encoding="utf-8") + (PAGE / "certify.css").read_text(encoding="utf-8")
+    style = (FOLDER / "report.css").read_text(encoding="utf-8") + (FOLDER / "certify.css").read_text(encoding="utf-8")
     known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    return _template().render(
+    return page_template("certify.html").render(
         policy=f"default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
         style=style,
         facts=_said(facts),

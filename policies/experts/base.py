@@ -234,8 +234,8 @@ class ExpertPolicy(Policy):
         self._asked[asking] += 1
         walking = (self._commands[:, COLUMNS["velocity"]] != 0).any(dim=1)
         self.generator.realign(self.sight.pose[:, 2], REALIGN * (mask & walking))
-        self.generator.step(MotionCommand.unpack(self._commands), mask)
-        return Chunk(self.generator.action()[:, None].clone(), phases=self._phases)
+        self.generator.step(self._commands, mask)
+        return Chunk(self.generator.action()[:, None], phases=self._phases)
 
     def _begin(self, beginning: np.ndarray) -> None:
         """Start the episodes of the worlds that ask first."""

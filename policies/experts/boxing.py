@@ -26,7 +26,7 @@ from arena_newton.policies.experts.eyes import Eyes, silhouette
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import Floor, signed_distance
 from arena_newton.policies.experts.style import Style
-from arena_newton.policies.experts.walking import Walk
+from arena_newton.policies.experts.walking import Walk, paced
 from arena_newton.rotations import rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import PALMS, TARGET
@@ -171,8 +171,7 @@ class BoxingExpert(Expert):
         striking, waiting = self._phases.at("strike"), self._phases.at("look")
         answer = self._walk.command(mask & ~waiting, dt)
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
-        pace = torch.stack([self._pace, self._pace, torch.ones_like(self._pace)], dim=1)
-        command.velocity = answer.velocity * pace * (~striking & ~waiting)[:, None]
+        command.velocity = paced(answer.velocity, self._pace) * (~striking & ~waiting)[:, None]
         command.hands = torch.ones_like(command.hands)
         going = self._phases.at("approach", "step up")
         command.waist[:, 0] = self._gaze() * (going | self._phases.at(*PLACES))

@@ -86,7 +86,6 @@ class FootballExpert(Expert):
         self._radius = float(sight.scene.mj_model.geom_size[sight.scene.geom_ids(BALL)[0], 0])
         self.walk = Walk(sight, NavigationLimits(forward=0.55, turn=0.9))
         self.states = Phases(PHASES, worlds, device)
-        self._shown = self.states.phase
         self.lane = torch.zeros(worlds, 3, device=device)
         """The line to walk: the point next to the ball x, y [m], and its direction [rad], shape [worlds, 3]."""
         self._aimed = torch.zeros(worlds, 2, device=device)
@@ -151,12 +150,11 @@ class FootballExpert(Expert):
         command.velocity[:, :2] += drift * states.at("approach", "kick")[:, None]
         command.step_time = self._step_time
         command.arms = self._arms
-        self._shown = select(mask, states.phase, self._shown)
         return command
 
     def phases(self) -> list[str]:
         """`approach`, `kick`, `follow` or `watch`."""
-        return [list(PHASES)[phase] for phase in self._shown.tolist()]
+        return self.states.names()
 
     def _ahead(self, pose: Tensor) -> Tensor:
         """The robot on its line: past the ball, and to the left [m], shape [worlds, 2]."""

@@ -88,7 +88,6 @@ class OpenDoorExpert(Expert):
         self.walk = Walk(sight, NavigationLimits(forward=0.55, turn=0.9, arrive_position=0.045, arrive_heading=0.06))
         self.palms = Palms(sight)
         self.states = Phases(PHASES, worlds, device)
-        self._shown = self.states.phase
         self._learned = torch.zeros(worlds, 2, device=device)
         self._ready, self._lane, self._forward = (torch.zeros(worlds, device=device) for _ in range(3))
         self._raised = torch.zeros(worlds, 3, device=device)
@@ -133,12 +132,11 @@ class OpenDoorExpert(Expert):
         command.velocity = select(moving, answer.velocity, command.velocity)
         self._reach(command, mask, dt)
         self._push(command)
-        self._shown = select(mask, states.phase, self._shown)
         return command
 
     def phases(self) -> list[str]:
         """Names of `PHASES`."""
-        return [list(PHASES)[phase] for phase in self._shown.tolist()]
+        return self.states.names()
 
     def _yaw(self) -> Tensor:
         """Heading through the doorway [rad], shape [worlds]."""

@@ -21,7 +21,7 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
-from arena_newton.policies.experts.walking import Walk, along
+from arena_newton.policies.experts.walking import Walk, along, paced
 from arena_newton.rotations import heading, matrix_from_quat, quat_from_yaw, rotate_xy, wrap_angle
 from arena_newton.tasks.pp_box import BOX, DECKS, TABLE
 from arena_newton.trackers.motions.commands import MotionCommand
@@ -450,10 +450,9 @@ class PPBoxExpert(Expert):
         slow = torch.full_like(self._pace, -LEAVE)
         backward = along(pose, self._stand[:, :2], self._stand[:, 2], slow)
         leave = along(pose, self._spot[:, :2], self._spot[:, 2], slow)
-        pace = torch.stack([self._pace, self._pace, torch.ones_like(self._pace)], dim=1)
         velocity = torch.zeros_like(walk)
-        velocity = select(state.at("approach", "step up"), walk * pace, velocity)
-        velocity = select(state.at("carry", "step in"), haul * pace, velocity)
+        velocity = select(state.at("approach", "step up"), paced(walk, self._pace), velocity)
+        velocity = select(state.at("carry", "step in"), paced(haul, self._pace), velocity)
         velocity = select(state.at("back", "retreat"), backward, velocity)
         velocity = select(state.at("leave"), leave, velocity)
         return select(state.at("turn"), self._turning, velocity)

@@ -18,6 +18,7 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.phases import select
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.policies.experts.style import Style
+from arena_newton.policies.experts.walking import paced
 from arena_newton.rotations import heading, rotate_xy
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.vis_navi import SIGN
@@ -137,8 +138,7 @@ class VisNaviExpert(Expert):
         self._clock = self._clock + dt * mask
         self._held = self._held + dt * (mask & answer.arrived)
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
-        pace = torch.stack([self._pace, self._pace, torch.ones_like(self._pace)], dim=1)
-        command.velocity = answer.velocity * pace
+        command.velocity = paced(answer.velocity, self._pace)
         return command
 
     def _legs(self) -> Tensor:

@@ -11,7 +11,7 @@ from arena_newton.policies.experts.planning import Floor, plan
 from arena_newton.rotations import rotate_xy, wrap_angle
 from arena_newton.trackers.motions.navigate import NavigationCommand, NavigationLimits, Navigator
 
-__all__ = ["Walk", "along"]
+__all__ = ["Walk", "along", "paced"]
 
 HEADING_GAIN = 1.5
 """Yaw rate for a heading error on a line [1/s]."""
@@ -53,6 +53,11 @@ class Walk:
     def command(self, mask: Tensor, dt: float) -> NavigationCommand:
         """One step of the loop for the worlds of `mask`, bool, shape [worlds], dt [s] after the last one."""
         return self.navigator.command(self.sight.pose, self.goal, dt, route=self._route, mask=mask)
+
+
+def paced(velocity: Tensor, pace: Tensor) -> Tensor:
+    """A velocity [worlds, 3] whose two speeds, not its yaw rate, are multiplied by a pace, shape [worlds]."""
+    return velocity * torch.stack([pace, pace, torch.ones_like(pace)], dim=1)
 
 
 def _padded(points: Tensor, length: int) -> Tensor:
