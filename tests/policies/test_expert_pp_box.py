@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from recorded_actions import Actions
 
 from arena_newton import policies, seeding, trackers
 from arena_newton.env import ArenaEnv
-from arena_newton.interfaces import Recorder
 from arena_newton.policies.experts import pp_box
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.pp_box import LONGEST, PPBoxExpert, pose_before
@@ -174,20 +174,6 @@ def test_a_box_on_a_hand_is_noticed(engine):
         env.physics.step()
         most = np.maximum(most, env.physics.pair_force.numpy())
     assert most[0] > 0.1 and most[1] == 0.0
-
-
-class Actions(Recorder):
-    """Keeps the actions of every episode, by its seed."""
-
-    def __init__(self):
-        self.worlds, self.rows = {}, {}
-
-    def start(self, env, world, episode):
-        self.worlds[world] = self.rows.setdefault(episode.episode_seed, [])
-
-    def before_physics(self, env, observation, action):
-        for world, rows in self.worlds.items():
-            rows.append(action[world].clone())
 
 
 def test_our_twist2_puts_the_box_down_and_lets_go(twist2):

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from recorded_actions import Actions
 
 from arena_newton import policies, seeding, trackers
 from arena_newton.env import ArenaEnv
-from arena_newton.interfaces import Recorder
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.policies.experts.sit_sofa import LONGEST, SOFA, TABLE, SitSofaExpert
@@ -114,20 +114,6 @@ def test_only_masked_worlds_change(still):
     now = expert.command(none, dt).pack(), expert.phase.phase, expert.phase.clock, expert.walk.goal
     assert all(torch.equal(new[~mask], old[~mask]) for new, old in zip(now, kept, strict=True))
     assert (now[1][mask] != kept[1][mask]).all()
-
-
-class Actions(Recorder):
-    """Keeps the actions of every episode, by its seed."""
-
-    def __init__(self):
-        self.worlds, self.rows = {}, {}
-
-    def start(self, env, world, episode):
-        self.worlds[world] = self.rows.setdefault(episode.episode_seed, [])
-
-    def before_physics(self, env, observation, action):
-        for world, rows in self.worlds.items():
-            rows.append(action[world].clone())
 
 
 def test_our_twist2_sits_down(twist2):
