@@ -53,7 +53,17 @@ class VideoWriter:
     because yuv420p halves both.
     """
 
-    def __init__(self, path: str | Path, width: int, height: int, fps: float = 25.0, *, crf: int = 20):
+    def __init__(
+        self,
+        path: str | Path,
+        width: int,
+        height: int,
+        fps: float = 25.0,
+        *,
+        crf: int = 20,
+        gop: int | None = None,
+        b_frames: bool = True,
+    ):
         """Open the file.
 
         Args:
@@ -62,6 +72,9 @@ class VideoWriter:
             height: Frame height [px].
             fps: Frame rate [1/s].
             crf: x264's constant rate factor; smaller is better and larger on disk.
+            gop: Frames from one key frame to the next; x264's own, at most 250, by default. A reader that wants one
+                frame decodes all from the key frame before it.
+            b_frames: Allow frames that are predicted from later ones: smaller, slower to read in any order.
 
         Raises:
             OSError: The file cannot be written; the error carries its name.
@@ -83,6 +96,10 @@ class VideoWriter:
         # One encoder thread: videos are written during a simulation that uses every core.
         self._stream.codec_context.thread_count = 1
         self._stream.options = {"crf": str(crf), "preset": "veryfast"}
+        if gop is not None:
+            self._stream.options |= {"g": str(gop), "keyint_min": str(gop), "sc_threshold": "0"}
+        if not b_frames:
+            self._stream.options |= {"bf": "0"}
 
     def write(self, frame: Picture) -> None:
         """Append a frame, uint8 [height, width, 3] (array or torch tensor).

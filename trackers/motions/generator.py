@@ -34,14 +34,14 @@ from arena_newton.trackers.motions.commands import (
 )
 from arena_newton.trackers.motions.kinematics import SOLE_CENTRE, SOLE_HEIGHT, chain, neutral_stance
 
-__all__ = ["Frames", "ReferenceGenerator"]
+__all__ = ["ReferenceFrames", "ReferenceGenerator"]
 
 REACHING_JOINTS = (15, 16, 17, 18, 22, 23, 24, 25)
 """Shoulders and elbows, MuJoCo order."""
 
 
 @dataclass
-class Frames:
+class ReferenceFrames:
     """One tick of reference; rows are worlds. Later ticks leave it as it is."""
 
     root_pos: Tensor
@@ -179,7 +179,7 @@ class ReferenceGenerator:
             "com": torch.cat([com, pelvis[:, 2:]], dim=1),
         }
 
-    def step(self, command: MotionCommand | Tensor, mask: Tensor | None = None) -> Frames:
+    def step(self, command: MotionCommand | Tensor, mask: Tensor | None = None) -> ReferenceFrames:
         """One 50 Hz tick.
 
         Args:
@@ -206,10 +206,10 @@ class ReferenceGenerator:
         return self.frames
 
     @property
-    def frames(self) -> Frames:
+    def frames(self) -> ReferenceFrames:
         """The present frame."""
         frame = self._frame.clone()
-        return Frames(**{name: frame[:, part] for name, part in gait.FRAME.items()})
+        return ReferenceFrames(**{name: frame[:, part] for name, part in gait.FRAME.items()})
 
     def action(self) -> Tensor:
         """Canonical action of the last tick, orientation relative to the yaw at reset, float32, shape [worlds, 40]."""

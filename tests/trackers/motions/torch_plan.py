@@ -82,7 +82,7 @@ from arena_newton.trackers.motions.commands import (
     MotionCommand,
     neutral_row,
 )
-from arena_newton.trackers.motions.generator import REACHING_JOINTS, Frames
+from arena_newton.trackers.motions.generator import REACHING_JOINTS, ReferenceFrames
 from arena_newton.trackers.motions.kinematics import SOLE_CENTRE, SOLE_HEIGHT, chain, neutral_stance
 
 CAREFUL_COM_AHEAD = SOLE_CENTRE
@@ -428,7 +428,7 @@ class TorchGenerator:
         for name, value in (memory | {"com": self._com}).items():
             value.copy_(solved[name])
 
-    def step(self, command: MotionCommand, mask: Tensor | None = None) -> Frames:
+    def step(self, command: MotionCommand, mask: Tensor | None = None) -> ReferenceFrames:
         """One 50 Hz tick."""
         old = self._s
         new = copy.copy(old)
@@ -550,7 +550,7 @@ class TorchGenerator:
     def _publish(self) -> None:
         """Makes the present frame available."""
         s = self._s
-        self.frames = Frames(s.root, quat_from_euler(s.euler), self._joints.clone(), s.hands)
+        self.frames = ReferenceFrames(s.root, quat_from_euler(s.euler), self._joints.clone(), s.hands)
 
     def action(self) -> Tensor:
         """Canonical action of the last tick, shape [worlds, 40]."""

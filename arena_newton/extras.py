@@ -1,0 +1,36 @@
+"""Parts of the product that need libraries which a bare evaluation does not: extras of the package."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from arena_newton.errors import InputError
+
+__all__ = ["EXTRAS", "require"]
+
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "data": ("pyarrow", "datasets", "pandas", "torchcodec"),
+    "plots": ("matplotlib",),
+    "teleop": ("viser", "websockets", "redis"),
+    "train": ("accelerate", "wandb"),
+}
+"""Extra → modules by which it is known to be installed."""
+
+
+def require(extra: str, purpose: str, modules: tuple[str, ...] = ()) -> None:
+    """Check that an extra is installed; nothing is imported.
+
+    Args:
+        extra: Its name, a key of `EXTRAS`.
+        purpose: What needs it, as the message begins: `data build`, `--viewer viser`.
+        modules: Those of its modules that are needed; all by default.
+
+    Raises:
+        InputError: One is missing; the message names the extra and the command that installs it.
+    """
+    for module in modules or EXTRAS[extra]:
+        if importlib.util.find_spec(module) is None:
+            raise InputError(
+                f"{purpose}: needs the extra [{extra}] ({module} is not installed): "
+                f"uv sync --extra {extra}, or pip install 'arena-newton[{extra}]'"
+            )
