@@ -20,6 +20,8 @@ MEAN_EVERY = 5
 MEAN_TOLERANCE = 4.0
 """Largest difference [grey levels] between the mean of decoded frames and that of the statistics, which were taken
 before encoding: x264 changes a mean by less than 1, and a fifth of the frames shows it within 2."""
+TIME_TOLERANCE = 1e-3
+"""Largest difference of a frame's time from its number, in frames."""
 COMPARED = 12
 """Frames of an episode that are compared with the recorded MP4's, bit for bit: its first, its last, some between."""
 
@@ -168,7 +170,7 @@ def _decoded(
     """Frames in order; each must be at its time, and key frames as often as `info.json` says."""
     group, since = about.get("video.g"), 0
     for number, frame in enumerate(container.decode(stream)):
-        if frame.pts is None or round(float(frame.pts * stream.time_base) * fps * 1000) != number * 1000:
+        if frame.time is None or abs(frame.time * fps - number) > TIME_TOLERANCE:
             raise DatasetMismatch(path, f"frame {number} is at another time than {number / fps:g} s")
         since = 0 if frame.key_frame else since + 1
         if isinstance(group, int) and since >= group:
