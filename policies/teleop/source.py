@@ -13,10 +13,9 @@ Recording = Literal["idle", "recording", "saved", "discarded"]
 """What becomes of the running episode: not recorded, recorded, just saved, just discarded."""
 
 Control = Literal["none", "start", "save", "cancel", "save_and_reset", "discard_and_reset", "quit"]
-"""What a person wants of the recording: `start` begins one at the present tick's episode start (the world is reset when
-it has moved), `save` and `cancel` end it, the `_and_reset` forms begin the next episode as well, `quit` ends the session.
-
-A control is an event: a source gives each once."""
+"""What a person wants of the recording: `start` begins one, in an episode that begins with it; `save` and `cancel` end
+it; the `_and_reset` forms also begin the next episode; `quit` ends the session. A control is an event: a source gives
+each once."""
 
 
 @dataclass(frozen=True)
