@@ -35,6 +35,7 @@ class Command:
 
 COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
+    Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
