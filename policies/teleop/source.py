@@ -41,6 +41,12 @@ class Telemetry:
     until a newer picture is there."""
     recording: Recording
     """State of the recording."""
+    outcome: str | None = None
+    """How the episode ended: `success`, `fall`, or the task's own event, such as `ball_out`; None while it goes on."""
+    note: str = ""
+    """One line for the person, such as the file that was saved."""
+    factor: float = 1.0
+    """Simulated time over time that passed, of the last seconds; below 1 the machine is too slow."""
 
 
 @dataclass(frozen=True)
