@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +13,7 @@ from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.flags import parse_flags
+from arena_newton.policies.teleop.ports import bind
 from arena_newton.policies.teleop.teleop_options import BrowserOptions, RedisOptions
 
 __all__ = ["COMMANDS", "TeleopCommand", "main"]
@@ -48,6 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 done, 1 failed, 2 bad input, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):  # a shell starts programs in the background deaf to Ctrl-C
+            signal.signal(number, signal.default_int_handler)
     return exit_code(lambda: _run(arguments))
 
 
@@ -61,6 +67,10 @@ def _run(arguments: list[str]) -> int:
     command = COMMANDS[name]
     options = parse_flags(command.options, arguments, f"{PROG} {name}")
     require("teleop", f"teleop {name}", command.modules)
+    if isinstance(options, BrowserOptions):  # libraries take seconds to load, a taken port shows at once
+        bind(options.port, "--port").close()
+        if not options.no_view:
+            bind(options.port_of_view(), "--view-port").close()
     module, _, function = command.work.partition(":")
     code: int = getattr(importlib.import_module(f"arena_newton.policies.teleop.{module}"), function)(options)
     return code

@@ -14,7 +14,8 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
 from arena_newton.policies.teleop.browser import BrowserSource
 from arena_newton.policies.teleop.driving import RANGES
-from arena_newton.policies.teleop.page_server import PageServer, bind, new_token
+from arena_newton.policies.teleop.page_server import PageServer, new_token
+from arena_newton.policies.teleop.ports import bind
 from arena_newton.policies.teleop.source import Source
 from arena_newton.policies.teleop.teleop_options import BrowserOptions, SessionOptions
 from arena_newton.policies.teleop.teleop_session import TeleopSession
@@ -130,14 +131,10 @@ def drive_by_browser(options: BrowserOptions) -> int:
     _camera(options)
     with contextlib.ExitStack() as stack:
         listening = stack.enter_context(bind(options.port, "--port"))
-        port = int(listening.getsockname()[1])
-        view_port = port + 1 if options.view_port is None and options.port else options.view_port or 0
-        if not options.no_view:
-            bind(view_port, "--view-port").close()
         env = make_world(options)
         stack.callback(env.close)
         token = new_token()
-        view = None if options.no_view else WorldView(env, view_port, token)
+        view = None if options.no_view else WorldView(env, options.port_of_view(), token)
         facts = {
             "task": env.spec.name,
             "instruction": env.spec.instruction,

@@ -30,11 +30,10 @@ from websockets.typing import Origin
 
 from arena_newton.errors import InputError
 from arena_newton.policies.teleop.driving import Held, read_held
+from arena_newton.policies.teleop.ports import LOCAL
 
-__all__ = ["LOCAL", "PageServer", "bind", "new_token"]
+__all__ = ["PageServer", "new_token"]
 
-LOCAL = "127.0.0.1"
-"""The only address that is served."""
 FILES = {
     "": ("page.html", "text/html; charset=utf-8"),
     "page.css": ("page.css", "text/css; charset=utf-8"),
@@ -55,23 +54,6 @@ TAKEN_OVER, UNFIT = 4001, 1008
 """Codes with which a socket is closed: another page drives now, a message cannot be read."""
 
 
-def bind(port: int, flag: str) -> socket.socket:
-    """A listening socket of this machine.
-
-    Args:
-        port: TCP port; 0 takes a free one.
-        flag: What the message names.
-
-    Raises:
-        InputError: The port is taken or not allowed.
-    """
-    try:
-        return socket.create_server((LOCAL, port))
-    except (OSError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "no such port"
-        raise InputError(f"{flag} {port}: cannot be served at {LOCAL} ({reason}); name another port") from None
-
-
 def new_token() -> str:
     """A token that nobody guesses."""
     return secrets.token_urlsafe(16)
@@ -84,7 +66,7 @@ class PageServer:
         """Begin to serve.
 
         Args:
-            listening: The port, from `bind`; it belongs to the server from now on.
+            listening: The port, from `ports.bind`; it belongs to the server from now on.
             token: What every address must name; `new_token` makes one.
             facts: What the page is told once, as JSON.
             frame: Address of the page that shows the world; None: none.

@@ -50,6 +50,10 @@ class BrowserOptions(SessionOptions):
     no_view: bool = False
     """Leave the world's view out, on a machine that is too slow for it: the head camera's picture stays."""
 
+    def port_of_view(self) -> int:
+        """TCP port of the world's view; 0: a free one."""
+        return self.view_port if self.view_port is not None else self.port + 1 if self.port else 0
+
 
 @dataclass(frozen=True)
 class RedisOptions(SessionOptions):

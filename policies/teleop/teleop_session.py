@@ -335,6 +335,7 @@ class TeleopSession:
         )
         path = self._recorder.file(episode)
         self._recorder.finish(env, 0, result)
+        self.pace.restart()  # the world stood still while the file was written
         if path.exists():
             self._recording = "saved"
             self.saved.append(path)

@@ -25,7 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CAMERA_PRIMS
 from arena_newton.pictures.follow import WALL_GAP, room_walls
 from arena_newton.policies.teleop.driving import CAMERAS
-from arena_newton.policies.teleop.page_server import LOCAL, bind
+from arena_newton.policies.teleop.ports import LOCAL, bind
 from arena_newton.robot import TICK
 from arena_newton.rotations import heading_np
 
@@ -42,6 +42,8 @@ AIM = (0.9, 0.0, -0.05)
 """The point that it looks at, likewise [m]."""
 SWING = 0.8
 """Time in which the camera takes up a turn of the robot [s]."""
+PANEL = 300
+"""Width of viser's own panel, which the page hides [px]; its style sheet names it too."""
 FOV = 0.95
 """Height of the following camera's view [rad]."""
 
@@ -82,6 +84,8 @@ class WorldView:
         self._room = _room_camera(env)
         self._viewer.set_model(env.scene.model)
         server.gui.reset()  # Newton's panel: nothing of it is a person's who drives
+        server.gui.main_panel.dock_right()  # the page shows what is left of it
+        server.gui.main_panel.set_width(PANEL)
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
 
     def draw(self) -> None:

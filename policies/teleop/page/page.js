@@ -5,8 +5,8 @@ const byId = (id) => document.getElementById(id);
 const SLIDERS = ["height", "look", "hand_forward", "hand_aside", "hand_up"];
 const NEUTRAL = { height: 0.78, look: 0, hand_forward: 0.3, hand_aside: 0.14, hand_up: 0.15 };
 const SLIDER_KEYS = {
-  r: ["height", 1], f: ["height", -1], ",": ["look", 1], ".": ["look", -1], pageup: ["hand_forward", 1],
-  pagedown: ["hand_forward", -1], arrowright: ["hand_aside", 1], arrowleft: ["hand_aside", -1], arrowup: ["hand_up", 1],
+  r: ["height", 1], f: ["height", -1], ",": ["look", 1], ".": ["look", -1], t: ["hand_forward", 1],
+  g: ["hand_forward", -1], arrowright: ["hand_aside", 1], arrowleft: ["hand_aside", -1], arrowup: ["hand_up", 1],
   arrowdown: ["hand_up", -1],
 };
 const TRAVEL = 3; // seconds from one end of a slider to the other by key
@@ -153,7 +153,7 @@ function send() {
   readGamepad();
   moveSliders();
   const d = drive();
-  show("stick", "knob", -d.left, -d.forward, 52);
+  show("stick", "knob", -d.left, -d.forward, 39);
   show("turn", "wheel", -d.turn, 0, 52);
   if (!socket || socket.readyState !== WebSocket.OPEN) return;
   if (socket.bufferedAmount > 0) return; // stale messages help nobody
@@ -212,7 +212,7 @@ addEventListener("keydown", (event) => {
   const key = event.key.toLowerCase();
   if (!event.repeat) press(key);
   keys.add(key);
-  if (key.length > 1 || key === " ") event.preventDefault();
+  if (key in SLIDER_KEYS || key === " " || key === "backspace") event.preventDefault(); // no scrolling, no going back
 });
 addEventListener("keyup", (event) => keys.delete(event.key.toLowerCase()));
 addEventListener("blur", letGo);
