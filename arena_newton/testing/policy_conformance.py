@@ -28,7 +28,7 @@ from arena_newton.testing.findings import (
     perform,
 )
 
-__all__ = ["MAX_CHUNK", "check_policy"]
+__all__ = ["MAX_CHUNK", "SEEDS", "check_policy"]
 
 SEEDS = (11, 12, 13)
 """Episode seeds of the worlds by default."""
