@@ -35,6 +35,7 @@ class Command:
 
 COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
+    Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from arena_newton.robot import DriveGains, PhysicsRate
     from arena_newton.scene import Scene
     from arena_newton.tasks.base import TaskSpec
+    from arena_newton.tracking import TrackerLoop
 
 __all__ = [
     "Chunk",
@@ -319,6 +320,10 @@ class World(Protocol):
     spec: TaskSpec
     scene: Scene
     tracker: Any
+    loop: TrackerLoop
+    """What turns actions into actuator targets; holds what was executed at the last tick."""
+    mode: str
+    """Evaluation mode."""
     worlds: int
     torch_device: torch.device
     startup_ticks: int

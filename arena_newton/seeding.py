@@ -9,13 +9,23 @@ import zlib
 
 import numpy as np
 
-__all__ = ["episode_seed", "light_rng", "object_rng", "object_seed"]
+__all__ = ["DEMONSTRATION", "EVALUATION", "TELEOPERATION", "episode_seed", "light_rng", "object_rng", "object_seed"]
+__all__ += ["recording_seed", "seed_range"]
+
+EVALUATION = "evaluation"
+"""Range of the seeds that judge a policy, which are positive int32 as the original's: 0 to 2^31 - 1."""
+DEMONSTRATION = "demonstration"
+"""Range of the seeds of recorded experts: 2^31 to 2^32 - 1, so that no episode of it is ever evaluated."""
+TELEOPERATION = "teleoperation"
+"""Range of the seeds of recorded people: the same numbers as of demonstrations, drawn apart from them."""
 
 _U64 = (1 << 64) - 1
 _EPISODE_STEP = 0x9E3779B185EBCA87
 """Step of the object seed between the episodes of one process; every evaluation episode is the first of its process."""
 _FIRST_WORLD = 0x85EBCA77
 """What the original's first world adds to the key of an object's generator."""
+_RECORDED = 1 << 31
+"""Bit of the seeds of recordings."""
 _LIGHT_KEY = 0x1A2B3C4D
 """Separates the light's generator from all others."""
 
@@ -30,6 +40,24 @@ def episode_seed(gym_id: str, group_seed: int, repeat: int) -> int:
     """
     digest = hashlib.sha256(f"{gym_id}|{group_seed}|{repeat}".encode()).digest()
     return int.from_bytes(digest[-4:], "big") & 0x7FFFFFFF
+
+
+def recording_seed(gym_id: str, kind: str, group_seed: int, repeat: int) -> int:
+    """Seed of one episode to learn from: as `episode_seed`, but with bit 31 set, which no evaluation seed has.
+
+    Args:
+        gym_id: The task's id as the original spells it.
+        kind: `DEMONSTRATION` or `TELEOPERATION`.
+        group_seed: Number of a series of recordings.
+        repeat: Number of the episode in its series.
+    """
+    digest = hashlib.sha256(f"{gym_id}|{kind}|{group_seed}|{repeat}".encode()).digest()
+    return int.from_bytes(digest[-4:], "big") | _RECORDED
+
+
+def seed_range(episode_seed: int) -> str:
+    """`EVALUATION` for a seed that may judge a policy, otherwise `DEMONSTRATION`: whoever learns may use it."""
+    return DEMONSTRATION if int(episode_seed) & _RECORDED else EVALUATION
 
 
 def object_seed(episode_seed: int) -> int:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import difflib
-import io
 import json
 import signal
 import sys
@@ -13,8 +9,6 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import tyro
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
@@ -26,6 +20,7 @@ from arena_newton.eval.options import (
     ReportOptions,
     RunOptions,
 )
+from arena_newton.flags import parse_flags
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -65,45 +60,6 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
     return exit_code(work)
 
 
-def _parse[T](kind: type[T], arguments: list[str], command: str, default: T | None = None) -> T:
-    """Parse flags with tyro; a complaint becomes one line of our own."""
-    prog = f"{PROG} {command}".rstrip()
-    missing = tyro.MISSING_NONPROP if default is None else default
-    try:
-        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there is said again in one line
-            return tyro.cli(kind, args=arguments, prog=prog, default=missing)
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            raise
-        raise InputError(_complaint(kind, arguments, prog)) from None
-
-
-def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
-    """What is wrong with arguments that tyro refuses: each flag with its values is given to it alone.
-
-    tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
-    """
-    groups: list[list[str]] = []
-    for argument in arguments:
-        if not groups or argument[:1] == "-" and not argument[1:2].isdigit():
-            groups.append([])
-        groups[-1].append(argument)
-    for flag, *values in groups:
-        flag, equals, joined = flag.partition("=")
-        alone = [flag, *([joined] if equals else []), *values]
-        try:
-            with contextlib.redirect_stderr(io.StringIO()):
-                _, unknown = tyro.cli(kind, args=alone, prog=prog, return_unknown_args=True)
-        except SystemExit:
-            return f"{flag}: cannot read {' '.join(alone[1:]) or 'it without a value'}"
-        if unknown:
-            known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(kind)]
-            near = difflib.get_close_matches(unknown[0], known, 1)
-            hint = f", did you mean {near[0]}?" if near else f"; see {prog} --help"
-            return f"{unknown[0]}: unknown argument{hint}"
-    return f"these arguments cannot be read together: {' '.join(arguments)}; see {prog} --help"
-
-
 def _folder(arguments: list[str], command: str) -> Path:
     if not arguments or arguments[0].startswith("-"):
         raise InputError(f"{command}: name the results folder: {PROG} {command} <out>")
@@ -128,7 +84,7 @@ def _wants_help(arguments: Sequence[str]) -> bool:
 def _run(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
         print(OVERVIEW)
-    options = _parse(RunOptions, arguments, "run")
+    options = parse_flags(RunOptions, arguments, f"{PROG} run")
     return _execute(options, factories)
 
 
@@ -149,11 +105,11 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
 def _resume(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
         print(f"usage: {PROG} resume <out> [flags]; flags that change the results are refused\n")
-        _parse(RunOptions, ["--help"], "resume <out>")
+        parse_flags(RunOptions, ["--help"], f"{PROG} resume <out>")
     folder = _folder(arguments, "resume")
     from arena_newton.eval.folder import stored_options
 
-    options = _parse(RunOptions, arguments, "resume", default=stored_options(folder))
+    options = parse_flags(RunOptions, arguments, f"{PROG} resume", default=stored_options(folder))
     if options.out != str(folder):
         raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
     return _execute(options, factories)
@@ -161,9 +117,9 @@ def _resume(arguments: list[str], factories: Factories | None) -> int:
 
 def _report(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
-        _parse(ReportOptions, ["--help"], "report <out> [<out> ...]")
+        parse_flags(ReportOptions, ["--help"], f"{PROG} report <out> [<out> ...]")
     folders = _folders(arguments, "report")
-    options = _parse(ReportOptions, arguments, "report")
+    options = parse_flags(ReportOptions, arguments, f"{PROG} report")
     from arena_newton.eval import report, tables
     from arena_newton.eval.results import load_run
 
@@ -187,9 +143,9 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
 
 def _film(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
-        _parse(FilmOptions, ["--help"], "film <out> [<out> ...]")
+        parse_flags(FilmOptions, ["--help"], f"{PROG} film <out> [<out> ...]")
     folders = _folders(arguments, "film")
-    options = _parse(FilmOptions, arguments, "film")
+    options = parse_flags(FilmOptions, arguments, f"{PROG} film")
     from arena_newton.eval import success_film
     from arena_newton.eval.results import load_run
 
@@ -202,7 +158,7 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     as_json = "--json" in arguments
     if _wants_help(arguments):
         print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
-    options = _parse(RunOptions, [a for a in arguments if a != "--json"], "list")
+    options = parse_flags(RunOptions, [a for a in arguments if a != "--json"], f"{PROG} list")
     from arena_newton.eval.config import resolve
     from arena_newton.eval.progress import simulated
     from arena_newton.text import counted
@@ -224,21 +180,21 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _bench(arguments: list[str], factories: Factories | None) -> int:
-    options = _parse(BenchOptions, arguments, "bench")
+    options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
 
     return bench.run(options)
 
 
 def _engines(arguments: list[str], factories: Factories | None) -> int:
-    options = _parse(EngineOptions, arguments, "engines")
+    options = parse_flags(EngineOptions, arguments, f"{PROG} engines")
     from arena_newton.eval import engines
 
     return engines.run(options)
 
 
 def _certify(arguments: list[str], factories: Factories | None) -> int:
-    options = _parse(CertifyOptions, arguments, "certify")
+    options = parse_flags(CertifyOptions, arguments, f"{PROG} certify")
     from arena_newton.eval import certify
 
     return certify.run(options, factories)

@@ -20,8 +20,16 @@ EDGES = imports(KNOWN)
 HEAVY = set("torch warp newton mujoco mujoco_warp pxr lerobot matplotlib cv2 av onnx onnxruntime rsl_rl".split())
 HEAVY |= {"safetensors", "trimesh"}
 """Libraries whose import takes longer than the help of a command may."""
-STARTS = ("__main__", "eval.__main__", "trackers.__main__", "trackers.evaluate", "trackers.train.__main__")
-STARTS += ("trackers.motions.__main__", "usd_scenes.__main__", "trackers.tracker_check", "policies.policy_check")
+STARTS = (
+    "__main__",
+    "data.__main__",
+    "eval.__main__",
+    "trackers.__main__",
+    "trackers.evaluate",
+    "trackers.train.__main__",
+)
+STARTS += ("trackers.train.__main__", "trackers.motions.__main__", "usd_scenes.__main__")
+STARTS += ("trackers.tracker_check", "policies.policy_check")
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
 PLANNING = ("eval.config", "eval.folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are

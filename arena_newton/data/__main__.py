@@ -1,0 +1,71 @@
+"""Command line of datasets: ``python -m arena_newton.data {clean,build,verify,merge,split,inspect,stats} ...``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from arena_newton.command_line import exit_code
+from arena_newton.errors import InputError
+from arena_newton.extras import require
+from arena_newton.flags import folders_named, parse_flags
+
+__all__ = ["COMMANDS", "DataCommand", "main"]
+
+PROG = "python -m arena_newton.data"
+
+
+@dataclass(frozen=True)
+class DataCommand:
+    """One command: what it is given after its folders, and who does it."""
+
+    words: str
+    """How it is called, such as `build <recordings> [<recordings> ...]`."""
+    purpose: str
+    options: type
+    """Dataclass of its flags."""
+    work: str
+    """`module:function` in this room; takes the folders and the flags, returns an exit code."""
+    extra: str | None = None
+    """Extra that it needs."""
+
+
+COMMANDS: dict[str, DataCommand] = {}
+"""By name, in the order of a dataset's life."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line, with the arguments of the process by default.
+
+    Returns:
+        Exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    return exit_code(lambda: _run(arguments))
+
+
+def _run(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        width = max(len(command.words) for command in COMMANDS.values())
+        lines = [f"  {PROG} {command.words:<{width}}  {command.purpose}" for command in COMMANDS.values()]
+        print("\n".join(["commands:", *lines]), file=sys.stdout if arguments else sys.stderr)
+        return 0 if arguments else 2
+    name = arguments.pop(0)
+    if name not in COMMANDS:
+        raise InputError(f"{name}: unknown command, known are {' '.join(COMMANDS)}")
+    command = COMMANDS[name]
+    if any(argument in ("-h", "--help") for argument in arguments):
+        parse_flags(command.options, ["--help"], f"{PROG} {command.words}")
+    folders = folders_named(arguments, name, PROG)
+    options = parse_flags(command.options, arguments, f"{PROG} {name}")
+    if command.extra is not None:
+        require(command.extra, f"data {name}")
+    module, _, function = command.work.partition(":")
+    code: int = getattr(importlib.import_module(f"arena_newton.data.{module}"), function)(folders, options)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Flags of a command from a dataclass: tyro parses them, a complaint is one line."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from arena_newton.errors import InputError
+
+__all__ = ["folders_named", "parse_flags"]
+
+
+def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | None = None) -> T:
+    """Parse flags with tyro; a complaint becomes one line of our own.
+
+    Args:
+        kind: Dataclass of the flags, each with a default.
+        arguments: What was typed after the command.
+        prog: The command, as help and complaints name it.
+        default: Values of flags that are not given; the dataclass' own by default.
+
+    Raises:
+        InputError: A flag is unknown or its value unfit.
+        SystemExit: Help was asked for and printed.
+    """
+    missing = tyro.MISSING_NONPROP if default is None else default
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there is said again in one line
+            return tyro.cli(kind, args=arguments, prog=prog, default=missing)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise InputError(_complaint(kind, arguments, prog)) from None
+
+
+def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
+    """What is wrong with arguments that tyro refuses: each flag with its values is given to it alone.
+
+    tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
+    """
+    groups: list[list[str]] = []
+    for argument in arguments:
+        if not groups or argument[:1] == "-" and not argument[1:2].isdigit():
+            groups.append([])
+        groups[-1].append(argument)
+    for flag, *values in groups:
+        flag, equals, joined = flag.partition("=")
+        alone = [flag, *([joined] if equals else []), *values]
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):
+                _, unknown = tyro.cli(kind, args=alone, prog=prog, return_unknown_args=True)
+        except SystemExit:
+            return f"{flag}: cannot read {' '.join(alone[1:]) or 'it without a value'}"
+        if unknown:
+            known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(kind)]
+            near = difflib.get_close_matches(unknown[0], known, 1)
+            hint = f", did you mean {near[0]}?" if near else f"; see {prog} --help"
+            return f"{unknown[0]}: unknown argument{hint}"
+    return f"these arguments cannot be read together: {' '.join(arguments)}; see {prog} --help"
+
+
+def folders_named(arguments: list[str], command: str, prog: str) -> list[Path]:
+    """Take the folders or files that a command begins with out of its arguments, each once.
+
+    Args:
+        arguments: What was typed after the command; they are removed from it.
+        command: The command, such as `report`.
+        prog: How the program is called.
+
+    Raises:
+        InputError: None is named, or one twice.
+    """
+    found: list[Path] = []
+    while arguments and not arguments[0].startswith("-"):
+        found.append(Path(arguments.pop(0)).expanduser())
+    if not found:
+        raise InputError(f"{command}: name a folder: {prog} {command} <folder>")
+    for number, folder in enumerate(found):
+        if folder.resolve() in [other.resolve() for other in found[:number]]:
+            raise InputError(f"{command} {folder}: is named twice")
+    return found
