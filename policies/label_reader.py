@@ -32,7 +32,7 @@ def read_by(policy: Policy, labels: str) -> Policy:
         InputError: The protocol is unknown, or the policy is always of another one.
     """
     wanted = protocol(labels)
-    own = policy.labels
+    own = getattr(policy, "labels", None)  # a plug-in need not know of protocols
     if own is not None and own != wanted.name:
         raise InputError(f"--labels {labels}: policy {policy.name} gives actions of {own}; leave the flag out")
     return policy if wanted is LABELS["v3.1"] else V4Policy(policy)
