@@ -17,6 +17,7 @@ import torch
 from arena_newton import robot
 from arena_newton.canonical import ACTION, ACTION_WIDTH, validate_action
 from arena_newton.errors import InputError
+from arena_newton.foreign import numbers
 from arena_newton.rotations import matrix_from_quat, quat_from_euler
 
 __all__ = ["LABELS", "V4", "LabelProtocol", "V4Decoder", "action_names", "decode_v4", "encode_v4", "protocol"]
@@ -49,6 +50,34 @@ class LabelProtocol:
     """Name in LeRobot's `info.json`; policy servers check that of v3.1."""
     slots: Mapping[str, slice]
     sentence: str
+
+    def validate(self, actions: object, where: str) -> np.ndarray:
+        """Check actions of this protocol and return them as float32.
+
+        Args:
+            actions: Array-like, shape [..., 40].
+            where: What the message names as the origin.
+
+        Returns:
+            float32, shape [..., 40].
+
+        Raises:
+            InputError: Wrong width, no numbers, NaN or infinity, or of v3.1 an orientation that names no rotation.
+        """
+        if self.slots is ACTION:
+            return validate_action(actions, where)
+        array = numbers(np.asarray(actions), f"{where}: action", np.float32)
+        if array.ndim == 0 or array.shape[-1] != ACTION_WIDTH:
+            raise InputError(f"{where}: action has shape {list(array.shape)}, expected [..., {ACTION_WIDTH}]")
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            *row, column = bad[0].tolist()
+            at = f", row {'/'.join(map(str, row))}" if row else ""
+            name = action_names(self.name)[column]
+            raise InputError(
+                f"{where}{at}: {name} (index {column}) is {array[tuple(bad[0])]}, expected a finite number"
+            )
+        return array
 
 
 LABELS: dict[str, LabelProtocol] = {
@@ -119,6 +148,7 @@ def encode_v4(actions: np.ndarray, yaw0: float = 0.0) -> np.ndarray:
     steps = np.diff(np.rint((yaw - yaw0) / (robot.TICK * RATE_STEP)))
     labels[:, V4["yaw_rate"]] = steps[:, None] * RATE_STEP
     labels[:, V4["reserved"]] = 0.0
+    labels[:, V4["roll_pitch"]] += 0.0  # no minus zero
     return labels
 
 
