@@ -5,32 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from arena_newton import tasks as task_registry
-from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.foreign import read_arrays
 from arena_newton.policies.base import DATASET_FILE, Chunk, Json, Mask, Observation, Policy, dataset_target, world_mask
+from arena_newton.policies.open_loop import RecordedEpisodes, played
 from arena_newton.trackers.motions import load_actions, load_clip
 from arena_newton.trackers.motions.playback import clip_actions, startup_actions
 
-if TYPE_CHECKING:
-    from arena_newton.interfaces import World
-
-__all__ = ["RecordedEpisodes", "ReplayEpisodes", "ReplayPolicy", "from_spec"]
-
-_XY = ACTION["root_xy_delta"]
-
-
-def _played(recording: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Actions at ticks of any shape; after the end the last one without displacement, shape [..., 40]."""
-    actions = recording[np.minimum(ticks, len(recording) - 1)]
-    actions[ticks >= len(recording), _XY] = 0.0
-    return actions
+__all__ = ["ReplayEpisodes", "ReplayPolicy", "from_spec"]
 
 
 class ReplayPolicy(Policy):
@@ -84,7 +71,7 @@ class ReplayPolicy(Policy):
         asking = world_mask(observation.mask, worlds)
         ticks = self._steps[:, None] + np.arange(self.chunk_size)
         self._steps[asking] += self.chunk_size
-        return Chunk(_played(self.actions, ticks))
+        return Chunk(played(self.actions, ticks))
 
     def describe(self) -> Json:
         """File name and hash, and the times of the start."""
@@ -94,56 +81,6 @@ class ReplayPolicy(Policy):
     def _grow(self, worlds: int) -> None:
         if len(self._steps) != worlds:
             self._steps = np.zeros(worlds, dtype=np.int64)
-
-
-class RecordedEpisodes(Policy):
-    """Base of policies that play recordings of episodes, open loop."""
-
-    labels = "v3.1"
-    chunk_size = 20
-
-    def __init__(self) -> None:
-        """Play nothing yet."""
-        self.path = Path()
-        self.playing: list[np.ndarray | None] = []
-        """What each world plays, shape [ticks, 40]."""
-        self._mode = "base"
-        self._asked: list[tuple[str, str, int]] = []
-        self._steps = np.zeros(0, dtype=np.int64)
-
-    def recording(self, task: str, mode: str, seed: int) -> np.ndarray | None:
-        """Actions of an episode, by Gym id, mode and episode seed, shape [ticks, 40]; None where there are none."""
-        raise NotImplementedError
-
-    def attach(self, env: World) -> None:
-        """Take the mode whose recordings are played."""
-        self._mode = getattr(env, "mode", "base")
-
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
-        """Take the recordings of the worlds in `mask`."""
-        if len(self._steps) != len(seeds):
-            self._steps = np.zeros(len(seeds), dtype=np.int64)
-            self.playing, self._asked = [None] * len(seeds), [("", "", 0)] * len(seeds)
-        for world in np.flatnonzero(world_mask(mask, len(seeds))):
-            self._asked[world] = (tasks[world], self._mode, int(seeds[world]))
-            self.playing[world] = self.recording(*self._asked[world])
-            self._steps[world] = 0
-
-    def act(self, observation: Observation) -> Chunk:
-        """The next actions of the worlds that ask; a world without a recording gets an error."""
-        worlds = len(observation.state)
-        actions = np.zeros((worlds, self.chunk_size, ACTION_WIDTH), dtype=np.float32)
-        errors = {}
-        for world in np.flatnonzero(world_mask(observation.mask, worlds)):
-            recording = self.playing[world]
-            if recording is None:
-                task, mode, seed = self._asked[world]
-                errors[int(world)] = f"{self.path}: no recording of {task}, mode {mode}, episode seed {seed}"
-                continue
-            ticks = self._steps[world] + np.arange(self.chunk_size)
-            actions[world] = _played(recording, ticks)
-            self._steps[world] += self.chunk_size
-        return Chunk(actions, errors)
 
 
 class ReplayEpisodes(RecordedEpisodes):

@@ -16,7 +16,7 @@ from arena_newton.data.lerobot_reader import DatasetActions
 from arena_newton.errors import InputError
 from arena_newton.foreign import read_bytes
 from arena_newton.policies.base import Json, Mask
-from arena_newton.policies.replay import RecordedEpisodes
+from arena_newton.policies.open_loop import RecordedEpisodes
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
