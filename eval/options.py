@@ -81,6 +81,16 @@ class RunOptions:
     """Size of the world camera's pictures, such as 960x540 [px]."""
     follow: bool = False
     """Let the world camera follow the robot."""
+    viewer: str | None = None
+    """Show the first 16 worlds while they run: viser (a page on this machine), rerun (its page), usd (<out>/viewer)."""
+    viewer_port: int = 8080
+    """TCP port of the viewer's page."""
+    viewer_follow: bool = False
+    """Let the page's camera go with the first robot."""
+    viewer_real_time: bool = False
+    """Hold the run back to real time while a viewer shows it."""
+    viewer_failures: bool = False
+    """Write a .viser recording of each episode that fails, to walk around in."""
     actions: bool = False
     """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
     tracker in a run."""
