@@ -287,12 +287,14 @@ def _own_functions(kind: Layout, labels: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet_video() -> Iterator[None]:
-    """Let FFmpeg speak of errors only: it tells every file that is joined. Afterwards it has its own level again."""
+    """Let FFmpeg speak of errors only: LeRobot lets it print, and it tells every file that is joined."""
+    before = av.logging.get_level()
     av.logging.set_libav_level(av.logging.ERROR)
     try:
         yield
     finally:
         av.logging.set_libav_level(av.logging.INFO)
+        av.logging.set_level(before)
 
 
 def _features(chosen: Chosen, kind: Layout, labels: str) -> dict[str, dict[str, object]]:
