@@ -63,13 +63,18 @@ def test_every_order_gives_the_recorded_pictures(made, camera):
 def test_few_files_stay_open(made):
     """With one file open at a time the pictures are the same, and no more files are open."""
     root, decoded = made
+
+    def opened():
+        names = [str(path.resolve()) for path in Path("/proc/self/fd").iterdir() if path.exists()]
+        return sum(name.startswith(str(root)) for name in names)
+
+    before = opened()
     frames = Frames(root, open_files=1)
     for row in (0, ROWS + 3, 2 * ROWS + 5, 7):
         assert np.array_equal(frames[row], decoded["front"][row])
-    with open("/proc/self/maps") as _:
-        names = [str(path.resolve()) for path in Path("/proc/self/fd").iterdir() if path.exists()]
-    assert sum(name.startswith(str(root)) for name in names) <= 1
+        assert opened() == before + 1
     frames.close()
+    assert opened() == before
     assert np.array_equal(frames[3], decoded["front"][3])
 
 
