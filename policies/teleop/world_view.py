@@ -165,8 +165,8 @@ def _guarded(port: int, token: str) -> Iterator[None]:
     def guarded(*args: Any, process_request: Callable[..., Response | None], **options: Any) -> object:
         def answer(connection: object, request: Request) -> Response | None:
             named = hmac.compare_digest(request.path.strip("/").encode(), token.encode())
-            wants_socket = request.headers.get("Upgrade", "").lower() == "websocket"
-            if request.headers.get("Host") not in hosts or (wants_socket and not named):
+            wants_socket = bool(request.headers.get_all("Upgrade"))
+            if request.headers.get_all("Host") not in [[host] for host in hosts] or (wants_socket and not named):
                 return Response(http.HTTPStatus.NOT_FOUND.value, "Not Found", Headers({"Content-Length": "0"}), b"")
             return process_request(connection, request)
 
