@@ -11,7 +11,7 @@ import http
 import io
 import math
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import newton.viewer
 import numpy as np
@@ -159,10 +159,10 @@ def _room_camera(env: ArenaEnv) -> tuple[np.ndarray, np.ndarray, float]:
 @contextlib.contextmanager
 def _guarded(port: int, token: str) -> Iterator[None]:
     """While viser starts, its server is made to check token, `Host` and `Origin`: it has no option for that."""
-    serve = websockets.asyncio.server.serve
+    serve: Callable[..., object] = websockets.asyncio.server.serve
     hosts = [f"{name}:{port}" for name in (LOCAL, "localhost")]
 
-    def guarded(*args: Any, process_request: Callable[..., Response | None], **options: Any) -> object:
+    def guarded(*args: object, process_request: Callable[..., Response | None], **options: object) -> object:
         def answer(connection: object, request: Request) -> Response | None:
             named = hmac.compare_digest(request.path.strip("/").encode(), token.encode())
             wants_socket = bool(request.headers.get_all("Upgrade"))
@@ -177,4 +177,4 @@ def _guarded(port: int, token: str) -> Iterator[None]:
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+        websockets.asyncio.server.serve = serve  # type: ignore[assignment,misc]
