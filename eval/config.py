@@ -43,6 +43,8 @@ DRIVES: Mapping[str, DriveGains | None] = {
     "humanoidarena": TWIST2_HUMANOIDARENA_DRIVE,
 }
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
+LABELS = ("v3.1", "v4")
+"""Label protocols, `data.label_protocols.LABELS`, which loads torch."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
 ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
 """Flags that a resumed run does not take over."""
@@ -104,6 +106,7 @@ class RunConfig:
             "checkpoint": dict(self.checkpoint_hashes),
             "policy": self.policy_label,
             "policy_file": self.policy_hash,
+            "labels": flags.labels,
             "worlds": flags.worlds if self.worlds_matter else None,
             "rules": flags.rules,
             "rules_hash": self.rules_hash,
@@ -240,6 +243,8 @@ def _check_flags(options: RunOptions) -> None:
                 raise InputError(f"{_flag(field.name)} {plain_text(text)}: has control characters in it")
     if options.drive not in DRIVES:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
+    if options.labels not in LABELS:
+        raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     if options.video_episodes is not None and options.video_episodes < 1:
         raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
     for name in ("video_episodes", "video_size", "follow"):
@@ -320,6 +325,7 @@ def _policy_options(options: RunOptions) -> JsonObject:
             "retries": options.remote_retries,
             "sequential": options.remote_sequential,
             "verify_ssl": not options.remote_insecure,
+            "labels": options.labels,
         }
     for field in dataclasses.fields(options):
         if field.name.startswith("remote_") and getattr(options, field.name) != field.default:

@@ -46,6 +46,8 @@ class RunOptions:
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
     """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>, remote:<url>."""
+    labels: str = "v3.1"
+    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"

@@ -32,6 +32,7 @@ from arena_newton.files import file_label
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.policies.base import Policy, PolicyUnavailable
+from arena_newton.policies.label_reader import read_by
 from arena_newton.quiet import quiet_warp
 from arena_newton.robot import TICK
 from arena_newton.rollout import Rollout
@@ -109,7 +110,7 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
         policy.check_task(task, mode, [episode.episode_seed for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
-    return config.with_parts(made, policy), policy
+    return config.with_parts(made, policy), read_by(policy, config.flags.labels)
 
 
 def _play(
