@@ -21,7 +21,7 @@ def won(folder: Path) -> dict[tuple[str, str, int, int], bool]:
 
 def sign_test(a: int, b: int) -> float:
     """Probability that a fair coin splits a + b episodes at least as unevenly."""
-    tail = sum(math.comb(a + b, k) for k in range(min(a, b) + 1)) / 2 ** (a + b)
+    tail: float = sum(math.comb(a + b, k) for k in range(min(a, b) + 1)) / 2 ** (a + b)
     return min(1.0, 2.0 * tail)
 
 

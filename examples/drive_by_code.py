@@ -6,10 +6,11 @@ Shows: `MotionCommand`, whose channels combine freely, and `ReferenceGenerator`,
 """
 
 import argparse
+from collections.abc import Sequence
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
 from arena_newton.eval.plan import expand
-from arena_newton.interfaces import Recorder
+from arena_newton.policies.base import Mask
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 
@@ -21,11 +22,11 @@ class Driver(policies.Policy):
 
     name = "driver"
 
-    def reset(self, seeds, tasks, mask=None):
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Stand at the origin of a new reference."""
         self.generator, self.tick = ReferenceGenerator(worlds=1), 0
 
-    def act(self, observation):
+    def act(self, observation: policies.Observation) -> policies.Chunk:
         """One action per tick."""
         name = [word for start, word in SCRIPT if self.tick * 0.02 >= start][-1]
         command = MotionCommand.neutral(1)
@@ -38,14 +39,11 @@ class Driver(policies.Policy):
         return policies.Chunk(self.generator.action()[:, None], phases=[name])
 
 
-class Position(Recorder):
-    """Looks on."""
-
-    def tick(self, env):
-        """Print once a second where the robot is."""
-        if env.tick[0] >= 0 and env.tick[0] % 50 == 0:
-            x, y, z = env.physics.qpos.numpy()[0, env.scene.robot.root_qpos :][:3]
-            print(f"{env.tick[0] * 0.02:4.0f} s  x {x:+.2f}  y {y:+.2f}  height {z:.2f} m")
+def report(env: ArenaEnv) -> None:
+    """Print once a second where the robot is."""
+    if env.tick[0] >= 0 and env.tick[0] % 50 == 0:
+        x, y, z = env.physics.qpos.numpy()[0, env.scene.robot.root_qpos :][:3]
+        print(f"{env.tick[0] * 0.02:4.0f} s  x {x:+.2f}  y {y:+.2f}  height {z:.2f} m")
 
 
 if __name__ == "__main__":
@@ -55,6 +53,6 @@ if __name__ == "__main__":
     args = parser.parse_args()
     env = ArenaEnv("football", tracker=trackers.get(args.tracker), worlds=1, engine="mujoco")
     episodes = expand(["football"], trackers=[args.tracker], policy="driver", seeds=[0], repeats=1)
-    (result,) = Rollout(env, Driver(), episodes, recorder=Position(), max_steps=args.max_steps).run()
+    (result,) = Rollout(env, Driver(), episodes, max_steps=args.max_steps, on_tick=lambda _: report(env)).run()
     print(f"{result.outcome}; " + ", ".join(f"{name} from {tick * 0.02:g} s" for name, tick in result.phases))
     env.close()

@@ -7,12 +7,14 @@ name under which the command line knows it. Another program finds it through an 
 """
 
 import argparse
+from collections.abc import Sequence
 
 import numpy as np
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
 from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.eval.plan import expand
+from arena_newton.policies.base import Mask
 from arena_newton.testing import check_policy
 
 
@@ -22,15 +24,17 @@ class Squat(policies.Policy):
     name = "squat"
     chunk_size = 10
 
-    def reset(self, seeds, tasks, mask=None):
+    ticks = depth = np.zeros(0)
+
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Begin episodes: draw a depth from the seed, and forget the time."""
-        if not hasattr(self, "ticks") or len(self.ticks) != len(seeds):
-            self.ticks, self.depth = np.zeros(len(seeds), int), np.zeros(len(seeds))
+        if len(self.ticks) != len(seeds):
+            self.ticks, self.depth = np.zeros(len(seeds)), np.zeros(len(seeds))
         for world in np.flatnonzero(policies.world_mask(mask, len(seeds))):
             self.ticks[world] = 0
             self.depth[world] = np.random.default_rng(seeds[world]).uniform(0.05, 0.15)
 
-    def act(self, observation):
+    def act(self, observation: policies.Observation) -> policies.Chunk:
         """Lower the reference root as one second of a cosine; the tracker bends the knees."""
         time = 0.02 * (self.ticks[:, None] + np.arange(self.chunk_size))
         actions = np.tile(STAND_ACTION, (len(time), self.chunk_size, 1))
