@@ -245,7 +245,8 @@ class ResultsFolder:
 
     def sweep(self) -> None:
         """Remove what unfinished recordings left."""
-        for pattern in (f"videos/*{PARTIAL}", f"strips/*{PARTIAL}", f"actions/*{PARTIAL}", "actions/*.partial"):
+        folders = ("videos", "strips", "actions", "failures")
+        for pattern in (*(f"{name}/*{PARTIAL}" for name in folders), "actions/*.partial"):
             for part in self.path.glob(pattern):
                 with contextlib.suppress(OSError):
                     part.unlink()
