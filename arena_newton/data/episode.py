@@ -122,6 +122,8 @@ FIELDS = (
     Field("arena_reason", "", "text", "finer cause"),
     Field("arena_margin", "", "float64", "signed distance to success at the end"),
     Field("arena_configuration", "", "text", "JSON: what the run depends on, hashes included"),
+    Field("arena_cleaned", "", "text", "JSON: rows that `data clean` dropped, by rule, and their source; else absent"),
+    Field("arena_source_rows", "T", "int64", "row of the source of each row that `data clean` left; else absent"),
 )
 """All arrays; `<object>` is an object's name in the original's records, `<camera>` a prefix of `CAMERAS`."""
 
