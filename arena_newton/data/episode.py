@@ -9,7 +9,6 @@ The bytes depend on the episode alone: not on the number of worlds, on when or w
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import zipfile
@@ -148,9 +147,9 @@ def write_episode(path: Path, arrays: Mapping[str, np.ndarray], *, sync: bool = 
             for name, array in arrays.items():
                 member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
                 member.compress_type = zipfile.ZIP_DEFLATED
-                content = io.BytesIO()
-                np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
-                archive.writestr(member, content.getbuffer(), compresslevel=4)
+                member.file_size = array.nbytes + limits.HEADER_BYTES  # decides on the form of the member's header
+                with archive.open(member, "w") as content:
+                    np.lib.format.write_array(content, np.asanyarray(array, order="C"), allow_pickle=False)
 
 
 def episode_files(folders: Iterable[str | Path]) -> list[Path]:

@@ -5,7 +5,7 @@ from typing import Literal
 
 from arena_newton.errors import InputError
 
-__all__ = ["STRIP_SIZES", "CameraConfig", "Fit", "video_sizes"]
+__all__ = ["SIZE_LIMITS", "STRIP_SIZES", "CameraConfig", "Fit", "video_sizes"]
 
 Fit = Literal["native", "pad"]
 STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
