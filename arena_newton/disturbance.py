@@ -74,7 +74,9 @@ class ActionNoise(Recorder):
         """
         self.levels = levels or NoiseLevels()
         self.ticks = ticks
+        self._env: World | None = None
         self._series: torch.Tensor | None = None
+        """Noise of each world's episode, shape [worlds, ticks, 33]."""
 
     def describe(self) -> dict[str, object]:
         """What a result must record to name this disturbance exactly, as JSON."""
@@ -82,7 +84,8 @@ class ActionNoise(Recorder):
 
     def start(self, env: World, world: int, episode: Planned) -> None:
         """Draw the noise of an episode."""
-        if self._series is None or len(self._series) != env.worlds or self._series.device != env.torch_device:
+        if self._series is None or self._env is not env:
+            self._env = env
             self._series = torch.zeros((env.worlds, self.ticks, WIDTH), device=env.torch_device)
             self._series[..., -2] = 1.0
         drawn = noise_series(episode.episode_seed, self.ticks, self.levels)

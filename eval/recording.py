@@ -28,7 +28,15 @@ from arena_newton.eval.records import JsonObject
 from arena_newton.interfaces import EpisodeResult
 from arena_newton.text import counted
 
-__all__ = ["agrees", "demonstration_recorder", "disturbance_of", "facts_of", "is_recorded", "outcome_lines"]
+__all__ = [
+    "agrees",
+    "demonstration_recorder",
+    "disturbance_of",
+    "encoding_threads",
+    "facts_of",
+    "is_recorded",
+    "outcome_lines",
+]
 
 MOST_THREADS = 16
 """Threads that encode pictures, at most; otherwise as many as there are cores."""
@@ -65,8 +73,13 @@ def demonstration_recorder(config: RunConfig, folder: Path, facts: JsonObject) -
         depth=config.flags.record_depth,
         only_success=config.flags.keep is not None,
         facts=facts,
-        threads=max(1, min(MOST_THREADS, len(os.sched_getaffinity(0)))),
+        threads=encoding_threads(),
     )
+
+
+def encoding_threads() -> int:
+    """Threads that encode pictures: one per core that this process may use, up to `MOST_THREADS`."""
+    return max(1, min(MOST_THREADS, len(os.sched_getaffinity(0))))
 
 
 def disturbance_of(config: RunConfig, ticks: int) -> ActionNoise | None:

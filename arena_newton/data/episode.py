@@ -120,6 +120,9 @@ FIELDS = (
     Field("arena_outcome", "", "text", "success, fall or timeout"),
     Field("arena_reason", "", "text", "finer cause"),
     Field("arena_margin", "", "float64", "signed distance to success at the end"),
+    Field("rerecord_any_success", "", "bool", "the task succeeded while the episode was played again for its pictures"),
+    Field("rerecord_final_reward", "", "float64", "1 where its last tick then was a success, otherwise 0"),
+    Field("rerecord_max_reward", "", "float64", "1 where any of its ticks then was a success, otherwise 0"),
     Field("arena_configuration", "", "text", "JSON: what the run depends on, hashes included"),
 )
 """All arrays; `<object>` is an object's name in the original's records, `<camera>` a prefix of `CAMERAS`."""
