@@ -37,13 +37,19 @@ COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
     Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
+    Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
+    Command("trackers check", "arena_newton.trackers.tracker_check", "try what the interface promises on a tracker"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
     Command("trackers train", "arena_newton.trackers.train.__main__", "train a tracker, export weights, draw curves"),
     Command("trackers motions", "arena_newton.trackers.motions.__main__", "convert, inspect, render, generate motions"),
 )
+
+
+DOCTORS = {"--tracker": "trackers check", "--policy": "policies check"}
+"""Flag of `doctor` → the command that it stands for: the world below cannot examine what is above it."""
 
 
 def _overview(within: str) -> str:
@@ -64,10 +70,22 @@ def _overview(within: str) -> str:
     )
 
 
+def _examining(arguments: list[str]) -> list[str]:
+    """`doctor --tracker NAME ...` as the command that it stands for; everything else as it is."""
+    flag, equals, name = arguments[1].partition("=") if arguments[:1] == ["doctor"] and arguments[1:] else ("", "", "")
+    if flag not in DOCTORS:
+        return arguments
+    rest = [name, *arguments[2:]] if equals else arguments[2:]
+    if not rest or not rest[0] or rest[0].startswith("-"):
+        raise InputError(f"doctor {flag}: name the {flag[2:]} behind it")
+    return [*DOCTORS[flag].split(), *rest]
+
+
 def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(__version__)
         return 0
+    arguments = _examining(arguments)
     found = [c for c in COMMANDS if arguments[: len(c.words.split())] == c.words.split()]
     if found:
         command = max(found, key=lambda c: len(c.words))

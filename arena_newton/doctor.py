@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import shutil
+import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Finding", "examine", "main", "versions"]
+from arena_newton.extras import EXTRAS
+from arena_newton.probe import faults
+
+__all__ = ["Finding", "examine", "examine_extras", "main", "versions"]
 
 USAGE = """usage: arena-newton doctor
+       arena-newton doctor --tracker NAME [--checkpoint PATH]
+       arena-newton doctor --policy SPEC [--task TASK]
 
-Examines packages, devices, engines, kernel cache, disk and scenes, and says what to do about what is missing.
-Exit code 0: a run can start; 1: a problem must be solved first."""
+Examines packages, extras, devices, engines, kernel cache, disk and scenes, and says what to do about what is missing.
+With --tracker or --policy it tries what the interface promises on one of them, a package's own included; these are
+short for `trackers check` and `policies check`.
+Exit code 0: a run can start, every promise is kept; 1: a problem must be solved first; 2: bad input."""
 _REQUIRED = {
     "newton": "physics, scenes and cameras",
     "warp-lang": "kernels",
@@ -40,6 +49,17 @@ _OPTIONAL = {
     "onnxruntime": "check of converted checkpoints",
     "av": "videos (--video)",
 }
+_EXTRA_PURPOSES = {
+    "data": "datasets in LeRobot's format",
+    "plots": "charts",
+    "teleop": "a person drives the robot; viewers of a run",
+    "train": "LeRobot's trainer",
+}
+"""Extra → what it is for."""
+_TORCHCODEC_MEMORY = 8 << 30
+"""Memory that loading torchcodec may take beyond the interpreter's own [bytes]; it loads torch."""
+_TORCHCODEC_TIME = 60.0
+"""Time that it may take [s]; 3 s on an idle machine."""
 _INSTALL = "run `uv sync` in the checkout, or `pip install --upgrade arena-newton`"
 _MIN_FREE_GIB = 2.0
 """Below this free space a run with videos or a cold kernel cache may end on a full disk [GiB]."""
@@ -83,6 +103,36 @@ def _packages() -> list[Finding]:
         missing = Finding(name, "missing", status, f"needed for {purpose}: {_INSTALL}")
         findings.append(missing if version is None else Finding(name, version))
     return findings
+
+
+def examine_extras() -> list[Finding]:
+    """Which extras are installed, and whether the data extra's video reader works."""
+    findings = []
+    for extra, modules in EXTRAS.items():
+        absent = [module for module in modules if importlib.util.find_spec(module) is None]
+        advice = f"needed for {_EXTRA_PURPOSES[extra]}: uv sync --extra {extra}, or pip install 'arena-newton[{extra}]'"
+        if absent:
+            findings.append(Finding(f"extra [{extra}]", f"without {', '.join(absent)}", "note", advice))
+        else:
+            findings.append(Finding(f"extra [{extra}]", "installed"))
+    if importlib.util.find_spec("torchcodec") is not None:
+        findings.append(_torchcodec())
+    return findings
+
+
+def _torchcodec() -> Finding:
+    """Whether torchcodec loads: it is installed without FFmpeg's shared libraries, and does not without them."""
+    try:
+        fault = faults("module", ["torchcodec"], memory=_TORCHCODEC_MEMORY, seconds=_TORCHCODEC_TIME)[0]
+    except (OSError, subprocess.SubprocessError) as error:
+        fault = _short(error)
+    if fault is None:
+        return Finding("torchcodec", "loads")
+    advice = (
+        "LeRobot then reads videos with PyAV, 2 to 4 times slower: install FFmpeg's shared libraries, "
+        "`apt install ffmpeg`"
+    )
+    return Finding("torchcodec", f"does not load ({' '.join(fault.split())[:120]})", "note", advice)
 
 
 def _devices() -> list[Finding]:
@@ -182,21 +232,24 @@ def examine() -> list[Finding]:
     findings = _packages()
     if any(finding.status == "bad" for finding in findings):
         return findings
-    return [*findings, *_devices(), *_engines(), *_storage(), *_scenes()]
+    return [*findings, *examine_extras(), *_devices(), *_engines(), *_storage(), *_scenes()]
 
 
 def main(argv: Sequence[str] = ()) -> int:
     """Print the findings.
 
     Args:
-        argv: Arguments; there are none but ``--help``.
+        argv: Arguments; there are none but ``--help``: the front door hands `--tracker` and `--policy` to others.
 
     Returns:
         Exit code: 0 when a run can start, 1 when a problem must be solved first.
     """
     if argv:
         helps = argv[0] in ("-h", "--help")
-        print(USAGE if helps else f"error: doctor {argv[0]}: takes no arguments", file=None if helps else sys.stderr)
+        print(
+            USAGE if helps else f"error: doctor {argv[0]}: unknown, expected --tracker NAME or --policy SPEC",
+            file=None if helps else sys.stderr,
+        )
         return 0 if helps else 2
     findings = examine()
     width = max(len(finding.subject) for finding in findings)

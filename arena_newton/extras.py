@@ -11,6 +11,7 @@ __all__ = ["EXTRAS", "require"]
 EXTRAS: dict[str, tuple[str, ...]] = {
     "data": ("pyarrow", "datasets", "pandas", "torchcodec"),
     "plots": ("matplotlib",),
+    "rerun": ("rerun",),
     "teleop": ("viser", "websockets", "redis"),
     "train": ("accelerate", "wandb"),
 }

@@ -1,7 +1,8 @@
-"""Open files in a separate process first, where a library's compiled reader does not validate them.
+"""Try in a separate process first what may take this one down: files of compiled readers, libraries that may not load.
 
 A damaged binary layer can make USD allocate any amount of memory or run forever, and so can a network in
-onnxruntime. Here the file is opened once by a process with limited memory and time, which may crash.
+onnxruntime. A library whose shared libraries are absent may leave half of itself behind. Here each is tried once by a
+process with limited memory and time, which may crash.
 """
 
 import json
@@ -15,15 +16,16 @@ __all__ = ["faults"]
 
 CRASHED = "it crashes its reader or takes too much memory"
 TOO_LONG = "it takes too long to read"
-_KINDS = ("crate", "network")
+_KINDS = ("crate", "network", "module")
 
 
 def faults(kind: str, paths: Sequence[str], *, memory: int, seconds: float) -> list[str | None]:
-    """Try to open files: None for each that can be read, otherwise its reader's message.
+    """Try to open files or import modules: None for each that can be, otherwise its reader's message.
 
     Args:
-        kind: `crate` for USD layers, `network` for ONNX files (path, a tab, the width of the input).
-        paths: The files.
+        kind: `crate` for USD layers, `network` for ONNX files (path, a tab, the width of the input), `module` for
+            Python modules that are imported.
+        paths: The files, or the modules' names.
         memory: Memory that each may take in addition to the library itself [bytes].
         seconds: Time that each may take [s].
     """
@@ -72,6 +74,12 @@ def _network(given: str) -> None:
     session.run(None, {session.get_inputs()[0].name: np.zeros((rows, int(width)), np.float32)})
 
 
+def _module(name: str) -> None:
+    import importlib
+
+    importlib.import_module(name)
+
+
 def _limited(work: Callable[[str], None], path: str, memory: int, seconds: float) -> str | None:
     """The answer for one file, which a fork opens."""
     import resource
@@ -103,12 +111,12 @@ def _limited(work: Callable[[str], None], path: str, memory: int, seconds: float
 
 def _main() -> None:
     kind, memory, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
-    work = (_crate, _network)[_KINDS.index(kind)]
+    work = (_crate, _network, _module)[_KINDS.index(kind)]
     if kind == "crate":
         from pxr import Sdf
 
         Sdf.Layer.CreateAnonymous(".usdc")  # loads the plugins once, before the forks
-    else:
+    elif kind == "network":
         import onnxruntime  # noqa: F401
     errors = os.dup(2)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

@@ -29,7 +29,7 @@ from arena_newton.interfaces import (
 from arena_newton.kernels import tick as codes
 from arena_newton.robot import TICK
 
-__all__ = ["Rollout"]
+__all__ = ["Rollout", "ending"]
 
 
 @dataclass
@@ -43,6 +43,30 @@ class _Running:
     """Wall-clock time of its reset [s]."""
     phases: list[tuple[str, int]] = field(default_factory=list)
     """The policy's phases and their first ticks so far."""
+
+
+def ending(env: World, code: int, tick: int, budget: int) -> tuple[str, str, str | None] | None:
+    """Outcome, reason and message of an episode; None while it goes on.
+
+    Args:
+        env: The worlds.
+        code: What `env.step` said of the episode's world.
+        tick: Ticks since its step 0, the one that ended now included; negative in the start-up.
+        budget: Its step budget [ticks].
+    """
+    if code == codes.ERROR_STATE:
+        return "error", "nonfinite_state", "the simulation state of this world became non-finite"
+    if code == codes.ERROR_TARGETS:
+        return "error", "tracker", f"tracker {env.tracker.name}: a joint target is not finite"
+    if code == codes.ERROR_ACTION:
+        return "error", "bad_action", "the policy's action is non-finite or its rot6d is degenerate"
+    if code == codes.SUCCESS:
+        return "success", "success", None
+    if code == codes.FALL:
+        return "fall", "startup_fall" if tick <= 0 else "fall", None
+    if code > codes.EVENT:
+        return "timeout", env.spec.events[code - codes.EVENT], None
+    return ("timeout", "timeout", None) if tick >= budget else None
 
 
 class Rollout:
@@ -183,40 +207,23 @@ class Rollout:
         """Finish the episodes that a tick ended; returns their worlds."""
         ended = []
         for world in np.flatnonzero(self.env.active).tolist():
-            ending = self._ending(int(status[world]), int(self.env.tick[world]))
-            if ending is not None:
-                self._finish(world, *ending)
+            found = ending(self.env, int(status[world]), int(self.env.tick[world]), self.budget)
+            if found is not None:
+                self._finish(world, *found)
                 ended.append(world)
         return ended
-
-    def _ending(self, code: int, tick: int) -> tuple[str, str, str | None] | None:
-        """Outcome, reason and message of an episode with this status at this tick; None while it goes on."""
-        if code == codes.ERROR_STATE:
-            return "error", "nonfinite_state", "the simulation state of this world became non-finite"
-        if code == codes.ERROR_TARGETS:
-            return "error", "tracker", f"tracker {self.env.tracker.name}: a joint target is not finite"
-        if code == codes.ERROR_ACTION:
-            return "error", "bad_action", "the policy's action is non-finite or its rot6d is degenerate"
-        if code == codes.SUCCESS:
-            return "success", "success", None
-        if code == codes.FALL:
-            return "fall", "fall", None
-        if code > codes.EVENT:
-            return "timeout", self.env.spec.events[code - codes.EVENT], None
-        return ("timeout", "timeout", None) if tick >= self.budget else None
 
     def _finish(self, world: int, outcome: str, reason: str, error: str | None) -> None:
         """Report how a world's episode ended."""
         env, running = self.env, self._running.pop(world)
         tick, verdict = int(env.tick[world]), env.verdict(world)
-        startup = outcome == "fall" and tick <= 0
         result = EpisodeResult(
             episode=running.episode,
             outcome=outcome,
-            reason="startup_fall" if startup else reason,
+            reason=reason,
             steps=max(tick, 0),
             margin=verdict.margin,
-            startup_fall=startup,
+            startup_fall=reason == "startup_fall",
             overflow=verdict.overflow,
             sim_s=float((tick + env.startup_ticks) * TICK),
             wall_s=time.perf_counter() - running.began,

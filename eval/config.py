@@ -23,8 +23,9 @@ from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RecordOptions, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
+from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
-from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig, Fit, video_sizes
+from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
 
@@ -44,6 +45,11 @@ DRIVES: Mapping[str, DriveGains | None] = {
     "humanoidarena": TWIST2_HUMANOIDARENA_DRIVE,
 }
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
+LABELS = ("v3.1", "v4")
+"""Label protocols, `data.label_protocols.LABELS`, which loads torch."""
+ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
+ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
+"""Flags that a resumed run does not take over."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +97,9 @@ class RunConfig:
     def identity(self) -> Identity:
         """What the results depend on, by flag name; two runs with equal identity may share a results folder.
 
-        Videos and the folder are absent: they do not change an episode. So is the number of worlds, except for a policy
-        that depends on it. Files count by content. What each environment was built with and the libraries' versions are
-        stored next to it in config.json.
+        Videos, viewers and the folder are absent: they do not change an episode. So is the number of worlds, except for
+        a policy that depends on it. Files count by content. What each environment was built with and the libraries'
+        versions are stored next to it in config.json.
         """
         flags = self.flags
         return {
@@ -104,6 +110,7 @@ class RunConfig:
             "checkpoint": dict(self.checkpoint_hashes),
             "policy": self.policy_label,
             "policy_file": self.policy_hash,
+            "labels": flags.labels,
             "worlds": flags.worlds if self.worlds_matter else None,
             "rules": flags.rules,
             "rules_hash": self.rules_hash,
@@ -136,7 +143,7 @@ class RunConfig:
 
     def stored_flags(self) -> JsonObject:
         """What `resume` starts from: all flags but those of one call."""
-        once = dict.fromkeys(("retry_errors", "accept_versions", "skip_broken", "verbose"), False)
+        once = {field.name: field.default for field in dataclasses.fields(self.flags) if field.name in ONE_CALL}
         flags: JsonObject = json.loads(json.dumps(dataclasses.asdict(self.flags) | once))
         return flags
 
@@ -278,6 +285,8 @@ def _check_flags(options: RunOptions) -> None:
                 raise InputError(f"{_flag(field.name)} {plain_text(text)}: has control characters in it")
     if options.drive not in DRIVES:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
+    if options.labels not in LABELS:
+        raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     if options.video_episodes is not None and options.video_episodes < 1:
         raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
     for name in ("video_episodes", "video_size", "follow"):
@@ -286,12 +295,33 @@ def _check_flags(options: RunOptions) -> None:
     for name in ("record_cameras", "record_size", "record_depth"):
         if getattr(options, name) != getattr(RunOptions, name) and not options.record:
             raise InputError(f"{_flag(name)}: belongs to --record, which is not given")
+    _check_viewer(options)
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: must be alone, name either all or single tasks")
     if options.seeds and min(options.seeds) < 0:
         raise InputError(f"--seeds {min(options.seeds)}: expected numbers of at least 0")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
+
+
+def _check_viewer(options: RunOptions) -> None:
+    """Refuse a viewer that cannot be started, before anything is."""
+    if options.viewer is None:
+        for name in ("viewer_follow", "viewer_port", "viewer_real_time"):
+            if getattr(options, name) != getattr(RunOptions(), name):
+                raise InputError(f"{_flag(name)}: belongs to --viewer, which is not given")
+    elif options.viewer not in VIEWERS:
+        raise InputError(f"--viewer {options.viewer}: unknown, choose from {', '.join(VIEWERS)}")
+    if options.viewer_follow and options.viewer != "viser":
+        raise InputError(f"--viewer-follow: belongs to --viewer viser, not {options.viewer}")
+    if not 1 <= options.viewer_port <= MOST_PORT:
+        raise InputError(f"--viewer-port {options.viewer_port}: expected 1 to {MOST_PORT}")
+    if options.viewer == "viser":
+        require("teleop", "--viewer viser", ("viser",))
+    if options.viewer == "rerun":
+        require("rerun", "--viewer rerun")
+    if options.viewer_failures:
+        require("teleop", "--viewer-failures", ("viser",))
 
 
 def _flag(name: str) -> str:
@@ -370,6 +400,7 @@ def _policy_options(options: RunOptions) -> JsonObject:
             "retries": options.remote_retries,
             "sequential": options.remote_sequential,
             "verify_ssl": not options.remote_insecure,
+            "labels": options.labels,
         }
     for field in dataclasses.fields(options):
         if field.name.startswith("remote_") and getattr(options, field.name) != field.default:

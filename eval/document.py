@@ -72,6 +72,7 @@ class Identity(_Identity, total=False):
     """The hash alone in a folder of an earlier version."""
     policy: Name
     policy_file: Hash
+    labels: Name
     worlds: Annotated[float | None, Fit("a number or null")]
     rules_hash: Name
     engine: Name

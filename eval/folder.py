@@ -36,7 +36,7 @@ __all__ = [
 
 EPISODES = "episodes"
 """Folder of the files of recorded episodes."""
-SUBFOLDERS = ("videos", "strips", "actions", "original", EPISODES, f"{EPISODES}/{VIDEO_FOLDER}")
+SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f"{EPISODES}/{VIDEO_FOLDER}")
 """Folders that a run writes inside its own."""
 RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
 """Flags that all episodes of a folder share, though they change none of them."""

@@ -47,6 +47,8 @@ class RunOptions:
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
     """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>, remote:<url>."""
+    labels: str = "v3.1"
+    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
@@ -87,6 +89,16 @@ class RunOptions:
     """Size of their pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
+    viewer: str | None = None
+    """Show the first 16 worlds while they run: viser (a page on this machine), rerun (its page), usd (<out>/viewer)."""
+    viewer_port: int = 8080
+    """TCP port of the viewer's page."""
+    viewer_follow: bool = False
+    """Let the page's camera go with the first robot."""
+    viewer_real_time: bool = False
+    """Hold the run back to real time while a viewer shows it."""
+    viewer_failures: bool = False
+    """Write a .viser recording of each episode that fails, to walk around in."""
     actions: bool = False
     """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
     tracker in a run."""

@@ -23,6 +23,7 @@ from arena_newton.eval import console, recording, report, rounds
 from arena_newton.eval.config import DRIVES, RunConfig
 from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
+from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
@@ -31,12 +32,14 @@ from arena_newton.files import file_label
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.policies.base import Policy, PolicyUnavailable
+from arena_newton.policies.label_reader import read_by
 from arena_newton.quiet import quiet_warp
 from arena_newton.robot import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.text import counted, plain_text
 from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
+from arena_newton.viewing import FailureRecorder, WorldViewer
 
 __all__ = ["Factories", "RunStopped", "execute"]
 
@@ -110,16 +113,17 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
         policy.check_task(task, mode, [episode.episode_seed for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
-    return config.with_parts(made, policy), policy
+    return config.with_parts(made, policy), read_by(policy, config.flags.labels)
 
 
 def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy: Policy, resume: str) -> bool:
     """Play what is missing; False when it was interrupted. Errors say how to go on: by the command `resume`."""
+    viewer = _viewer(config, folder.path)
     folder.make()
     with Journal(folder.journal) as journal:
         folder.settle(config, journal.records)
         folder.sweep()
-        run = _Run(config, folder, journal, factories, policy)
+        run = _Run(config, folder, journal, factories, policy, viewer)
         try:
             run.play()
         except KeyboardInterrupt:
@@ -133,6 +137,8 @@ def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy
             raise RunStopped(f"{error}; {run.kept()}; continue with: {resume}") from None
         finally:
             folder.sweep()
+            if viewer is not None:
+                viewer.close()
     return True
 
 
@@ -153,6 +159,8 @@ class _Run:
     journal: Journal
     factories: Factories
     policy: Policy
+    viewer: WorldViewer | None = None
+    """What shows the worlds, if anything does."""
     progress: Progress = field(init=False)
     hashes: dict[str, str | None] = field(default_factory=dict)
     """What the present environment's episodes name their run by; empty before it is built."""
@@ -272,6 +280,11 @@ class _Run:
             recorder = _recorder(config, self.folder.path, tracker)
             recorders: list[Recorder] = [] if recorder is None else [recorder]
             recorders += [ActionRecorder(self.folder.path / "actions")] if flags.actions else []
+            if flags.viewer_failures:
+                recorders.append(FailureRecorder(self.folder.path / "failures", _prefix(flags, tracker)))
+            if self.viewer is not None:
+                self.viewer.open(env, group)
+                recorders.append(self.viewer)
             noise = recording.disturbance_of(config, episodes[0].max_steps)
             recorders += [] if noise is None else [noise]
             described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
@@ -366,8 +379,28 @@ def _recorder(config: RunConfig, folder: Path, tracker: str) -> EpisodeRecorder 
     if not (flags.video or flags.strip):
         return None
     kinds = {"video": flags.video, "strip": flags.strip, "follow": flags.follow}
-    prefix = file_label(tracker) if len(flags.tracker) > 1 else ""
+    prefix = _prefix(flags, tracker)
     return EpisodeRecorder(folder, **kinds, episodes=flags.video_episodes, size=config.video_size, prefix=prefix)
+
+
+def _prefix(flags: RunOptions, tracker: str) -> str:
+    return file_label(tracker) if len(flags.tracker) > 1 else ""
+
+
+def _viewer(config: RunConfig, folder: Path) -> WorldViewer | None:
+    """Start the viewer of --viewer, and say where it is."""
+    flags = config.flags
+    if flags.viewer is None:
+        return None
+    viewer = WorldViewer(
+        flags.viewer,
+        port=flags.viewer_port,
+        out=folder / "viewer",
+        follow=flags.viewer_follow,
+        real_time=flags.viewer_real_time,
+    )
+    print(f"viewer: {viewer.url or folder / 'viewer'}", flush=True)
+    return viewer
 
 
 def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str | None]) -> EpisodeRecord:

@@ -61,6 +61,8 @@ class Policy:
     """Whether the head camera must be rendered for `act`."""
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
+    labels: str | None = None
+    """Protocol of its actions (`data.label_protocols`), where they are of one always; None: as `--labels` says."""
     chunk_size: int = 1
     """Actions per chunk, where the policy knows it in advance."""
     depends_on_worlds: bool = False

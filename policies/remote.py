@@ -26,15 +26,16 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH, validate_action
+from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.data.label_protocols import LABELS, protocol
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 
 __all__ = ["MAX_FAILURES", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
 
-ROBOT_TYPE = "unitree_g1_refpose_v3_1"
-"""Robot type that the original's server checks: action schema v3.1."""
+ROBOT_TYPE = LABELS["v3.1"].robot_type
+"""Robot type that the original's server checks: actions of v3.1; those of other protocols have their own."""
 TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 """Environment variable with the token that is sent as `Authorization: Bearer`; it is neither printed nor stored."""
 MAX_REPLY = 4 * 2**20
@@ -198,6 +199,7 @@ class RemotePolicy(Policy):
         backoff: float = 0.25,
         sequential: bool = False,
         verify_ssl: bool = True,
+        labels: str = "v3.1",
     ):
         """Take the server's address; nothing is sent yet.
 
@@ -208,6 +210,7 @@ class RemotePolicy(Policy):
             backoff: Pause before the first repeated attempt [s]; it doubles each time.
             sequential: Ask for one world after another, in their order, for servers whose noise depends on the order.
             verify_ssl: Check the certificate of an https server.
+            labels: Protocol of the server's actions; those of v4 must be decoded (`policies.label_reader`).
 
         Raises:
             InputError: Not a valid address, one with a user name or password, or a token that no HTTP header can carry.
@@ -217,6 +220,7 @@ class RemotePolicy(Policy):
             raise InputError(f"--remote-timeout {timeout:g}: expected seconds above 0 and up to a day")
         if retries < 0:
             raise InputError(f"--remote-retries {retries}: expected at least 0")
+        self.protocol = protocol(labels)
         self.url = url.rstrip("/")
         self.timeout, self.retries, self.backoff, self.sequential = timeout, retries, backoff, sequential
         self._address = (host, port)
@@ -344,7 +348,7 @@ class RemotePolicy(Policy):
             seen["images"] = {"front": {"shape": list(picture.shape), "dtype": "uint8", "data_b64": data}}
         body = {
             "observation": seen,
-            "robot_type": ROBOT_TYPE,
+            "robot_type": self.protocol.robot_type,
             "return_chunk": True,
             "task": observation.gym_id,
             # Not sent by the original's client, and not read by its server.
@@ -371,7 +375,7 @@ class RemotePolicy(Policy):
             if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in row):
                 raise _RemoteError(f"{where}: an action holds something that is not a number")
         try:
-            return validate_action(rows, where)
+            return self.protocol.validate(rows, where)
         except InputError as error:
             raise _RemoteError(str(error)) from error
         except OverflowError as error:

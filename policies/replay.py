@@ -35,6 +35,7 @@ def _played(recording: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 class ReplayPolicy(Policy):
     """Plays actions from the start of each episode; afterwards it holds the last one without displacement."""
 
+    labels = "v3.1"
     chunk_size = 20
 
     def __init__(self, path: str | Path, *, startup_stand: float = 1.0, startup_blend: float = 1.0):
@@ -100,6 +101,7 @@ class ReplayEpisodes(Policy):
     To separate tracker from policy effects, replay the recorded actions through another tracker.
     """
 
+    labels = "v3.1"
     chunk_size = 20
 
     def __init__(self, folder: str | Path):

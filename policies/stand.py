@@ -15,6 +15,7 @@ class StandPolicy(Policy):
     """Answers the standing action."""
 
     name = "stand"
+    labels = "v3.1"
     chunk_size = 50
 
     def act(self, observation: Observation) -> Chunk:

@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import tomllib
 from pathlib import Path
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -50,3 +51,19 @@ def football_warp():
     from arena_newton.scene import load_scene
 
     return load_scene("football", worlds=2, device="cpu", rules=rule_sets.get("paper"))
+
+
+@pytest.fixture
+def installed_falcon(tmp_path, monkeypatch):
+    """The example package of a tracker as an installer leaves it: importable, with its entry points."""
+    package = ROOT / "tests" / "trackers" / "falcon_package"
+    project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
+    info = tmp_path / "falcon_tracker-1.0.dist-info"
+    info.mkdir()
+    info.joinpath("METADATA").write_text("Metadata-Version: 2.1\nName: falcon-tracker\nVersion: 1.0\n")
+    lines = [f"[{g}]\n" + "".join(f"{k} = {v}\n" for k, v in e.items()) for g, e in project["entry-points"].items()]
+    info.joinpath("entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("falcon_tracker", None)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton.command_line import exit_code
+from arena_newton.data.data_options import BuildOptions, DatasetBenchOptions, VerifyOptions
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.flags import folders_named, parse_flags
@@ -32,7 +33,29 @@ class DataCommand:
     """Extra that it needs."""
 
 
-COMMANDS: dict[str, DataCommand] = {}
+COMMANDS: dict[str, DataCommand] = {
+    "build": DataCommand(
+        words="build <recordings> [<recordings> ...] --out <dataset>",
+        purpose="make a LeRobot v3.0 dataset of recorded episodes",
+        options=BuildOptions,
+        work="lerobot_dataset:build",
+        extra="data",
+    ),
+    "verify": DataCommand(
+        words="verify <dataset> [--recordings <recordings> ...]",
+        purpose="check a dataset number by number and frame by frame, and against its recordings",
+        options=VerifyOptions,
+        work="verification:verify",
+        extra="data",
+    ),
+    "bench": DataCommand(
+        words="bench <dataset> [--recordings <recordings> ...]",
+        purpose="measure random reads, and the time that building takes",
+        options=DatasetBenchOptions,
+        work="dataset_bench:bench",
+        extra="data",
+    ),
+}
 """By name, in the order of a dataset's life."""
 
 

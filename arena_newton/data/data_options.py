@@ -2,4 +2,49 @@
 
 from __future__ import annotations
 
-__all__: list[str] = []
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["BuildOptions", "DatasetBenchOptions", "VerifyOptions"]
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """Make a LeRobot v3.0 dataset of recorded episodes."""
+
+    out: Path = Path("dataset")
+    """Folder of the dataset, which must not exist yet."""
+    labels: str = "v3.1"
+    """What the actions mean: v3.1 (reference pose, the original's) or v4 (root velocities)."""
+    layout: str = "arena"
+    """Names of the features: arena (the original's), sonic (GR00T-WholeBodyControl) or lerobot (Unitree G1)."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to take: front left_wrist right_wrist world; all that the episodes have by default."""
+    repo_id: str = ""
+    """Name of the dataset in LeRobot, such as local/boxing; local/<folder> by default. It is not stored."""
+    only_success: bool = False
+    """Leave out episodes that did not succeed."""
+    allow_evaluation_seeds: bool = False
+    """Take episodes whose seeds are those of evaluations, on which nothing should be trained."""
+    file_mb: int = 0
+    """Size of a video file [MB]; 0: 5 for pictures up to 256 px high, 25 for larger ones."""
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Check a dataset against itself and against the recordings that it was built from."""
+
+    recordings: tuple[Path, ...] = ()
+    """Folders of the recorded episodes; without them only the dataset itself is checked."""
+
+
+@dataclass(frozen=True)
+class DatasetBenchOptions:
+    """Measure how fast a dataset is read in random order."""
+
+    reads: int = 2000
+    """Pictures that each reader reads."""
+    recordings: tuple[Path, ...] = ()
+    """Folders of recorded episodes: they are built once more, and the time is measured."""
+    seed: int = 0
+    """Of the order in which pictures are read."""

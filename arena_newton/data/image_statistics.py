@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-__all__ = ["VALUES", "add_picture", "statistics"]
+__all__ = ["QUANTILES", "VALUES", "add_picture", "statistics"]
 
 VALUES = 256
 """Values of a channel."""

@@ -5,7 +5,7 @@ from typing import Literal
 
 from arena_newton.errors import InputError
 
-__all__ = ["SIZE_LIMITS", "STRIP_SIZES", "CameraConfig", "Fit", "video_sizes"]
+__all__ = ["MOST_PORT", "MOST_VIEWED", "SIZE_LIMITS", "STRIP_SIZES", "VIEWERS", "CameraConfig", "Fit", "video_sizes"]
 
 Fit = Literal["native", "pad"]
 STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
@@ -14,6 +14,12 @@ VIDEO_SIZE = (480, 270)
 """Size of world videos (width, height) [px]."""
 SIZE_LIMITS = (32, 4096)
 """Smallest and largest width and height of a video, the head camera's too [px]; H.264 encoders end at 4096."""
+VIEWERS = ("viser", "rerun", "usd")
+"""Kinds of --viewer."""
+MOST_VIEWED = 16
+"""Most worlds that a viewer shows."""
+MOST_PORT = 65534
+"""Highest TCP port of a viewer's page: rerun takes the next one too."""
 
 
 @dataclass(frozen=True)

@@ -191,6 +191,7 @@ class ExpertPolicy(Policy):
     """
 
     name = "expert"
+    labels = "v3.1"
     chunk_size = 1
 
     def __init__(self) -> None:

@@ -1,8 +1,6 @@
 """A stranger's package brings a tracker with one class and an entry point: FALCON, whose weights are its own."""
 
 import re
-import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +14,6 @@ PACKAGE = Path(__file__).parent / "falcon_package"
 
 
 @pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """The package as an installer leaves it: importable, its entry points in a `.dist-info` beside it."""
-    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
-    info = tmp_path / "falcon_tracker-1.0.dist-info"
-    info.mkdir()
-    info.joinpath("METADATA").write_text("Metadata-Version: 2.1\nName: falcon-tracker\nVersion: 1.0\n")
-    lines = [f"[{g}]\n" + "".join(f"{k} = {v}\n" for k, v in e.items()) for g, e in project["entry-points"].items()]
-    info.joinpath("entry_points.txt").write_text("\n".join(lines))
-    monkeypatch.syspath_prepend(PACKAGE)
-    monkeypatch.syspath_prepend(tmp_path)
-    yield
-    sys.modules.pop("falcon_tracker", None)
-
-
-@pytest.fixture
 def weights(shared):
     return shared / "reference/falcon/falcon_g1_29dof.onnx"
 
@@ -41,7 +24,7 @@ def test_package_uses_public_names():
     assert not re.search(r"\._[a-z]|import _[a-z]", source)
 
 
-def test_registers(installed):
+def test_registers(installed_falcon):
     """Installed, it is listed beside our own trackers and says what it needs."""
     assert "falcon" in trackers.names()
     with pytest.raises(InputError, match="g1_29dof.onnx"):
@@ -53,7 +36,7 @@ def test_absent():
     assert "falcon" not in trackers.names()
 
 
-def test_observation(installed, weights):
+def test_observation(installed_falcon, weights):
     """575 numbers: five frames, oldest first, terms in the order of their names; arms ride on the reference."""
     tracker = trackers.get("falcon", weights)
     tracker.bind(2)
@@ -69,7 +52,7 @@ def test_observation(installed, weights):
     torch.testing.assert_close(targets[:, 15:], command.joints[:, 15:] + 0.25 * tracker.last_action[:, 15:])
 
 
-def test_stands_and_walks(installed, weights):
+def test_stands_and_walks(installed_falcon, weights):
     """FALCON keeps the robot up in our physics for 4 s and walks forward on command, through the usual environment."""
     import dataclasses
 

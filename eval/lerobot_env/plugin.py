@@ -1,0 +1,156 @@
+"""What LeRobot's command line knows of our worlds: flags, features, and how a batch is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from arena_newton import tasks as task_registry
+from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from gymnasium.vector import VectorEnv
+
+__all__ = ["CAMERAS", "ArenaNewtonEnv", "DropRepeated"]
+
+FPS = 50
+"""Ticks per second."""
+CAMERAS = {"front": "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
+"""Name in datasets (the original's) → camera of the scene."""
+REPEATED = f"observation.{OBS_STATE}"
+"""What LeRobot makes of an observation that has a dataset's name already."""
+
+
+@dataclass
+class DropRepeated(ObservationProcessorStep):  # type: ignore[misc]  # LeRobot's classes are Any to a type checker
+    """Drops what is observed under a dataset's name, for `--eval.recording`; policies get it as `observation.state`."""
+
+    def observation(self, observation: dict[str, object]) -> dict[str, object]:
+        """The observation without its second copy of the state."""
+        return {key: value for key, value in observation.items() if key != REPEATED}
+
+    def transform_features(self, features: dict[str, object]) -> dict[str, object]:
+        """Features are those of the policy already."""
+        return features
+
+
+@EnvConfig.register_subclass("arena_newton")
+@dataclass
+class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
+    """Worlds of one task, or of several one after the other; `--env.<field>` on LeRobot's command line."""
+
+    task: str | None = "vis_navi"
+    """Task name, several with commas between, or `all`."""
+    fps: int = FPS
+    """Ticks per second; the world has no other."""
+    tracker: str = "twist2"
+    """Tracker that executes actions."""
+    checkpoint: str | None = None
+    """Its weights; those of the package when none are named."""
+    mode: str = "base"
+    """`base`, `execution`, `semantic` or `visual`."""
+    rules: str = "paper"
+    """Rule set."""
+    engine: str = "auto"
+    """`auto`, `mujoco` or `warp`."""
+    device: str | None = None
+    """Device of the worlds and of the tracker, such as `cpu` or `cuda:0`."""
+    variant_file: str | None = None
+    """USD layer instead of the one task's own scene."""
+    fast_physics: bool = False
+    """Use the tracker's fast physics rate."""
+    cameras: str = "front"
+    """Observed cameras, with commas between: front, left_wrist, right_wrist, world."""
+    image_width: int = 224
+    """Width of pictures [px]."""
+    image_height: int = 224
+    """Height of pictures [px]."""
+    episode_length: int | None = None
+    """Cap on the step budget of the rule set [ticks]."""
+
+    def __post_init__(self) -> None:
+        """Name the features.
+
+        Raises:
+            InputError: An unknown task or camera, or another number of ticks per second than the world has.
+        """
+        if self.fps != FPS:
+            raise InputError(f"--env.fps {self.fps}: the world has {FPS} ticks per second")
+        if self.max_parallel_tasks != 1:  # threads would break captured CUDA graphs
+            raise InputError(
+                f"--env.max_parallel_tasks {self.max_parallel_tasks}: tasks run one after the other, use 1"
+            )
+        for task in self.tasks:
+            task_registry.get(task)
+        shape = (self.image_height, self.image_width, 3)
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_WIDTH,)),
+            OBS_STATE: PolicyFeature(FeatureType.STATE, (STATE_WIDTH,)),
+            **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
+        }
+        self.features_map = {key: key for key in self.features}
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Task names."""
+        names = [name.strip() for name in (self.task or "").split(",") if name.strip()]
+        if not names:
+            raise InputError("--env.task: nothing named, at least one task is needed")
+        return task_registry.names() if names == ["all"] else tuple(names)
+
+    @property
+    def prims(self) -> dict[str, str]:
+        """Name in datasets → camera of the scene."""
+        names = [name.strip() for name in self.cameras.split(",") if name.strip()]
+        for name in names:
+            if name not in CAMERAS:
+                raise InputError(f"--env.cameras {name}: unknown, choose from {', '.join(CAMERAS)}")
+        return {name: CAMERAS[name] for name in names}
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Options of `arena_newton.eval.gym.ArenaVectorEnv`.
+
+        The start-up is inside the reset, so that a policy is first asked at step 0; ended worlds are frozen until
+        LeRobot's next rollout. The state has its name of datasets too: a recording of LeRobot has columns by it.
+        """
+        return {
+            "tracker": self.tracker,
+            "checkpoint": self.checkpoint,
+            "mode": self.mode,
+            "rules": self.rules,
+            "engine": self.engine,
+            "device": self.device,
+            "variant_file": self.variant_file,
+            "fast_physics": self.fast_physics,
+            "image_size": (self.image_width, self.image_height),
+            "cameras": self.prims,
+            "state_keys": ("agent_pos", OBS_STATE),
+            "instruction": False,
+            "settle": "reset",
+            "autoreset_mode": "disabled",
+            "max_episode_steps": self.episode_length,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """One batch of worlds per task, as {task: {0: batch}}.
+
+        Args:
+            n_envs: Worlds in a batch, LeRobot's `--eval.batch_size`.
+            use_async_envs: Ignored: the worlds of a batch are simulated at once, in this process.
+        """
+        from arena_newton.eval.gym import ArenaVectorEnv
+
+        return {task: {0: ArenaVectorEnv(task, n_envs, **self.gym_kwargs)} for task in self.tasks}
+
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """What changes observations before the policy's own processors, and actions after them."""
+        return PolicyProcessorPipeline(steps=[DropRepeated()]), PolicyProcessorPipeline(steps=[])

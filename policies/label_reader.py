@@ -1,0 +1,103 @@
+"""Reads a policy's actions by the label protocol that it was trained on, so that the world is given v3.1 always."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from arena_newton.canonical import ACTION_WIDTH
+from arena_newton.data.label_protocols import LABELS, V4Decoder, protocol
+from arena_newton.errors import InputError
+from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
+
+if TYPE_CHECKING:
+    from arena_newton.interfaces import World
+
+__all__ = ["V4Policy", "read_by"]
+
+
+def read_by(policy: Policy, labels: str) -> Policy:
+    """The policy as the world understands it.
+
+    Args:
+        policy: Whose actions are of `labels`.
+        labels: Name of the protocol.
+
+    Returns:
+        The policy itself where it answers v3.1, else one that decodes its chunks.
+
+    Raises:
+        InputError: The protocol is unknown, or the policy is always of another one.
+    """
+    wanted = protocol(labels)
+    own = getattr(policy, "labels", None)  # a plug-in need not know of protocols
+    if own is not None and own != wanted.name:
+        raise InputError(f"--labels {labels}: policy {policy.name} gives actions of {own}; leave the flag out")
+    return policy if wanted is LABELS["v3.1"] else V4Policy(policy)
+
+
+class V4Policy(Policy):
+    """Decodes the v4 actions of another policy per world; an episode's heading is that of its own start.
+
+    A chunk must be executed to its end before the next one is asked for, as `rollout.Rollout` does.
+    """
+
+    labels = "v3.1"
+
+    def __init__(self, policy: Policy):
+        """Take the policy whose actions are of v4."""
+        self.policy = policy
+        self.name = policy.name
+        self.needs_image, self.camera = policy.needs_image, policy.camera
+        self.chunk_size = policy.chunk_size
+        self._decoder: V4Decoder | None = None
+
+    @property
+    def depends_on_worlds(self) -> bool:  # type: ignore[override]
+        """See `Policy.depends_on_worlds`; known when the policy was checked."""
+        return self.policy.depends_on_worlds
+
+    def check(self) -> None:
+        """See `Policy.check`."""
+        self.policy.check()
+
+    def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
+        """See `Policy.check_task`."""
+        self.policy.check_task(task, mode, seeds)
+
+    def attach(self, env: World) -> None:
+        """Take the worlds whose headings are integrated."""
+        self.policy.attach(env)
+        self._decoder = V4Decoder(env.worlds, env.torch_device)
+
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
+        """Begin new episodes at their heading."""
+        if self._decoder is not None:
+            self._decoder.reset(world_mask(mask, len(seeds)))
+        self.policy.reset(seeds, tasks, mask)
+
+    def act(self, observation: Observation) -> Chunk:
+        """The policy's chunk as v3.1.
+
+        Raises:
+            InputError: It has another shape than a chunk.
+        """
+        answer = self.policy.act(observation)
+        actions = torch.as_tensor(answer.actions, dtype=torch.float32, device=observation.state.device)
+        worlds = len(observation.state)
+        if actions.ndim != 3 or actions.shape[::2] != (worlds, ACTION_WIDTH) or not actions.shape[1]:
+            shape = f"a chunk of shape {list(actions.shape)}, expected [{worlds}, n, {ACTION_WIDTH}]"
+            raise InputError(f"policy {self.name}: {shape} with n of at least 1")
+        if self._decoder is None:  # used without an environment, as a policy server does
+            self._decoder = V4Decoder(worlds, actions.device)
+        return Chunk(self._decoder.decode(actions, observation.mask), answer.errors, answer.phases)
+
+    def describe(self) -> Json:
+        """What the policy says of itself, and how it is read."""
+        return self.policy.describe() | {"labels": "v4"}
+
+    def close(self) -> None:
+        """See `Policy.close`."""
+        self.policy.close()

@@ -1,0 +1,129 @@
+"""The doctor: extras, what of them works, and trackers and policies by name."""
+
+import importlib.util
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from arena_newton import doctor, extras, policies, probe, trackers
+from arena_newton.__main__ import main
+from arena_newton.canonical import STAND_ACTION
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def found(findings, subject):
+    """The one finding about a subject."""
+    (finding,) = [finding for finding in findings if finding.subject == subject]
+    return finding
+
+
+def test_modules_are_tried_in_another_process(tmp_path, monkeypatch):
+    """A module that imports has no fault; one that does not, crashes or hangs is told, in their order."""
+    (tmp_path / "dies_at_once.py").write_text("import os\nos.abort()\n")
+    (tmp_path / "never_ends.py").write_text("import time\ntime.sleep(100)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    names = ["json", "no_such_module", "dies_at_once", "never_ends"]
+    answers = probe.faults("module", names, memory=1 << 30, seconds=2.0)
+    assert answers == [None, "No module named 'no_such_module'", probe.CRASHED, probe.TOO_LONG]
+
+
+def test_every_extra_is_reported(monkeypatch):
+    """Each extra of the package has a line; its name is one of the project's."""
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(extras.EXTRAS) == set(declared)
+    monkeypatch.setattr(doctor, "faults", lambda *_, **__: [None])
+    findings = doctor.examine_extras()
+    for extra in extras.EXTRAS:
+        finding = found(findings, f"extra [{extra}]")
+        assert finding.status == "ok" or f"uv sync --extra {extra}" in finding.advice
+
+
+def test_a_missing_extra_is_a_note(monkeypatch):
+    """What is not installed is named with the command that installs it; a bare evaluation runs without."""
+    monkeypatch.setattr(doctor, "faults", lambda *_, **__: [None])
+    monkeypatch.setitem(extras.EXTRAS, "data", ("json", "no_such_module"))
+    finding = found(doctor.examine_extras(), "extra [data]")
+    assert finding.status == "note" and finding.value == "without no_such_module"
+    assert "uv sync --extra data, or pip install 'arena-newton[data]'" in finding.advice
+
+
+def test_torchcodec_without_ffmpeg_is_a_note(monkeypatch):
+    """A torchcodec that does not load is a note that says what it costs and what to install."""
+    if importlib.util.find_spec("torchcodec") is None:
+        pytest.skip("needs the extra [data]")
+    monkeypatch.setattr(doctor, "faults", lambda *_, **__: ["Could not load libtorchcodec.\nlibavutil.so.56: absent"])
+    finding = found(doctor.examine_extras(), "torchcodec")
+    assert finding.status == "note" and "libavutil.so.56" in finding.value and "\n" not in finding.value
+    assert "apt install ffmpeg" in finding.advice and "2 to 4 times slower" in finding.advice
+    monkeypatch.setattr(doctor, "faults", lambda *_, **__: [None])
+    assert found(doctor.examine_extras(), "torchcodec").status == "ok"
+
+
+class Deaf(trackers.Tracker):
+    """Answers one row, however many worlds there are."""
+
+    name = "deaf"
+
+    def step(self, command, state, mask=None):
+        return command.joints[:1]
+
+
+def test_a_tracker_by_name(monkeypatch, capsys):
+    """A tracker that conforms is 0, one that does not is 1 with its broken promises; both spellings are one command."""
+    trackers.register("deaf", lambda checkpoint: Deaf())
+    for arguments in (["doctor", "--tracker", "pd"], ["doctor", "--tracker=pd"], ["trackers", "check", "pd"]):
+        assert main(arguments) == 0
+        assert capsys.readouterr().out.endswith("tracker pd: keeps all 13 promises\n")
+    assert main(["doctor", "--tracker", "deaf"]) == 1
+    assert "! targets " in (out := capsys.readouterr().out) and "expected a float32 tensor [3, 29]" in out
+
+
+def test_a_strangers_tracker_by_name(installed_falcon, shared, capsys):
+    """An installed package's tracker is examined by its name, with the checkpoint that it needs."""
+    assert main(["doctor", "--tracker", "falcon"]) == 2
+    assert "g1_29dof.onnx" in capsys.readouterr().err
+    checkpoint = shared / "reference/falcon/falcon_g1_29dof.onnx"
+    assert main(["doctor", "--tracker", "falcon", "--checkpoint", str(checkpoint)]) == 0
+
+
+class Rash(policies.Policy):
+    """Answers an action without a chunk."""
+
+    name = "rash"
+
+    def act(self, observation):
+        return policies.Chunk(STAND_ACTION[None])
+
+
+def test_a_policy_by_name(capsys):
+    """A policy that conforms is 0, one that does not is 1; one that reads the world is tried in worlds."""
+    policies.register("rash", lambda argument: Rash())
+    assert main(["doctor", "--policy", "stand"]) == 0
+    assert main(["doctor", "--policy", "expert", "--task", "boxing", "--seeds", "3", "4"]) == 0
+    assert "not tried in real worlds" in capsys.readouterr().out
+    assert main(["policies", "check", "rash"]) == 1
+    assert "! chunk " in (out := capsys.readouterr().out) and "[1, 40], expected [3, n, 40]" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("doctor --tracker", "doctor --tracker: name the tracker behind it"),
+        ("doctor --policy --task boxing", "doctor --policy: name the policy behind it"),
+        ("doctor --tracker nothing", "--tracker nothing: unknown tracker"),
+        ("doctor --tracker pd --worlds 1", "--worlds 1: masks need at least 2"),
+        ("doctor --tracker pd --worlds x", "--worlds: invalid int value"),
+        ("doctor --tracker twist2 --checkpoint none.onnx", "none.onnx: no such file"),
+        ("doctor --policy nothing", "--policy nothing: unknown policy"),
+        ("doctor --policy stand --task nothing", "nothing"),
+        ("doctor --policy stand --seeds 1 1", "--seeds 1 1: masks need at least 2 different ones"),
+        ("doctor --scene", "doctor --scene: unknown, expected --tracker NAME or --policy SPEC"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, said, capsys):
+    """What cannot be examined is named in one line with exit code 2."""
+    assert main(arguments.split()) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.startswith("error: ") and error.count("\n") == 1

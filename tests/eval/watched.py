@@ -1,0 +1,52 @@
+"""Worlds that keep a hash of every tick, and a recorder of actions: to compare two ways to play episodes."""
+
+import hashlib
+
+import numpy as np
+
+from arena_newton.env import ArenaEnv
+from arena_newton.interfaces import Recorder
+
+
+class WatchedEnv(ArenaEnv):
+    """Keeps, by episode seed, a hash of the physical state and the observed 64 numbers after every tick."""
+
+    history: dict[int, list[str]] = {}
+    """Of all watched worlds since it was last cleared."""
+
+    def reset(self, seeds, worlds=None, *, spawn=None):
+        super().reset(seeds, worlds, spawn=spawn)
+        self.playing = getattr(self, "playing", {})
+        for seed, world in zip(seeds, range(self.worlds) if worlds is None else worlds, strict=True):
+            self.playing[int(world)] = int(seed)
+            self.history[int(seed)] = []
+
+    def step(self, action, worlds=None):
+        stepping = self.active.copy() if worlds is None else self.active & worlds
+        status = super().step(action, worlds)
+        qpos, qvel = self.physics.qpos.numpy(), self.physics.qvel.numpy()
+        state = self.observe().state.cpu().numpy()
+        for world in np.flatnonzero(stepping).tolist():
+            words = qpos[world].tobytes() + qvel[world].tobytes() + state[world].tobytes()
+            self.history[self.playing[world]].append(hashlib.sha256(words).hexdigest()[:16])
+        return status
+
+
+class Table(Recorder):
+    """Keeps the actions of every episode, by its seed: float32, shape [ticks, 40]."""
+
+    def __init__(self):
+        self.rows, self.playing = {}, {}
+
+    def start(self, env, world, episode):
+        self.playing[world] = episode.episode_seed
+        self.rows[episode.episode_seed] = []
+
+    def before_physics(self, env, observation, action):
+        for world in np.flatnonzero(env.active & (env.tick >= 0)).tolist():
+            self.rows[self.playing[world]].append(action[world].cpu().numpy().copy())
+
+    def at(self, seed, tick):
+        """The action of a tick; the last one after the end."""
+        rows = self.rows[int(seed)]
+        return rows[min(int(tick), len(rows) - 1)]

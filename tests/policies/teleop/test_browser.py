@@ -1,0 +1,361 @@
+"""The page: who may open it, what drives the robot, when it stops. Distances are judged, not times."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import READY, Chromium, wait_for
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from arena_newton.data.episode import EpisodeFile
+from arena_newton.errors import InputError
+from arena_newton.policies.teleop import __main__ as command
+from arena_newton.policies.teleop.browser import DEAD_MAN
+from arena_newton.policies.teleop.driving import RANGES, Held
+from arena_newton.policies.teleop.page_server import TAKEN_OVER, UNFIT, PageServer, new_token
+from arena_newton.policies.teleop.ports import LOCAL, bind
+
+FOREIGN = "http://evil.example"
+"""A web site in another tab."""
+
+
+@pytest.fixture
+def server():
+    """A page's server without a world."""
+    made = PageServer(bind(0, "--port"), new_token(), {"task": "football", "ranges": RANGES})
+    yield made
+    made.close()
+
+
+def fetch(url: str, **headers: str) -> tuple[int, bytes, dict]:
+    """Status, body and headers of a GET."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=READY) as answer:
+            return answer.status, answer.read(), dict(answer.headers)
+    except urllib.error.HTTPError as error:
+        return error.code, error.read(), dict(error.headers)
+
+
+def page_socket(server: PageServer, *, path: str | None = None, origin: str | None = None, **headers: str):
+    """The socket as the page opens it."""
+    url = (path or server.url).replace("http://", "ws://") + "socket"
+    own = server.url.rsplit("/", 2)[0]
+    return connect(url, origin=origin or own, additional_headers=headers, open_timeout=READY, compression=None)
+
+
+def test_the_page_needs_the_token(server):
+    """The files are served under the token alone, to this machine's names alone, and no other site may frame them."""
+    for name in ("", "page.css", "page.js"):
+        status, body, headers = fetch(server.url + name)
+        assert status == 200 and len(body) > 500
+        assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    root = server.url.rsplit("/", 2)[0]
+    token = server.url.split("/")[3]
+    wrong = [
+        "/",
+        "/page.html",
+        f"/{token[:-1]}/",
+        f"/{'A' * len(token)}/page.js",
+        f"/{token}/../session.py",
+        f"/{token}/x",
+    ]
+    for path in (*wrong, f"/{token}/%2e%2e/browser.py", "/é/"):
+        status, body, _ = fetch(root + urllib.request.quote(path))
+        assert (status, body) == (404, b""), path
+    assert fetch(server.url, Host="evil.example")[:2] == (404, b""), "a name that points here is not this machine"
+
+
+@pytest.mark.parametrize(
+    "change", [{"origin": FOREIGN}, {"origin": "null"}, {"path": "wrong"}, {"Host": "evil.example"}]
+)
+def test_the_socket_is_the_page_s_alone(server, change):
+    """A foreign Origin or a wrong token opens no socket."""
+    if change.get("path"):
+        change = {"path": server.url.replace(server.url.split("/")[3], new_token())}
+    with pytest.raises((InvalidStatus, ConnectionClosed)) as refused:
+        page_socket(server, **change).recv(timeout=READY)
+    if isinstance(refused.value, InvalidStatus):
+        assert refused.value.response.status_code in (403, 404)
+    assert server.held()[1] == float("inf") and not server.connected
+
+
+def test_what_is_held_arrives_and_grows_old(server):
+    """A message is held and ages until the next; a closed socket holds nothing; events arrive once."""
+    with page_socket(server) as page:
+        assert json.loads(page.recv(timeout=READY))["kind"] == "facts"
+        page.send(json.dumps({"forward": 0.5, "events": ["start", "kick_left"]}))
+        held, age = wait_for(lambda: server.held() if server.held()[0].forward else None, "message")
+        assert held == Held(forward=0.5) and 0.0 <= age < READY
+        assert server.events() == ["start", "kick_left"] and server.events() == []
+        time.sleep(0.05)
+        assert server.held()[1] >= 0.05
+        server.publish({"tick": 7}, np.zeros((24, 32, 3), np.uint8))
+        answers = [page.recv(timeout=READY) for _ in range(2)]
+        assert json.loads(answers[0]) == {"kind": "state", "tick": 7} and answers[1][:2] == b"\xff\xd8"
+    wait_for(lambda: server.held()[1] == float("inf"), "end of the page")
+
+
+def test_the_newest_page_drives(server):
+    """A second page takes over; the first one is told and moves nothing any more."""
+    with page_socket(server) as first:
+        first.recv(timeout=READY)
+        with page_socket(server) as second:
+            second.recv(timeout=READY)
+            with pytest.raises(ConnectionClosed) as closed:
+                while True:
+                    first.recv(timeout=READY)
+            assert closed.value.rcvd.code == TAKEN_OVER
+            second.send('{"turn": 1}')
+            wait_for(lambda: server.held()[0].turn == 1.0, "message")
+
+
+@pytest.mark.parametrize("message", ["x", '{"forward": "fast"}', '{"x": 1}', b"\xff\x00", "[" + "1," * 5000 + "1]"])
+def test_an_unfit_message_ends_the_page_alone(server, message):
+    """Whatever a page sends, it loses its socket at worst; the next one is served."""
+    with page_socket(server) as page:
+        page.recv(timeout=READY)
+        page.send(message)
+        with pytest.raises(ConnectionClosed) as closed:
+            while True:
+                page.recv(timeout=READY)
+        assert closed.value.rcvd.code in (UNFIT, 1009, 1007)
+    wait_for(lambda: not server.connected, "end of the page")
+    with page_socket(server) as page:
+        assert json.loads(page.recv(timeout=READY))["task"] == "football"
+
+
+def test_a_taken_port_is_an_error(capsys):
+    """Page and view name the port that is taken, before anything heavy is loaded; the exit code is 2."""
+    with socket.create_server((LOCAL, 0)) as taken:
+        port = taken.getsockname()[1]
+        for flags in (["--port", str(port)], ["--port", "0", "--view-port", str(port)]):
+            assert command.main(["browser", *flags]) == 2
+            assert f"{flags[-2]} {port}: cannot be served" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no such port"):
+        bind(70000, "--port")
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["browser", "--task", "chess"], "--task chess"),
+        (["browser", "--mode", "dark"], "--mode dark"),
+        (["browser", "--variant", "none.usda"], "--variant none.usda"),
+        (["browser", "--seed", "-1"], "--seed -1"),
+        (["browser", "--ego-size", "9x9"], "--ego-size 9x9"),
+        (["browser", "--speed", "9"], "--speed"),
+        (["pigeon"], "pigeon"),
+    ],
+)
+def test_wrong_flags_are_one_line(flags, named, capsys):
+    """A wrong flag is named in one line, with exit code 2."""
+    ports = ["--port", "0"] if flags[0] == "browser" else []
+    assert command.main([*flags, *ports]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: ") and named in error
+
+
+class Session:
+    """The command in a process of its own."""
+
+    def __init__(self, folder: Path, *flags: str):
+        self.log = folder / "log.txt"
+        environment = os.environ | {"OMP_NUM_THREADS": "2"}
+        arguments = ["browser", "--task", "football", "--port", "0", "--out", str(folder / "saved"), *flags]
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "arena_newton.policies.teleop", *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+            )
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+
+        def look() -> str | None:
+            if self.process.poll() is not None:
+                pytest.fail(f"the session ended:\n{self.log.read_text()}", pytrace=False)
+            found = re.search(r"open (http://\S+)", self.log.read_text())
+            return found and found[1]
+
+        return wait_for(look, "address in the log")
+
+    def end(self) -> str:
+        """Ctrl-C; what it said."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            self.process.wait(timeout=READY)
+        return self.log.read_text()
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A session with a world's view, and a page that is open."""
+    folder = tmp_path_factory.mktemp("browser")
+    one = Session(folder, "--ego-size", "64x48")
+    try:
+        with Chromium(folder / "profile") as page:
+            page.open(one.url)
+            page.wait("Number(document.body?.dataset.tick) > 0", "world that runs")
+            yield one, page, folder / "saved"
+    finally:
+        one.end()
+
+
+def place(page: Chromium) -> np.ndarray:
+    """Where the robot is [m]."""
+    return np.array(str(page.value("document.body.dataset.position")).split(), dtype=float)
+
+
+def still(page: Chromium) -> np.ndarray:
+    """Wait until the robot stands, and say where."""
+    before = [place(page), 0]
+
+    def check() -> bool:
+        tick, now = int(page.value("Number(document.body.dataset.tick)")), place(page)
+        if tick - before[1] < 50:
+            return False
+        stands = bool(np.linalg.norm(now - before[0]) < 0.02)
+        before[:] = [now, tick]
+        return stands
+
+    wait_for(check, "robot that stands")
+    return before[0]
+
+
+def walked(page: Chromium, start: np.ndarray, metres: float) -> None:
+    """Wait until the robot is so far from a point."""
+    wait_for(lambda: np.linalg.norm((place(page) - start)[:2]) > metres, f"walk of {metres} m")
+
+
+def test_the_page_shows_the_world(running):
+    """Task, head camera, state and the view of the world arrive, and no policy of the page forbids one of them."""
+    _, page, _ = running
+    assert "football" in str(page.value("document.getElementById('task').textContent"))
+    page.wait("document.getElementById('picture').naturalWidth == 64", "picture of the head camera")
+    page.wait("document.getElementById('driven').textContent == 'you drive'", "page that drives")
+    assert "websocket=ws://127.0.0.1" in str(page.value("document.getElementById('frame').src"))
+
+
+def test_the_view_needs_token_and_origin(running):
+    """Viser's socket opens for its own page with the token, and for nobody else."""
+    _, page, _ = running
+    frame = str(page.value("document.getElementById('frame').src"))
+    own, inner = re.match(r"(http://[^/]+)/\?websocket=(ws://\S+)", frame).groups()
+    options = {"subprotocols": ["viser-v1.1.1"], "open_timeout": READY}
+    with connect(inner, origin=own, **options):
+        pass
+    for url, origin in ((inner, FOREIGN), (inner.rsplit("/", 1)[0], own), (inner[:-3] + "abc", own)):
+        with pytest.raises(InvalidStatus):
+            connect(url, origin=origin, **options)
+
+
+def test_a_held_key_walks_and_a_released_one_stops(running):
+    """The robot walks while `w` is held, to its left with `a`, and stands when they are released."""
+    _, page, _ = running
+    start = still(page)
+    page.key("w", True)
+    walked(page, start, 0.4)
+    page.key("w", False)
+    ahead = still(page) - start
+    assert ahead[1] > 0.4 and abs(ahead[0]) < 0.5 * ahead[1], "football faces along y"
+    start = still(page)
+    page.key("a", True)
+    walked(page, start, 0.2)
+    page.key("a", False)
+    aside = still(page) - start
+    assert aside[0] < -0.15 and abs(aside[1]) < -aside[0]
+
+
+def test_the_stick_walks_and_leaving_the_window_stops(running):
+    """The stick is dragged with a mouse; a key that is held when the window loses its focus is let go."""
+    _, page, _ = running
+    start = still(page)
+    x, y = page.value(
+        "(({x,y,width,height}) => [x+width/2, y+height/2])(document.getElementById('stick').getBoundingClientRect())"
+    )
+    page.mouse("mousePressed", x, y)
+    page.mouse("mouseMoved", x, y + 60)
+    walked(page, start, 0.3)
+    page.mouse("mouseReleased", x, y + 60)
+    back = still(page) - start
+    assert back[1] < -0.25
+    start = still(page)
+    page.key("w", True)
+    walked(page, start, 0.1)
+    page.value("window.dispatchEvent(new Event('blur'))")
+    still(page)
+    page.key("w", False)
+
+
+def test_a_recorded_episode_is_saved(running):
+    """Record, walk, save: the file is an episode whose robot walked; its name is on the page."""
+    one, page, folder = running
+    page.value("document.getElementById('record').click()")
+    page.wait("document.body.dataset.recording == 'recording' && Number(document.body.dataset.tick) > 0", "recording")
+    start = place(page)
+    page.key("w", True)
+    walked(page, start, 0.3)
+    page.key("w", False)
+    page.value("document.getElementById('save').click()")
+    page.wait("document.body.dataset.recording == 'saved'", "saved episode")
+    (file,) = folder.glob("*.npz")
+    assert file.name in str(page.value("document.getElementById('note').textContent"))
+    episode = EpisodeFile(file)
+    position = episode.array("robot_root_position")
+    assert np.linalg.norm(position[-1, :2] - position[0, :2]) > 0.2
+    assert episode.text("arena_policy") == "teleop-browser"
+
+
+def test_a_socket_that_closes_or_stalls_stops_the_robot(running):
+    """No message for 0.3 s is nobody: a page that hangs, and one that goes, leave a robot that stands."""
+    one, page, _ = running
+    assert DEAD_MAN == 0.3
+    page.wait("Number(document.body.dataset.tick) > 0", "world that runs")
+    start = still(page)
+    page.key("w", True)
+    walked(page, start, 0.3)
+    # The page hangs with the key held; the socket stays open.
+    page.value("{ const end = performance.now() + 6000; while (performance.now() < end); }")
+    hung = page.value("document.body.dataset.position")
+    page.key("w", False)
+    at = still(page)
+    assert np.linalg.norm((at - start)[:2]) < 2.0, "6 s of walking are 3.5 m"
+    assert hung is not None
+    start = still(page)
+    page.key("w", True)
+    walked(page, start, 0.2)
+    page.open("about:blank")
+    token_page = one.url
+    time.sleep(3.0)
+    page.open(token_page)
+    page.wait("Number(document.body?.dataset.tick) > 0", "world that runs")
+    first = place(page)
+    assert np.linalg.norm((still(page) - first)[:2]) < 0.05, "it stood before the page was back"
+
+
+def test_the_end_says_how_real_the_time_was(tmp_path):
+    """Ctrl-C ends the session with exit code 0 and one line: real-time factor, late ticks, pictures, episodes."""
+    one = Session(tmp_path, "--no-view", "--no-ego")
+    with connect(
+        one.url.replace("http", "ws") + "socket", origin=one.url.rsplit("/", 2)[0], open_timeout=READY
+    ) as page:
+        wait_for(lambda: json.loads(page.recv(timeout=READY)).get("tick", -1) > 0, "world that runs")
+    said = one.end()
+    assert one.process.returncode == 0
+    assert re.search(
+        r"real-time factor [01]\.\d+; \d+ of \d+ ticks late .*; 0 pictures, 0 put off; 0 episodes saved", said
+    )
