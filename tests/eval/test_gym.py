@@ -1,5 +1,8 @@
 """Gymnasium: its spaces and flags, the same episodes as a rollout, worlds that do not touch each other."""
 
+import re
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -319,6 +322,15 @@ def test_seeds_make_episodes(make):
         assert env.env.draws[world] == env.env.spec.draw(seed, "base", env.env.rules)
 
 
+def test_episodes_to_learn_from(make):
+    """Seeds of the range of demonstrations are of episodes that no evaluation has, and follow from the number alone."""
+    env = make("football", seed_range="demonstration")
+    _, info = env.reset(seed=20)
+    gym_id = tasks.get("football").gym_id
+    wanted = [seeding.recording_seed(gym_id, seeding.DEMONSTRATION, 1, repeat) for repeat in (0, 1)]
+    assert info["episode_seed"].tolist() == wanted and min(wanted) >= 2**31
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -366,6 +378,7 @@ def shared_env():
         ({"render_mode": "human"}, "render_mode human"),
         ({"image_size": (64,)}, "image_size"),
         ({"repeats": 0}, "repeats 0"),
+        ({"seed_range": "exam"}, "seed_range exam"),
         ({"max_episode_steps": 0}, "max_episode_steps 0"),
         ({"cameras": {"front": "nose"}, "image_size": (32, 32)}, "nose"),
     ],
@@ -374,3 +387,13 @@ def test_wrong_options_are_refused(options, message):
     """An option that is unknown or unfit is named."""
     with pytest.raises(InputError, match=message):
         ArenaVectorEnv(**({"task": "football", "engine": "mujoco", "device": "cpu", "image_size": None} | options))
+
+
+def test_the_page_about_gymnasium():
+    """Every Python block of docs/gym.md runs, one after the other, and gives what the page says."""
+    page = (Path(__file__).parents[2] / "docs" / "gym.md").read_text()
+    world = {"__name__": "docs_gym"}
+    for block in re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE):
+        exec(compile(block, "docs/gym.md", "exec"), world)
+    assert world["action"].shape == (2, 40) and not world["info"]["settling"]
+    assert (world["info"]["seed"], world["info"]["steps"]) == (21, 1)
