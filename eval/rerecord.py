@@ -68,6 +68,8 @@ def run(options: RecordOptions, factories: Factories | None = None) -> int:
     stems = [file.stem for file in files]
     groups: dict[tuple[str, ...], list[EpisodeFile]] = {}
     for file in files:
+        if "arena_cleaned" in file:
+            raise InputError(f"{file.path}: was cleaned, rows are missing; name the recording that it was made of")
         if stems.count(file.stem) > 1:
             raise InputError(f"{source}: {file.stem} is there twice")
         names = ("arena_task", "arena_tracker", "arena_mode", "arena_rules")
