@@ -26,6 +26,7 @@ from arena_newton.eval.records import JsonObject
 from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
+from arena_newton.policies.base import DATASET_FILE, dataset_target
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
 
@@ -218,9 +219,12 @@ def resolve(options: RunOptions) -> RunConfig:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
-    policy_path = _existing("--policy", target) if scheme in POLICY_PATH_SCHEMES and target else None
-    shown = Path(target).parent if Path(target).name == "actions" else Path(target)
-    label = f"{scheme}:{shown.name or Path(target).name}" if policy_path else options.policy
+    if scheme in POLICY_PATH_SCHEMES and target:
+        at, episode = dataset_target(str(Path(target).expanduser()))
+        policy_path, ending = _existing("--policy", str(at)), "" if episode is None else f"#{episode}"
+    else:
+        policy_path, ending = None, ""
+    label = f"{scheme}:{_shown(policy_path)}{ending}" if policy_path else options.policy
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
@@ -237,7 +241,7 @@ def resolve(options: RunOptions) -> RunConfig:
         follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,
-        policy=f"{scheme}:{policy_path}" if policy_path else options.policy,
+        policy=f"{scheme}:{policy_path}{ending}" if policy_path else options.policy,
     )
     episodes = plan.expand(
         flags.task,
@@ -252,7 +256,7 @@ def resolve(options: RunOptions) -> RunConfig:
     )
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
-    policy_hash = hash_path(policy_path) if policy_path else None
+    policy_hash = hash_path(_decisive(policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
     engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     return RunConfig(
@@ -406,6 +410,19 @@ def _policy_options(options: RunOptions) -> JsonObject:
         if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
             raise InputError(f"{_flag(field.name)}: belongs to --policy remote:<url>, not {options.policy}")
     return {}
+
+
+def _shown(path: Path) -> str:
+    """Name of what is replayed: that of the run for its folder `actions`."""
+    return path.parent.name if path.name == "actions" and path.parent.name else path.name
+
+
+def _decisive(path: Path) -> Path:
+    """What of a policy's path counts by content: of a dataset, which may be large, its description.
+
+    The policy itself says the hash of the actions that it plays.
+    """
+    return path / DATASET_FILE if (path / DATASET_FILE).is_file() else path
 
 
 def _existing(flag: str, given: str | None) -> Path | None:

@@ -46,7 +46,8 @@ class RunOptions:
     """Weights of the one tracker named: a .safetensors or official .onnx file (SONIC: a folder or two files with a
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
-    """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>, remote:<url>."""
+    """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>,
+    replay:<LeRobot dataset>#<episode, or all>, remote:<url>."""
     labels: str = "v3.1"
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4."""
     mode: tuple[str, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import gc
@@ -81,11 +82,13 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
         raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
     began = time.perf_counter()
     command = "python -m arena_newton.eval {} " + shlex.quote(str(folder.path))
-    try:
-        if not _play(config, folder, factories, policy, command.format("resume")):
+    with contextlib.ExitStack() as ended:
+        ended.callback(policy.close)
+        viewer = _viewer(config, folder.path)
+        if viewer is not None:
+            ended.callback(viewer.close)
+        if not _play(config, folder, factories, policy, viewer, command.format("resume")):
             return 130
-    finally:
-        policy.close()
     try:
         loaded = load_run(folder.path)
         results = report.write_reports(loaded)
@@ -116,9 +119,15 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
     return config.with_parts(made, policy), read_by(policy, config.flags.labels)
 
 
-def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy: Policy, resume: str) -> bool:
+def _play(
+    config: RunConfig,
+    folder: ResultsFolder,
+    factories: Factories,
+    policy: Policy,
+    viewer: WorldViewer | None,
+    resume: str,
+) -> bool:
     """Play what is missing; False when it was interrupted. Errors say how to go on: by the command `resume`."""
-    viewer = _viewer(config, folder.path)
     folder.make()
     with Journal(folder.journal) as journal:
         folder.settle(config, journal.records)
@@ -137,8 +146,6 @@ def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy
             raise RunStopped(f"{error}; {run.kept()}; continue with: {resume}") from None
         finally:
             folder.sweep()
-            if viewer is not None:
-                viewer.close()
     return True
 
 

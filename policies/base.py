@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,12 +19,14 @@ if TYPE_CHECKING:
     from arena_newton.pictures.camera import CameraConfig
 
 __all__ = [
+    "DATASET_FILE",
     "Chunk",
     "Observation",
     "Policy",
     "PolicyError",
     "PolicyUnavailable",
     "check_spec",
+    "dataset_target",
     "get",
     "names",
     "register",
@@ -32,6 +35,8 @@ __all__ = [
 
 Json = dict[str, Any]
 """A JSON object."""
+DATASET_FILE = "meta/info.json"
+"""File by which a folder is known to be a LeRobot dataset."""
 type Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
 """Worlds, bool, shape [worlds]; None: all."""
 
@@ -127,6 +132,14 @@ def world_mask(mask: Mask, worlds: int) -> np.ndarray:
         return np.ones(worlds, dtype=bool)
     values = mask if isinstance(mask, Sequence | np.ndarray) else mask.detach().cpu()
     return np.asarray(values).astype(bool).reshape(worlds)
+
+
+def dataset_target(argument: str) -> tuple[Path, str | None]:
+    """Path and episode of `<path>#<episode>`; a path that has a `#` in its own name is taken as it is."""
+    if Path(argument).exists():
+        return Path(argument), None
+    path, hash_sign, episode = argument.rpartition("#")
+    return (Path(path), episode) if hash_sign else (Path(argument), None)
 
 
 def check_spec(spec: str) -> None:

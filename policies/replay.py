@@ -5,31 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from arena_newton import tasks as task_registry
-from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.errors import InputError
+from arena_newton.extras import require
 from arena_newton.foreign import read_arrays
-from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
+from arena_newton.policies.base import DATASET_FILE, Chunk, Json, Mask, Observation, Policy, dataset_target, world_mask
+from arena_newton.policies.open_loop import RecordedEpisodes, played
 from arena_newton.trackers.motions import load_actions, load_clip
 from arena_newton.trackers.motions.playback import clip_actions, startup_actions
 
-if TYPE_CHECKING:
-    from arena_newton.env import ArenaEnv
-
 __all__ = ["ReplayEpisodes", "ReplayPolicy", "from_spec"]
-
-_XY = ACTION["root_xy_delta"]
-
-
-def _played(recording: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Actions at ticks of any shape; after the end the last one without displacement, shape [..., 40]."""
-    actions = recording[np.minimum(ticks, len(recording) - 1)]
-    actions[ticks >= len(recording), _XY] = 0.0
-    return actions
 
 
 class ReplayPolicy(Policy):
@@ -83,7 +71,7 @@ class ReplayPolicy(Policy):
         asking = world_mask(observation.mask, worlds)
         ticks = self._steps[:, None] + np.arange(self.chunk_size)
         self._steps[asking] += self.chunk_size
-        return Chunk(_played(self.actions, ticks))
+        return Chunk(played(self.actions, ticks))
 
     def describe(self) -> Json:
         """File name and hash, and the times of the start."""
@@ -95,14 +83,11 @@ class ReplayPolicy(Policy):
             self._steps = np.zeros(worlds, dtype=np.int64)
 
 
-class ReplayEpisodes(Policy):
+class ReplayEpisodes(RecordedEpisodes):
     """Plays each episode's own recording from a folder that `run --actions` wrote, open loop.
 
     To separate tracker from policy effects, replay the recorded actions through another tracker.
     """
-
-    labels = "v3.1"
-    chunk_size = 20
 
     def __init__(self, folder: str | Path):
         """Read the recordings.
@@ -114,10 +99,10 @@ class ReplayEpisodes(Policy):
         Raises:
             InputError: There are none, one is unfit, or two are of the same episode.
         """
+        super().__init__()
         self.path = Path(folder)
         self.name = f"replay-{self.path.parent.name if self.path.name == 'actions' else self.path.name}"
         self._episodes: dict[tuple[str, str, int], np.ndarray] = {}
-        self._mode = "base"
         files = sorted(self.path.glob("*.npz"))
         if not files:
             raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; run --actions writes them")
@@ -132,9 +117,6 @@ class ReplayEpisodes(Policy):
             if episode in self._episodes:
                 raise InputError(f"--policy replay:{file}: a second recording of episode seed {episode[2]}, keep one")
             self._episodes[episode] = actions
-        self._playing: list[np.ndarray | None] = []
-        self._asked: list[tuple[str, str, int]] = []
-        self._steps = np.zeros(0, dtype=np.int64)
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
         """Refuse a task without a recording, or episodes of which none has one."""
@@ -149,45 +131,32 @@ class ReplayEpisodes(Policy):
         if seeds and not any((mode, seed) in here for seed in seeds):
             raise InputError(f"{where}: recordings of task {task}, but of other --seeds")
 
-    def attach(self, env: ArenaEnv) -> None:  # type: ignore[override]  # worlds have a mode
-        """Take the mode whose recordings are played."""
-        self._mode = env.mode
-
-    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
-        """Take the recordings of the worlds in `mask`."""
-        if len(self._steps) != len(seeds):
-            self._steps = np.zeros(len(seeds), dtype=np.int64)
-            self._playing, self._asked = [None] * len(seeds), [("", "", 0)] * len(seeds)
-        for world in np.flatnonzero(world_mask(mask, len(seeds))):
-            self._asked[world] = (tasks[world], self._mode, int(seeds[world]))
-            self._playing[world] = self._episodes.get(self._asked[world])
-            self._steps[world] = 0
-
-    def act(self, observation: Observation) -> Chunk:
-        """The next actions of the worlds that ask; a world without a recording gets an error."""
-        worlds = len(observation.state)
-        actions = np.zeros((worlds, self.chunk_size, ACTION_WIDTH), dtype=np.float32)
-        errors = {}
-        for world in np.flatnonzero(world_mask(observation.mask, worlds)):
-            recording = self._playing[world]
-            if recording is None:
-                task, mode, seed = self._asked[world]
-                errors[int(world)] = f"{self.path}: no recording of {task}, mode {mode}, episode seed {seed}"
-                continue
-            ticks = self._steps[world] + np.arange(self.chunk_size)
-            actions[world] = _played(recording, ticks)
-            self._steps[world] += self.chunk_size
-        return Chunk(actions, errors)
+    def recording(self, task: str, mode: str, seed: int) -> np.ndarray | None:
+        """See `RecordedEpisodes.recording`."""
+        return self._episodes.get((task, mode, seed))
 
     def describe(self) -> Json:
         """Folder and number of episodes."""
         return {"name": self.name, "folder": self.path.name, "episodes": len(self._episodes)}
 
 
-def from_spec(argument: str | None) -> ReplayPolicy | ReplayEpisodes:
-    """Make the policy for `--policy replay:<path>`; without a path it is refused."""
+def from_spec(argument: str | None) -> Policy:
+    """Make the policy for `--policy replay:<path>`; without a path it is refused.
+
+    Raises:
+        InputError: What is at the path cannot be played; the message says what can.
+    """
     if not argument:
         raise InputError(
-            "--policy replay: needs a file or a folder, as in replay:walk.pkl, replay:actions.npz, replay:run/actions"
+            "--policy replay: needs a file or a folder, as in replay:walk.pkl, replay:actions.npz, replay:run/actions, "
+            "replay:dataset#0"
         )
-    return ReplayEpisodes(argument) if Path(argument).is_dir() else ReplayPolicy(argument)
+    path, episode = dataset_target(argument)
+    if (path / DATASET_FILE).is_file():
+        require("data", f"--policy replay:{argument}", ("pyarrow",))
+        from arena_newton.policies.replay_dataset import ReplayDataset
+
+        return ReplayDataset(path, episode)
+    if episode is not None:
+        raise InputError(f"--policy replay:{argument}: {path} is no LeRobot dataset (it has no {DATASET_FILE})")
+    return ReplayEpisodes(path) if path.is_dir() else ReplayPolicy(path)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton.command_line import exit_code
-from arena_newton.data.data_options import BuildOptions, DatasetBenchOptions, VerifyOptions
+from arena_newton.data.data_options import BuildOptions, CleanOptions, DatasetBenchOptions, VerifyOptions
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.flags import folders_named, parse_flags
@@ -34,6 +34,12 @@ class DataCommand:
 
 
 COMMANDS: dict[str, DataCommand] = {
+    "clean": DataCommand(
+        words="clean <recordings> [<recordings> ...] --out <folder>",
+        purpose="drop rows that a stalled or jumping source spoiled",
+        options=CleanOptions,
+        work="cleaning:clean",
+    ),
     "build": DataCommand(
         words="build <recordings> [<recordings> ...] --out <dataset>",
         purpose="make a LeRobot v3.0 dataset of recorded episodes",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["BuildOptions", "DatasetBenchOptions", "VerifyOptions"]
+__all__ = ["BuildOptions", "CleanOptions", "DatasetBenchOptions", "VerifyOptions"]
 
 
 @dataclass(frozen=True)
@@ -48,3 +48,27 @@ class DatasetBenchOptions:
     """Folders of recorded episodes: they are built once more, and the time is measured."""
     seed: int = 0
     """Of the order in which pictures are read."""
+
+
+@dataclass(frozen=True)
+class CleanOptions:
+    """Drop rows that a stalled or jumping source spoiled; each of five rules may be turned off."""
+
+    out: Path = Path("cleaned")
+    """Folder to write, which must not exist yet; the recordings stay as they are."""
+    count: bool = False
+    """Only count and print; nothing is written."""
+    nonmonotonic: bool = True
+    """Drop a row whose frame index does not grow."""
+    gap: bool = True
+    """Drop a row whose frame index grows by more than --max-gap."""
+    backward: bool = True
+    """Drop a row at which the clock does not go on."""
+    slow: bool = True
+    """Drop a row at which the clock goes on by more than --max-step control steps."""
+    held: bool = True
+    """Drop a row whose action is that of the row before while a joint moves by 0.02 rad."""
+    max_gap: int = 1
+    """Largest step of the frame index."""
+    max_step: float = 2.5
+    """Longest step of the clock [control steps]."""

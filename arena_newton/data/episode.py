@@ -124,6 +124,8 @@ FIELDS = (
     Field("rerecord_final_reward", "", "float64", "1 where its last tick then was a success, otherwise 0"),
     Field("rerecord_max_reward", "", "float64", "1 where any of its ticks then was a success, otherwise 0"),
     Field("arena_configuration", "", "text", "JSON: what the run depends on, hashes included"),
+    Field("arena_cleaned", "", "text", "JSON: rows that `data clean` dropped, by rule, and their source; else absent"),
+    Field("arena_source_rows", "T", "int64", "row of the source of each row that `data clean` left; else absent"),
 )
 """All arrays; `<object>` is an object's name in the original's records, `<camera>` a prefix of `CAMERAS`."""
 

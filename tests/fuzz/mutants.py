@@ -279,6 +279,34 @@ def recordings(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], t
     return read, lambda: ("runs/mutant.npz", zipped(arrays, rng))
 
 
+def datasets(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+    sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
+    from original_dataset import write_dataset
+
+    from arena_newton.canonical import STAND_ACTION
+    from arena_newton.data.lerobot_reader import DatasetActions
+
+    episodes = [{"task": "boxing", "mode": "base", "tracker": "twist2", "episode_seed": n} for n in range(2)]
+    root = write_dataset(folder / "set", [np.tile(STAND_ACTION, (20, 1))] * 2, info={"arena": {"episodes": episodes}})
+    sound = {path: path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+    def read(path: Path) -> None:
+        actions = DatasetActions(root)
+        actions.seeds()
+        for episode in range(actions.episodes):
+            actions.task(episode)
+            actions.actions(episode)
+
+    def made() -> tuple[str, bytes]:
+        for path, data in sound.items():
+            path.write_bytes(data)
+        path = rng.choice(list(sound))
+        text = path.suffix == ".json"
+        return str(path.relative_to(folder)), damaged(sound[path], rng, text=text)
+
+    return read, made
+
+
 def pickles(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
     from arena_newton.trackers.motions.formats import read_file
 
@@ -381,7 +409,9 @@ def void(_: object) -> None:
     """Nothing is made of what was read."""
 
 
-READERS = {f.__name__: f for f in (usda, usdc, usdz, images, motions, recordings, pickles, tables, onnx, safetensors)}
+READERS = {
+    f.__name__: f for f in (usda, usdc, usdz, images, motions, recordings, datasets, pickles, tables, onnx, safetensors)
+}
 
 
 def held() -> int:

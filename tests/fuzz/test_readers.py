@@ -9,6 +9,7 @@ import pytest
 
 MUTANTS = 200
 READERS = ("usda", "usdc", "usdz", "images", "motions", "recordings", "pickles", "tables", "onnx", "safetensors")
+READERS += ("datasets",)
 
 
 @pytest.mark.timeout(300)

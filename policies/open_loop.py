@@ -1,0 +1,76 @@
+"""Base of policies that play recordings of episodes, whatever the robot does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from arena_newton.canonical import ACTION, ACTION_WIDTH
+from arena_newton.policies.base import Chunk, Mask, Observation, Policy, world_mask
+
+if TYPE_CHECKING:
+    from arena_newton.interfaces import World
+
+__all__ = ["RecordedEpisodes", "played"]
+
+_XY = ACTION["root_xy_delta"]
+
+
+def played(recording: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Actions at ticks of any shape; after the end the last one without displacement, shape [..., 40]."""
+    actions = recording[np.minimum(ticks, len(recording) - 1)]
+    actions[ticks >= len(recording), _XY] = 0.0
+    return actions
+
+
+class RecordedEpisodes(Policy):
+    """Base of policies that play recordings of episodes, open loop."""
+
+    labels = "v3.1"
+    chunk_size = 20
+
+    def __init__(self) -> None:
+        """Play nothing yet."""
+        self.path = Path()
+        self.playing: list[np.ndarray | None] = []
+        """What each world plays, shape [ticks, 40]."""
+        self._mode = "base"
+        self._asked: list[tuple[str, str, int]] = []
+        self._steps = np.zeros(0, dtype=np.int64)
+
+    def recording(self, task: str, mode: str, seed: int) -> np.ndarray | None:
+        """Actions of an episode, by Gym id, mode and episode seed, shape [ticks, 40]; None where there are none."""
+        raise NotImplementedError
+
+    def attach(self, env: World) -> None:
+        """Take the mode whose recordings are played."""
+        self._mode = getattr(env, "mode", "base")
+
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
+        """Take the recordings of the worlds in `mask`."""
+        if len(self._steps) != len(seeds):
+            self._steps = np.zeros(len(seeds), dtype=np.int64)
+            self.playing, self._asked = [None] * len(seeds), [("", "", 0)] * len(seeds)
+        for world in np.flatnonzero(world_mask(mask, len(seeds))):
+            self._asked[world] = (tasks[world], self._mode, int(seeds[world]))
+            self.playing[world] = self.recording(*self._asked[world])
+            self._steps[world] = 0
+
+    def act(self, observation: Observation) -> Chunk:
+        """The next actions of the worlds that ask; a world without a recording gets an error."""
+        worlds = len(observation.state)
+        actions = np.zeros((worlds, self.chunk_size, ACTION_WIDTH), dtype=np.float32)
+        errors = {}
+        for world in np.flatnonzero(world_mask(observation.mask, worlds)):
+            recording = self.playing[world]
+            if recording is None:
+                task, mode, seed = self._asked[world]
+                errors[int(world)] = f"{self.path}: no recording of {task}, mode {mode}, episode seed {seed}"
+                continue
+            ticks = self._steps[world] + np.arange(self.chunk_size)
+            actions[world] = played(recording, ticks)
+            self._steps[world] += self.chunk_size
+        return Chunk(actions, errors)
