@@ -177,7 +177,7 @@ def test_nobody_there_means_stand():
     assert speed[100:150].mean() > 0.4
     assert speed[-10:].max() < 0.01 and speed[150:].sum() * TICK < 0.8
     change = np.abs(np.diff(actions, axis=0))[:, :-2]
-    assert (change[149:].max() <= 1.2 * change[60:149].max()), "no jump where the messages stop"
+    assert change[149:].max() <= 1.2 * change[60:149].max(), "no jump where the messages stop"
     assert abs(actions[-1, 2] - 0.7) < 0.02 and actions[-1, -2:].tolist() == [1.0, 0.0]
 
 
