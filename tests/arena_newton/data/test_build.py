@@ -194,25 +194,47 @@ def test_bytes_do_not_depend_on_the_worlds(tmp_path):
     assert main(["verify", str(built[0]), "--recordings", str(tmp_path / "r3")]) == 0
 
 
-def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_path):
-    """Killed at random moments, a build leaves no dataset or a whole one; the next one sweeps its remains."""
-    whole, chance = content(dataset), random.Random(5)
-    out, found = tmp_path / "d", set()
-    for _ in range(12):
-        child = os.fork()
-        if child == 0:
-            try:
-                written(recordings, out)
-            finally:
-                os._exit(0)
-        time.sleep(chance.uniform(0.0, 0.8))
+def build_and_kill(recordings, out, delay):
+    """Build in a process of its own, which is killed so long [s] after it has begun to write.
+
+    Returns the time from its beginning to the end, and whether it left an unfinished folder.
+    """
+    part = out.with_name("d.part")
+    child = os.fork()
+    if child == 0:
+        try:
+            written(recordings, out)
+        finally:
+            os._exit(0)
+    limit = time.monotonic() + 60
+    while not (part / "temporary").exists() and not out.exists():
+        assert time.monotonic() < limit, "the build did not begin"
+        time.sleep(0.0005)
+    begin = time.monotonic()
+    if delay is None:
+        os.waitpid(child, 0)
+    else:
+        time.sleep(delay)
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        found.add((out.exists(), (tmp_path / "d.part").exists()))
+    return time.monotonic() - begin, part.exists()
+
+
+def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_path):
+    """Killed at random moments, a build leaves no dataset or a whole one; the next one sweeps its remains."""
+    whole, chance, out = content(dataset), random.Random(5), tmp_path / "d"
+    duration, _ = build_and_kill(recordings, out, None)
+    assert content(out) == whole
+    shutil.rmtree(out)
+    unfinished = 0
+    for number in range(12):
+        # The first one at once: it certainly meets a build at work.
+        _, left = build_and_kill(recordings, out, chance.uniform(0.0, 1.1 * duration) if number else 0.0)
+        unfinished += left
         if out.exists():
             assert content(out) == whole
             shutil.rmtree(out)
-    assert (False, True) in found, "no kill met a build at work"
+    assert unfinished, "no kill met a build at work"
     written(recordings, out)
     assert content(out) == whole and sorted(os.listdir(tmp_path)) == ["d"]
 

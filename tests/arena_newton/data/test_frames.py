@@ -130,3 +130,19 @@ def test_it_needs_no_lerobot():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout == "light\n", done.stderr
+
+
+def test_bench_measures_both_readers_and_the_build(made, tmp_path, capsys):
+    """`data bench` prints reads of LeRobot and of ours, and the time of a build; a wrong flag is named."""
+    from arena_newton.data.__main__ import main
+
+    root, _ = made
+    consistent_episode(tmp_path / "r", repeat=0)
+    code = main(["bench", str(root), "--reads", "20", "--recordings", str(tmp_path / "r")])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(",")[0] for line in lines[:3]] == ["random reads", "random reads", "building"]
+    assert "data.Frames, 224x224, 3 episodes, 2 cameras" in lines[1] and "1 episode, 40 rows" in lines[2]
+    assert code == int(any("MISS" in line for line in lines))
+    assert not list(root.parent.glob("tmp*")), "what was built is removed"
+    assert main(["bench", str(root), "--reads", "0"]) == 2
+    assert "--reads 0" in capsys.readouterr().err
