@@ -8,7 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton.command_line import exit_code
-from arena_newton.data.data_options import BuildOptions, CleanOptions, DatasetBenchOptions, VerifyOptions
+from arena_newton.data.data_options import (
+    BuildOptions,
+    CleanOptions,
+    DatasetBenchOptions,
+    MergeOptions,
+    SplitOptions,
+    VerifyOptions,
+)
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.flags import folders_named, parse_flags
@@ -53,6 +60,19 @@ COMMANDS: dict[str, DataCommand] = {
         options=VerifyOptions,
         work="verification:verify",
         extra="data",
+    ),
+    "merge": DataCommand(
+        words="merge <dataset> <dataset> [<dataset> ...] --out <dataset>",
+        purpose="make one dataset of several; pictures are copied as they are",
+        options=MergeOptions,
+        work="sets:merge",
+        extra="data",
+    ),
+    "split": DataCommand(
+        words="split <datasets or recordings ...> --out-train <folder> --out-held-out <folder>",
+        purpose="hold out episodes by their seeds",
+        options=SplitOptions,
+        work="sets:split",
     ),
     "bench": DataCommand(
         words="bench <dataset> [--recordings <recordings> ...]",

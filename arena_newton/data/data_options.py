@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["BuildOptions", "CleanOptions", "DatasetBenchOptions", "VerifyOptions"]
+__all__ = ["BuildOptions", "CleanOptions", "DatasetBenchOptions", "MergeOptions", "SplitOptions", "VerifyOptions"]
 
 
 @dataclass(frozen=True)
@@ -72,3 +72,25 @@ class CleanOptions:
     """Largest step of the frame index."""
     max_step: float = 2.5
     """Longest step of the clock [control steps]."""
+
+
+@dataclass(frozen=True)
+class MergeOptions:
+    """Write one dataset of several, in the order given."""
+
+    out: Path = Path("merged")
+    """Folder of the dataset, which must not exist yet."""
+
+
+@dataclass(frozen=True)
+class SplitOptions:
+    """Write two sets: an episode's side depends on its seed alone, so that merged sets are split alike."""
+
+    out_train: Path = Path("train")
+    """Folder of the episodes to train on, which must not exist yet."""
+    out_held_out: Path = Path("held_out")
+    """Folder of the episodes held out, which must not exist yet."""
+    fraction: float = 0.1
+    """Probability that an episode is held out."""
+    seed: int = 0
+    """Another number draws other sides."""
