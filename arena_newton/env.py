@@ -128,6 +128,8 @@ class ArenaEnv:
         self._newton_state: newton.State | None = None
         self.camera: Camera | None = None
         """Head camera of policies that see."""
+        self.camera_config = camera
+        """What it was made from."""
         if camera is not None:
             self.camera = Camera.from_scene(self.scene, lights=self.lights, **dataclasses.asdict(camera))
         self._bind_kernels()

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     import torch
     import warp as wp
 
-    from arena_newton.pictures.camera import WorldLights
+    from arena_newton.pictures.camera import Camera, WorldLights
+    from arena_newton.pictures.settings import CameraConfig
     from arena_newton.robot import DriveGains, PhysicsRate
     from arena_newton.scene import Scene
     from arena_newton.tasks.base import TaskSpec
@@ -334,6 +335,10 @@ class World(Protocol):
     """Worlds that run an episode, bool, shape [worlds]."""
     budget: int
     """Step budget of the rule set [ticks]."""
+    camera: Camera | None
+    """Head camera of policies that see."""
+    camera_config: CameraConfig | None
+    """What it was made from."""
 
     @property
     def physics(self) -> Physics:

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 
 __all__ = ["DEMONSTRATION", "EVALUATION", "TELEOPERATION", "episode_seed", "light_rng", "object_rng", "object_seed"]
-__all__ += ["recording_seed", "seed_range"]
+__all__ += ["planned_seed", "recording_seed", "seed_range"]
 
 EVALUATION = "evaluation"
 """Range of the seeds that judge a policy, which are positive int32 as the original's: 0 to 2^31 - 1."""
@@ -53,6 +53,13 @@ def recording_seed(gym_id: str, kind: str, group_seed: int, repeat: int) -> int:
     """
     digest = hashlib.sha256(f"{gym_id}|{kind}|{group_seed}|{repeat}".encode()).digest()
     return int.from_bytes(digest[-4:], "big") | _RECORDED
+
+
+def planned_seed(gym_id: str, kind: str, group_seed: int, repeat: int) -> int:
+    """Seed of one planned episode: `episode_seed` for `EVALUATION`, `recording_seed` for the ranges of recordings."""
+    if kind == EVALUATION:
+        return episode_seed(gym_id, group_seed, repeat)
+    return recording_seed(gym_id, kind, group_seed, repeat)
 
 
 def seed_range(episode_seed: int) -> str:

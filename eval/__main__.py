@@ -17,6 +17,7 @@ from arena_newton.eval.options import (
     CertifyOptions,
     EngineOptions,
     FilmOptions,
+    RecordOptions,
     ReportOptions,
     RunOptions,
 )
@@ -31,6 +32,7 @@ PROG = "python -m arena_newton.eval"
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
+  {PROG} record [flags]          record demonstrations for datasets, or more cameras with --from <out>
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} list [flags] [--json]   show the plan, run nothing
@@ -100,6 +102,17 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
     from arena_newton.eval.run import execute
 
     return execute(folder, factories)
+
+
+def _record(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(RecordOptions, arguments, f"{PROG} record")
+    if options.source is not None:
+        from arena_newton.eval import rerecord
+
+        return rerecord.run(options, factories)
+    from arena_newton.eval.config import recording_run
+
+    return _execute(recording_run(options), factories)
 
 
 def _resume(arguments: list[str], factories: Factories | None) -> int:
@@ -202,6 +215,7 @@ def _certify(arguments: list[str], factories: Factories | None) -> int:
 
 _COMMANDS = {
     "run": _run,
+    "record": _record,
     "resume": _resume,
     "report": _report,
     "film": _film,

@@ -13,17 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton import __version__, policies, rule_sets, trackers
+from arena_newton import __version__, policies, rule_sets, seeding, trackers
 from arena_newton import tasks as task_specs
+from arena_newton.data.episode import CAMERAS
 from arena_newton.devices import resolve_engine
 from arena_newton.errors import InputError
-from arena_newton.eval import plan
+from arena_newton.eval import plan, rounds
 from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
-from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RunOptions, is_quick
+from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RecordOptions, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
 from arena_newton.extras import require
-from arena_newton.pictures.settings import MOST_PORT, VIEWERS, CameraConfig, video_sizes
+from arena_newton.noise_levels import NoiseLevels
+from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
 from arena_newton.policies.base import DATASET_FILE, dataset_target
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
     from arena_newton.trackers.base import Tracker
 
-__all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "resolve"]
+__all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "recorded_cameras", "recording_run", "resolve"]
 
 DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
@@ -82,6 +84,8 @@ class RunConfig:
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str
     """The package's own code that moves and judges, by content."""
+    recording: Mapping[str, CameraConfig] | None = None
+    """Recorded cameras by name; None where nothing is recorded."""
     camera: CameraConfig | None = None
     """Camera that the policy asks for; None for one that does not see."""
     worlds_matter: bool = False
@@ -123,7 +127,15 @@ class RunConfig:
             "code": self.code_hash,
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
+            **self._demonstrations(),
         }
+
+    def _demonstrations(self) -> Identity:
+        """What tells a run of `eval record` from an evaluation; nothing for one."""
+        if self.flags.series is None:
+            return {}  # type: ignore[typeddict-item]  # a part of one
+        noise = NoiseLevels().describe() if self.flags.disturb else None
+        return {"seed_range": seeding.DEMONSTRATION, "disturbance": noise, "keep": self.flags.keep}  # type: ignore[typeddict-item]
 
     @property
     def hash(self) -> str:
@@ -157,6 +169,33 @@ def plain_facts(facts: Mapping[str, object]) -> JsonObject:
     """Facts as strict JSON gives them back; anything else as text."""
     plain: JsonObject = json.loads(json.dumps(facts, default=str))
     return plain
+
+
+def recording_run(options: RecordOptions) -> RunOptions:
+    """The flags of a run that records demonstrations.
+
+    Raises:
+        InputError: A number is out of range.
+    """
+    if options.episodes < 1:
+        raise InputError(f"--episodes {options.episodes}: expected at least 1")
+    if options.seed_series < 0:
+        raise InputError(f"--seed-series {options.seed_series}: expected at least 0")
+    if options.accept_differences:
+        raise InputError("--accept-differences: belongs to --from, which is not given")
+    shared = {f.name for f in dataclasses.fields(RunOptions)} & {f.name for f in dataclasses.fields(options)}
+    attempts = options.episodes * (rounds.ATTEMPTS if options.only_success else 1)
+    return RunOptions(
+        **{name: getattr(options, name) for name in shared},
+        seeds=(options.seed_series,),
+        repeats=attempts,
+        record=True,
+        record_cameras=options.cameras,
+        record_size=options.size,
+        record_depth=options.depth,
+        series=options.seed_series,
+        keep=options.episodes if options.only_success else None,
+    )
 
 
 def resolve(options: RunOptions) -> RunConfig:
@@ -213,8 +252,10 @@ def resolve(options: RunOptions) -> RunConfig:
         seeds=flags.seeds,
         repeats=repeats,
         max_steps=flags.max_steps,
+        seed_range=seeding.EVALUATION if flags.series is None else seeding.DEMONSTRATION,
     )
     video_size, policy_options = _size(options.video_size), _policy_options(options)
+    recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
     engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
@@ -228,6 +269,7 @@ def resolve(options: RunOptions) -> RunConfig:
         checkpoint=checkpoint,
         variant=variant,
         video_size=video_size,
+        recording=recording,
         policy_options=policy_options,
         checkpoint_hashes=checkpoint_hashes,
         policy_hash=policy_hash,
@@ -254,6 +296,9 @@ def _check_flags(options: RunOptions) -> None:
     for name in ("video_episodes", "video_size", "follow"):
         if getattr(options, name) and not (options.video or options.strip or is_quick(options)):
             raise InputError(f"{_flag(name)}: belongs to --video or --strip, neither is given")
+    for name in ("record_cameras", "record_size", "record_depth"):
+        if getattr(options, name) != getattr(RunOptions, name) and not options.record:
+            raise InputError(f"{_flag(name)}: belongs to --record, which is not given")
     _check_viewer(options)
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: must be alone, name either all or single tasks")
@@ -295,6 +340,36 @@ def _size(given: str | None) -> tuple[int, int] | None:
     if not numbers:
         raise InputError(f"--video-size {given}: expected width x height, such as 960x540")
     return video_sizes((int(numbers[1]), int(numbers[2])))["world"]
+
+
+def recorded_cameras(options: RunOptions) -> dict[str, CameraConfig]:
+    """Recorded cameras by name.
+
+    Pictures of the sensor's own shape (4:3) show what it shows; in others, such as squares, it has black bars as in the
+    pictures of policies. The world camera has no sensor to keep to.
+
+    Raises:
+        InputError: An unknown camera, one named twice, or an unfit size.
+    """
+    numbers = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", options.record_size)
+    width, height = (int(numbers[1]), int(numbers[2])) if numbers else (0, 0)
+    low, high = SIZE_LIMITS
+    if not all(low <= n <= high and n % 2 == 0 for n in (width, height)):
+        raise InputError(
+            f"--record-size {options.record_size}: expected width x height, even numbers from {low} to {high}, such as "
+            "224x224 or 640x480"
+        )
+    if options.record_depth and not options.record_cameras:
+        raise InputError("--record-depth: belongs to cameras, none is recorded")
+    found = {}
+    for name in options.record_cameras:
+        if name not in CAMERAS:
+            raise InputError(f"--record-cameras {plain_text(name)}: unknown, choose from {' '.join(CAMERAS)}")
+        if name in found:
+            raise InputError(f"--record-cameras {name}: given twice")
+        fit: Fit = "native" if name == "world" or 3 * width == 4 * height else "pad"
+        found[name] = CameraConfig(width=width, height=height, prim="ego" if name == "front" else name, fit=fit)
+    return found
 
 
 def _variant_hash(variant: Path) -> str:

@@ -34,11 +34,15 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, s
         where = f"rules {flags.rules}, engine {flags.engine} on {config.device}"
         print(f"configuration {config.hash}: {', '.join(parts)}, {where}")
     planned, remain = counted(len(config.episodes), "episode"), sum(map(len, waiting.values()))
+    if flags.keep is not None:
+        planned = f"{flags.keep:,} successes to record of each task, tracker and mode"
+        planned += f" in at most {len(config.episodes):,} attempts"
     if not remain:
         print(f"  {planned}, all finished -> {folder}", flush=True)
         return
     finished = len(config.episodes) - remain
     size = f"{planned}, {finished} finished, {remain} remain" if finished else planned
+    size = size if flags.keep is None else f"{planned}, {remain} due"
     worlds = min(flags.worlds, max(map(len, waiting.values())))
     most = simulated(sum(episode.max_steps for group in waiting.values() for episode in group))
     print(f"  {size}, {counted(worlds, 'world')} at once, {most} -> {folder}", flush=True)

@@ -35,6 +35,10 @@ __all__ = ["CONFIG_FILE", "Document", "Identity", "Status", "check_plan", "read_
 CONFIG_FILE = "config.json"
 
 
+SEED_RANGES = (seeding.EVALUATION, seeding.DEMONSTRATION)
+"""Ranges of seeds that runs play."""
+
+
 def _distinct(values: list[Json]) -> bool:
     return bool(values) and len(set(values)) == len(values)
 
@@ -80,6 +84,12 @@ class Identity(_Identity, total=False):
     code: Annotated[str, Fit("a hash")]
     tracker_facts: FactsOrNone
     policy_facts: FactsOrNone
+    seed_range: Annotated[str, Fit("a range of seeds", lambda value: value in SEED_RANGES)]
+    """Absent in an evaluation."""
+    disturbance: FactsOrNone
+    """What disturbed the execution of recorded episodes."""
+    keep: Annotated[Positive | None, Fit("a number or null")]
+    """Successes to record of each task, tracker and mode."""
 
 
 class Status(TypedDict):
@@ -166,13 +176,14 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
     config = document["config"]
     by_hand = "the journal was changed by hand"
     numbers: dict[_Key, int] = {}
-    ended: dict[int, str] = {}
+    ended: dict[int, EpisodeRecord] = {}
     budgets, plan = _budgets(config), _plan_numbers(folder / CONFIG_FILE, config)
     if plan and document["planned"] != len(plan):
         count = f"planned is {document['planned']}, the plan has {len(plan)}"
         raise InputError(f"{folder / CONFIG_FILE}: {count}; it was changed by hand")
     run: JsonObject = {key: config[key] for key in _PARTS if key in config}
     named = trackers_of(config)
+    kind = config.get("seed_range") or seeding.EVALUATION
     for record in records:
         key = (record.task, record.tracker, record.mode, record.group_seed, record.repeat)
         words = f"{record.task} {record.mode} seed {record.group_seed} repeat {record.repeat}"
@@ -187,7 +198,7 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
             raise InputError(f"{name}: is not in the plan of {CONFIG_FILE}; {by_hand}")
         if numbers.setdefault(key, record.index) != record.index:
             raise InputError(f"{name}: is in the journal as episode {numbers[key]} too")
-        seed = seeding.episode_seed(document["gym_ids"][record.task], record.group_seed, record.repeat)
+        seed = seeding.planned_seed(document["gym_ids"][record.task], kind, record.group_seed, record.repeat)
         planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
         if named is not None and record.tracker not in named:
             planned["tracker"] = " or ".join(named)
@@ -203,9 +214,16 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
                 )
         if record.steps > record.max_steps:
             raise InputError(f"{name}: {record.steps} steps of at most {record.max_steps}; {by_hand}")
-        if ended.get(record.index, "error") != "error":
-            raise InputError(f"{name}: is in the journal again after it had ended ({ended[record.index]}); {by_hand}")
-        ended[record.index] = record.outcome
+        before = ended.get(record.index)
+        if before is not None and before.outcome != "error" and not _recorded_again(before, record):
+            raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
+        ended[record.index] = record
+
+
+def _recorded_again(before: EpisodeRecord, record: EpisodeRecord) -> bool:
+    """Whether an episode was played again because its recording was missing: it ended as before."""
+    same = all(getattr(before, key) == getattr(record, key) for key in ("outcome", "reason", "steps"))
+    return same and "episode" in (record.media or {})
 
 
 def _budgets(config: Identity) -> dict[str, int]:

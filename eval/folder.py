@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from arena_newton import rule_sets, tasks
+from arena_newton.data.episode import VIDEO_FOLDER
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import document as documents
 from arena_newton.eval.config import RunConfig, plain_facts
@@ -22,10 +23,23 @@ from arena_newton.eval.records import JsonObject, check_types
 from arena_newton.files import PARTIAL
 from arena_newton.text import plain_text
 
-__all__ = ["BREAK_FILE", "SUBFOLDERS", "ResultsFolder", "iso", "results_folder", "setting", "stored_options"]
+__all__ = [
+    "BREAK_FILE",
+    "EPISODES",
+    "SUBFOLDERS",
+    "ResultsFolder",
+    "iso",
+    "results_folder",
+    "setting",
+    "stored_options",
+]
 
-SUBFOLDERS = ("videos", "strips", "actions", "original")
+EPISODES = "episodes"
+"""Folder of the files of recorded episodes."""
+SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f"{EPISODES}/{VIDEO_FOLDER}")
 """Folders that a run writes inside its own."""
+RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
+"""Flags that all episodes of a folder share, though they change none of them."""
 BREAK_FILE = "break.txt"
 """Where the trace of a break is kept for who looks into it."""
 
@@ -108,6 +122,12 @@ class ResultsFolder:
                 f"{folder}: holds results of another configuration: {key} was {setting(was)}, now {setting(now)}; "
                 "choose another --out"
             )
+        for name in RECORDING_FLAGS:
+            default = getattr(RunOptions, name)
+            kept, given = stored["options"].get(name, default), getattr(self.config.flags, name)
+            if given != (tuple(kept) if isinstance(kept, list) else kept):
+                flag = f"--{name.replace('_', '-')}"
+                raise InputError(f"{folder}: was begun with {flag} {setting(kept)}; choose another --out")
         known = [moving_versions(versions) for versions in _versions(stored)]
         present = moving_versions(self.installed)
         if present not in known and not self.config.flags.accept_versions:
@@ -245,8 +265,7 @@ class ResultsFolder:
 
     def sweep(self) -> None:
         """Remove what unfinished recordings left."""
-        folders = ("videos", "strips", "actions", "failures")
-        for pattern in (*(f"{name}/*{PARTIAL}" for name in folders), "actions/*.partial"):
+        for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial"):
             for part in self.path.glob(pattern):
                 with contextlib.suppress(OSError):
                     part.unlink()

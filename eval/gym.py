@@ -102,6 +102,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         reward: str = "success",
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         repeats: int = PROTOCOL_REPEATS,
+        seed_range: str = seeding.EVALUATION,
         max_episode_steps: int | None = None,
         render_mode: str | None = "rgb_array",
     ):
@@ -133,6 +134,8 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
                 them, or `DISABLED`: a world that ended is frozen until it is reset. It moves no more, whatever its
                 action; its observation, picture, flags and info are those of its end, its reward is 0.
             repeats: Episodes per group seed in the numbering of seeds.
+            seed_range: `evaluation`, or `demonstration`: episodes of the same numbers that no evaluation ever has, to
+                learn from.
             max_episode_steps: Cap on the step budget of the rule set [ticks].
             render_mode: `rgb_array`, or None.
 
@@ -144,6 +147,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self.render_mode = None if render_mode is None else _choice("render_mode", render_mode, ("rgb_array",))
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
+        self.seed_range = _choice("seed_range", seed_range, (seeding.EVALUATION, seeding.DEMONSTRATION))
         self.repeats = _at_least_1("repeats", repeats)
         self.num_envs = _at_least_1("num_envs", num_envs)
         cap = None if max_episode_steps is None else _at_least_1("max_episode_steps", max_episode_steps)
@@ -243,6 +247,13 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._look(mask)
         return self._observation(), self._info(mask)
 
+    def episode_seed(self, number: int) -> int:
+        """Seed from which everything random about episode `number` follows."""
+        gym_id, (group, repeat) = self.env.spec.gym_id, divmod(number, self.repeats)
+        if self.seed_range == seeding.EVALUATION:
+            return seeding.episode_seed(gym_id, group, repeat)
+        return seeding.recording_seed(gym_id, self.seed_range, group, repeat)
+
     def _reset_mask(self, options: Mapping[str, object] | None) -> np.ndarray:
         unknown = set(options or ()) - {RESET_MASK, NEW_ROLLOUT}
         if unknown:
@@ -268,13 +279,12 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             self._next = max(named) + 1
         elif self._next is None:
             self._next = int(self.np_random.integers(PROTOCOL_EPISODES, DRAWN_SEEDS))
-        gym_id = self.env.spec.gym_id
         for world, number in zip(worlds.tolist(), given, strict=True):
             if number is None:
                 number = self._next or 0
                 self._next = number + 1
             self._seed[world] = number
-            self._episode_seed[world] = seeding.episode_seed(gym_id, *divmod(number, self.repeats))
+            self._episode_seed[world] = self.episode_seed(number)
         self.env.reset(self._episode_seed[worlds].tolist(), worlds)
         self._begun |= mask
         self._unfilmed |= mask

@@ -15,6 +15,7 @@ __all__ = [
     "CertifyOptions",
     "EngineOptions",
     "FilmOptions",
+    "RecordOptions",
     "ReportOptions",
     "RunOptions",
     "is_quick",
@@ -81,6 +82,14 @@ class RunOptions:
     """Size of the world camera's pictures, such as 960x540 [px]."""
     follow: bool = False
     """Let the world camera follow the robot."""
+    record: bool = False
+    """Write what a dataset is built of: an NPZ per episode and an MP4 per camera, one frame per tick, in episodes/."""
+    record_cameras: tuple[str, ...] = ("front",)
+    """Cameras of --record: front left_wrist right_wrist world; without a name after it, none."""
+    record_size: str = "224x224"
+    """Size of their pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
+    record_depth: bool = False
+    """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
     viewer: str | None = None
     """Show the first 16 worlds while they run: viser (a page on this machine), rerun (its page), usd (<out>/viewer)."""
     viewer_port: int = 8080
@@ -113,12 +122,76 @@ class RunOptions:
     """For --policy remote: ask for one world after the other, in their order."""
     remote_insecure: bool = False
     """For --policy remote: do not check the certificate of an https server."""
+    series: Annotated[int | None, tyro.conf.Suppress] = None
+    """Series of demonstrations whose seeds are played instead of the evaluation's (`eval record`)."""
+    keep: Annotated[int | None, tyro.conf.Suppress] = None
+    """Successes to record of each task, tracker and mode; None: all episodes of the plan."""
+    disturb: Annotated[bool, tyro.conf.Suppress] = False
+    """Disturb what is executed; the recorded action is the policy's own."""
 
 
 def is_quick(options: RunOptions) -> bool:
     """Whether the flags leave the plan open: the default run over all tasks."""
-    named = options.task or options.mode or options.seeds
+    named = options.task or options.mode or options.seeds or options.series is not None
     return not named and (options.repeats, options.max_steps) == (None, None)
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """Record demonstrations: episodes as files, of which `python -m arena_newton.data build` makes a dataset.
+
+    Seeds are of a range of their own, which no evaluation plays. `python -m arena_newton.eval resume <out>` continues.
+    With --from FOLDER recorded episodes are played again, action by action, for more cameras.
+    """
+
+    task: tuple[str, ...] = ()
+    """Task names, or `all`; all when none is named."""
+    tracker: tuple[str, ...] = ()
+    """Trackers that execute the 40D action: twist2 (when none is named) sonic ..."""
+    checkpoint: str | None = None
+    """Weights of the one tracker named; those that come with the package when none are named."""
+    policy: str = "expert"
+    """Policy that is recorded."""
+    mode: tuple[str, ...] = ()
+    """Modes: base (when none is named) execution semantic visual."""
+    rules: str = "paper"
+    """Rule set: paper or released."""
+    drive: str = "auto"
+    """Gains of the joints' drives: auto, twist2, humanoidarena."""
+    episodes: int = 100
+    """Episodes of each task, tracker and mode."""
+    only_success: bool = False
+    """Keep so many successes, with at most twice as many attempts; what fails is counted and not kept."""
+    disturb: bool = True
+    """Add slow noise to what is executed, not to the recorded action, so that recoveries are recorded."""
+    seed_series: int = 0
+    """Number of the series of seeds: another one gives other episodes."""
+    cameras: tuple[str, ...] = ("front",)
+    """Cameras: front left_wrist right_wrist world; without a name after it, none."""
+    size: str = "224x224"
+    """Size of the pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
+    depth: bool = False
+    """Write the depth of each picture too, float16 [m]."""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "auto"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    variant: str | None = None
+    """USD file that replaces or extends the scene of the one task named."""
+    fast_physics: bool = False
+    """Run a 1 ms tracker at 5 ms x 4 substeps."""
+    max_steps: int | None = None
+    """Cap on the step budget of the rule set [ticks of 0.02 s]."""
+    out: str | None = None
+    """Folder; results/<date>_<time> when none is named."""
+    verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
+    """Print the whole configuration."""
+    source: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Play the recorded episodes of this folder again, and write them with these cameras to --out."""
+    accept_differences: bool = False
+    """With --from: go on although code, tracker, rules or scene are not those of the recording."""
 
 
 @dataclass(frozen=True)

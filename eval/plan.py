@@ -59,11 +59,13 @@ def expand(
     seeds: Sequence[int] = PROTOCOL_SEEDS,
     repeats: int = PROTOCOL_REPEATS,
     max_steps: int | None = None,
+    seed_range: str = seeding.EVALUATION,
 ) -> list[Episode]:
     """Episodes of a run: tasks × trackers × modes × group seeds × repeats, in this order.
 
     `task_names` may be `all` alone; `repeats` are the episodes per group seed; `max_steps` caps the rule set's step
-    budgets; trackers, policy, rules and engine are the names that results carry.
+    budgets; trackers, policy, rules and engine are the names that results carry. Of another `seed_range` than the
+    evaluation's, `seeds` are numbers of series.
 
     Raises:
         InputError: Unknown task, mode or rule set, something named twice, or nothing to run.
@@ -99,7 +101,7 @@ def expand(
         for tracker, mode in itertools.product(trackers, modes):
             for position, group_seed in enumerate(seeds):
                 for repeat in range(repeats):
-                    seed = seeding.episode_seed(spec.gym_id, group_seed, repeat)
+                    seed = seeding.planned_seed(spec.gym_id, seed_range, group_seed, repeat)
                     episodes.append(
                         Episode(
                             index=len(episodes),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn, TextIO
 
@@ -124,6 +124,13 @@ class Progress:
                 self._estimate()
             self._line(now)
         self._last = now
+
+    def more(self, budgets: Sequence[int]) -> None:
+        """Episodes with these budgets [ticks] are planned besides."""
+        self.planned += len(budgets)
+        self.budget += sum(budgets)
+        if self._bar is not None:
+            self._bar.total = self.budget
 
     def episode(self, budget: int, used: int) -> None:
         """An episode is over.

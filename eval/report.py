@@ -111,6 +111,9 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     outside = outside_suites(cell["task"] for cell in results["cells"])
     if outside:
         found.append(f"The averages are those of the paper's seven tasks; not in them: {' '.join(outside)}.")
+    if "seed_range" in results["config"]:
+        noise = " and disturbed execution" if results["config"].get("disturbance") else ""
+        found.append(f"Demonstrations with seeds of their own range{noise}: no benchmark result.")
     cap = results["config"]["max_steps"]
     if cap is not None:
         found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")
@@ -177,11 +180,12 @@ def write_reports(run: RunRecord) -> Results:
     write_atomic(run.folder / "table.csv", table_csv(results))
     write_atomic(run.folder / "report.md", _markdown(run, results))
     write_atomic(run.folder / "report.html", _html(run, results))
-    write_original(
-        run.folder / "original",
-        run.records,
-        gym_ids=run.document["gym_ids"],
-        seeds=run.config["seeds"],
-        repeats=run.config["repeats"],
-    )
+    if "seed_range" not in run.config:  # the original's files are of evaluations
+        write_original(
+            run.folder / "original",
+            run.records,
+            gym_ids=run.document["gym_ids"],
+            seeds=run.config["seeds"],
+            repeats=run.config["repeats"],
+        )
     return results

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NotRequired
 
+from arena_newton.eval import rounds
 from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.stats import Aggregate, aggregate
@@ -65,6 +66,15 @@ def load_run(folder: Path) -> RunRecord:
     return RunRecord(folder, document, in_plan_order(records))
 
 
+def _complete(run: RunRecord) -> bool:
+    """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
+    planned, keep = run.document["planned"], run.config.get("keep")
+    if keep is None:
+        return len(run.records) == planned
+    groups = planned // run.config["repeats"]
+    return rounds.complete(planned, groups, {record.index: record.outcome for record in run.records}, keep)
+
+
 def results_json(run: RunRecord) -> Results:
     """Content of results.json."""
     figures = aggregate(run.records)
@@ -73,7 +83,7 @@ def results_json(run: RunRecord) -> Results:
         "config": run.config,
         "planned": run.document["planned"],
         "finished": len(run.records),
-        "complete": len(run.records) == run.document["planned"],
+        "complete": _complete(run),
         "cells": figures["cells"],
         "suites": figures["suites"],
     }

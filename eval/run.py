@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import gc
@@ -16,9 +17,10 @@ from pathlib import Path
 import warp as wp
 
 from arena_newton import policies, trackers
+from arena_newton.data.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import console, report
+from arena_newton.eval import console, recording, report, rounds
 from arena_newton.eval.config import DRIVES, RunConfig
 from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
@@ -80,17 +82,24 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
         raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
     began = time.perf_counter()
     command = "python -m arena_newton.eval {} " + shlex.quote(str(folder.path))
-    try:
-        if not _play(config, folder, factories, policy, command.format("resume")):
+    with contextlib.ExitStack() as ended:
+        ended.callback(policy.close)
+        viewer = _viewer(config, folder.path)
+        if viewer is not None:
+            ended.callback(viewer.close)
+        if not _play(config, folder, factories, policy, viewer, command.format("resume")):
             return 130
-    finally:
-        policy.close()
     try:
         loaded = load_run(folder.path)
         results = report.write_reports(loaded)
     except StorageError as error:
         raise StorageError(f"{error}; free space, then: {command.format('report')}") from None
     console.result(loaded, results, command.format("resume"), time.perf_counter() - began)
+    for line in recording.outcome_lines(config, folder.path, loaded.records):
+        print(line)
+    if config.flags.keep is not None:
+        kept = sum(record.outcome == "success" for record in loaded.records)
+        return 0 if kept >= config.flags.keep * len(_groups(config.episodes)) else 1
     return 0 if results["complete"] and not any(record.outcome == "error" for record in loaded.records) else 1
 
 
@@ -110,12 +119,19 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
     return config.with_parts(made, policy), read_by(policy, config.flags.labels)
 
 
-def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy: Policy, resume: str) -> bool:
+def _play(
+    config: RunConfig,
+    folder: ResultsFolder,
+    factories: Factories,
+    policy: Policy,
+    viewer: WorldViewer | None,
+    resume: str,
+) -> bool:
     """Play what is missing; False when it was interrupted. Errors say how to go on: by the command `resume`."""
-    viewer = _viewer(config, folder.path)
     folder.make()
     with Journal(folder.journal) as journal:
         folder.settle(config, journal.records)
+        folder.sweep()
         run = _Run(config, folder, journal, factories, policy, viewer)
         try:
             run.play()
@@ -130,8 +146,6 @@ def _play(config: RunConfig, folder: ResultsFolder, factories: Factories, policy
             raise RunStopped(f"{error}; {run.kept()}; continue with: {resume}") from None
         finally:
             folder.sweep()
-            if viewer is not None:
-                viewer.close()
     return True
 
 
@@ -157,6 +171,8 @@ class _Run:
     progress: Progress = field(init=False)
     hashes: dict[str, str | None] = field(default_factory=dict)
     """What the present environment's episodes name their run by; empty before it is built."""
+    ended: dict[int, EpisodeRecord] = field(default_factory=dict)
+    """Episodes that are in the journal, their files whole, by number; of two lines the last."""
 
     def kept(self) -> str:
         """How many of the planned episodes are in the journal, in words."""
@@ -168,15 +184,17 @@ class _Run:
         if self.journal.torn_bytes:
             torn = counted(self.journal.torn_bytes, "byte")
             print(f"  cut a torn last line of {torn} off the journal", file=sys.stderr)
-        done = self._done()
-        waiting = _groups(episode for episode in self.config.episodes if episode.index not in done)
+        done = self.ended = self._done()
+        waiting = self._waiting()
         console.announce(self.config, self.folder.path, waiting)
         if not waiting:
             self.folder.finished()
             return
         budget = {episode.index: episode.max_steps for episode in self.config.episodes}
+        finished = sum(budget[index] for index in done)
+        coming = [episode.max_steps for group in waiting.values() for episode in group]
         self.progress = Progress(
-            sum(budget.values()), planned=len(budget), finished=len(done), done=sum(budget[index] for index in done)
+            finished + sum(coming), planned=len(done) + len(coming), finished=len(done), done=finished
         )
         try:
             with self.folder.running():
@@ -186,11 +204,26 @@ class _Run:
         finally:
             self.progress.close()
 
-    def _done(self) -> set[int]:
-        """Numbers of the finished episodes."""
-        ended = {record.index: record.outcome for record in self.journal.records}
-        again = self.config.flags.retry_errors
-        return {index for index, outcome in ended.items() if not (again and outcome == "error")}
+    def _done(self) -> dict[int, EpisodeRecord]:
+        """The finished episodes; one whose recording is missing is none."""
+        ended = {record.index: record for record in self.journal.records}
+        again, planned = self.config.flags.retry_errors, {e.index: e for e in self.config.episodes}
+        done = {index: record for index, record in ended.items() if not (again and record.outcome == "error")}
+        where = self.folder.path
+        lost = [i for i, r in done.items() if not recording.is_recorded(self.config, where, r, planned[i])]
+        if lost:
+            print(f"  of {counted(len(lost), 'episode')} the recording is missing: played again", file=sys.stderr)
+        return {index: record for index, record in done.items() if index not in lost}
+
+    def _waiting(self) -> dict[tuple[str, str, str], list[Episode]]:
+        """Episodes to play next, by task, tracker and mode."""
+        outcomes = {index: record.outcome for index, record in self.ended.items()}
+        found = {}
+        for names, group in _groups(self.config.episodes).items():
+            wanted = set(rounds.due([e.index for e in group], outcomes, self.config.flags.keep))
+            if wanted:
+                found[names] = [episode for episode in group if episode.index in wanted]
+        return found
 
     def _play_group(self, group: str, episodes: list[Episode]) -> None:
         """Run the episodes of one task, tracker and mode, which name the group.
@@ -203,7 +236,7 @@ class _Run:
             started = min(self.config.flags.worlds, len(left))
             order = list(left.values())
             try:
-                self._play_in_one(group, order, left)
+                self._play_in_one(group, list(order), order, left)
                 return
             except (InputError, StorageError, PolicyUnavailable, RunStopped):
                 raise
@@ -222,17 +255,16 @@ class _Run:
                     raise RunStopped(console.broken(group, message, running if self.hashes else [])) from None
                 self.progress.say(f"  {group}: {message}; {counted(len(running), 'episode')} end as errors")
                 for episode in running:
-                    result = EpisodeResult(episode, "error", "environment", 0, math.nan, error=message)
-                    self.journal.append(_record(result, {}, self.hashes))
+                    self._keep(EpisodeResult(episode, "error", "environment", 0, math.nan, error=message), {})
                     del left[episode.index]
                     self.progress.episode(episode.max_steps, 0)
 
-    def _play_in_one(self, group: str, episodes: list[Episode], left: dict[int, Episode]) -> None:
-        """Run episodes in one environment; those that end are taken out of `left`."""
+    def _play_in_one(self, group: str, episodes: list[Episode], order: list[Episode], left: dict[int, Episode]) -> None:
+        """Run episodes in one environment; those that end are taken out of `left`, later rounds are added to both."""
         config, flags = self.config, self.config.flags
         task, tracker, mode = episodes[0].task, episodes[0].tracker, episodes[0].mode
         self.hashes = {}
-        env = recorder = None
+        env = recorder = files = None
         if kernels_to_compile(Path(wp.config.kernel_cache_dir or "."), flags.engine or "", config.device):
             self.progress.say("  compiling kernels, once; this takes a minute or some")
         try:
@@ -260,30 +292,92 @@ class _Run:
             if self.viewer is not None:
                 self.viewer.open(env, group)
                 recorders.append(self.viewer)
+            noise = recording.disturbance_of(config, episodes[0].max_steps)
+            recorders += [] if noise is None else [noise]
+            described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
+            files = recording.demonstration_recorder(config, self.folder.path, described)
+            recorders += [] if files is None else [files]
+
+            def keep(result: EpisodeResult, media: dict[str, str]) -> None:
+                pictures = recorder.media(result.episode) if recorder is not None else {}
+                self._keep(result, pictures | media)
+                left.pop(result.episode.index, None)
 
             def on_finish(result: EpisodeResult) -> None:
-                media = recorder.media(result.episode) if recorder is not None else {}
-                self.journal.append(_record(result, media, self.hashes))
-                left.pop(result.episode.index, None)
+                if files is None:
+                    keep(result, {})
                 self.progress.episode(result.episode.max_steps, round(result.sim_s / TICK))
 
+            def on_tick(active: int) -> None:
+                self.progress.tick(active)
+                if files is not None:
+                    self._keep_saved(files, keep)
+
             self.hashes = self.folder.hashes(tracker, facts)
-            Rollout(
-                env,
-                self.policy,
-                episodes,
-                recorder=recorders,
-                max_steps=episodes[0].max_steps,
-                on_finish=on_finish,
-                on_tick=self.progress.tick,
-            ).run()
+            while episodes:
+                Rollout(
+                    env,
+                    self.policy,
+                    episodes,
+                    recorder=recorders,
+                    disturbance=noise,
+                    max_steps=episodes[0].max_steps,
+                    on_finish=on_finish,
+                    on_tick=on_tick,
+                ).run()
+                if files is not None:
+                    self._keep_saved(files, keep, wait=True)
+                    files.check()
+                episodes = self._next_round(task, tracker, mode, order, left)
         finally:
-            if recorder is not None:
-                recorder.close()
-            if env is not None:
-                env.close()
-            env = recorder = None
-            gc.collect()
+            try:
+                if files is not None:  # what has ended is kept, whatever happened to the others
+                    self._keep_saved(files, keep, wait=True)
+            finally:
+                for one in (files, recorder, env):
+                    if one is not None:
+                        one.close()
+                env = recorder = files = None
+                gc.collect()
+
+    def _next_round(
+        self, task: str, tracker: str, mode: str, order: list[Episode], left: dict[int, Episode]
+    ) -> list[Episode]:
+        """More attempts where successes are missing; they are added to what is left."""
+        if self.config.flags.keep is None:
+            return []
+        more = self._waiting().get((task, tracker, mode), [])
+        order += more
+        left |= {episode.index: episode for episode in more}
+        self.progress.more([episode.max_steps for episode in more])
+        return more
+
+    def _keep_saved(
+        self, files: DemonstrationRecorder, keep: Callable[[EpisodeResult, dict[str, str]], None], *, wait: bool = False
+    ) -> None:
+        """Journal the episodes whose files are on the disk."""
+        for saved in files.saved(wait=wait):
+            where = {name: path.relative_to(self.folder.path).as_posix() for name, path in saved.files.items()}
+            keep(saved.result, where)
+
+    def _keep(self, result: EpisodeResult, media: dict[str, str]) -> None:
+        """Append an episode to the journal.
+
+        Raises:
+            RunStopped: It was played again for its recording, and ended in another way.
+        """
+        before = next((r for r in reversed(self.journal.records) if r.index == result.episode.index), None)
+        if before is not None and before.outcome != "error" and not recording.agrees(before, result):
+            for path in media.values():
+                (self.folder.path / path).unlink(missing_ok=True)
+            raise RunStopped(
+                f"{result.episode.key}: was played again for its recording and ended as {result.outcome} after "
+                f"{result.steps} steps, the journal has {before.outcome} after {before.steps}: engine "
+                f"{self.config.flags.engine} does not repeat an episode bit for bit; record into another --out"
+            )
+        record = _record(result, media, self.hashes)
+        self.journal.append(record)
+        self.ended[record.index] = record
 
 
 def _recorder(config: RunConfig, folder: Path, tracker: str) -> EpisodeRecorder | None:

@@ -82,8 +82,15 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
 
     `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
-    words: list[object] = ["python", "-m", "arena_newton.eval", "--task", record.task, "--mode", record.mode]
-    words += ["--tracker", record.tracker, "--seeds", record.group_seed, "--repeats", record.repeat + 1]
+    words: list[object] = ["python", "-m", "arena_newton.eval"]
+    series = options.get("series")
+    words += ["record"] if series is not None else []
+    words += ["--task", record.task, "--mode", record.mode, "--tracker", record.tracker]
+    if series is not None:
+        words += ["--seed-series", record.group_seed, "--episodes", record.repeat + 1]
+        words += [] if options.get("disturb") is True else ["--no-disturb"]
+    else:
+        words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
     for name in REPLAYED:
         value = options.get(name)
         if value not in (None, "", "auto"):
@@ -96,7 +103,8 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
             words += ["--" + name.replace("_", "-"), value]
     words += ["--worlds", worlds] if worlds is not None else []
     words += ["--fast-physics"] if options.get("fast_physics") is True else []
-    return " ".join(shlex.quote(plain(word)) for word in [*words, "--video", "--strip"])
+    words += [] if series is not None else ["--video", "--strip"]
+    return " ".join(shlex.quote(plain(word)) for word in words)
 
 
 def environment_facts(facts: Mapping[str, Json]) -> list[tuple[str, str]]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 import torch
@@ -15,9 +17,12 @@ import warp as wp
 from arena_newton import robot as g1
 from arena_newton import seeding
 from arena_newton.canonical import ACTION, HAND_CLOSED, STATE
+from arena_newton.data.encoding import Encoders, PictureSlot, PictureSlots
 from arena_newton.data.episode import SCHEMA_VERSION, VIDEO_FOLDER, vision, write_episode
 from arena_newton.data.image_statistics import VALUES, add_picture
-from arena_newton.files import file_label
+from arena_newton.errors import ArenaError
+from arena_newton.files import PARTIAL, file_label
+from arena_newton.foreign import create
 from arena_newton.interfaces import Recorder
 from arena_newton.pictures.camera import Camera
 from arena_newton.pictures.video import VideoWriter
@@ -27,7 +32,7 @@ if TYPE_CHECKING:
     from arena_newton.interfaces import EpisodeResult, Observation, World
     from arena_newton.pictures.settings import CameraConfig
 
-__all__ = ["DemonstrationRecorder", "RecordedEpisode", "episode_label"]
+__all__ = ["DemonstrationRecorder", "RecordedEpisode", "SavedEpisode", "episode_label"]
 
 FPS = round(1 / g1.TICK)
 """Frames per second: one a tick."""
@@ -37,21 +42,52 @@ GOP_SMALL, GOP_LARGE = 10, 2
 """Frames from one key frame to the next, between the size of the files and the time to read any one frame."""
 CRF = 20
 """Constant rate factor of x264."""
+WAITING_EPISODES = 8
+"""Ended episodes whose files are not written yet, beside one per world: more of them wait for the disk."""
 
 
 class RecordedEpisode(Protocol):
     """What a planned episode must have so that its file says where it comes from."""
 
-    index: int
-    task: str
-    tracker: str
-    policy: str
-    mode: str
-    rules: str
-    group_seed: int
-    repeat: int
-    episode_seed: int
-    object_seed: int
+    @property
+    def index(self) -> int:
+        """Number in the plan."""
+
+    @property
+    def task(self) -> str:
+        """Task."""
+
+    @property
+    def tracker(self) -> str:
+        """Tracker."""
+
+    @property
+    def policy(self) -> str:
+        """Policy."""
+
+    @property
+    def mode(self) -> str:
+        """Mode."""
+
+    @property
+    def rules(self) -> str:
+        """Rule set."""
+
+    @property
+    def group_seed(self) -> int:
+        """Group seed, or number of the series."""
+
+    @property
+    def repeat(self) -> int:
+        """Number in the series."""
+
+    @property
+    def episode_seed(self) -> int:
+        """Everything random about the episode follows from it."""
+
+    @property
+    def object_seed(self) -> int:
+        """Master seed of the objects."""
 
 
 def episode_label(episode: RecordedEpisode) -> str:
@@ -60,21 +96,100 @@ def episode_label(episode: RecordedEpisode) -> str:
     return "__".join([*parts, f"seed{episode.group_seed}", f"repeat{episode.repeat:04d}"])
 
 
+class _Film:
+    """Pictures of one camera of an episode: used by the episode's thread only."""
+
+    def __init__(self, folder: Path, stem: str, camera: str, fps: int):
+        """Nothing is opened before the first picture."""
+        self.video = folder / VIDEO_FOLDER / f"{stem}_{camera}_rgb.mp4"
+        self.depth = folder / f"{stem}_{camera}_depth.raw{PARTIAL}"
+        self.fps = fps
+        self.writer: VideoWriter | None = None
+        self.histogram = np.zeros((3, VALUES), np.int64)
+        self._depth_file: BinaryIO | None = None
+        self._depth_shape: tuple[int, ...] = ()
+
+    def add(self, picture: np.ndarray, depth: np.ndarray | None) -> None:
+        """Append a frame, and its depth if that is recorded."""
+        if self.writer is None:
+            height, width = picture.shape[:2]
+            gop = _gop(height)
+            self.writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, b_frames=False, sync=True)
+        self.writer.write(picture)
+        add_picture(self.histogram, picture)
+        if depth is not None:
+            if self._depth_file is None:
+                self._depth_file, self._depth_shape = create(self.depth), depth.shape
+            try:
+                self._depth_file.write(np.ascontiguousarray(depth).data)
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, str(self.depth)) from None
+
+    def close(self) -> None:
+        """Finish the video."""
+        if self.writer is not None:
+            self.writer.close()
+        if self._depth_file is not None:
+            self._depth_file.close()
+
+    def fields(self, name: str, rows: int) -> dict[str, np.ndarray | np.generic]:
+        """What the file says of the camera."""
+        writer = self.writer
+        if writer is None:
+            return {}
+        if writer.frames != rows:
+            raise ArenaError(f"{self.video}: {writer.frames} frames for {rows} rows")
+        codec = {"vcodec": "h264", "g": _gop(writer.height), "crf": CRF, "preset": "veryfast", "bf": 0}
+        found: dict[str, np.ndarray | np.generic] = {
+            vision(name, "storage_format"): np.str_("video_v1"),
+            vision(name, "frame_indices"): np.arange(rows),
+            vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{self.video.name}"),
+            vision(name, "rgb_fps"): np.float64(self.fps),
+            vision(name, "num_frames"): np.int64(writer.frames),
+        }
+        if self._depth_shape:
+            shape = (rows, *self._depth_shape)
+            found[vision(name, "depth")] = np.memmap(self.depth, np.float16, "r", shape=shape)
+        return found | {
+            f"arena_{vision(name, 'size')}": np.array([writer.width, writer.height]),
+            f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
+            f"arena_{vision(name, 'histogram')}": self.histogram,
+        }
+
+    def discard(self, *, whole: bool = True) -> None:
+        """Remove what is no file of the episode; with `whole` the video too."""
+        if whole and self.writer is not None:
+            self.writer.discard()
+            self.video.unlink(missing_ok=True)
+        if self._depth_file is not None:
+            self._depth_file.close()
+            self.depth.unlink(missing_ok=True)
+
+
 @dataclass
 class _Stream:
     """What is recorded of one world's episode."""
 
     episode: RecordedEpisode
     label: str
+    thread: int
     initial: dict[str, np.ndarray]
     """Fields of the reset."""
+    films: dict[str, _Film]
     heading: float = 0.0
-    before: list[np.ndarray] = field(default_factory=list)
-    """Packed rows of the ticks' beginnings."""
-    after: list[np.ndarray] = field(default_factory=list)
-    """Packed rows of what was executed."""
-    writers: dict[str, VideoWriter] = field(default_factory=dict)
-    histograms: dict[str, np.ndarray] = field(default_factory=dict)
+    rows: list[np.ndarray] = field(default_factory=list)
+    """Packed rows: the beginning of a tick, then what was executed in it."""
+    broken: bool = False
+    """A file of it could not be written; set by its thread."""
+
+
+@dataclass(frozen=True)
+class SavedEpisode:
+    """An episode that ended, and whose files are on the disk."""
+
+    result: EpisodeResult
+    files: Mapping[str, Path]
+    """`episode`, the NPZ, and the MP4 of each camera, by its name; empty where nothing was to be kept."""
 
 
 class DemonstrationRecorder(Recorder):
@@ -87,26 +202,43 @@ class DemonstrationRecorder(Recorder):
         folder: str | Path,
         *,
         cameras: Mapping[str, CameraConfig] | None = None,
+        depth: bool = False,
         seeds: str | None = None,
         only_success: bool = False,
         facts: Mapping[str, object] | None = None,
+        threads: int = 0,
+        finishing: Callable[[RecordedEpisode, EpisodeResult, dict[str, np.ndarray]], dict[str, np.ndarray]]
+        | None = None,
     ):
         """Set up the recorder.
 
         Args:
             folder: Where `<label>.npz` and `videos/` are written.
             cameras: Camera as datasets name it (`episode.CAMERAS`) → its picture; none: states and actions only.
+            depth: Record the depth of each picture too, float16 [m].
             seeds: Range of the seeds, where the seed itself does not tell (`seeding.TELEOPERATION`).
             only_success: Write successes only.
             facts: What the run depends on, as JSON; it must not name times, folders or numbers of worlds.
+            threads: Threads that encode and write. Without any, an episode's files are there when it has ended;
+                with threads, when `saved` names it.
+            finishing: Makes the arrays that are written from those that were recorded.
         """
-        self.folder, self.cameras = Path(folder), dict(cameras or {})
-        self.seeds, self.only_success = seeds, only_success
+        self.folder, self.cameras, self.depth = Path(folder), dict(cameras or {}), depth
+        self.seeds, self.only_success, self.finishing = seeds, only_success, finishing
         self.facts = json.dumps(dict(facts or {}), sort_keys=True)
         self._env: World | None = None
         self._views: dict[str, Camera] = {}
+        self._shared: str | None = None
+        """Camera whose pictures the policy sees too."""
+        self._slots: dict[str, PictureSlots] = {}
+        self._depth_slots: dict[str, PictureSlots] = {}
         self._streams: dict[int, _Stream] = {}
         self._acting: list[int] = []
+        self._before: torch.Tensor | None = None
+        self._encoders = Encoders(threads)
+        self._threads = threads
+        self._saved: deque[SavedEpisode] = deque()
+        self._ended = 0
 
     def file(self, episode: RecordedEpisode) -> Path:
         """The NPZ of an episode."""
@@ -118,18 +250,12 @@ class DemonstrationRecorder(Recorder):
             return
         self._discard()
         self._env = env
-        self._views = {
-            name: Camera.from_scene(
-                env.scene,
-                prim=config.prim,
-                width=config.width,
-                height=config.height,
-                fit=config.fit,
-                samples=config.samples,
-                lights=env.lights,
-            )
-            for name, config in self.cameras.items()
-        }
+        self._slots, self._depth_slots = {}, {}
+        front = self.cameras.get("front")
+        # Depths of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
+        same = env.camera is not None and front == env.camera_config and not self.depth
+        self._shared = "front" if same else None
+        self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
         scene = env.scene
         self._bodies = {}
         for placed in env.spec.objects:
@@ -144,7 +270,8 @@ class DemonstrationRecorder(Recorder):
         physics, reference = env.physics, env.loop.reference
         view = wp.to_torch
         self._xpos, self._xquat = view(physics.xpos), view(physics.xquat)
-        self._live = view(physics.qpos), view(physics.qvel)
+        self._qpos = view(physics.qpos)
+        self._live = self._qpos, view(physics.qvel)
         self._after = (
             env.loop.action,
             view(reference.mimic),
@@ -156,25 +283,37 @@ class DemonstrationRecorder(Recorder):
         self._heading = view(reference.heading)
         self._object_rows = torch.tensor(list(self._bodies.values()), dtype=torch.long, device=env.torch_device)
 
-    def start(self, env: World, world: int, episode: RecordedEpisode) -> None:
-        """An episode without rows yet.
+    def _view(self, env: World, name: str, config: CameraConfig) -> Camera:
+        if name == self._shared and env.camera is not None:
+            return env.camera
+        return Camera.from_scene(
+            env.scene,
+            prim=config.prim,
+            width=config.width,
+            height=config.height,
+            fit=config.fit,
+            samples=config.samples,
+            lights=env.lights,
+        )
 
-        Raises:
-            OSError: A file cannot be written; the error carries its name.
-        """
+    def start(self, env: World, world: int, episode: RecordedEpisode) -> None:
+        """An episode without rows yet."""
         self._bind(env)
         initial = {}
         for name, body in self._bodies.items():
             initial[f"episode_init_env_obj_{name}_position"] = self._xpos[world, body].cpu().numpy().copy()
             initial[f"episode_init_env_obj_{name}_orientation"] = self._xquat[world, body].cpu().numpy().copy()
-        self._streams[world] = _Stream(episode, episode_label(episode), initial)
+        label = episode_label(episode)
+        films = {name: _Film(self.folder, label, name, FPS) for name in self.cameras}
+        self._streams[world] = _Stream(episode, label, self._encoders.join(), initial, films)
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """Keep state, label and pictures of the worlds that act.
 
         Raises:
-            OSError: A file cannot be written; the error carries its name.
+            OSError: A file could not be written; the error carries its name.
         """
+        self._encoders.check()
         mask = env.active & (env.tick >= 0)
         self._acting = [world for world in np.flatnonzero(mask).tolist() if world in self._streams]
         if not self._acting or observation is None:
@@ -182,37 +321,62 @@ class DemonstrationRecorder(Recorder):
         worlds = env.worlds
         objects = self._xpos[:, self._object_rows].reshape(worlds, -1), self._xquat[:, self._object_rows]
         parts = (observation.state, action, *self._live, objects[0], objects[1].reshape(worlds, -1))
-        rows = torch.cat([part.float() for part in parts], dim=1).cpu().numpy()
-        self._widths = [part.shape[1] for part in parts]
+        self._before = torch.cat([part.float() for part in parts], dim=1)
+        self._widths = [part.shape[1] for part in (*parts, *self._after)]
         for world in self._acting:
             stream = self._streams[world]
-            if not stream.before:
+            if not stream.rows:
                 stream.heading = float(self._heading[world])
-            stream.before.append(rows[world].copy())
         for name, camera in self._views.items():
-            pictures = env.render(camera, mask).cpu().numpy()
-            for world in self._acting:
-                self._picture(self._streams[world], name, pictures[world])
+            self._film(env, name, camera, mask, observation)
 
-    def _picture(self, stream: _Stream, name: str, picture: np.ndarray) -> None:
-        """Append a frame to a camera's video."""
-        height, width = picture.shape[:2]
-        if name not in stream.writers:
-            path = self.folder / VIDEO_FOLDER / f"{stream.label}_{name}_rgb.mp4"
-            stream.writers[name] = VideoWriter(path, width, height, FPS, crf=CRF, gop=_gop(height), b_frames=False)
-            stream.histograms[name] = np.zeros((3, VALUES), np.int64)
-        stream.writers[name].write(picture)
-        add_picture(stream.histograms[name], picture)
+    def _film(self, env: World, name: str, camera: Camera, mask: np.ndarray, observation: Observation) -> None:
+        """Render a camera and hand the pictures to the episodes' threads."""
+        missing = mask
+        if name == self._shared and observation.image is not None:  # what the policy saw is rendered once
+            missing = mask & ~observation.mask
+        if missing.any():
+            env.render(camera, missing)
+        chosen = torch.tensor(self._acting, device=env.torch_device)
+        slot = self._slot(self._slots, name, wp.to_torch(camera.image), chosen)
+        depth = None
+        if self.depth:
+            depth = self._slot(self._depth_slots, name, camera.distance_picture().half(), chosen)
+        for row, world in enumerate(self._acting):
+            stream = self._streams[world]
+            self._encoders.submit(stream.thread, partial(self._encode, stream, name, row, slot, depth))
+
+    def _slot(
+        self, slots: dict[str, PictureSlots], name: str, pictures: torch.Tensor, chosen: torch.Tensor
+    ) -> PictureSlot:
+        """Pictures of the worlds that act, copied to the host."""
+        if name not in slots:
+            slots[name] = PictureSlots(pictures, None if self._threads else 1)
+        slot = slots[name].take(len(chosen))
+        slot.fill(pictures if len(chosen) == len(pictures) else pictures[chosen])
+        return slot
+
+    def _encode(self, stream: _Stream, name: str, row: int, slot: PictureSlot, depth: PictureSlot | None) -> None:
+        """A picture's encoding, in the episode's thread."""
+        try:
+            if not stream.broken:
+                stream.films[name].add(slot.picture(row), None if depth is None else depth.picture(row))
+        except BaseException:
+            stream.broken = True
+            raise
+        finally:
+            self._slots[name].release(slot)
+            if depth is not None:
+                self._depth_slots[name].release(depth)
 
     def tick(self, env: World) -> None:
         """Keep what was executed."""
-        if not self._acting:
+        if not self._acting or self._before is None:
             return
-        self._executed = [part.shape[1] for part in self._after]
-        rows = torch.cat([part.float() for part in self._after], dim=1).cpu().numpy()
+        rows = torch.cat([self._before, *(part.float() for part in self._after)], dim=1).cpu().numpy()
         for world in self._acting:
-            self._streams[world].after.append(rows[world].copy())
-        self._acting = []
+            self._streams[world].rows.append(rows[world].copy())
+        self._acting, self._before = [], None
 
     def finish(self, env: World, world: int, result: EpisodeResult) -> None:
         """Write the episode; one that ended as an error, or before its first action, leaves nothing.
@@ -223,21 +387,73 @@ class DemonstrationRecorder(Recorder):
         stream = self._streams.pop(world, None)
         if stream is None:
             return
+        self._ended += 1
         wanted = result.outcome == "success" or (not self.only_success and result.outcome != "error")
-        if not wanted or not stream.before:
-            for writer in stream.writers.values():
-                writer.discard()
-            return
-        for writer in stream.writers.values():
-            writer.close()
-        write_episode(self.file(stream.episode), self._fields(env, world, stream, result))
+        if wanted and stream.rows:
+            last = self._qpos[world].cpu().numpy().copy()
+            job = partial(self._save, stream, result, partial(self._fields, env, stream, result, last, env.describe()))
+        else:
+            job = partial(self._drop, stream, result)
+        self._encoders.submit(stream.thread, job)
+        self._encoders.leave(stream.thread)
+        self._encoders.check()
+        if self._ended - len(self._saved) > env.worlds + WAITING_EPISODES:
+            self._encoders.wait()
 
-    def _fields(self, env: World, world: int, stream: _Stream, result: EpisodeResult) -> dict[str, np.ndarray]:
-        """All arrays of an episode, in the order of `episode.FIELDS`."""
-        episode, rows = stream.episode, len(stream.before)
-        state, action, qpos, qvel, positions, quats = _split(stream.before, self._widths)
-        executed, mimic, targets, position, quat, joints = _split(stream.after, self._executed)
-        robot, physics = env.scene.robot, env.physics
+    def _save(self, stream: _Stream, result: EpisodeResult, fields: Callable[[], dict[str, np.ndarray]]) -> None:
+        """An episode's files, in its thread."""
+        if stream.broken:
+            self._drop(stream, None)
+            return
+        path = self.file(stream.episode)
+        try:
+            for film in stream.films.values():
+                film.close()
+            write_episode(path, fields())
+        except BaseException:
+            self._drop(stream, None)
+            raise
+        for film in stream.films.values():
+            film.discard(whole=False)
+        files = {name: film.video for name, film in stream.films.items() if film.writer is not None}
+        self._saved.append(SavedEpisode(result, {"episode": path} | files))
+
+    def _drop(self, stream: _Stream, result: EpisodeResult | None) -> None:
+        """Nothing stays of an episode; a result is told."""
+        for film in stream.films.values():
+            film.discard()
+        if result is not None:
+            self._saved.append(SavedEpisode(result, {}))
+
+    def saved(self, *, wait: bool = False) -> list[SavedEpisode]:
+        """Episodes whose files were completed since the last call.
+
+        Args:
+            wait: Until all that ended are written.
+        """
+        if wait:
+            self._encoders.wait()
+        found = [self._saved.popleft() for _ in range(len(self._saved))]
+        self._ended -= len(found)
+        return found
+
+    def check(self) -> None:
+        """Raise what went wrong in a thread.
+
+        Raises:
+            OSError: A file could not be written; the error carries its name.
+        """
+        self._encoders.check()
+
+    def _fields(
+        self, env: World, stream: _Stream, result: EpisodeResult, last: np.ndarray, facts: Mapping[str, object]
+    ) -> dict[str, np.ndarray]:
+        """All arrays of an episode, in the order of `episode.FIELDS`; in its thread, so nothing that moves is read."""
+        episode, rows = stream.episode, len(stream.rows)
+        before, after = (parts := _split(stream.rows, self._widths))[:-6], parts[-6:]
+        state, action, qpos, qvel, positions, quats = before
+        executed, mimic, targets, position, quat, joints = after
+        robot = env.scene.robot
         root = slice(robot.root_qpos + 3, robot.root_qpos + 7)
         linear = qvel[:, robot.root_qvel : robot.root_qvel + 3]
         angular = qvel[:, robot.root_qvel + 3 : robot.root_qvel + 6]
@@ -249,7 +465,6 @@ class DemonstrationRecorder(Recorder):
             phase[tick:] = names.index(name)
         raw_state = state.copy()
         raw_state[:, STATE["root_rot6d"]] = matrix_from_quat(turned)[:, :, :2].reshape(rows, 6).numpy()
-        facts = env.describe()
         fields: dict[str, np.ndarray | np.generic] = {
             "schema_version": np.str_(SCHEMA_VERSION),
             "task": np.str_(env.spec.gym_id),
@@ -271,8 +486,8 @@ class DemonstrationRecorder(Recorder):
             "pico_right_grip_binary": hands[:, 1],
             "vla_state": raw_state,
             "system_control_frequency": np.float64(FPS),
-            "system_decimation": np.int64(facts["substeps"]),
-            "system_physics_dt": np.float64(facts["physics_dt"]),
+            "system_decimation": np.int64(str(facts["substeps"])),
+            "system_physics_dt": np.float64(str(facts["physics_dt"])),
             "system_timestamp": np.arange(rows) * g1.TICK,
         }
         for number, name in enumerate(self._bodies):
@@ -288,24 +503,15 @@ class DemonstrationRecorder(Recorder):
         fields |= stream.initial
         fields["episode_object_seed"] = np.uint64(episode.object_seed)
         fields["episode_object_seed_source"] = np.str_("arena_episode_seed")
-        for name, writer in stream.writers.items():
-            fields[vision(name, "storage_format")] = np.str_("video_v1")
-            fields[vision(name, "frame_indices")] = np.arange(rows)
-            fields[vision(name, "rgb_video_path")] = np.str_(f"{VIDEO_FOLDER}/{writer.path.name}")
-            fields[vision(name, "rgb_fps")] = np.float64(FPS)
-            fields[vision(name, "num_frames")] = np.int64(writer.frames)
-            fields[f"arena_{vision(name, 'size')}"] = np.array([writer.width, writer.height])
-            codec = {"vcodec": "h264", "g": _gop(writer.height), "crf": CRF, "preset": "veryfast", "bf": 0}
-            fields[f"arena_{vision(name, 'codec')}"] = np.str_(json.dumps(codec))
-            fields[f"arena_{vision(name, 'histogram')}"] = stream.histograms[name]
-        physical = wp.to_torch(physics.qpos)[world].cpu().numpy().copy()
+        for name, film in stream.films.items():
+            fields |= film.fields(name, rows)
         fields |= {
             "arena_state": state,
             "arena_action": action,
             "arena_executed_action": executed,
             "arena_qpos": qpos,
             "arena_qvel": qvel,
-            "arena_final_qpos": physical,
+            "arena_final_qpos": last,
             "arena_initial_heading": np.float32(stream.heading),
             "arena_phase": phase,
             "arena_phase_names": np.array(names, dtype=np.str_),
@@ -325,18 +531,29 @@ class DemonstrationRecorder(Recorder):
             "arena_margin": np.float64(result.margin),
             "arena_configuration": np.str_(self.facts),
         }
-        return {name: np.asarray(value) for name, value in fields.items()}
+        arrays = {name: np.asanyarray(value) for name, value in fields.items()}
+        return arrays if self.finishing is None else self.finishing(episode, result, arrays)
 
     def close(self) -> None:
         """Drop what is unfinished; no partial file stays."""
         self._discard()
+        self._encoders.close()
         self._env, self._views = None, {}
 
     def _discard(self) -> None:
+        self._encoders.wait()
         for stream in self._streams.values():
-            for writer in stream.writers.values():
-                writer.discard()
-        self._streams, self._acting = {}, []
+            self._drop(stream, None)
+            self._encoders.leave(stream.thread)
+        self._streams, self._acting, self._before = {}, [], None
+
+    def __enter__(self) -> DemonstrationRecorder:
+        """The recorder itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Drop what is unfinished."""
+        self.close()
 
 
 def _gop(height: int) -> int:

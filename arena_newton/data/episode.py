@@ -9,7 +9,6 @@ The bytes depend on the episode alone: not on the number of worlds, on when or w
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import zipfile
@@ -121,6 +120,9 @@ FIELDS = (
     Field("arena_outcome", "", "text", "success, fall or timeout"),
     Field("arena_reason", "", "text", "finer cause"),
     Field("arena_margin", "", "float64", "signed distance to success at the end"),
+    Field("rerecord_any_success", "", "bool", "the task succeeded while the episode was played again for its pictures"),
+    Field("rerecord_final_reward", "", "float64", "1 where its last tick then was a success, otherwise 0"),
+    Field("rerecord_max_reward", "", "float64", "1 where any of its ticks then was a success, otherwise 0"),
     Field("arena_configuration", "", "text", "JSON: what the run depends on, hashes included"),
     Field("arena_cleaned", "", "text", "JSON: rows that `data clean` dropped, by rule, and their source; else absent"),
     Field("arena_source_rows", "T", "int64", "row of the source of each row that `data clean` left; else absent"),
@@ -150,9 +152,9 @@ def write_episode(path: Path, arrays: Mapping[str, np.ndarray], *, sync: bool = 
             for name, array in arrays.items():
                 member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
                 member.compress_type = zipfile.ZIP_DEFLATED
-                content = io.BytesIO()
-                np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
-                archive.writestr(member, content.getbuffer(), compresslevel=4)
+                member.file_size = array.nbytes + limits.HEADER_BYTES  # decides on the form of the member's header
+                with archive.open(member, "w") as content:
+                    np.lib.format.write_array(content, np.asanyarray(array, order="C"), allow_pickle=False)
 
 
 def episode_files(folders: Iterable[str | Path]) -> list[Path]:

@@ -57,6 +57,14 @@ SMALL_HEIGHT = 256
 SMALL_MB, LARGE_MB = 5, 25
 """Size of a video file [MB]: a reader that opens the file for every picture reads four times as fast from 5 MB as from
 80, and LeRobot copies the whole file to append an episode."""
+FACTS = tuple(
+    f"arena_{word}"
+    for word in (
+        *("task", "instruction", "tracker", "policy", "mode", "rules", "seed_range", "group_seed", "repeat"),
+        *("episode_seed", "outcome", "configuration"),
+    )
+)
+"""Fields of an episode that a dataset names; they are read at once."""
 LOCK = f"{PARTIAL}.lock"
 """Ending of the file that is locked while a dataset is built."""
 
@@ -160,6 +168,8 @@ def choose(
         InputError: They do not fit; the message names the episode.
     """
     every = list(opened(files))
+    for episode in every:
+        episode.load(FACTS)
     episodes = [episode for episode in every if not only_success or episode.text("arena_outcome") == "success"]
     if not episodes:
         raise InputError(f"none of {counted(len(every), 'episode')} succeeded; there is nothing to build")
@@ -342,6 +352,11 @@ def _write(
     )
     finished = FinishedVideos(temporary)
     dataset.writer._streaming_encoder = finished if videos else None
+    # It asks for every row, and pandas takes 0.1 ms each time.
+    numbers: dict[str, int] = {}
+    for episode in chosen.episodes:
+        numbers.setdefault(episode.text("arena_instruction"), len(numbers))
+    dataset.meta.get_task_index = numbers.__getitem__
     bar = tqdm(total=chosen.rows, unit="row", desc="build", disable=None, dynamic_ncols=True)
     with bar, contextlib.closing(_Closing(dataset)):
         for index, (episode, videos_of_it) in enumerate(zip(chosen.episodes, chosen.videos, strict=True)):
@@ -350,7 +365,7 @@ def _write(
             given |= {"frame_index": np.arange(rows), "timestamp": (np.arange(rows) / chosen.fps).astype(np.float32)}
             # LeRobot fills in the last three; it wants their names.
             given |= {"episode_index": index, "index": [], "task_index": []}
-            given |= kind.rows(episode, labels)
+            given |= kind.rows(EpisodeFile(episode.path), labels)  # whose arrays are not kept
             pictures = {}
             for camera, video in videos_of_it.items():
                 key = kind.image_key(camera)

@@ -425,6 +425,20 @@ class Camera:
             self._render(state, None)
         return self._torch_image[:count]
 
+    def distance_picture(self) -> torch.Tensor:
+        """Distance along the ray to what each pixel of the last render shows [m], 0 where it shows nothing.
+
+        Returns:
+            float32 [views, height, width] on the model's device; with several rays per pixel that of one of them.
+        """
+        depth: torch.Tensor = wp.to_torch(self.buffers.depth)[:, :: self.samples, :: self.samples]
+        if tuple(depth.shape[1:]) == (self.height, self.width):
+            return depth
+        whole = depth.new_zeros((self.views, self.height, self.width))
+        top, left = self._origin
+        whole[:, top : top + self._size[0], left : left + self._size[1]] = depth
+        return whole
+
     def distances(self, view: int, points: np.ndarray) -> np.ndarray:
         """Distance to what the last render met in the direction of some points [m], 0 where it met nothing.
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 from arena_newton.errors import InputError
 
-__all__ = ["MOST_PORT", "MOST_VIEWED", "STRIP_SIZES", "VIEWERS", "CameraConfig", "Fit", "video_sizes"]
+__all__ = ["MOST_PORT", "MOST_VIEWED", "SIZE_LIMITS", "STRIP_SIZES", "VIEWERS", "CameraConfig", "Fit", "video_sizes"]
 
 Fit = Literal["native", "pad"]
 STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}

@@ -63,6 +63,7 @@ class VideoWriter:
         crf: int = 20,
         gop: int | None = None,
         b_frames: bool = True,
+        sync: bool = False,
     ):
         """Open the file.
 
@@ -75,12 +76,13 @@ class VideoWriter:
             gop: Frames from one key frame to the next; x264's own, at most 250, by default. A reader that wants one
                 frame decodes all from the key frame before it.
             b_frames: Allow frames that are predicted from later ones: smaller, slower to read in any order.
+            sync: Wait at the end until the file is on the disk.
 
         Raises:
             OSError: The file cannot be written; the error carries its name.
         """
         self.path = Path(path)
-        self.width, self.height = int(width), int(height)
+        self.width, self.height, self.sync = int(width), int(height), sync
         self.frames = 0
         """Frames written so far."""
         self._size = (self.height + self.height % 2, self.width + self.width % 2)
@@ -141,6 +143,9 @@ class VideoWriter:
             self._mux(self._stream.encode(None))
             container, self._container = self._container, None
             container.close()
+            if self.sync:
+                with self._part.open("rb") as file:
+                    os.fsync(file.fileno())
             os.replace(self._part, self.path)
         except OSError as error:
             self.discard()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
@@ -116,7 +116,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
         return {name: CAMERAS[name] for name in names}
 
     @property
-    def gym_kwargs(self) -> dict[str, Any]:
+    def gym_kwargs(self) -> dict[str, object]:
         """Options of `arena_newton.eval.gym.ArenaVectorEnv`.
 
         The start-up is inside the reset, so that a policy is first asked at step 0; ended worlds are frozen until
@@ -149,7 +149,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
         """
         from arena_newton.eval.gym import ArenaVectorEnv
 
-        return {task: {0: ArenaVectorEnv(task, n_envs, **self.gym_kwargs)} for task in self.tasks}
+        options = cast("dict[str, Any]", self.gym_kwargs)
+        return {task: {0: ArenaVectorEnv(task, n_envs, **options)} for task in self.tasks}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """What changes observations before the policy's own processors, and actions after them."""

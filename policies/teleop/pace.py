@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from arena_newton.robot import TICK
 
-__all__ = ["Pace", "Picture"]
+__all__ = ["Pace", "TimedPicture"]
 
 LATE = TICK
 """A tick that begins so much after its time is late [s]."""
@@ -78,7 +78,7 @@ class Pace:
         self._recent.append(now)
 
 
-class Picture:
+class TimedPicture:
     """A picture that is drawn now and then, when the time between two ticks allows it."""
 
     def __init__(self, draw: Callable[[], None], period: float):

@@ -75,7 +75,8 @@ class PageServer:
         self.port = int(listening.getsockname()[1])
         self._facts = {"kind": "facts", **facts, "frame": frame}
         hosts = [f"{name}:{self.port}" for name in (LOCAL, "localhost")]
-        self._hosts = hosts
+        self._named = [[host] for host in hosts]
+        """What the one `Host` of a request may be."""
         origin = frame.split("/", 3)[:3] if frame else None
         frames = "/".join(origin) if origin else "'none'"
         self._policy = (
@@ -155,7 +156,7 @@ class PageServer:
         """A file; None lets the socket's handshake go on; whatever does not name the token gets nothing."""
         token, _, path = request.path.partition("?")[0].removeprefix("/").partition("/")
         known = hmac.compare_digest(token.encode(), self._token.encode())
-        if not known or request.headers.get("Host") not in self._hosts:
+        if not known or request.headers.get_all("Host") not in self._named:
             return _response(http.HTTPStatus.NOT_FOUND, b"", "text/plain")
         if path == SOCKET:
             return None

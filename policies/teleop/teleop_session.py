@@ -21,7 +21,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeResult
 from arena_newton.kernels import tick as codes
 from arena_newton.pictures.camera import Camera
-from arena_newton.policies.teleop.pace import Pace, Picture
+from arena_newton.policies.teleop.pace import Pace, TimedPicture
 from arena_newton.policies.teleop.source import Telemetry, Wish
 from arena_newton.policies.teleop.standing import Stander
 from arena_newton.robot import TICK
@@ -137,7 +137,7 @@ class TeleopSession:
         self._ended = 0
         """Ticks since the episode ended."""
         self._image: np.ndarray | None = None
-        self._pictures = [Picture(draw, period) for draw, period in displays]
+        self._pictures = [TimedPicture(draw, period) for draw, period in displays]
         if camera is not None:
             self._lens = Camera.from_scene(
                 env.scene,
@@ -148,7 +148,7 @@ class TeleopSession:
                 samples=camera.samples,
                 lights=env.lights,
             )
-            self._pictures.append(Picture(self._look, PICTURE_PERIOD))
+            self._pictures.append(TimedPicture(self._look, PICTURE_PERIOD))
         self._qpos, self._qvel = (wp.to_torch(a) for a in (env.physics.qpos, env.physics.qvel))
 
     def _plan(self, index: int) -> PersonEpisode:

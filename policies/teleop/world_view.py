@@ -11,7 +11,7 @@ import http
 import io
 import math
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import newton.viewer
 import numpy as np
@@ -159,14 +159,14 @@ def _room_camera(env: ArenaEnv) -> tuple[np.ndarray, np.ndarray, float]:
 @contextlib.contextmanager
 def _guarded(port: int, token: str) -> Iterator[None]:
     """While viser starts, its server is made to check token, `Host` and `Origin`: it has no option for that."""
-    serve = websockets.asyncio.server.serve
+    serve: Callable[..., object] = websockets.asyncio.server.serve
     hosts = [f"{name}:{port}" for name in (LOCAL, "localhost")]
 
-    def guarded(*args: Any, process_request: Callable[..., Response | None], **options: Any) -> object:
+    def guarded(*args: object, process_request: Callable[..., Response | None], **options: object) -> object:
         def answer(connection: object, request: Request) -> Response | None:
             named = hmac.compare_digest(request.path.strip("/").encode(), token.encode())
-            wants_socket = request.headers.get("Upgrade", "").lower() == "websocket"
-            if request.headers.get("Host") not in hosts or (wants_socket and not named):
+            wants_socket = bool(request.headers.get_all("Upgrade"))
+            if request.headers.get_all("Host") not in [[host] for host in hosts] or (wants_socket and not named):
                 return Response(http.HTTPStatus.NOT_FOUND.value, "Not Found", Headers({"Content-Length": "0"}), b"")
             return process_request(connection, request)
 
@@ -177,4 +177,4 @@ def _guarded(port: int, token: str) -> Iterator[None]:
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+        websockets.asyncio.server.serve = serve  # type: ignore[assignment,misc]

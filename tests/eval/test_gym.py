@@ -319,6 +319,15 @@ def test_seeds_make_episodes(make):
         assert env.env.draws[world] == env.env.spec.draw(seed, "base", env.env.rules)
 
 
+def test_episodes_to_learn_from(make):
+    """Seeds of the range of demonstrations are of episodes that no evaluation has, and follow from the number alone."""
+    env = make("football", seed_range="demonstration")
+    _, info = env.reset(seed=20)
+    gym_id = tasks.get("football").gym_id
+    wanted = [seeding.recording_seed(gym_id, seeding.DEMONSTRATION, 1, repeat) for repeat in (0, 1)]
+    assert info["episode_seed"].tolist() == wanted and min(wanted) >= 2**31
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -366,6 +375,7 @@ def shared_env():
         ({"render_mode": "human"}, "render_mode human"),
         ({"image_size": (64,)}, "image_size"),
         ({"repeats": 0}, "repeats 0"),
+        ({"seed_range": "exam"}, "seed_range exam"),
         ({"max_episode_steps": 0}, "max_episode_steps 0"),
         ({"cameras": {"front": "nose"}, "image_size": (32, 32)}, "nose"),
     ],

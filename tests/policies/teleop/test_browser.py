@@ -251,7 +251,7 @@ def test_the_page_shows_the_world(running):
 
 
 def test_the_view_needs_token_and_origin(running):
-    """viser's socket opens for its own page with the token, and for nobody else."""
+    """The socket of viser opens for its own page with the token, and for nobody else."""
     _, page, _ = running
     frame = str(page.value("document.getElementById('frame').src"))
     own, inner = re.match(r"(http://[^/]+)/\?websocket=(ws://\S+)", frame).groups()

@@ -12,7 +12,7 @@ from arena_newton.data.episode import EpisodeFile
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.policies.teleop.driving import EVENTS, RANGES, Driver, Held, read_held
-from arena_newton.policies.teleop.pace import STARVED, Pace, Picture
+from arena_newton.policies.teleop.pace import STARVED, Pace, TimedPicture
 from arena_newton.policies.teleop.source import Telemetry, Wish
 from arena_newton.policies.teleop.standing import SECONDS, Stander
 from arena_newton.policies.teleop.teleop_session import TeleopSession
@@ -109,7 +109,7 @@ def test_pictures_are_put_off_before_ticks_are_late():
     def draw() -> None:
         clock.now += 3.0 * TICK
 
-    picture = Picture(draw, 0.1)
+    picture = TimedPicture(draw, 0.1)
     drawn = []
     for _ in range(500):
         pace.wait()
@@ -119,7 +119,7 @@ def test_pictures_are_put_off_before_ticks_are_late():
     assert STARVED <= np.median(np.diff(drawn)) <= STARVED + 0.2
     assert pace.factor > 0.95
 
-    cheap = Picture(lambda: None, 0.1)
+    cheap = TimedPicture(lambda: None, 0.1)
     for _ in range(500):
         pace.wait()
         cheap.try_draw(pace)

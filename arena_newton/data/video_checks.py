@@ -1,0 +1,198 @@
+"""Decodes every frame of a dataset's videos and holds them against the tables and the recorded MP4s."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+
+from arena_newton.data.dataset_files import DatasetFiles, EpisodeRow, VideoPart
+from arena_newton.data.frames import OpenVideo
+from arena_newton.errors import ArenaError, InputError
+
+__all__ = ["DatasetMismatch", "check_videos"]
+
+MEAN_EVERY = 5
+"""Of so many frames one counts for the mean of an episode's pictures."""
+MEAN_TOLERANCE = 4.0
+"""Largest difference [grey levels] between the mean of decoded frames and that of the statistics, which were taken
+before encoding: x264 changes a mean by less than 1, and a fifth of the frames shows it within 2."""
+COMPARED = 12
+"""Frames of an episode that are compared with the recorded MP4's, bit for bit: its first, its last, some between."""
+
+
+class DatasetMismatch(ArenaError):
+    """The first thing in a dataset that is not as it should be."""
+
+    def __init__(self, file: Path | str, message: str, *, episode: int | None = None, row: int | None = None):
+        """Name it.
+
+        Args:
+            file: File of the dataset.
+            message: What is wrong, the column included.
+            episode: Number of the episode.
+            row: Its row or frame.
+        """
+        parts = [str(file)]
+        parts += [f"episode {episode}"] if episode is not None else []
+        parts += [f"row {row}"] if row is not None else []
+        super().__init__(f"{', '.join(parts)}: {message}")
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Frames of a recorded MP4 that are compared."""
+
+    path: Path
+    frames: Mapping[int, np.ndarray]
+
+
+def check_videos(
+    files: DatasetFiles,
+    key: str,
+    means: Sequence[np.ndarray],
+    sources: Mapping[int, Path],
+    progress: Iterator[None] | None = None,
+) -> int:
+    """Decode all frames of a camera.
+
+    Args:
+        files: The dataset.
+        key: Feature of the camera.
+        means: Mean of each episode's pictures by its statistics, 0 to 1, shape [3].
+        sources: Recorded MP4 of each episode, where there is one.
+        progress: Advanced once per frame.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        DatasetMismatch: A video is not what the tables say.
+    """
+    by_file: dict[Path, list[tuple[EpisodeRow, VideoPart]]] = {}
+    for row in files.episode_rows:
+        part = files.video(row, key)
+        if part.frames != row.length:
+            raise DatasetMismatch(part.path, f"{part.frames} frames for {row.length} rows", episode=row.index)
+        by_file.setdefault(part.path, []).append((row, part))
+    stray = sorted(set((files.root / "videos" / key).rglob("*.mp4")) - set(by_file))
+    if stray:
+        raise DatasetMismatch(stray[0], "no episode has frames in it")
+    total = 0
+    for path, parts in by_file.items():
+        expected = 0
+        for row, part in parts:
+            if part.first != expected:
+                raise DatasetMismatch(path, f"begins at frame {part.first}, expected {expected}", episode=row.index)
+            expected += part.frames
+        try:
+            total += _check_file(files, key, path, parts, means, sources, progress)
+        except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
+            raise DatasetMismatch(path, f"cannot be decoded ({type(error).__name__})") from error
+    return total
+
+
+def _check_file(
+    files: DatasetFiles,
+    key: str,
+    path: Path,
+    parts: Sequence[tuple[EpisodeRow, VideoPart]],
+    means: Sequence[np.ndarray],
+    sources: Mapping[int, Path],
+    progress: Iterator[None] | None,
+) -> int:
+    info = files.features[key].get("info")
+    about = info if isinstance(info, dict) else {}
+    shape = files.features[key].get("shape")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        codec = stream.codec_context
+        _check_stream(path, codec, stream, about, shape, files.fps)
+        codec.thread_count = 1
+        frames = _decoded(container, stream, path, files.fps, about)
+        for row, part in parts:
+            source = _source(sources.get(row.index), part, row)
+            sums, counted = np.zeros(3), 0
+            for number in range(part.frames):
+                frame = next(frames, None)
+                if frame is None:
+                    raise DatasetMismatch(path, "the video has no frame for it", episode=row.index, row=number)
+                wanted = source is not None and number in source.frames
+                if wanted or number % MEAN_EVERY == 0:
+                    picture = frame.to_ndarray(format="rgb24")
+                    if number % MEAN_EVERY == 0:
+                        sums += picture.reshape(-1, 3).mean(axis=0)
+                        counted += 1
+                    if wanted and source is not None and not np.array_equal(picture, source.frames[number]):
+                        message = f"{key} differs from frame {number} of {source.path}"
+                        raise DatasetMismatch(path, message, episode=row.index, row=number)
+                if progress is not None:
+                    next(progress, None)
+            apart = np.abs(sums / counted - 255.0 * np.asarray(means[row.index]).reshape(3)).max()
+            if not apart <= MEAN_TOLERANCE:
+                message = f"{key}: mean of the pictures is {apart:.1f} grey levels from that of the statistics"
+                raise DatasetMismatch(path, message, episode=row.index)
+        if next(frames, None) is not None:
+            message = f"{key}: the video goes on after the last episode's last frame"
+            raise DatasetMismatch(path, message, episode=parts[-1][0].index)
+    return sum(part.frames for _, part in parts)
+
+
+def _check_stream(
+    path: Path,
+    codec: av.VideoCodecContext,
+    stream: av.VideoStream,
+    about: Mapping[str, object],
+    shape: object,
+    fps: int,
+) -> None:
+    """Size, codec and rate, which `info.json` names."""
+    size = [codec.height, codec.width, 3]
+    even = [n + n % 2 for n in shape[:2]] if isinstance(shape, list | tuple) and len(shape) == 3 else None
+    if even != size[:2]:
+        raise DatasetMismatch(path, f"pictures are {size[1]}x{size[0]}, info.json says shape {shape}")
+    named = about.get("video.codec")
+    if named is not None and named != codec.codec.canonical_name:
+        raise DatasetMismatch(path, f"codec is {codec.codec.canonical_name}, info.json says {named}")
+    rate = float(stream.average_rate or 0)
+    if abs(rate - fps) > 1e-3:
+        raise DatasetMismatch(path, f"{rate:g} frames per second, info.json says {fps}")
+
+
+def _decoded(
+    container: av.container.InputContainer, stream: av.VideoStream, path: Path, fps: int, about: Mapping[str, object]
+) -> Iterator[av.VideoFrame]:
+    """Frames in order; each must be at its time, and key frames as often as `info.json` says."""
+    group, since = about.get("video.g"), 0
+    for number, frame in enumerate(container.decode(stream)):
+        if frame.pts is None or round(float(frame.pts * stream.time_base) * fps * 1000) != number * 1000:
+            raise DatasetMismatch(path, f"frame {number} is at another time than {number / fps:g} s")
+        since = 0 if frame.key_frame else since + 1
+        if isinstance(group, int) and since >= group:
+            raise DatasetMismatch(path, f"no key frame in {since + 1} frames, info.json says one in {group}")
+        yield frame
+
+
+def _source(path: Path | None, part: VideoPart, row: EpisodeRow) -> _Source | None:
+    """Some frames of the recorded MP4.
+
+    Raises:
+        InputError: It cannot be read.
+        DatasetMismatch: It has another number of frames.
+    """
+    if path is None:
+        return None
+    try:
+        video = OpenVideo(path)
+    except (av.error.FFmpegError, OSError, IndexError) as error:
+        raise InputError(f"{path}: not a readable video ({type(error).__name__})") from error
+    try:
+        if len(video.times) != part.frames:
+            raise DatasetMismatch(part.path, f"{part.frames} frames, {path} has {len(video.times)}", episode=row.index)
+        chosen = sorted({int(n) for n in np.linspace(0, part.frames - 1, min(COMPARED, part.frames)).round()})
+        return _Source(path, {number: video.read(number) for number in chosen})
+    finally:
+        video.close()

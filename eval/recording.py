@@ -1,0 +1,149 @@
+"""Recording as a sink of evaluation: the recorder of an environment, what its files say of the run, what is recorded.
+
+A run with `--record` writes `episodes/<episode>.npz` and `episodes/videos/` beside its journal; an episode's line is
+appended once its files are on the disk.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import av
+
+from arena_newton import rule_sets
+from arena_newton import tasks as task_specs
+from arena_newton.data.demonstration import DemonstrationRecorder, episode_label
+from arena_newton.data.episode import EpisodeFile
+from arena_newton.disturbance import ActionNoise
+from arena_newton.errors import InputError
+from arena_newton.eval.config import RunConfig
+from arena_newton.eval.folder import EPISODES
+from arena_newton.eval.identity import PACKAGE, hash_paths, moving_versions, scene_files
+from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.plan import Episode
+from arena_newton.eval.records import JsonObject
+from arena_newton.interfaces import EpisodeResult
+from arena_newton.text import counted
+
+__all__ = [
+    "agrees",
+    "demonstration_recorder",
+    "disturbance_of",
+    "encoding_threads",
+    "facts_of",
+    "is_recorded",
+    "outcome_lines",
+]
+
+MOST_THREADS = 16
+"""Threads that encode pictures, at most; otherwise as many as there are cores."""
+
+
+def facts_of(
+    config: RunConfig, task: str, tracker: str, environment: JsonObject, versions: Mapping[str, str | None]
+) -> JsonObject:
+    """What an episode's file says of the run: what its bytes depend on, and no time, folder or number of worlds.
+
+    Only what concerns the episode's own task and tracker, so that its bytes do not depend on what else was played.
+    """
+    identity, flags = config.identity(), config.flags
+    left_out = ("task", "mode", "tracker", "seeds", "repeats", "keep", "checkpoint", "tracker_facts", "scenes")
+    facts: JsonObject = {key: value for key, value in identity.items() if key not in left_out}
+    comparable = {key: str(value).split(":")[0] if key == "device" else value for key, value in environment.items()}
+    return facts | {
+        "checkpoint": config.checkpoint_hashes[tracker],
+        "tracker_facts": (config.tracker_facts or {}).get(tracker),
+        "rules_hash": rule_sets.get(flags.rules).hash_for((task,)),
+        "scenes": hash_paths(PACKAGE, scene_files(PACKAGE, (task,), task_specs.names())),
+        "environment": comparable,
+        "versions": moving_versions(dict(versions)) | {"av": av.__version__},
+    }
+
+
+def demonstration_recorder(config: RunConfig, folder: Path, facts: JsonObject) -> DemonstrationRecorder | None:
+    """The recorder of an environment; None where nothing is recorded."""
+    if config.recording is None:
+        return None
+    return DemonstrationRecorder(
+        folder / EPISODES,
+        cameras=config.recording,
+        depth=config.flags.record_depth,
+        only_success=config.flags.keep is not None,
+        facts=facts,
+        threads=encoding_threads(),
+    )
+
+
+def encoding_threads() -> int:
+    """Threads that encode pictures: one per core that this process may use, up to `MOST_THREADS`."""
+    return max(1, min(MOST_THREADS, len(os.sched_getaffinity(0))))
+
+
+def disturbance_of(config: RunConfig, ticks: int) -> ActionNoise | None:
+    """What disturbs the execution of episodes of so many ticks at most; None where nothing does."""
+    return ActionNoise(ticks) if config.flags.disturb else None
+
+
+def is_recorded(config: RunConfig, folder: Path, record: EpisodeRecord, episode: Episode) -> bool:
+    """Whether the files of a journalled episode are whole, or it has none to write.
+
+    Files get their names when they are complete, so that this finds what was removed, cut or exchanged later.
+    """
+    if config.recording is None or record.outcome == "error" or record.steps < 1:
+        return True
+    if config.flags.keep is not None and record.outcome != "success":
+        return True
+    path = folder / EPISODES / f"{episode_label(episode)}.npz"
+    try:
+        if path.is_symlink():
+            return False
+        file = EpisodeFile(path)
+        same = file.integer("arena_episode_seed") == episode.episode_seed and file.rows == record.steps
+        return same and set(file.cameras) == set(config.recording) and _whole(file, file.cameras)
+    except InputError:
+        return False
+
+
+def _whole(file: EpisodeFile, cameras: Iterable[str]) -> bool:
+    """Whether each video has a frame per row, by its index."""
+    for camera in cameras:
+        try:
+            with av.open(str(file.video(camera))) as video:
+                if video.streams.video[0].frames != file.rows:
+                    return False
+        except (av.error.FFmpegError, OSError, IndexError):
+            return False
+    return True
+
+
+def agrees(record: EpisodeRecord, result: EpisodeResult) -> bool:
+    """Whether an episode that was played again ended as the journal says."""
+    return (record.outcome, record.reason, record.steps) == (result.outcome, result.reason, result.steps)
+
+
+def outcome_lines(config: RunConfig, folder: Path, records: Sequence[EpisodeRecord]) -> list[str]:
+    """What was recorded, what was dropped, where it is, and how a dataset is made of it."""
+    if config.recording is None:
+        return []
+    keep = config.flags.keep
+    kept = [r for r in records if r.steps and (r.outcome == "success" if keep is not None else r.outcome != "error")]
+    dropped = Counter(r.outcome for r in records) - Counter(r.outcome for r in kept)
+    size = sum(file.stat().st_size for file in (folder / EPISODES).rglob("*") if file.is_file())
+    rows = sum(r.steps for r in kept)
+    line = f"recorded: {counted(len(kept), 'episode')}, {rows:,} ticks, {size / 1e6:,.1f} MB -> {folder / EPISODES}"
+    found = [line]
+    if dropped:
+        words = ", ".join(f"{number} {outcome}" for outcome, number in sorted(dropped.items()))
+        found.append(f"not kept: {words}")
+    if keep is not None:
+        groups = Counter((r.task, r.tracker, r.mode) for r in kept)
+        planned = dict.fromkeys((e.task, e.tracker, e.mode) for e in config.episodes)
+        found += [
+            f"{' '.join(group)}: {groups[group]} of {keep} successes, no attempts left"
+            for group in planned
+            if groups[group] < keep
+        ]
+    return [*found, f"dataset: python -m arena_newton.data build {folder} --out <dataset>"]

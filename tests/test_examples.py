@@ -1,0 +1,72 @@
+"""The examples: each runs, says what it shows, is short, and prints what its page promises."""
+
+import ast
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+MOST_LINES = 60
+SHORT: dict[str, list[str]] = {
+    "compare_runs": ["--max-steps", "4", "--out", "OUT"],
+    "drive_by_code": ["--max-steps", "60"],
+    "first_episode": ["--max-steps", "8", "--out", "OUT"],
+    "own_policy": ["--max-steps", "15"],
+    "own_tracker": ["--max-steps", "4"],
+    "swap": ["--max-steps", "4", "--episodes", "2"],
+    "usd_variant": ["--max-steps", "4", "--out", "OUT"],
+}
+"""Example → flags with which it takes seconds; OUT is a folder of the test's own."""
+SAYS = {
+    "compare_runs": r"expert: 0 of 4, 0 that the other loses\n.*stand: 0 of 4.*\nprobability .* by luck: 1\n",
+    "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
+    "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
+    "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
+    "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
+    "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
+    "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
+}
+"""Example → what its output holds."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Two threads that wait for each other on a busy machine make small networks a hundred times slower."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_every_example_is_run():
+    """No example is without a test, and no test without its example."""
+    assert {path.stem for path in EXAMPLES} == set(SHORT) == set(SAYS)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_example_says_what_it_shows(path):
+    """An example is short, begins with what it shows and how it is called, and uses public names alone."""
+    text = path.read_text()
+    said = ast.get_docstring(ast.parse(text)) or ""
+    assert text.count("\n") <= MOST_LINES
+    assert "Shows: " in said and f"python examples/{path.name}" in said
+    assert not re.search(r"\b(?!self)\w+\._[a-z]|import _[a-z]", text)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_example_runs(path, tmp_path, monkeypatch, capsys):
+    """An example runs through, with less to do than it does by default, and prints what it is about."""
+    flags = [str(tmp_path / "out") if flag == "OUT" else flag for flag in SHORT[path.stem]]
+    monkeypatch.setattr(sys, "argv", [str(path), *flags])
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(path), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert re.search(SAYS[path.stem], printed), printed
+    if "OUT" in SHORT[path.stem]:
+        assert any((tmp_path / "out").rglob("*.*"))
