@@ -12,8 +12,10 @@ from arena_newton.data.data_options import (
     BuildOptions,
     CleanOptions,
     DatasetBenchOptions,
+    InspectOptions,
     MergeOptions,
     SplitOptions,
+    StatsOptions,
     VerifyOptions,
 )
 from arena_newton.errors import InputError
@@ -73,6 +75,18 @@ COMMANDS: dict[str, DataCommand] = {
         purpose="hold out episodes by their seeds",
         options=SplitOptions,
         work="sets:split",
+    ),
+    "stats": DataCommand(
+        words="stats <datasets or recordings ...>",
+        purpose="print figures of episodes, and those unlike the others",
+        options=StatsOptions,
+        work="episode_figures:stats",
+    ),
+    "inspect": DataCommand(
+        words="inspect <datasets or recordings ...> --out <page.html>",
+        purpose="show episodes as one page: figures, phases, curves, film strips",
+        options=InspectOptions,
+        work="inspection:inspect",
     ),
     "bench": DataCommand(
         words="bench <dataset> [--recordings <recordings> ...]",

@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["BuildOptions", "CleanOptions", "DatasetBenchOptions", "MergeOptions", "SplitOptions", "VerifyOptions"]
+__all__ = [
+    "BuildOptions",
+    "CleanOptions",
+    "DatasetBenchOptions",
+    "InspectOptions",
+    "MergeOptions",
+    "SplitOptions",
+    "StatsOptions",
+    "VerifyOptions",
+]
 
 
 @dataclass(frozen=True)
@@ -94,3 +103,23 @@ class SplitOptions:
     """Probability that an episode is held out."""
     seed: int = 0
     """Another number draws other sides."""
+
+
+@dataclass(frozen=True)
+class StatsOptions:
+    """Print length, jerk, stillness, final pose and tracking error, and rank the episodes unlike the others."""
+
+    json: bool = False
+    """Print one JSON array of all episodes, the most unusual first."""
+
+
+@dataclass(frozen=True)
+class InspectOptions:
+    """Write one page that needs nothing else: figures, outliers, phases, curves and film strips."""
+
+    out: Path = Path("episodes.html")
+    """The page; one of that name is replaced."""
+    episodes: int = 40
+    """Most episodes in full, the most unusual ones; the table has all."""
+    pictures: int = 10
+    """Pictures of a film strip."""
