@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,8 @@ from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval import plan
+from arena_newton.eval.bench_figure import BenchFigure
+from arena_newton.eval.bench_recording import recording_figures
 from arena_newton.eval.options import BenchOptions
 from arena_newton.interfaces import Physics
 from arena_newton.pictures.recorder import EpisodeRecorder
@@ -38,27 +40,6 @@ from arena_newton.trackers.motions.generator import ReferenceGenerator
 __all__ = ["BenchFigure", "run"]
 
 NEEDS_CUDA = "not measured here (needs CUDA)"
-
-
-@dataclass(frozen=True)
-class BenchFigure:
-    """One line of the bench."""
-
-    name: str
-    bar: float
-    unit: str
-    at_most: bool
-    """True when smaller is better."""
-    value: float | None = None
-    """None when it was not measured."""
-    note: str = ""
-
-    @property
-    def verdict(self) -> str:
-        """``pass``, ``MISS`` or ``-``."""
-        if self.value is None:
-            return "-"
-        return "pass" if (self.value <= self.bar if self.at_most else self.value >= self.bar) else "MISS"
 
 
 def run(options: BenchOptions) -> int:
@@ -345,5 +326,6 @@ _ITEMS: dict[str, Callable[[BenchOptions], Iterator[BenchFigure]]] = {
     "throughput": _throughput,
     "camera": _camera,
     "pictures": _pictures,
+    "recording": recording_figures,
     "episodes": _episodes,
 }

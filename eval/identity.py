@@ -29,8 +29,9 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
-_REPORTING = """__main__ bench certify config console document engines folder html_report identity journal options
-    original_format progress recording records report rerecord results rounds stats success_film tables wording"""
+_REPORTING = """__main__ bench bench_figure bench_recording certify config console document engines folder
+    html_report identity journal options original_format progress recording records report rerecord
+    results rounds stats success_film tables wording"""
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 UNHASHED = (
     *(f"eval/{name}.py" for name in _REPORTING.split()),

@@ -224,7 +224,8 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: help tick generator throughput camera pictures episodes tests, or `all` (all but tests)."""
+    """What to measure: help tick generator throughput camera pictures recording episodes tests, or `all`
+    (all but tests)."""
     checkpoint: str | None = None
     """Weights of TWIST2; those that come with the package when none are named."""
     worlds: int = 20
@@ -235,6 +236,14 @@ class BenchOptions:
     """Worlds of the camera on CUDA."""
     rounds: int = 20
     """Rounds of each ratio; their medians are compared."""
+    recording_episodes: int = 2
+    """Episodes of `recording`; the figure to reach is for 100 VisNavi ones."""
+    recording_worlds: int = 2
+    """Worlds of `recording`; 100 on CUDA for the figure to reach."""
+    recording_size: str = "224x224"
+    """Size of the recorded pictures [px]."""
+    recording_task: str = "vis_navi"
+    """Task that is recorded."""
     json: bool = False
     """Print one JSON array instead of the table."""
 

@@ -68,6 +68,8 @@ def run(options: RecordOptions, factories: Factories | None = None) -> int:
     stems = [file.stem for file in files]
     groups: dict[tuple[str, ...], list[EpisodeFile]] = {}
     for file in files:
+        if "arena_cleaned" in file:
+            raise InputError(f"{file.path}: was cleaned, rows are missing; name the recording that it was made of")
         if stems.count(file.stem) > 1:
             raise InputError(f"{source}: {file.stem} is there twice")
         names = ("arena_task", "arena_tracker", "arena_mode", "arena_rules")
@@ -152,7 +154,9 @@ def _checked(options: RecordOptions, key: tuple[str, ...], group: Sequence[Episo
     """
     task, tracker, mode, rules, _ = key
     stored = group[0].json("arena_configuration")
-    drive, fast = stored.get("drive", "auto"), stored.get("fast_physics", False)
+    drive, fast = stored.get("drive", "auto"), stored.get("fast_physics", False) or options.fast_physics
+    if "environment" not in stored:  # a person's session names the environment's drive, which --drive may not know
+        drive = "auto"
     engine = stored.get("engine", "mujoco") if options.engine == "auto" else options.engine
     flags = RunOptions(
         task=(task,),
@@ -188,7 +192,12 @@ def _refuse_differences(
     options: RecordOptions, config: RunConfig, file: EpisodeFile, environment: Mapping[str, object]
 ) -> None:
     """Hold what is installed here to what a file says; what it does not say is not compared."""
-    stored, (tracker,) = file.json("arena_configuration"), config.flags.tracker
+    stored, (tracker,) = dict(file.json("arena_configuration")), config.flags.tracker
+    if environment and "environment" not in stored:
+        named = {key: stored[key] for key in environment if key in stored}
+        stored, environment = {"environment": named}, {key: environment[key] for key in named}
+    elif "environment" not in stored:
+        return
     facts = recording.facts_of(config, config.flags.task[0], tracker, plain_facts(environment), versions())
     compared = [key for key in MOVING if key in stored and (key != "environment" or environment)]
     now = {key: facts.get(key) for key in compared}

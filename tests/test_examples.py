@@ -1,12 +1,15 @@
 """The examples: each runs, says what it shows, is short, and prints what its page promises."""
 
 import ast
+import importlib.util
 import re
 import runpy
 import sys
 from pathlib import Path
 
 import pytest
+
+from arena_newton.extras import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -17,6 +20,7 @@ SHORT: dict[str, list[str]] = {
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
+    "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
     "usd_variant": ["--max-steps", "4", "--out", "OUT"],
 }
@@ -27,6 +31,7 @@ SAYS = {
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
+    "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }
@@ -62,6 +67,10 @@ def test_example_says_what_it_shows(path):
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(path, tmp_path, monkeypatch, capsys):
     """An example runs through, with less to do than it does by default, and prints what it is about."""
+    if path.stem == "record_and_build":
+        for module in EXTRAS["data"]:
+            if importlib.util.find_spec(module) is None:
+                pytest.skip(f"needs the extra [data]: {module} is not installed")
     flags = [str(tmp_path / "out") if flag == "OUT" else flag for flag in SHORT[path.stem]]
     monkeypatch.setattr(sys, "argv", [str(path), *flags])
     monkeypatch.chdir(tmp_path)

@@ -216,11 +216,17 @@ class DatasetFiles:
         Raises:
             InputError: One is missing, ragged or no numbers.
         """
+        check_size(path, PARQUET_BYTES)
+        try:
+            known = pyarrow.parquet.read_schema(path).names
+        except (pyarrow.ArrowException, OSError, ValueError) as error:
+            raise InputError(f"{path}: not a readable parquet file ({type(error).__name__})") from error
+        for name in names:
+            if name not in known:
+                raise InputError(f"{path}: has no column {name}")
         table = self.table(path, names)
         found = {}
         for name in names:
-            if name not in table.column_names:
-                raise InputError(f"{path}: has no column {name}")
             column = table.column(name).combine_chunks()
             kind = column.type
             try:

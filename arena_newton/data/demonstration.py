@@ -250,6 +250,7 @@ class DemonstrationRecorder(Recorder):
             return
         self._discard()
         self._env = env
+        self._described = env.describe()
         self._slots, self._depth_slots = {}, {}
         front = self.cameras.get("front")
         # Depths of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
@@ -337,23 +338,19 @@ class DemonstrationRecorder(Recorder):
             missing = mask & ~observation.mask
         if missing.any():
             env.render(camera, missing)
-        chosen = torch.tensor(self._acting, device=env.torch_device)
-        slot = self._slot(self._slots, name, wp.to_torch(camera.image), chosen)
-        depth = None
-        if self.depth:
-            depth = self._slot(self._depth_slots, name, camera.distance_picture().half(), chosen)
+        slot = self._slot(self._slots, name, wp.to_torch(camera.image))
+        depth = self._slot(self._depth_slots, name, camera.distance_picture().half()) if self.depth else None
         for row, world in enumerate(self._acting):
             stream = self._streams[world]
             self._encoders.submit(stream.thread, partial(self._encode, stream, name, row, slot, depth))
 
-    def _slot(
-        self, slots: dict[str, PictureSlots], name: str, pictures: torch.Tensor, chosen: torch.Tensor
-    ) -> PictureSlot:
+    def _slot(self, slots: dict[str, PictureSlots], name: str, pictures: torch.Tensor) -> PictureSlot:
         """Pictures of the worlds that act, copied to the host."""
         if name not in slots:
             slots[name] = PictureSlots(pictures, None if self._threads else 1)
-        slot = slots[name].take(len(chosen))
-        slot.fill(pictures if len(chosen) == len(pictures) else pictures[chosen])
+        slot = slots[name].take(len(self._acting))
+        every = len(self._acting) == len(pictures)
+        slot.fill(pictures if every else pictures[torch.tensor(self._acting, device=pictures.device)])
         return slot
 
     def _encode(self, stream: _Stream, name: str, row: int, slot: PictureSlot, depth: PictureSlot | None) -> None:
@@ -391,7 +388,7 @@ class DemonstrationRecorder(Recorder):
         wanted = result.outcome == "success" or (not self.only_success and result.outcome != "error")
         if wanted and stream.rows:
             last = self._qpos[world].cpu().numpy().copy()
-            job = partial(self._save, stream, result, partial(self._fields, env, stream, result, last, env.describe()))
+            job = partial(self._save, stream, result, partial(self._fields, env, stream, result, last, self._described))
         else:
             job = partial(self._drop, stream, result)
         self._encoders.submit(stream.thread, job)

@@ -32,8 +32,10 @@ class OpenVideo:
         self.path = path
         self._container = av.open(str(path))
         self._stream = self._container.streams.video[0]
+        if self._stream.codec_context is None:
+            self._container.close()
+            raise OSError(f"{path}: holds no video that can be decoded")
         # One thread: frames of one group depend on each other, and a reader has processes of its own.
-        self._stream.thread_type = "SLICE"
         self._stream.codec_context.thread_count = 1
         packets = [(p.pts, p.is_keyframe) for p in self._container.demux(self._stream) if p.pts is not None]
         self.times: list[int] = sorted(pts for pts, _ in packets)

@@ -11,11 +11,9 @@ the folders, the number of worlds that recorded or the hash seed of the process.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import importlib.metadata
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,10 +33,11 @@ from arena_newton.data.dataset_files import read_json
 from arena_newton.data.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.image_statistics import statistics
 from arena_newton.data.layouts import Layout, described_protocol, layout, modality
+from arena_newton.data.new_folder import new_folder
 from arena_newton.data.row_statistics import row_statistics
 from arena_newton.data.source_videos import SourceVideo, source_video
-from arena_newton.errors import ArenaError, InputError
-from arena_newton.files import PARTIAL, replace_atomically
+from arena_newton.errors import InputError
+from arena_newton.files import replace_atomically
 from arena_newton.text import counted
 
 if TYPE_CHECKING:
@@ -65,8 +64,6 @@ FACTS = tuple(
     )
 )
 """Fields of an episode that a dataset names; they are read at once."""
-LOCK = f"{PARTIAL}.lock"
-"""Ending of the file that is locked while a dataset is built."""
 
 
 @dataclass(frozen=True)
@@ -239,13 +236,16 @@ def write_dataset(
         ArenaError: It cannot be written.
     """
     check_version()
-    with _growing(out) as folder:
-        temporary = folder / "temporary"
+    with new_folder(out) as folder:
+        temporary, growing = folder / "temporary", folder / "growing"
         temporary.mkdir()
         with _in_folder(temporary), _own_functions(kind, labels), _quiet_video():
-            _write(chosen, folder / "dataset", temporary, kind=kind, labels=labels, repo_id=repo_id, file_mb=file_mb)
-        _finish(chosen, folder / "dataset", kind=kind, labels=labels)
-        os.rename(folder / "dataset", out)
+            _write(chosen, growing, temporary, kind=kind, labels=labels, repo_id=repo_id, file_mb=file_mb)
+        _finish(chosen, growing, kind=kind, labels=labels)
+        shutil.rmtree(temporary)
+        for entry in growing.iterdir():
+            entry.rename(folder / entry.name)
+        growing.rmdir()
 
 
 def check_version() -> None:
@@ -257,35 +257,6 @@ def check_version() -> None:
     version = importlib.metadata.version("lerobot")
     if version != LEROBOT:
         raise InputError(f"data build: knows the writer of lerobot {LEROBOT}, {version} is installed")
-
-
-@contextlib.contextmanager
-def _growing(out: Path) -> Iterator[Path]:
-    """The folder in which a dataset grows, emptied; it is removed at the end of the block, whatever happens."""
-    part, lock = out.with_name(out.name + PARTIAL), out.with_name(out.name + LOCK)
-    if out.exists() or out.is_symlink():
-        raise InputError(f"--out {out}: exists; remove it or name another folder")
-    if not out.name:
-        raise InputError(f"--out {out}: is no name of a folder")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if part.exists() and (part.is_symlink() or not lock.exists()):
-            raise InputError(f"--out {out}: {part} is in the way, and no build made it")
-        with os.fdopen(os.open(lock, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o644), "w") as held:
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"--out {out}: another build is writing it") from None
-            if part.exists():
-                shutil.rmtree(part)
-            part.mkdir()
-            try:
-                yield part
-            finally:
-                shutil.rmtree(part, ignore_errors=True)
-                lock.unlink(missing_ok=True)
-    except OSError as error:
-        raise ArenaError(f"{out}: the dataset cannot be written ({error})") from error
 
 
 @contextlib.contextmanager
@@ -316,12 +287,14 @@ def _own_functions(kind: Layout, labels: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet_video() -> Iterator[None]:
-    """Let FFmpeg speak of errors only: it tells every file that is joined. Afterwards it has its own level again."""
+    """Let FFmpeg speak of errors only: LeRobot lets it print, and it tells every file that is joined."""
+    before = av.logging.get_level()
     av.logging.set_libav_level(av.logging.ERROR)
     try:
         yield
     finally:
         av.logging.set_libav_level(av.logging.INFO)
+        av.logging.set_level(before)
 
 
 def _features(chosen: Chosen, kind: Layout, labels: str) -> dict[str, dict[str, object]]:
@@ -454,9 +427,9 @@ def _origin(chosen: Chosen, kind: Layout, labels: str) -> dict[str, object]:
         "layout": kind.name,
         "labels": labels,
         "cameras": {kind.image_key(camera): camera for camera in chosen.cameras},
-        "seed_ranges": sorted({episode["seed_range"] for episode in episodes}),
-        "trackers": sorted({episode["tracker"] for episode in episodes}),
-        "policies": sorted({episode["policy"] for episode in episodes}),
+        "seed_ranges": sorted({str(episode["seed_range"]) for episode in episodes}),
+        "trackers": sorted({str(episode["tracker"]) for episode in episodes}),
+        "policies": sorted({str(episode["policy"]) for episode in episodes}),
         "versions": {name: importlib.metadata.version(name) for name in LIBRARIES},
         "configurations": dict(sorted(configurations.items())),
         "episodes": episodes,

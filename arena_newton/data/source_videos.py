@@ -63,6 +63,8 @@ def _check(video: SourceVideo, rows: int) -> None:
     try:
         with av.open(str(video.path)) as container:
             stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise ValueError("no decoder")
             about = stream.codec_context.width, stream.codec_context.height, stream.codec_context.codec.canonical_name
             rate = float(stream.average_rate or 0)
             frames = sum(packet.size > 0 for packet in container.demux(stream))

@@ -15,11 +15,14 @@ from arena_newton.errors import ArenaError, InputError
 
 __all__ = ["DatasetMismatch", "check_videos"]
 
-MEAN_EVERY = 5
-"""Of so many frames one counts for the mean of an episode's pictures."""
-MEAN_TOLERANCE = 4.0
+MEAN_TOLERANCE = 3.0
 """Largest difference [grey levels] between the mean of decoded frames and that of the statistics, which were taken
-before encoding: x264 changes a mean by less than 1, and a fifth of the frames shows it within 2."""
+before encoding: x264 changes it by less than 1."""
+RED_GREEN_BLUE = np.array([[1.164, 0.0, 1.596], [1.164, -0.392, -0.813], [1.164, 2.017, 0.0]])
+"""Colour of luma and chroma less `BLACK` (ITU-R BT.601, limited range). Means can be converted, as it is linear."""
+BLACK = np.array([16.0, 128.0, 128.0])
+TIME_TOLERANCE = 1e-3
+"""Largest difference of a frame's time from its number, in frames."""
 COMPARED = 12
 """Frames of an episode that are compared with the recorded MP4's, bit for bit: its first, its last, some between."""
 
@@ -110,28 +113,27 @@ def _check_file(
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         codec = stream.codec_context
+        if codec is None:
+            raise DatasetMismatch(path, "holds no video that can be decoded")
         _check_stream(path, codec, stream, about, shape, files.fps)
         codec.thread_count = 1
         frames = _decoded(container, stream, path, files.fps, about)
         for row, part in parts:
             source = _source(sources.get(row.index), part, row)
-            sums, counted = np.zeros(3), 0
+            sums = np.zeros(3)
             for number in range(part.frames):
                 frame = next(frames, None)
                 if frame is None:
                     raise DatasetMismatch(path, "the video has no frame for it", episode=row.index, row=number)
-                wanted = source is not None and number in source.frames
-                if wanted or number % MEAN_EVERY == 0:
+                sums += _mean(frame)
+                if source is not None and number in source.frames:
                     picture = frame.to_ndarray(format="rgb24")
-                    if number % MEAN_EVERY == 0:
-                        sums += picture.reshape(-1, 3).mean(axis=0)
-                        counted += 1
-                    if wanted and source is not None and not np.array_equal(picture, source.frames[number]):
+                    if not np.array_equal(picture, source.frames[number]):
                         message = f"{key} differs from frame {number} of {source.path}"
                         raise DatasetMismatch(path, message, episode=row.index, row=number)
                 if progress is not None:
                     next(progress, None)
-            apart = np.abs(sums / counted - 255.0 * np.asarray(means[row.index]).reshape(3)).max()
+            apart = np.abs(sums / part.frames - 255.0 * np.asarray(means[row.index]).reshape(3)).max()
             if not apart <= MEAN_TOLERANCE:
                 message = f"{key}: mean of the pictures is {apart:.1f} grey levels from that of the statistics"
                 raise DatasetMismatch(path, message, episode=row.index)
@@ -139,6 +141,19 @@ def _check_file(
             message = f"{key}: the video goes on after the last episode's last frame"
             raise DatasetMismatch(path, message, episode=parts[-1][0].index)
     return sum(part.frames for _, part in parts)
+
+
+def _mean(frame: av.VideoFrame) -> np.ndarray:
+    """Mean colour of a frame, 0 to 255, shape [3]."""
+    if frame.format.name != "yuv420p":
+        picture: np.ndarray = frame.to_ndarray(format="rgb24").reshape(-1, 3).mean(axis=0)
+        return picture
+    means = []
+    for plane in frame.planes:
+        lines = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
+        means.append(lines[:, : plane.width].mean())
+    colour: np.ndarray = RED_GREEN_BLUE @ (np.array(means) - BLACK)
+    return colour
 
 
 def _check_stream(
@@ -168,7 +183,7 @@ def _decoded(
     """Frames in order; each must be at its time, and key frames as often as `info.json` says."""
     group, since = about.get("video.g"), 0
     for number, frame in enumerate(container.decode(stream)):
-        if frame.pts is None or round(float(frame.pts * stream.time_base) * fps * 1000) != number * 1000:
+        if frame.time is None or abs(frame.time * fps - number) > TIME_TOLERANCE:
             raise DatasetMismatch(path, f"frame {number} is at another time than {number / fps:g} s")
         since = 0 if frame.key_frame else since + 1
         if isinstance(group, int) and since >= group:

@@ -153,8 +153,8 @@ def _counts(env: World, looks: np.ndarray, shapes: torch.Tensor) -> list[tuple[i
     if not looks.any():
         return []
     image = env.observe(looks, image=True).image
-    assert image is not None and env.camera is not None  # type: ignore[attr-defined]
-    drawn = env.camera.shapes()  # type: ignore[attr-defined]
+    assert image is not None and env.camera is not None
+    drawn = env.camera.shapes()
     target = shapes[drawn.clamp_min(0)] & (drawn >= 0)
     found = []
     for world in np.flatnonzero(looks).tolist():

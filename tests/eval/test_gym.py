@@ -1,5 +1,8 @@
 """Gymnasium: its spaces and flags, the same episodes as a rollout, worlds that do not touch each other."""
 
+import re
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -384,3 +387,13 @@ def test_wrong_options_are_refused(options, message):
     """An option that is unknown or unfit is named."""
     with pytest.raises(InputError, match=message):
         ArenaVectorEnv(**({"task": "football", "engine": "mujoco", "device": "cpu", "image_size": None} | options))
+
+
+def test_the_page_about_gymnasium():
+    """Every Python block of docs/gym.md runs, one after the other, and gives what the page says."""
+    page = (Path(__file__).parents[2] / "docs" / "gym.md").read_text()
+    world = {"__name__": "docs_gym"}
+    for block in re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE):
+        exec(compile(block, "docs/gym.md", "exec"), world)
+    assert world["action"].shape == (2, 40) and not world["info"]["settling"]
+    assert (world["info"]["seed"], world["info"]["steps"]) == (21, 1)

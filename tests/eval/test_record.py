@@ -1,0 +1,218 @@
+"""Recording as a sink of evaluation: what is written, that it survives kills and full disks, and its bytes."""
+
+import errno
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import av
+import numpy as np
+import pytest
+
+from arena_newton import policies
+from arena_newton.data import demonstration
+from arena_newton.data.episode import EpisodeFile, episode_files
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.journal import read_journal
+from arena_newton.eval.results import load_run
+from arena_newton.eval.run import Factories
+from arena_newton.pictures.camera import Camera
+from arena_newton.pictures.settings import CameraConfig
+
+SMALL = ["--task", "boxing", "--size", "64x64", "--engine", "mujoco", "--device", "cpu"]
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Three disturbed episodes of boxing, recorded in three worlds without interruption."""
+    folder = tmp_path_factory.mktemp("recorded") / "whole"
+    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def copied(recorded, tmp_path):
+    """A copy of the recorded folder that a test may damage."""
+    return shutil.copytree(recorded, tmp_path / "copy")
+
+
+def contents(folder):
+    """Bytes of all episode files by name."""
+    found = {path.relative_to(folder).as_posix(): path for path in sorted((folder / "episodes").rglob("*"))}
+    return {name: path.read_bytes() for name, path in found.items() if path.is_file()}
+
+
+def same(folder, other):
+    """Whether two folders hold the same episodes, byte for byte; the names that differ are shown."""
+    mine, others = contents(folder), contents(other)
+    assert sorted(mine) == sorted(others)
+    assert [name for name in mine if mine[name] != others[name]] == []
+
+
+def test_every_row_has_its_frame_and_the_label_is_clean(recorded):
+    """Frames equal rows, the executed action has noise that the stored one lacks, and the seed is a demonstration's."""
+    files = episode_files([recorded])
+    assert len(files) == COUNT
+    for file in map(EpisodeFile, files):
+        with av.open(str(file.video("front"))) as video:
+            pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        assert len(pictures) == file.rows == file.integer("vision_num_frames")
+        assert pictures[0].shape == (64, 64, 3) and not pictures[0][:7].max() > 40  # black bars of a square
+        histogram = file.array("arena_vision_histogram", 3, 256)
+        mean = (histogram * np.arange(256)).sum(axis=1) / histogram.sum(axis=1)
+        assert np.allclose(np.mean(pictures, axis=(0, 1, 2)), mean, atol=3)
+        noise = file.array("arena_executed_action") - file.action
+        assert not noise[0].any() and (noise[:, 9:38].std(axis=0) > 0.01).all() and not noise[:, 38:].any()
+        assert file.text("arena_seed_range") == "demonstration" and file.integer("arena_episode_seed") >> 31 == 1
+        assert set(file.phases) >= {"approach", "strike"}
+
+
+def test_an_episodes_facts_name_no_folder_time_or_number_of_worlds(recorded):
+    """The configuration in a file holds hashes of what moved, the noise and the versions, and nothing of the call."""
+    text = EpisodeFile(episode_files([recorded])[0]).text("arena_configuration")
+    facts = json.loads(text)
+    assert all(facts[key] for key in ("code", "checkpoint", "rules_hash", "scenes", "versions", "tracker_facts"))
+    assert facts["disturbance"]["velocity"] == 0.08 and facts["worlds"] is None and facts["versions"]["av"]
+    assert str(recorded) not in text and "started_at" not in text
+
+
+def test_the_journal_names_the_files(recorded):
+    """An episode's line names its NPZ and its videos, below the folder."""
+    records, _ = read_journal(recorded / "episodes.jsonl")
+    assert len(records) == COUNT
+    for record in records:
+        assert set(record.media) == {"episode", "front"}
+        assert all((recorded / path).is_file() for path in record.media.values())
+
+
+def test_bytes_do_not_depend_on_worlds(recorded, tmp_path):
+    """One world after the other writes the same bytes as three at once."""
+    other = tmp_path / "one"
+    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "1", "--out", str(other)]) == 0
+    same(recorded, other)
+
+
+def test_kills_lose_at_most_what_was_running(recorded, tmp_path):
+    """Killed twice at random moments and resumed, with other hash seeds, a recording has the bytes of a whole one."""
+    folder, draw = tmp_path / "killed", random.Random(5)
+    command = [sys.executable, "-m", "arena_newton.eval", "record", *SMALL, "--episodes", str(COUNT)]
+    command += ["--worlds", "2", "--out", str(folder)]
+    kept = 0
+    for attempt in range(2):
+        environment = os.environ | {"PYTHONHASHSEED": str(attempt + 1)}
+        run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            began = time.monotonic()
+            while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 120 and run.poll() is None:
+                time.sleep(0.05)
+            time.sleep(draw.uniform(0.5, 4.0))
+        finally:
+            run.send_signal(signal.SIGKILL)
+            run.wait()
+        records, _ = read_journal(folder / "episodes.jsonl")
+        assert len(records) >= kept
+        kept = len(records)
+        for record in records:  # whatever is journalled is whole
+            assert EpisodeFile(folder / record.media["episode"]).rows == record.steps
+        command = [sys.executable, "-m", "arena_newton.eval", "resume", str(folder)]
+    assert main(["resume", str(folder)]) == 0
+    same(recorded, folder)
+    assert not list(folder.rglob("*.part"))
+
+
+def test_missing_and_torn_files_are_recorded_again(recorded, copied, capsys):
+    """A removed video, a cut NPZ and another video: those episodes are played again, with the same bytes."""
+    files = episode_files([copied])
+    files[0].write_bytes(files[0].read_bytes()[:-100])
+    EpisodeFile(files[1]).video("front").unlink()
+    other = EpisodeFile(episode_files([recorded])[0]).video("front")
+    shutil.copyfile(other, EpisodeFile(files[2]).video("front"))
+    lines = (copied / "episodes.jsonl").read_bytes()
+    assert main(["resume", str(copied)]) == 0
+    assert "of 3 episodes the recording is missing" in capsys.readouterr().err
+    same(recorded, copied)
+    assert (copied / "episodes.jsonl").read_bytes().startswith(lines)  # the journal only grows
+    assert len(load_run(copied).records) == COUNT
+
+
+def test_a_full_disk_loses_no_finished_episode(recorded, tmp_path, monkeypatch, capsys):
+    """A file that cannot be written stops the run by its name, exit code 2; resumed, the bytes are those of a whole."""
+    folder, written = tmp_path / "full", []
+    write = demonstration.write_episode
+
+    def full(path, arrays, **options):
+        written.append(path.name)
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        write(path, arrays, **options)
+
+    monkeypatch.setattr(demonstration, "write_episode", full)
+    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert "disk full" in said and written[1] in said and "resume" in said
+    records, _ = read_journal(folder / "episodes.jsonl")
+    done = {record.media["episode"].split("/")[1] for record in records}
+    assert written[0] in done and written[1] not in done
+    assert not (folder / "episodes" / written[1]).exists() and not list(folder.rglob("*.part"))
+    monkeypatch.undo()
+    assert main(["resume", str(folder)]) == 0
+    same(recorded, folder)
+
+
+def test_only_successes_are_kept_in_rounds(recorded, tmp_path, capsys):
+    """Under a cap that the slowest episode misses, another attempt is made; what failed is counted, and has no file."""
+    steps = {r.repeat: r.steps for r in load_run(recorded).records}
+    slowest = max(steps, key=steps.get)
+    cap = steps[slowest] - 1
+    folder = tmp_path / "successes"
+    flags = ["--episodes", str(COUNT), "--only-success", "--max-steps", str(cap), "--cameras", "--worlds", "2"]
+    code = main(["record", "--task", "boxing", "--engine", "mujoco", "--device", "cpu", *flags, "--out", str(folder)])
+    records = load_run(folder).records
+    kept = [r for r in records if r.outcome == "success"]
+    assert slowest not in {r.repeat for r in kept} and len(records) > COUNT
+    assert {r.repeat for r in records} == set(range(len(records)))
+    assert len(episode_files([folder])) == len(kept) <= COUNT and code == (0 if len(kept) == COUNT else 1)
+    assert all("episode" not in r.media for r in records if r.outcome != "success")
+    said = capsys.readouterr().out
+    assert f"recorded: {len(kept)} episode" in said and f"{len(records) - len(kept)} timeout" in said
+    assert json.loads((folder / "results.json").read_text())["complete"] is True
+
+
+def test_a_policys_picture_is_rendered_once(recorded, tmp_path, monkeypatch):
+    """Where the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
+    renders = []
+    render = Camera.render
+    monkeypatch.setattr(Camera, "render", lambda self, *a: renders.append(1) or render(self, *a))
+
+    def seeing(spec, **options):
+        policy = policies.get(spec, **options)
+        policy.needs_image, policy.camera = True, CameraConfig(width=64, height=64)
+        return policy
+
+    command = ["record", *SMALL, "--episodes", "1", "--out", str(tmp_path / "seen")]
+    assert main(command, Factories(policy=seeing)) == 0
+    (record,) = load_run(tmp_path / "seen").records
+    assert len(renders) <= record.steps + 1
+    assert (tmp_path / "seen" / record.media["front"]).read_bytes() == (recorded / record.media["front"]).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["episodes", "episodes/videos"])
+def test_links_are_not_followed(copied, tmp_path, capsys, name):
+    """A linked folder of episodes is refused."""
+    (copied / name).rename(tmp_path / "elsewhere")
+    (copied / name).symlink_to(tmp_path / "elsewhere")
+    assert main(["resume", str(copied)]) == 2
+    assert "is a link" in capsys.readouterr().err
+
+
+def test_a_folder_keeps_its_pictures(recorded, capsys):
+    """Another size in the same folder is refused."""
+    command = ["record", "--task", "boxing", "--size", "96x96", "--engine", "mujoco", "--device", "cpu"]
+    assert main([*command, "--episodes", str(COUNT), "--out", str(recorded)]) == 2
+    assert "was begun with --record-size 64x64" in capsys.readouterr().err
