@@ -52,6 +52,7 @@ _OPTIONAL = {
 _EXTRA_PURPOSES = {
     "data": "datasets in LeRobot's format",
     "plots": "charts",
+    "rerun": "`--viewer rerun`",
     "teleop": "a person drives the robot; viewers of a run",
     "train": "LeRobot's trainer",
 }
@@ -110,7 +111,8 @@ def examine_extras() -> list[Finding]:
     findings = []
     for extra, modules in EXTRAS.items():
         absent = [module for module in modules if importlib.util.find_spec(module) is None]
-        advice = f"needed for {_EXTRA_PURPOSES[extra]}: uv sync --extra {extra}, or pip install 'arena-newton[{extra}]'"
+        purpose = f"needed for {_EXTRA_PURPOSES[extra]}: " if extra in _EXTRA_PURPOSES else ""
+        advice = f"{purpose}uv sync --extra {extra}, or pip install 'arena-newton[{extra}]'"
         if absent:
             findings.append(Finding(f"extra [{extra}]", f"without {', '.join(absent)}", "note", advice))
         else:

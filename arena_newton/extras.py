@@ -9,7 +9,7 @@ from arena_newton.errors import InputError
 __all__ = ["EXTRAS", "require"]
 
 EXTRAS: dict[str, tuple[str, ...]] = {
-    "data": ("pyarrow", "datasets", "pandas", "torchcodec"),
+    "data": ("pyarrow", "datasets", "pandas"),
     "plots": ("matplotlib",),
     "rerun": ("rerun",),
     "teleop": ("viser", "websockets", "redis"),

@@ -67,20 +67,24 @@ class _Recording:
                 recorders.append(files)
             on_tick = None if files is None else (lambda active: saved.extend(files.saved()))
             saved: list[object] = []
-            results = Rollout(
-                self.env,
-                self.policy,
-                self.episodes,
-                recorder=recorders,
-                disturbance=noise,
-                max_steps=steps,
-                on_tick=on_tick,
-            ).run()
             size = 0
+            try:
+                results = Rollout(
+                    self.env,
+                    self.policy,
+                    self.episodes,
+                    recorder=recorders,
+                    disturbance=noise,
+                    max_steps=steps,
+                    on_tick=on_tick,
+                ).run()
+                if files is not None:
+                    saved += files.saved(wait=True)
+                    files.check()
+            finally:
+                if files is not None:
+                    files.close()
             if files is not None:
-                saved += files.saved(wait=True)
-                files.check()
-                files.close()
                 size = sum(path.stat().st_size for path in files.folder.rglob("*") if path.is_file())
             return time.perf_counter() - began, sum(result.steps for result in results), size
 

@@ -20,7 +20,7 @@ from lerobot.utils.import_utils import get_safe_default_video_backend
 
 from arena_newton.data.dataset_files import DatasetFiles
 from arena_newton.data.episode import episode_files
-from arena_newton.data.frames import Frames
+from arena_newton.data.frame_reader import Frames
 from arena_newton.data.layouts import layout
 from arena_newton.data.lerobot_dataset import choose, write_dataset
 from arena_newton.errors import InputError

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 __all__ = ["CAMERAS", "FIELDS", "SCHEMA_VERSION", "VIDEO_FOLDER", "EpisodeFile", "Field", "episode_files"]
-__all__ += ["opened", "vision", "write_episode"]
+__all__ += ["fields_table", "opened", "vision", "write_episode"]
 
 SCHEMA_VERSION = "arena_episode_v1"
 """Version of the fields."""
@@ -128,6 +128,12 @@ FIELDS = (
     Field("arena_source_rows", "T", "int64", "row of the source of each row that `data clean` left; else absent"),
 )
 """All arrays; `<object>` is an object's name in the original's records, `<camera>` a prefix of `CAMERAS`."""
+
+
+def fields_table() -> str:
+    """`FIELDS` as a Markdown table."""
+    rows = [f"| `{f.name}` | {f.kind} | {f.shape or 'one value'} | {f.sentence} |" for f in FIELDS]
+    return "\n".join(["| field | type | shape | what |", "|---|---|---|---|", *rows]) + "\n"
 
 
 def vision(camera: str, name: str) -> str:

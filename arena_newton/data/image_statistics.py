@@ -22,7 +22,7 @@ def add_picture(histogram: np.ndarray, picture: np.ndarray) -> None:
     """
     for channel in range(3):
         counts = cv2.calcHist([picture], [channel], None, [VALUES], [0, VALUES])
-        histogram[channel] += counts[:, 0].astype(np.int64)
+        histogram[channel] += counts.reshape(-1).astype(np.int64)  # OpenCV 5 gives [256], 4 gives [256, 1]
 
 
 def statistics(histogram: np.ndarray, frames: int) -> dict[str, np.ndarray]:

@@ -175,12 +175,12 @@ def _check_features(subject: _Subject) -> None:
         raise DatasetMismatch(subject.info, f"fps is {files.fps}, expected {FPS}")
     protocol = files.info.get("vla_protocol")
     if subject.kind.name == "arena" and (subject.arena is not None or protocol is not None):
-        about = protocol if isinstance(protocol, dict) else {}
-        wanted_protocol = described_protocol(subject.labels, str(about.get("backend_source", "")).split("+"))
+        told = protocol if isinstance(protocol, dict) else {}
+        wanted_protocol = described_protocol(subject.labels, str(told.get("backend_source", "")).split("+"))
         keys = list(wanted_protocol) if subject.arena is not None else ["version"]
         for name in keys:
-            if about.get(name) != wanted_protocol[name]:
-                shown = f"is {str(about.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
+            if told.get(name) != wanted_protocol[name]:
+                shown = f"is {str(told.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
                 raise DatasetMismatch(subject.info, f"vla_protocol: {name} {shown}")
     if subject.arena is not None:
         path = files.root / "meta" / "modality.json"

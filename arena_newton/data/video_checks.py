@@ -10,7 +10,7 @@ import av
 import numpy as np
 
 from arena_newton.data.dataset_files import DatasetFiles, EpisodeRow, VideoPart
-from arena_newton.data.frames import OpenVideo
+from arena_newton.data.frame_reader import OpenVideo
 from arena_newton.errors import ArenaError, InputError
 
 __all__ = ["DatasetMismatch", "check_videos"]

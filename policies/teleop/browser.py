@@ -52,7 +52,7 @@ class BrowserSource:
                 self._controls.append(event)  # type: ignore[arg-type]
         held = self._held()
         if held is not None and self._view is not None:
-            self._view.camera = held.camera
+            self._view.camera, self._view.frames = held.camera, held.frames
         control: Control = self._controls.popleft() if self._controls else "none"
         return Wish(self.driver.action(held, view), control)
 

@@ -44,9 +44,10 @@ RANGES: dict[str, tuple[float, float]] = {
     "hand_forward": (0.10, 0.50),
     "hand_aside": (-0.05, 0.35),
     "hand_up": (-0.15, 0.45),
+    "frames": (1.0, 240.0),
 }
 """Numbers of a message and their ranges: deflections of the stick, height of the pelvis [m], turn of the waist [rad],
-and where a reaching palm is ahead of, outward of and above the pelvis [m]."""
+where a reaching palm is ahead of, outward of and above the pelvis [m], and frames of the page per second."""
 CAMERAS = ("follow", "room", "free")
 """Where the page sees the world from: behind the robot, the scene's own camera, wherever a mouse takes it."""
 SWITCHES = ("reach_left", "reach_right", "close_left", "close_right", "high_steps", "sit")
@@ -93,6 +94,8 @@ class Held:
     sit: bool = False
     camera: str = CAMERAS[0]
     """One of `CAMERAS`."""
+    frames: float = 30.0
+    """Frames per second that the page draws."""
     events: tuple[str, ...] = ()
     """Names of `EVENTS`, in their order."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,7 +24,7 @@ from arena_newton.policies.teleop.world_view import PERIOD, WorldView
 from arena_newton.quiet import quiet_warp
 from arena_newton.rules import MODES
 
-__all__ = ["drive", "drive_by_browser", "make_world"]
+__all__ = ["drive", "drive_by_browser", "make_world", "session_facts"]
 
 LARGEST_SEED = 2**31 - 1
 """Largest number of a session."""
@@ -94,7 +95,7 @@ def drive(
             seed=options.seed,
             camera=_camera(options),
             displays=displays,
-            facts=env.describe() | {"seeds": seeding.TELEOPERATION},
+            facts=session_facts(env, options),
             say=lambda line: print(line, flush=True),
         )
         with contextlib.suppress(KeyboardInterrupt):
@@ -104,6 +105,31 @@ def drive(
         source.close()
         env.close()
     return 0
+
+
+def session_facts(env: ArenaEnv, options: SessionOptions) -> dict[str, object]:
+    """What the motion of a session's episodes depends on, as `eval record --from` compares it with what it has.
+
+    Args:
+        env: The world.
+        options: The flags.
+
+    Returns:
+        JSON.
+    """
+    facts: dict[str, object] = {
+        "engine": env.engine,
+        "device": str(env.device),
+        "drive": "auto",
+        "fast_physics": options.fast_physics,
+        "rules_hash": env.rules.hash_for((env.spec.name,)),
+        # Of a tracker that is not bound to a world yet: how its network runs here is the environment's.
+        "tracker_facts": trackers.get(options.tracker, options.checkpoint).describe(),
+        "environment": env.describe(),
+        "seeds": seeding.TELEOPERATION,
+    }
+    plain: dict[str, object] = json.loads(json.dumps(facts, default=str))
+    return plain
 
 
 def _camera(options: SessionOptions) -> CameraConfig | None:

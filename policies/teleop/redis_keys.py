@@ -38,7 +38,7 @@ __all__ = [
     "T_ACTION",
     "T_STATE",
     "Backend",
-    "Recorded",
+    "RecordingCommand",
     "closed_hands",
     "input_ready",
     "numbers",
@@ -198,14 +198,14 @@ def closed_hands(controllers: bytes, hands: tuple[bytes, bytes]) -> np.ndarray |
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordingCommand:
     """A command of the person about the recording."""
 
     command: str
     sequence: int
 
 
-def recording_command(raw: bytes) -> Recorded | None:
+def recording_command(raw: bytes) -> RecordingCommand | None:
     """What `RECORDING_CONTROL` says; None where it is absent.
 
     Raises:
@@ -217,7 +217,7 @@ def recording_command(raw: bytes) -> Recorded | None:
     command, sequence = (found.get("command"), found.get("sequence")) if isinstance(found, dict) else (None, None)
     if not isinstance(command, str) or type(sequence) is not int:
         raise InputError(f"{RECORDING_CONTROL}: needs a text `command` and a whole number `sequence`")
-    return Recorded(command, sequence)
+    return RecordingCommand(command, sequence)
 
 
 def input_ready(backend: Backend) -> str:

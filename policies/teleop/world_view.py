@@ -10,6 +10,7 @@ import hmac
 import http
 import io
 import math
+import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,8 @@ AIM = (0.9, 0.0, -0.05)
 """The point that it looks at, likewise [m]."""
 SWING = 0.8
 """Time in which the camera takes up a turn of the robot [s]."""
+AHEAD = 0.8
+"""Least time between two states of the world, in frames of the page."""
 PANEL = 300
 """Width of viser's own panel, which the page hides [px]; its style sheet names it too."""
 FOV = 0.95
@@ -74,6 +77,9 @@ class WorldView:
         """Address of viser's page, with the token of its socket."""
         self.camera = CAMERAS[0]
         """One of `driving.CAMERAS`."""
+        self.frames = 30.0
+        """Frames per second that the page draws."""
+        self._drawn = 0.0
         self._env = env
         self._state = env.scene.model.state()
         self._ticks = 0
@@ -89,7 +95,14 @@ class WorldView:
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
 
     def draw(self) -> None:
-        """Show the world as it is now."""
+        """Show the world as it is now, unless the page has not drawn the last one yet.
+
+        A browser without a graphics card draws a few frames a second; what is sent beyond them it draws seconds later.
+        """
+        now = time.monotonic()
+        if now - self._drawn < AHEAD / self.frames:
+            return
+        self._drawn = now
         self._env.physics.write_newton_state(self._state)
         self._ticks += 1
         self._viewer.begin_frame(self._ticks * TICK)

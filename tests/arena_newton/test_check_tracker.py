@@ -202,6 +202,18 @@ def test_a_memory_conforms():
         check_tracker(Lagging(), worlds=1)
 
 
+def test_a_tracker_without_memory_needs_no_mask():
+    """The shortest tracker of the documentation, two arguments and no history, keeps every promise."""
+
+    class Reference(Tracker):
+        name = "reference"
+
+        def step(self, command, state):
+            return command.joints
+
+    assert all(result.ok for result in check_tracker(Reference()))
+
+
 @pytest.mark.parametrize("broken", BROKEN, ids=lambda broken: broken.__name__)
 def test_each_check_finds_its_fault(broken):
     """A tracker with one fault fails the check of that promise with a message that says what is wrong."""

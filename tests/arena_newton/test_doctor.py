@@ -38,6 +38,9 @@ def test_every_extra_is_reported(monkeypatch):
     for extra in extras.EXTRAS:
         finding = found(findings, f"extra [{extra}]")
         assert finding.status == "ok" or f"uv sync --extra {extra}" in finding.advice
+    for extra, modules in extras.EXTRAS.items():
+        monkeypatch.setitem(extras.EXTRAS, extra, (*modules, "no_such_module"))
+        assert found(doctor.examine_extras(), f"extra [{extra}]").advice.startswith("needed for ")
 
 
 def test_a_missing_extra_is_a_note(monkeypatch):

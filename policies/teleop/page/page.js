@@ -20,7 +20,7 @@ const pads = { stick: [0, 0], turn: [0, 0] };
 const switches = { reach_left: false, reach_right: false, close_left: false, close_right: false, high_steps: false, sit: false };
 let values = { ...NEUTRAL };
 let ranges = null, camera = "follow", events = [], socket = null, recording = false, lastTick = 0;
-let pressed = [], gamepad = null;
+let pressed = [], gamepad = null, frames = 30, counted = 0;
 
 const clamp = (x, low = -1, high = 1) => Math.min(Math.max(x, low), high);
 const live = (x) => (Math.abs(x) < DEAD_ZONE ? 0 : x);
@@ -158,7 +158,7 @@ function send() {
   if (!socket || socket.readyState !== WebSocket.OPEN) return;
   if (socket.bufferedAmount > 0) return; // stale messages help nobody
   const hands = { close_left: switches.close_left || !!pressed[6], close_right: switches.close_right || !!pressed[7] };
-  socket.send(JSON.stringify({ ...d, ...values, ...switches, ...hands, camera, events }));
+  socket.send(JSON.stringify({ ...d, ...values, ...switches, ...hands, camera, frames, events }));
   events = [];
 }
 
@@ -221,3 +221,7 @@ for (const part of [document.querySelector("aside"), document.querySelector("hea
 slide();
 connect();
 setInterval(send, SEND_EVERY);
+// A view of the world that is sent faster than it can be drawn falls behind: the session asks how fast that is.
+const count = () => { counted++; requestAnimationFrame(count); };
+count();
+setInterval(() => { frames = clamp(counted, 1, 240); counted = 0; }, 1000);

@@ -28,7 +28,7 @@ from arena_newton.data import lerobot_dataset  # noqa: E402
 from arena_newton.data.__main__ import main  # noqa: E402
 from arena_newton.data.demonstration import DemonstrationRecorder  # noqa: E402
 from arena_newton.data.episode import EpisodeFile, episode_files  # noqa: E402
-from arena_newton.data.frames import OpenVideo  # noqa: E402
+from arena_newton.data.frame_reader import OpenVideo  # noqa: E402
 from arena_newton.data.label_protocols import encode_v4  # noqa: E402
 from arena_newton.data.layouts import LAYOUTS  # noqa: E402
 from arena_newton.data.lerobot_dataset import FinishedVideos, choose, write_dataset  # noqa: E402

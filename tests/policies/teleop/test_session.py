@@ -11,10 +11,13 @@ from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.data.episode import EpisodeFile
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
 from arena_newton.policies.teleop.driving import EVENTS, RANGES, Driver, Held, read_held
+from arena_newton.policies.teleop.driving_command import session_facts
 from arena_newton.policies.teleop.pace import STARVED, Pace, TimedPicture
 from arena_newton.policies.teleop.source import Telemetry, Wish
 from arena_newton.policies.teleop.standing import SECONDS, Stander
+from arena_newton.policies.teleop.teleop_options import BrowserOptions
 from arena_newton.policies.teleop.teleop_session import TeleopSession
 from arena_newton.robot import DEFAULT_POSE, TICK
 
@@ -173,7 +176,8 @@ def test_nobody_there_means_stand():
     speed = np.linalg.norm(actions[:, ACTION["root_xy_delta"]], axis=1) / TICK
     assert speed[100:150].mean() > 0.4
     assert speed[-10:].max() < 0.01 and speed[150:].sum() * TICK < 0.8
-    assert (np.abs(np.diff(actions, axis=0))[1:] <= 1.5 * FASTEST).all(), "no jump where the messages stop"
+    change = np.abs(np.diff(actions, axis=0))[:, :-2]
+    assert change[149:].max() <= 1.2 * change[60:149].max(), "no jump where the messages stop"
     assert abs(actions[-1, 2] - 0.7) < 0.02 and actions[-1, -2:].tolist() == [1.0, 0.0]
 
 
@@ -246,7 +250,7 @@ def saved(env, tmp_path_factory):
     """A session in which one episode was saved and one discarded, its folder and its source."""
     folder = tmp_path_factory.mktemp("person")
     source = Script({0: "start", 60: "save_and_reset", 61: "start", 80: "discard_and_reset"}, quit_at=85)
-    one = session(env, source, folder)
+    one = session(env, source, folder, facts=session_facts(env, BrowserOptions()))
     return one.run(), folder, source
 
 
@@ -276,6 +280,16 @@ def test_a_saved_episode_plays_again_bit_for_bit(saved, env):
         states.append(env.observe().state[0].numpy().copy())
         env.step(torch.from_numpy(action)[None])
     np.testing.assert_array_equal(np.stack(states), episode.array("arena_state"))
+
+
+def test_pictures_come_afterwards(saved, tmp_path):
+    """`eval record --from` plays the person's episodes again, finds every position equal, and adds the pictures."""
+    out = tmp_path / "pictures"
+    assert main(["record", "--from", str(saved[1]), "--out", str(out), "--size", "64x64"]) == 0
+    (file,) = (out / "episodes").glob("*.npz")
+    episode = EpisodeFile(file)
+    assert episode.cameras == ("front",) and episode.video("front").is_file()
+    assert episode.text("arena_seed_range") == seeding.TELEOPERATION
 
 
 def test_a_seed_is_not_recorded_twice(saved, env):
