@@ -8,7 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton.command_line import exit_code
-from arena_newton.data.data_options import BuildOptions, CleanOptions, DatasetBenchOptions, VerifyOptions
+from arena_newton.data.data_options import (
+    BuildOptions,
+    CleanOptions,
+    DatasetBenchOptions,
+    InspectOptions,
+    MergeOptions,
+    SplitOptions,
+    StatsOptions,
+    VerifyOptions,
+)
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.flags import folders_named, parse_flags
@@ -53,6 +62,31 @@ COMMANDS: dict[str, DataCommand] = {
         options=VerifyOptions,
         work="verification:verify",
         extra="data",
+    ),
+    "merge": DataCommand(
+        words="merge <dataset> <dataset> [<dataset> ...] --out <dataset>",
+        purpose="make one dataset of several; pictures are copied as they are",
+        options=MergeOptions,
+        work="sets:merge",
+        extra="data",
+    ),
+    "split": DataCommand(
+        words="split <datasets or recordings ...> --out-train <folder> --out-held-out <folder>",
+        purpose="hold out episodes by their seeds",
+        options=SplitOptions,
+        work="sets:split",
+    ),
+    "stats": DataCommand(
+        words="stats <datasets or recordings ...>",
+        purpose="print figures of episodes, and those unlike the others",
+        options=StatsOptions,
+        work="episode_figures:stats",
+    ),
+    "inspect": DataCommand(
+        words="inspect <datasets or recordings ...> --out <page.html>",
+        purpose="show episodes as one page: figures, phases, curves, film strips",
+        options=InspectOptions,
+        work="inspection:inspect",
     ),
     "bench": DataCommand(
         words="bench <dataset> [--recordings <recordings> ...]",

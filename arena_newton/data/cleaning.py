@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +20,7 @@ from tqdm import tqdm
 
 from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, episode_files, vision, write_episode
 from arena_newton.data.image_statistics import VALUES, add_picture
-from arena_newton.data.new_folder import new_folder
+from arena_newton.data.new_folder import link, new_folder
 from arena_newton.errors import InputError
 from arena_newton.foreign import numbers, read_arrays, read_bytes
 from arena_newton.pictures.video import VideoWriter
@@ -205,9 +203,9 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
     cameras = [camera for camera in CAMERAS if vision(camera, "rgb_video_path") in arrays]
     videos = {camera: _video(file, arrays, camera) for camera in cameras}
     if stays.all():
-        _copy(file, folder / file.name)
+        link(file, folder / file.name)
         for video in videos.values():
-            _copy(video, folder / VIDEO_FOLDER / video.name)
+            link(video, folder / VIDEO_FOLDER / video.name)
         return found, stays
     kept = {name: array[stays] if _is_rows(name, array, len(stays)) else array for name, array in arrays.items()}
     rows = int(stays.sum())
@@ -242,14 +240,6 @@ def _video(file: Path, arrays: Mapping[str, np.ndarray], camera: str) -> Path:
     if given.parent.name not in (VIDEO_FOLDER, "") or not given.name or not video.is_file() or video.is_symlink():
         raise InputError(f"{file}: {name}: {video} is missing")
     return video
-
-
-def _copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except OSError:  # another disk, or one without links
-        shutil.copyfile(source, target)
 
 
 def _encoded_again(

@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["BuildOptions", "CleanOptions", "DatasetBenchOptions", "VerifyOptions"]
+__all__ = [
+    "BuildOptions",
+    "CleanOptions",
+    "DatasetBenchOptions",
+    "InspectOptions",
+    "MergeOptions",
+    "SplitOptions",
+    "StatsOptions",
+    "VerifyOptions",
+]
 
 
 @dataclass(frozen=True)
@@ -72,3 +81,45 @@ class CleanOptions:
     """Largest step of the frame index."""
     max_step: float = 2.5
     """Longest step of the clock [control steps]."""
+
+
+@dataclass(frozen=True)
+class MergeOptions:
+    """Write one dataset of several, in the order given."""
+
+    out: Path = Path("merged")
+    """Folder of the dataset, which must not exist yet."""
+
+
+@dataclass(frozen=True)
+class SplitOptions:
+    """Write two sets: an episode's side depends on its seed alone, so that merged sets are split alike."""
+
+    out_train: Path = Path("train")
+    """Folder of the episodes to train on, which must not exist yet."""
+    out_held_out: Path = Path("held_out")
+    """Folder of the episodes held out, which must not exist yet."""
+    fraction: float = 0.1
+    """Probability that an episode is held out."""
+    seed: int = 0
+    """Another number draws other sides."""
+
+
+@dataclass(frozen=True)
+class StatsOptions:
+    """Print length, jerk, stillness, final pose and tracking error, and rank the episodes unlike the others."""
+
+    json: bool = False
+    """Print one JSON array of all episodes, the most unusual first."""
+
+
+@dataclass(frozen=True)
+class InspectOptions:
+    """Write one page that needs nothing else: figures, outliers, phases, curves and film strips."""
+
+    out: Path = Path("episodes.html")
+    """The page; one of that name is replaced."""
+    episodes: int = 40
+    """Most episodes in full, the most unusual ones; the table has all."""
+    pictures: int = 10
+    """Pictures of a film strip."""

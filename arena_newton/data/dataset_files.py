@@ -202,9 +202,11 @@ class DatasetFiles:
         """
         check_size(path, PARQUET_BYTES)
         try:
-            return pyarrow.parquet.read_table(
+            table = pyarrow.parquet.read_table(
                 path, columns=None if columns is None else list(columns), memory_map=False
             )
+            table.validate(full=True)  # text of a damaged file may be none
+            return table
         except (pyarrow.ArrowException, OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: not a readable parquet file ({type(error).__name__})") from error
 

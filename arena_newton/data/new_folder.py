@@ -12,7 +12,7 @@ from pathlib import Path
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files import PARTIAL
 
-__all__ = ["new_folder"]
+__all__ = ["link", "new_folder"]
 
 LOCK = f"{PARTIAL}.lock"
 """Ending of the file that is locked while the folder grows."""
@@ -53,3 +53,12 @@ def new_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
                 lock.unlink(missing_ok=True)
     except OSError as error:
         raise ArenaError(f"{flag} {out}: cannot be written ({error})") from error
+
+
+def link(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it to another disk."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:
+        shutil.copyfile(source, target)

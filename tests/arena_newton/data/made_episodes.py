@@ -10,13 +10,15 @@ from arena_newton.data.demonstration import FPS
 from arena_newton.data.episode import SCHEMA_VERSION, vision, write_episode
 from arena_newton.data.image_statistics import VALUES, add_picture
 from arena_newton.pictures.video import VideoWriter
+from arena_newton.robot import CANONICAL_TO_MUJOCO
 
 
 def pictures(rows, size, seed):
-    """Pictures of which each says its number in grey, with a coloured corner."""
-    found = np.zeros((rows, size, size, 3), np.uint8)
-    found[:] = (np.arange(rows) * 5 % 200 + 20)[:, None, None, None]
-    found[:, : size // 4, : size // 4] = np.random.default_rng(seed).integers(0, 255, 3)
+    """Pictures on which a bar moves by a column each, so that all have one mean, with a coloured corner."""
+    found = np.full((rows, size, size, 3), 60, np.uint8)
+    for number in range(rows):
+        found[number, size // 4 :, (number + np.arange(size // 4)) % size] = 180
+    found[:, : size // 4, : size // 4] = np.random.default_rng(seed).integers(60, 180, 3)
     return found
 
 
@@ -44,7 +46,8 @@ def make_episode(
     qpos = np.cumsum(rng.normal(0, 0.004, (rows, 29)), axis=0).astype(np.float32)
     state = np.zeros((rows, 64), np.float32)
     state[:, [0, 3]] = 1.0
-    state[:, 6:35] = qpos
+    qvel = np.gradient(qpos, axis=0).astype(np.float32) if rows > 1 else qpos
+    state[:, 6:35], state[:, 35:] = qpos[:, CANONICAL_TO_MUJOCO], qvel[:, CANONICAL_TO_MUJOCO]
     half = np.where(np.arange(rows) < rows // 2, 0, 1).astype(np.int16)
     three, quat = np.zeros((rows, 3), np.float32), np.tile(np.float32([1, 0, 0, 0]), (rows, 1))
     path = np.stack([0.01 * np.arange(rows), np.zeros(rows), np.full(rows, 0.8)], axis=1).astype(np.float32)
@@ -54,7 +57,7 @@ def make_episode(
         "task": np.str_(spec.gym_id),
         "num_frames": np.int64(rows),
         "robot_qpos_before_decimation": qpos,
-        "robot_qvel_before_decimation": np.gradient(qpos, axis=0).astype(np.float32) if rows > 1 else qpos,
+        "robot_qvel_before_decimation": qvel,
         "robot_root_position": path,
         "robot_root_orientation": quat,
         **{f"robot_root_{k}_vel_{f}": three for k in ("lin", "ang") for f in ("world", "local")},
