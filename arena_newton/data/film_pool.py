@@ -236,10 +236,11 @@ class FilmPool(Filming):
         films = {name: ending.facts[reel.number] for name, reel in ending.reels.items()}
         if not ending.whole:
             for reel in ending.reels.values():
-                if ending.facts[reel.number] is not None:
-                    reel.video.unlink(missing_ok=True)
-                for path in (reel.depth, reel.video.with_name(reel.video.name + PARTIAL)):  # of a process that is gone
-                    path.unlink(missing_ok=True)
+                made = [reel.video] if ending.facts[reel.number] is not None else []
+                # What a process that is gone has left, too.
+                for path in (*made, reel.depth, reel.video.with_name(reel.video.name + PARTIAL)):
+                    with contextlib.suppress(OSError):
+                        path.unlink()
         self._writers.submit(next(self._turns), partial(ending.then, films if ending.whole else None))
 
     def check(self) -> None:

@@ -7,6 +7,7 @@ with its recorder: by the end of the connection, or because its parent is anothe
 
 from __future__ import annotations
 
+import contextlib
 import json
 import mmap
 import os
@@ -154,7 +155,8 @@ class _Films:
     def _broken(self, number: int, error: Exception) -> None:
         """Say why a film cannot be written, and drop it."""
         film = self._films.pop(number)
-        film.discard()
+        with contextlib.suppress(OSError):
+            film.discard()
         code, name = (error.errno, error.filename) if isinstance(error, OSError) else (None, None)
         reason = os.strerror(code) if code else f"{type(error).__name__}: {error}"
         self._answer({"error": reason, "errno": code, "file": os.fspath(name or film.video)})
