@@ -32,14 +32,17 @@ __all__ = [
     "agrees",
     "demonstration_recorder",
     "disturbance_of",
+    "encoding_processes",
     "encoding_threads",
     "facts_of",
     "is_recorded",
     "outcome_lines",
 ]
 
-MOST_THREADS = 16
-"""Threads that encode pictures, at most; otherwise as many as there are cores."""
+MOST_ENCODERS = 16
+"""Threads or processes that encode pictures, at most; otherwise as many as there are cores."""
+PROCESS_CORES = 4
+"""Cores from which on processes encode: threads of one process use little more than three."""
 
 
 def facts_of(
@@ -74,12 +77,19 @@ def demonstration_recorder(config: RunConfig, folder: Path, facts: JsonObject) -
         only_success=config.flags.keep is not None,
         facts=facts,
         threads=encoding_threads(),
+        processes=encoding_processes(),
     )
 
 
 def encoding_threads() -> int:
-    """Threads that encode pictures: one per core that this process may use, up to `MOST_THREADS`."""
-    return max(1, min(MOST_THREADS, len(os.sched_getaffinity(0))))
+    """Threads that encode pictures, and write files: one per core that this process may use, up to `MOST_ENCODERS`."""
+    return max(1, min(MOST_ENCODERS, len(os.sched_getaffinity(0))))
+
+
+def encoding_processes() -> int:
+    """Processes that encode pictures instead of threads: all cores but the simulation's, none with few cores."""
+    cores = len(os.sched_getaffinity(0))
+    return 0 if cores < PROCESS_CORES else min(MOST_ENCODERS, cores - 1)
 
 
 def disturbance_of(config: RunConfig, ticks: int) -> ActionNoise | None:

@@ -248,6 +248,7 @@ class _Replay:
                 cameras=config.recording,
                 depth=flags.record_depth,
                 threads=recording.encoding_threads(),
+                processes=recording.encoding_processes(),
                 finishing=self._finished,
             )
             with recorder:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
@@ -17,15 +17,14 @@ import warp as wp
 from arena_newton import robot as g1
 from arena_newton import seeding
 from arena_newton.canonical import ACTION, HAND_CLOSED, STATE
-from arena_newton.data.encoding import Encoders, PictureSlot, PictureSlots
+from arena_newton.data.encoding import Filming, FilmThreads, Pictured, Reel
 from arena_newton.data.episode import SCHEMA_VERSION, VIDEO_FOLDER, vision, write_episode
-from arena_newton.data.image_statistics import VALUES, add_picture
+from arena_newton.data.film import CRF, FilmFacts, key_frames
+from arena_newton.data.film_pool import FilmPool
 from arena_newton.errors import ArenaError
 from arena_newton.files import PARTIAL, file_label
-from arena_newton.foreign import create
 from arena_newton.interfaces import Recorder
 from arena_newton.pictures.camera import Camera
-from arena_newton.pictures.video import VideoWriter
 from arena_newton.rotations import matrix_from_quat, quat_apply, quat_conjugate
 
 if TYPE_CHECKING:
@@ -36,12 +35,6 @@ __all__ = ["DemonstrationRecorder", "RecordedEpisode", "SavedEpisode", "episode_
 
 FPS = round(1 / g1.TICK)
 """Frames per second: one a tick."""
-SMALL = 256
-"""Pictures up to this height [px] have a key frame every `GOP_SMALL` frames, larger ones every `GOP_LARGE`."""
-GOP_SMALL, GOP_LARGE = 10, 2
-"""Frames from one key frame to the next, between the size of the files and the time to read any one frame."""
-CRF = 20
-"""Constant rate factor of x264."""
 WAITING_EPISODES = 8
 """Ended episodes whose files are not written yet, beside one per world: more of them wait for the disk."""
 
@@ -96,91 +89,20 @@ def episode_label(episode: RecordedEpisode) -> str:
     return "__".join([*parts, f"seed{episode.group_seed}", f"repeat{episode.repeat:04d}"])
 
 
-class _Film:
-    """Pictures of one camera of an episode: used by the episode's thread only."""
-
-    def __init__(self, folder: Path, stem: str, camera: str, fps: int):
-        """Nothing is opened before the first picture."""
-        self.video = folder / VIDEO_FOLDER / f"{stem}_{camera}_rgb.mp4"
-        self.depth = folder / f"{stem}_{camera}_depth.raw{PARTIAL}"
-        self.fps = fps
-        self.writer: VideoWriter | None = None
-        self.histogram = np.zeros((3, VALUES), np.int64)
-        self._depth_file: BinaryIO | None = None
-        self._depth_shape: tuple[int, ...] = ()
-
-    def add(self, picture: np.ndarray, depth: np.ndarray | None) -> None:
-        """Append a frame, and its depth if that is recorded."""
-        if self.writer is None:
-            height, width = picture.shape[:2]
-            gop = _gop(height)
-            self.writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, b_frames=False, sync=True)
-        self.writer.write(picture)
-        add_picture(self.histogram, picture)
-        if depth is not None:
-            if self._depth_file is None:
-                self._depth_file, self._depth_shape = create(self.depth), depth.shape
-            try:
-                self._depth_file.write(np.ascontiguousarray(depth).data)
-            except OSError as error:
-                raise OSError(error.errno, error.strerror, str(self.depth)) from None
-
-    def close(self) -> None:
-        """Finish the video."""
-        if self.writer is not None:
-            self.writer.close()
-        if self._depth_file is not None:
-            self._depth_file.close()
-
-    def fields(self, name: str, rows: int) -> dict[str, np.ndarray | np.generic]:
-        """What the file says of the camera."""
-        writer = self.writer
-        if writer is None:
-            return {}
-        if writer.frames != rows:
-            raise ArenaError(f"{self.video}: {writer.frames} frames for {rows} rows")
-        codec = {"vcodec": "h264", "g": _gop(writer.height), "crf": CRF, "preset": "veryfast", "bf": 0}
-        found: dict[str, np.ndarray | np.generic] = {
-            vision(name, "storage_format"): np.str_("video_v1"),
-            vision(name, "frame_indices"): np.arange(rows),
-            vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{self.video.name}"),
-            vision(name, "rgb_fps"): np.float64(self.fps),
-            vision(name, "num_frames"): np.int64(writer.frames),
-        }
-        if self._depth_shape:
-            shape = (rows, *self._depth_shape)
-            found[vision(name, "depth")] = np.memmap(self.depth, np.float16, "r", shape=shape)
-        return found | {
-            f"arena_{vision(name, 'size')}": np.array([writer.width, writer.height]),
-            f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
-            f"arena_{vision(name, 'histogram')}": self.histogram,
-        }
-
-    def discard(self, *, whole: bool = True) -> None:
-        """Remove what is no file of the episode; with `whole` the video too."""
-        if whole and self.writer is not None:
-            self.writer.discard()
-            self.video.unlink(missing_ok=True)
-        if self._depth_file is not None:
-            self._depth_file.close()
-            self.depth.unlink(missing_ok=True)
-
-
 @dataclass
 class _Stream:
     """What is recorded of one world's episode."""
 
     episode: RecordedEpisode
-    label: str
-    thread: int
+    worker: int
+    """Whoever makes its films."""
     initial: dict[str, np.ndarray]
     """Fields of the reset."""
-    films: dict[str, _Film]
+    reels: dict[str, Reel]
+    """Its films by camera."""
     heading: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     """Packed rows: the beginning of a tick, then what was executed in it."""
-    broken: bool = False
-    """A file of it could not be written; set by its thread."""
 
 
 @dataclass(frozen=True)
@@ -207,6 +129,7 @@ class DemonstrationRecorder(Recorder):
         only_success: bool = False,
         facts: Mapping[str, object] | None = None,
         threads: int = 0,
+        processes: int = 0,
         finishing: Callable[[RecordedEpisode, EpisodeResult, dict[str, np.ndarray]], dict[str, np.ndarray]]
         | None = None,
     ):
@@ -221,6 +144,8 @@ class DemonstrationRecorder(Recorder):
             facts: What the run depends on, as JSON; it must not name times, folders or numbers of worlds.
             threads: Threads that encode and write. Without any, an episode's files are there when it has ended;
                 with threads, when `saved` names it.
+            processes: Processes that encode instead of the threads, which then only write the NPZ files. They start
+                with the first episode, where there are cameras.
             finishing: Makes the arrays that are written from those that were recorded.
         """
         self.folder, self.cameras, self.depth = Path(folder), dict(cameras or {}), depth
@@ -230,13 +155,14 @@ class DemonstrationRecorder(Recorder):
         self._views: dict[str, Camera] = {}
         self._shared: str | None = None
         """Camera whose pictures the policy sees too."""
-        self._slots: dict[str, PictureSlots] = {}
-        self._depth_slots: dict[str, PictureSlots] = {}
         self._streams: dict[int, _Stream] = {}
         self._acting: list[int] = []
+        self._reels: dict[str, list[Reel]] = {}
+        """The films of the worlds that act, by camera."""
+        self._chosen: torch.Tensor | None = None
+        """The worlds that act, where not all do."""
         self._before: torch.Tensor | None = None
-        self._encoders = Encoders(threads)
-        self._threads = threads
+        self._filming: Filming = FilmPool(processes, threads) if processes and self.cameras else FilmThreads(threads)
         self._saved: deque[SavedEpisode] = deque()
         self._ended = 0
 
@@ -251,12 +177,13 @@ class DemonstrationRecorder(Recorder):
         self._discard()
         self._env = env
         self._described = env.describe()
-        self._slots, self._depth_slots = {}, {}
         front = self.cameras.get("front")
         # Depths of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
         same = env.camera is not None and front == env.camera_config and not self.depth
         self._shared = "front" if same else None
         self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
+        pictured = {name: Pictured(env.worlds, c.height, c.width, self.depth) for name, c in self._views.items()}
+        self._filming.bind(pictured, torch.device(env.torch_device))
         scene = env.scene
         self._bodies = {}
         for placed in env.spec.objects:
@@ -304,19 +231,24 @@ class DemonstrationRecorder(Recorder):
         for name, body in self._bodies.items():
             initial[f"episode_init_env_obj_{name}_position"] = self._xpos[world, body].cpu().numpy().copy()
             initial[f"episode_init_env_obj_{name}_orientation"] = self._xquat[world, body].cpu().numpy().copy()
-        label = episode_label(episode)
-        films = {name: _Film(self.folder, label, name, FPS) for name in self.cameras}
-        self._streams[world] = _Stream(episode, label, self._encoders.join(), initial, films)
+        label, worker = episode_label(episode), self._filming.join()
+        reels = {}
+        for name in self.cameras:
+            video = self.folder / VIDEO_FOLDER / f"{label}_{name}_rgb.mp4"
+            depth = self.folder / f"{label}_{name}_depth.raw{PARTIAL}"
+            reels[name] = self._filming.open(worker, video, depth, FPS)
+        self._streams[world] = _Stream(episode, worker, initial, reels)
+        self._reels = {}
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """Keep state, label and pictures of the worlds that act.
 
         Raises:
-            OSError: A file could not be written; the error carries its name.
+            OSError: A file could not be written, which the error names, or a process that encodes ended.
         """
-        self._encoders.check()
+        self._filming.check()
         mask = env.active & (env.tick >= 0)
-        self._acting = [world for world in np.flatnonzero(mask).tolist() if world in self._streams]
+        self._act([world for world in np.flatnonzero(mask).tolist() if world in self._streams])
         if not self._acting or observation is None:
             return
         worlds = env.worlds
@@ -331,49 +263,46 @@ class DemonstrationRecorder(Recorder):
         for name, camera in self._views.items():
             self._film(env, name, camera, mask, observation)
 
+    def _act(self, worlds: list[int]) -> None:
+        """Which worlds act in this tick; what follows from that is made where it changes."""
+        if worlds == self._acting and self._reels:
+            return
+        self._acting = worlds
+        self._reels = {name: [self._streams[world].reels[name] for world in worlds] for name in self.cameras}
+        self._chosen = None
+
     def _film(self, env: World, name: str, camera: Camera, mask: np.ndarray, observation: Observation) -> None:
-        """Render a camera and hand the pictures to the episodes' threads."""
+        """Render a camera and hand the pictures to whoever makes the films."""
         missing = mask
         if name == self._shared and observation.image is not None:  # what the policy saw is rendered once
             missing = mask & ~observation.mask
         if missing.any():
             env.render(camera, missing)
-        slot = self._slot(self._slots, name, wp.to_torch(camera.image))
-        depth = self._slot(self._depth_slots, name, camera.distance_picture().half()) if self.depth else None
-        for row, world in enumerate(self._acting):
-            stream = self._streams[world]
-            self._encoders.submit(stream.thread, partial(self._encode, stream, name, row, slot, depth))
+        pictures = self._taken(wp.to_torch(camera.image))
+        depths = self._taken(camera.distance_picture()).half() if self.depth else None
+        self._filming.add(name, self._reels[name], pictures, depths)
 
-    def _slot(self, slots: dict[str, PictureSlots], name: str, pictures: torch.Tensor) -> PictureSlot:
-        """Pictures of the worlds that act, copied to the host."""
-        if name not in slots:
-            slots[name] = PictureSlots(pictures, None if self._threads else 1)
-        slot = slots[name].take(len(self._acting))
-        every = len(self._acting) == len(pictures)
-        slot.fill(pictures if every else pictures[torch.tensor(self._acting, device=pictures.device)])
-        return slot
-
-    def _encode(self, stream: _Stream, name: str, row: int, slot: PictureSlot, depth: PictureSlot | None) -> None:
-        """A picture's encoding, in the episode's thread."""
-        try:
-            if not stream.broken:
-                stream.films[name].add(slot.picture(row), None if depth is None else depth.picture(row))
-        except BaseException:
-            stream.broken = True
-            raise
-        finally:
-            self._slots[name].release(slot)
-            if depth is not None:
-                self._depth_slots[name].release(depth)
+    def _taken(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Pictures of the worlds that act."""
+        if len(self._acting) == len(pictures):
+            return pictures
+        if self._chosen is None:
+            self._chosen = torch.tensor(self._acting, device=pictures.device)
+        return pictures[self._chosen]
 
     def tick(self, env: World) -> None:
-        """Keep what was executed."""
+        """Keep what was executed.
+
+        Raises:
+            OSError: As `before_physics`.
+        """
         if not self._acting or self._before is None:
             return
         rows = torch.cat([self._before, *(part.float() for part in self._after)], dim=1).cpu().numpy()
         for world in self._acting:
             self._streams[world].rows.append(rows[world].copy())
-        self._acting, self._before = [], None
+        self._before = None
+        self._filming.check()  # the GPU has done what it was asked for: the pictures are there
 
     def finish(self, env: World, world: int, result: EpisodeResult) -> None:
         """Write the episode; one that ended as an error, or before its first action, leaves nothing.
@@ -385,42 +314,44 @@ class DemonstrationRecorder(Recorder):
         if stream is None:
             return
         self._ended += 1
+        self._reels = {}
         wanted = result.outcome == "success" or (not self.only_success and result.outcome != "error")
         if wanted and stream.rows:
             last = self._qpos[world].cpu().numpy().copy()
-            job = partial(self._save, stream, result, partial(self._fields, env, stream, result, last, self._described))
+            fields = partial(self._fields, env, stream, result, last, self._described)
+            self._filming.finish(stream.worker, stream.reels, partial(self._save, stream, result, fields))
         else:
-            job = partial(self._drop, stream, result)
-        self._encoders.submit(stream.thread, job)
-        self._encoders.leave(stream.thread)
-        self._encoders.check()
+            dropped = partial(self._saved.append, SavedEpisode(result, {}))
+            self._filming.discard(stream.worker, stream.reels, dropped)
+        self._filming.leave(stream.worker)
+        self._filming.check()
         if self._ended - len(self._saved) > env.worlds + WAITING_EPISODES:
-            self._encoders.wait()
+            self._filming.wait()
 
-    def _save(self, stream: _Stream, result: EpisodeResult, fields: Callable[[], dict[str, np.ndarray]]) -> None:
-        """An episode's files, in its thread."""
-        if stream.broken:
-            self._drop(stream, None)
+    def _save(
+        self,
+        stream: _Stream,
+        result: EpisodeResult,
+        fields: Callable[[Mapping[str, FilmFacts | None]], dict[str, np.ndarray]],
+        films: Mapping[str, FilmFacts | None] | None,
+    ) -> None:
+        """Write the file of an episode whose films are finished, in any thread; one with a broken film has none."""
+        if films is None:
             return
         path = self.file(stream.episode)
+        made = {name: facts for name, facts in films.items() if facts is not None}
         try:
-            for film in stream.films.values():
-                film.close()
-            write_episode(path, fields())
+            write_episode(path, fields(films))
         except BaseException:
-            self._drop(stream, None)
+            for name in made:
+                stream.reels[name].video.unlink(missing_ok=True)
             raise
-        for film in stream.films.values():
-            film.discard(whole=False)
-        files = {name: film.video for name, film in stream.films.items() if film.writer is not None}
+        finally:
+            for name, facts in made.items():
+                if facts.depth_shape:
+                    stream.reels[name].depth.unlink(missing_ok=True)
+        files = {name: stream.reels[name].video for name in made}
         self._saved.append(SavedEpisode(result, {"episode": path} | files))
-
-    def _drop(self, stream: _Stream, result: EpisodeResult | None) -> None:
-        """Nothing stays of an episode; a result is told."""
-        for film in stream.films.values():
-            film.discard()
-        if result is not None:
-            self._saved.append(SavedEpisode(result, {}))
 
     def saved(self, *, wait: bool = False) -> list[SavedEpisode]:
         """Episodes whose files were completed since the last call.
@@ -429,21 +360,27 @@ class DemonstrationRecorder(Recorder):
             wait: Until all that ended are written.
         """
         if wait:
-            self._encoders.wait()
+            self._filming.wait()
         found = [self._saved.popleft() for _ in range(len(self._saved))]
         self._ended -= len(found)
         return found
 
     def check(self) -> None:
-        """Raise what went wrong in a thread.
+        """Raise what went wrong in a thread or process.
 
         Raises:
-            OSError: A file could not be written; the error carries its name.
+            OSError: A file could not be written, which the error names, or a process that encodes ended.
         """
-        self._encoders.check()
+        self._filming.check()
 
     def _fields(
-        self, env: World, stream: _Stream, result: EpisodeResult, last: np.ndarray, facts: Mapping[str, object]
+        self,
+        env: World,
+        stream: _Stream,
+        result: EpisodeResult,
+        last: np.ndarray,
+        facts: Mapping[str, object],
+        films: Mapping[str, FilmFacts | None],
     ) -> dict[str, np.ndarray]:
         """All arrays of an episode, in the order of `episode.FIELDS`; in its thread, so nothing that moves is read."""
         episode, rows = stream.episode, len(stream.rows)
@@ -500,8 +437,9 @@ class DemonstrationRecorder(Recorder):
         fields |= stream.initial
         fields["episode_object_seed"] = np.uint64(episode.object_seed)
         fields["episode_object_seed_source"] = np.str_("arena_episode_seed")
-        for name, film in stream.films.items():
-            fields |= film.fields(name, rows)
+        for name, film in films.items():
+            if film is not None:
+                fields |= _film_fields(name, stream.reels[name], film, rows)
         fields |= {
             "arena_state": state,
             "arena_action": action,
@@ -534,15 +472,16 @@ class DemonstrationRecorder(Recorder):
     def close(self) -> None:
         """Drop what is unfinished; no partial file stays."""
         self._discard()
-        self._encoders.close()
+        self._filming.close()
         self._env, self._views = None, {}
 
     def _discard(self) -> None:
-        self._encoders.wait()
+        self._filming.wait()
         for stream in self._streams.values():
-            self._drop(stream, None)
-            self._encoders.leave(stream.thread)
-        self._streams, self._acting, self._before = {}, [], None
+            self._filming.discard(stream.worker, stream.reels, lambda: None)
+            self._filming.leave(stream.worker)
+        self._filming.wait()
+        self._streams, self._acting, self._reels, self._before = {}, [], {}, None
 
     def __enter__(self) -> DemonstrationRecorder:
         """The recorder itself."""
@@ -553,8 +492,30 @@ class DemonstrationRecorder(Recorder):
         self.close()
 
 
-def _gop(height: int) -> int:
-    return GOP_SMALL if height <= SMALL else GOP_LARGE
+def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str, np.ndarray | np.generic]:
+    """What the file says of a camera.
+
+    Raises:
+        ArenaError: The film has another number of pictures.
+    """
+    if film.frames != rows:
+        raise ArenaError(f"{reel.video}: {film.frames} frames for {rows} rows")
+    codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0}
+    found: dict[str, np.ndarray | np.generic] = {
+        vision(name, "storage_format"): np.str_("video_v1"),
+        vision(name, "frame_indices"): np.arange(rows),
+        vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{reel.video.name}"),
+        vision(name, "rgb_fps"): np.float64(FPS),
+        vision(name, "num_frames"): np.int64(film.frames),
+    }
+    if film.depth_shape:
+        shape = (rows, *film.depth_shape)
+        found[vision(name, "depth")] = np.memmap(reel.depth, np.float16, "r", shape=shape)
+    return found | {
+        f"arena_{vision(name, 'size')}": np.array([film.width, film.height]),
+        f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
+        f"arena_{vision(name, 'histogram')}": film.histogram,
+    }
 
 
 def _split(rows: Sequence[np.ndarray], widths: Sequence[int]) -> list[np.ndarray]:

@@ -1,21 +1,39 @@
-"""Threads that encode and write episodes while their worlds go on.
+"""Threads that write episodes, and films that are encoded by threads, while their worlds go on.
 
-An episode belongs to one thread, which does its jobs in their order: frame after frame, then the files. Pictures wait
+An episode belongs to one worker, which does its jobs in their order: frame after frame, then the files. Pictures wait
 in slots of memory that were allocated once; where all are taken, whoever brings the next pictures waits. So memory is
 bounded, no frame is dropped, and a slow disk slows the simulation instead of failing it.
+
+Python's global lock lets few threads encode at once; `film_pool` does the same with processes.
 """
 
 from __future__ import annotations
 
+import abc
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
 
-__all__ = ["Encoders", "PictureSlot", "PictureSlots"]
+from arena_newton.data.film import Film, FilmFacts
+
+__all__ = [
+    "Encoders",
+    "FilmThreads",
+    "Filming",
+    "PictureSlot",
+    "PictureSlots",
+    "Pictured",
+    "Reel",
+    "copy_pictures",
+    "slots_of",
+]
 
 SLOT_BYTES = 512 << 20
 """Memory of the pictures of one camera that wait [B]: as many slots as fit into it, `SLOTS` of them at least and most.
@@ -24,6 +42,113 @@ SLOTS = (2, 12)
 """Least and most slots of a camera."""
 
 Job = Callable[[], None]
+
+
+def slots_of(size: int) -> int:
+    """Slots of a camera whose pictures of one tick take so many bytes."""
+    return min(max(SLOT_BYTES // max(size, 1), SLOTS[0]), SLOTS[1])
+
+
+def copy_pictures(rows: torch.Tensor, pictures: torch.Tensor) -> None:
+    """Copy pictures [n, ...] to the first rows on the host; from a GPU on torch's stream, without waiting for it."""
+    if pictures.is_cuda:
+        rows[: len(pictures)].copy_(pictures, non_blocking=True)
+    else:  # torch would wake a thread per core, while every core encodes
+        np.copyto(rows.numpy()[: len(pictures)], pictures.numpy())
+
+
+@dataclass(frozen=True)
+class Pictured:
+    """The pictures of a camera."""
+
+    worlds: int
+    height: int
+    """[px]."""
+    width: int
+    """[px]."""
+    depth: bool
+    """Whether their depths are recorded too."""
+
+
+@dataclass(eq=False)
+class Reel:
+    """A film that others make: what its recorder knows of it."""
+
+    number: int
+    """No other one of the same `Filming` has it."""
+    worker: int
+    """Whoever makes the films of its episode."""
+    video: Path
+    """The MP4."""
+    depth: Path
+    """Raw depths, until they are written into the episode's file."""
+    film: Film | None = None
+    """The film itself, where it is made in this process."""
+    broken: bool = False
+    """It could not be written; nothing is left of it."""
+
+
+Finished = Callable[[Mapping[str, FilmFacts | None] | None], None]
+"""What is done with an episode's finished films, by camera; None where one of them is broken. A film without pictures
+has no facts."""
+
+
+class Filming(abc.ABC):
+    """Makes the films of the episodes that are recorded at the same time, and then writes the episodes' files."""
+
+    @abc.abstractmethod
+    def bind(self, cameras: Mapping[str, Pictured], device: torch.device) -> None:
+        """Prepare for pictures of these cameras, which come from a device; no film is in the making."""
+
+    @abc.abstractmethod
+    def join(self) -> int:
+        """A worker for a new episode; `leave` gives it back."""
+
+    @abc.abstractmethod
+    def leave(self, worker: int) -> None:
+        """The episode brings no more pictures."""
+
+    @abc.abstractmethod
+    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
+        """A film of an episode."""
+
+    @abc.abstractmethod
+    def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
+        """Append a picture to each film; waits where the workers are too far behind.
+
+        Args:
+            camera: Its name in `bind`.
+            reels: The films. A list that is given again must be the same one in content.
+            pictures: uint8, shape [len(reels), H, W, 3]; they may change afterwards.
+            depths: float16 [m], shape [len(reels), H, W].
+
+        Raises:
+            OSError: A worker ended.
+        """
+
+    @abc.abstractmethod
+    def finish(self, worker: int, reels: Mapping[str, Reel], then: Finished) -> None:
+        """Finish an episode's films, and then do that; not necessarily at once, and in any thread."""
+
+    @abc.abstractmethod
+    def discard(self, worker: int, reels: Mapping[str, Reel], then: Job) -> None:
+        """Drop an episode's films, and then do that."""
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Raise the first error since the last call.
+
+        Raises:
+            OSError: A file could not be written, which the error names, or a worker ended.
+        """
+
+    @abc.abstractmethod
+    def wait(self) -> None:
+        """Return when all that was asked for is done."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Do what was asked for, and end the workers."""
 
 
 class Encoders:
@@ -113,7 +238,7 @@ class PictureSlot:
 
     def fill(self, pictures: torch.Tensor) -> None:
         """Take pictures [n, ...]; from a GPU without waiting for them."""
-        self.rows[: len(pictures)].copy_(pictures, non_blocking=True)
+        copy_pictures(self.rows, pictures)
         if pictures.is_cuda:
             self._copied = torch.cuda.Event()
             self._copied.record(torch.cuda.current_stream(pictures.device))
@@ -129,13 +254,9 @@ class PictureSlot:
 class PictureSlots:
     """Slots of one camera."""
 
-    def __init__(self, like: torch.Tensor, count: int | None = None):
+    def __init__(self, shape: Sequence[int], dtype: torch.dtype, count: int, *, pinned: bool = False):
         """Allocate slots for pictures of this shape [n, ...], pinned where they come from a GPU."""
-        size = like.numel() * like.element_size()
-        count = count or min(max(SLOT_BYTES // max(size, 1), SLOTS[0]), SLOTS[1])
-        self._slots = [
-            PictureSlot(torch.empty(like.shape, dtype=like.dtype, pin_memory=like.is_cuda)) for _ in range(count)
-        ]
+        self._slots = [PictureSlot(torch.empty(shape, dtype=dtype, pin_memory=pinned)) for _ in range(count)]
         self._changed = threading.Condition()
 
     def take(self, users: int) -> PictureSlot:
@@ -152,3 +273,103 @@ class PictureSlots:
             slot.users -= 1
             if not slot.users:
                 self._changed.notify()
+
+
+class FilmThreads(Filming):
+    """Films that threads make; without a thread, whoever brings the pictures."""
+
+    def __init__(self, threads: int):
+        """Start the threads."""
+        self._encoders, self._threads = Encoders(threads), threads
+        self._slots: dict[str, tuple[PictureSlots, PictureSlots | None]] = {}
+        self._opened = 0
+
+    def bind(self, cameras: Mapping[str, Pictured], device: torch.device) -> None:
+        """Allocate the slots."""
+        pinned = device.type == "cuda"
+        self._slots = {}
+        for name, made in cameras.items():
+            shape = made.worlds, made.height, made.width
+            count = slots_of(3 * made.worlds * made.height * made.width) if self._threads else 1
+            depths = PictureSlots(shape, torch.float16, count, pinned=pinned) if made.depth else None
+            self._slots[name] = PictureSlots((*shape, 3), torch.uint8, count, pinned=pinned), depths
+
+    def join(self) -> int:
+        """The thread with the fewest episodes."""
+        return self._encoders.join()
+
+    def leave(self, worker: int) -> None:
+        """The episode brings no more pictures."""
+        self._encoders.leave(worker)
+
+    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
+        """A film of an episode."""
+        self._opened += 1
+        return Reel(self._opened, worker, video, depth, Film(video, depth, fps))
+
+    def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
+        """Append a picture to each film; waits while all slots are taken."""
+        slots, depth_slots = self._slots[camera]
+        slot = slots.take(len(reels))
+        slot.fill(pictures)
+        depth = None
+        if depth_slots is not None and depths is not None:
+            depth = depth_slots.take(len(reels))
+            depth.fill(depths)
+        for row, reel in enumerate(reels):
+            self._encoders.submit(reel.worker, partial(self._encode, camera, reel, row, slot, depth))
+
+    def _encode(self, camera: str, reel: Reel, row: int, slot: PictureSlot, depth: PictureSlot | None) -> None:
+        """A picture's encoding, in the episode's thread."""
+        slots, depth_slots = self._slots[camera]
+        try:
+            if not reel.broken and reel.film is not None:
+                reel.film.add(slot.picture(row), None if depth is None else depth.picture(row))
+        except BaseException:
+            reel.broken = True
+            raise
+        finally:
+            slots.release(slot)
+            if depth is not None and depth_slots is not None:
+                depth_slots.release(depth)
+
+    def finish(self, worker: int, reels: Mapping[str, Reel], then: Finished) -> None:
+        """Finish an episode's films, and then do that, in its thread."""
+        self._encoders.submit(worker, partial(self._finish, reels, then))
+
+    def _finish(self, reels: Mapping[str, Reel], then: Finished) -> None:
+        found: dict[str, FilmFacts | None] | None = None
+        try:
+            if not any(reel.broken for reel in reels.values()):
+                found = {name: reel.film.close() if reel.film else None for name, reel in reels.items()}
+        finally:
+            if found is None:
+                _discard(reels)
+            then(found)
+
+    def discard(self, worker: int, reels: Mapping[str, Reel], then: Job) -> None:
+        """Drop an episode's films, and then do that, in its thread."""
+
+        def drop() -> None:
+            _discard(reels)
+            then()
+
+        self._encoders.submit(worker, drop)
+
+    def check(self) -> None:
+        """Raise the first error since the last call."""
+        self._encoders.check()
+
+    def wait(self) -> None:
+        """Return when all that was asked for is done."""
+        self._encoders.wait()
+
+    def close(self) -> None:
+        """Do what was asked for, and end the threads."""
+        self._encoders.close()
+
+
+def _discard(reels: Mapping[str, Reel]) -> None:
+    for reel in reels.values():
+        if reel.film is not None:
+            reel.film.discard()

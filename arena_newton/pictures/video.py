@@ -8,15 +8,21 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import av
 import cv2
 import numpy as np
-import torch
 
 from arena_newton.errors import ArenaError
 from arena_newton.files import PARTIAL, replace_atomically
 from arena_newton.foreign import create
+
+if TYPE_CHECKING:  # a process that encodes pictures starts without torch
+    import torch
+
+    Picture = np.ndarray | torch.Tensor
+    """A frame, uint8, shape [H, W, 3]."""
 
 __all__ = ["VideoWriter", "caption", "evenly", "film_strip"]
 
@@ -29,13 +35,10 @@ LABEL_FRACTION = 0.12
 JPEG_QUALITY = 90
 """Quality of film strips that are JPEGs: a third of the PNG's size, no visible loss at the size of a page."""
 
-Picture = np.ndarray | torch.Tensor
-"""A frame, uint8, shape [H, W, 3]."""
-
 
 def _rgb(frame: Picture) -> np.ndarray:
     """A frame as a contiguous array."""
-    frame = frame.cpu().numpy() if isinstance(frame, torch.Tensor) else np.asarray(frame)
+    frame = np.asarray(frame.cpu() if hasattr(frame, "cpu") else frame)
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ArenaError(f"a frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
     return np.ascontiguousarray(frame)

@@ -53,7 +53,7 @@ def test_an_error_of_a_job_reaches_whoever_checks_and_stops_no_other_job(threads
 
 def test_full_slots_hold_back_whoever_brings_pictures():
     """With all slots taken the next pictures wait until a user has released one; none is overwritten."""
-    slots = PictureSlots(torch.zeros(2, 3, dtype=torch.uint8), 2)
+    slots = PictureSlots((2, 3), torch.uint8, 2)
     first, second = slots.take(2), slots.take(1)
     first.fill(torch.full((2, 3), 7, dtype=torch.uint8))
     taken = []

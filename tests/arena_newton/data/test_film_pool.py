@@ -1,0 +1,182 @@
+"""Films that processes encode: the bytes of one process, clear errors of those that end, none that outlives its own."""
+
+import contextlib
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton.data.encoding import FilmThreads, Pictured
+from arena_newton.data.film_pool import FilmPool
+
+WORLDS, TICKS, SIZE = 5, 14, 64
+CPU = torch.device("cpu")
+
+CHILD = """
+import sys, time
+import torch
+from pathlib import Path
+from arena_newton.data.encoding import Pictured
+from arena_newton.data.film_pool import FilmPool
+pool = FilmPool(2, 1)
+pool.bind({"front": Pictured(2, 64, 64, False)}, torch.device("cpu"))
+reels = [pool.open(pool.join(), Path(sys.argv[1]) / f"{n}.mp4", Path(sys.argv[1]) / f"{n}.raw", 50) for n in range(2)]
+pool.add("front", reels, torch.zeros(2, 64, 64, 3, dtype=torch.uint8), None)
+pool.wait()
+print(len(list(Path(sys.argv[1]).glob("*.part"))), flush=True)
+time.sleep(60)
+"""
+
+
+def pictures(tick):
+    """Pictures and depths of a tick, of as many worlds as act in it."""
+    draw = np.random.default_rng(tick)
+    worlds = WORLDS - tick % 2
+    depths = torch.from_numpy(draw.random((worlds, SIZE, SIZE)).astype(np.float16))
+    return torch.from_numpy(draw.integers(0, 255, (worlds, SIZE, SIZE, 3), np.uint8)), depths
+
+
+def begin(filming, folder, worlds=WORLDS, depth=True):
+    """Films of some worlds."""
+    filming.bind({"front": Pictured(worlds, SIZE, SIZE, depth)}, CPU)
+    workers = [filming.join() for _ in range(worlds)]
+    return [filming.open(w, folder / f"{n}.mp4", folder / f"{n}.raw", 50) for n, w in enumerate(workers)]
+
+
+def film(filming, folder):
+    """Facts of the films of all worlds; the last one has no picture in every other tick."""
+    folder.mkdir()
+    reels, facts = begin(filming, folder), {}
+    every = [reels, reels[:-1]]
+    for tick in range(TICKS):
+        filming.add("front", every[tick % 2], *pictures(tick))
+        filming.check()
+    for number, reel in enumerate(reels):
+        filming.finish(reel.worker, {"front": reel}, lambda films, n=number: facts.update({n: films["front"]}))
+        filming.leave(reel.worker)
+    filming.wait()
+    filming.check()
+    filming.close()
+    return facts
+
+
+def dropped(filming, reels):
+    """Drop films; whether that was said of each."""
+    said = []
+    for reel in reels:
+        filming.discard(reel.worker, {"front": reel}, lambda: said.append(1))
+    filming.wait()
+    filming.close()
+    return len(said) == len(reels)
+
+
+def test_bytes_are_those_of_threads_and_of_neither(tmp_path):
+    """Two processes, two threads and none make the same videos, depths, histograms and numbers of frames."""
+    makers = {"pool": FilmPool(2, 1), "threads": FilmThreads(2), "none": FilmThreads(0)}
+    facts = {name: film(filming, tmp_path / name) for name, filming in makers.items()}
+    for name in ("threads", "none"):
+        for world in range(WORLDS):
+            for ending in ("mp4", "raw"):
+                file = f"{world}.{ending}"
+                assert (tmp_path / "pool" / file).read_bytes() == (tmp_path / name / file).read_bytes(), (name, file)
+            one, other = dict(vars(facts["pool"][world])), dict(vars(facts[name][world]))
+            assert np.array_equal(one.pop("histogram"), other.pop("histogram")) and one == other
+    assert facts["pool"][0].frames == TICKS and facts["pool"][WORLDS - 1].frames == TICKS // 2
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_dropped_films_leave_no_file(tmp_path):
+    """What is dropped in the middle is gone, and the pool takes other pictures afterwards."""
+    pool = FilmPool(2, 1)
+    reels = begin(pool, tmp_path)
+    pool.add("front", reels, *pictures(0))
+    pool.wait()
+    assert len(list(tmp_path.iterdir())) == 2 * WORLDS
+    for reel in reels:
+        pool.discard(reel.worker, {"front": reel}, lambda: None)
+    more = begin(pool, tmp_path, worlds=2, depth=False)
+    pool.add("front", more, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
+    assert dropped(pool, more) and list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    """The error of a process arrives with number and file; the episode has no films, the others have theirs."""
+    pool = FilmPool(2, 1)
+    pool.bind({"front": Pictured(2, SIZE, SIZE, False)}, CPU)
+    (tmp_path / "file").touch()
+    whole = pool.open(pool.join(), tmp_path / "a.mp4", tmp_path / "a.raw", 50)
+    broken = pool.open(pool.join(), tmp_path / "file" / "b.mp4", tmp_path / "b.raw", 50)
+    pool.add("front", [whole, broken], torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
+    told = {}
+    for reel in (whole, broken):
+        pool.finish(reel.worker, {"front": reel}, lambda films, reel=reel: told.update({reel: films}))
+    pool.wait()
+    with pytest.raises(OSError, match=r"file") as caught:
+        pool.check()
+    assert caught.value.errno in (errno.EEXIST, errno.ENOTDIR)
+    pool.check()
+    pool.close()
+    assert told[broken] is None and told[whole]["front"].frames == 1 and (tmp_path / "a.mp4").is_file()
+
+
+def children(parent, wanted):
+    """Process numbers of the encoders of a process, once so many run."""
+    until = time.monotonic() + 30
+    while time.monotonic() < until:
+        found = []
+        for entry in os.listdir("/proc"):
+            with contextlib.suppress(OSError, ValueError, IndexError):
+                with open(f"/proc/{int(entry)}/stat") as file:
+                    status = file.read().rsplit(")", 1)[1].split()
+                with open(f"/proc/{int(entry)}/cmdline") as file:
+                    if int(status[1]) == parent and "film_process" in file.read() and status[0] != "Z":
+                        found.append(int(entry))
+        if len(found) == wanted:
+            return found
+        time.sleep(0.05)
+    pytest.fail(f"{found} instead of {wanted} encoders")
+
+
+def test_a_killed_process_is_one_clear_error(tmp_path):
+    """The films of a killed process are lost and said to be, those of the others are whole; nothing waits for ever."""
+    pool = FilmPool(2, 1)
+    reels = begin(pool, tmp_path, worlds=2)
+    pool.add("front", reels, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half())
+    pool.wait()
+    victim = min(children(os.getpid(), 2))  # processes are started in their order
+    os.kill(victim, signal.SIGKILL)
+    with pytest.raises(ChildProcessError, match=r"a process that encodes pictures ended \(SIGKILL; out of memory\?\)"):
+        for _ in range(200):
+            pool.add(
+                "front", reels, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half()
+            )
+            pool.check()
+            time.sleep(0.01)
+    told = []
+    for reel in reels:
+        pool.finish(reel.worker, {"front": reel}, told.append)
+    pool.wait()
+    pool.close()
+    assert sorted(films is None for films in told) == [False, True]
+    assert len(list(tmp_path.glob("*.mp4"))) == 1 and not list(tmp_path.glob("*.part"))
+
+
+def test_no_process_outlives_a_killed_recorder(tmp_path):
+    """Kill -9 of the recording process ends its encoders, which leave its partial files to the next call."""
+    run = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert run.stdout.readline() == "2\n"
+        encoders = children(run.pid, 2)
+    finally:
+        run.kill()
+        run.communicate()
+    until = time.monotonic() + 10
+    while any(os.path.exists(f"/proc/{one}") for one in encoders) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not [one for one in encoders if os.path.exists(f"/proc/{one}")]
