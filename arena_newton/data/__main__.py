@@ -89,8 +89,8 @@ COMMANDS: dict[str, DataCommand] = {
         work="inspection:inspect",
     ),
     "bench": DataCommand(
-        words="bench <dataset> [--recordings <recordings> ...]",
-        purpose="measure random reads, and the time that building takes",
+        words="bench <dataset> [--recordings <recordings> ...] | <recordings> --made 100",
+        purpose="measure random reads, and the time that building and verifying take",
         options=DatasetBenchOptions,
         work="dataset_bench:bench",
         extra="data",

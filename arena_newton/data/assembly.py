@@ -411,7 +411,7 @@ def _arena(selections: Sequence[Selection]) -> dict[str, object] | None:
     """Block `arena` of the chosen episodes; None where one dataset has none."""
     episodes: list[dict[str, object]] = []
     configurations: dict[str, object] = {}
-    versions: dict[str, list[str]] = {}
+    versions: dict[str, set[str]] = {}
     for selection in selections:
         listed, block = described(selection.files), selection.files.info.get("arena")
         if listed is None or not isinstance(block, dict):
@@ -423,8 +423,7 @@ def _arena(selections: Sequence[Selection]) -> dict[str, object] | None:
             if isinstance(known, dict) and code in known:
                 configurations[str(code)] = known[code]
         for name, version in block["versions"].items() if isinstance(block.get("versions"), dict) else ():
-            versions.setdefault(name, [])
-            versions[name] += [] if str(version) in versions[name] else [str(version)]
+            versions.setdefault(name, set()).update([] if version is None else [str(version)])
         episodes += chosen
     block = selections[0].files.info["arena"]
     assert isinstance(block, dict)
@@ -433,7 +432,7 @@ def _arena(selections: Sequence[Selection]) -> dict[str, object] | None:
     return {
         **block,
         **changed,
-        "versions": {name: ", ".join(sorted(found)) for name, found in versions.items()},
+        "versions": {name: ", ".join(sorted(found)) or None for name, found in versions.items()},
         "configurations": dict(sorted(configurations.items())),
         "episodes": episodes,
     }

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from arena_newton import robot
 from arena_newton.canonical import ACTION, HAND_CLOSED, STATE
 from arena_newton.data.episode_figures import FIGURES, EpisodeFigures, figures, ranked
-from arena_newton.data.frames import OpenVideo
+from arena_newton.data.frame_reader import OpenVideo
 from arena_newton.data.motion_source import Motion, motions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files import replace_atomically

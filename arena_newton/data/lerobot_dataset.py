@@ -28,7 +28,7 @@ from lerobot.datasets import dataset_writer
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
-from arena_newton import seeding
+from arena_newton import __version__, seeding
 from arena_newton.data.dataset_files import read_json
 from arena_newton.data.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.image_statistics import statistics
@@ -49,8 +49,8 @@ LEROBOT = "0.6.1"
 """Version of LeRobot whose writer this knows."""
 SCHEMA = "arena_dataset_v1"
 """Version of the block `arena` of `info.json`."""
-LIBRARIES = ("arena-newton", "lerobot", "av", "datasets", "numpy", "pandas", "pyarrow")
-"""Those that make the bytes of a dataset."""
+LIBRARIES = ("lerobot", "av", "datasets", "numpy", "pandas", "pyarrow")
+"""Those that make the bytes of a dataset, besides this package."""
 SMALL_HEIGHT = 256
 """Pictures up to this height [px] go into video files of `SMALL_MB`, larger ones into files of `LARGE_MB`."""
 SMALL_MB, LARGE_MB = 5, 25
@@ -254,9 +254,18 @@ def check_version() -> None:
     Raises:
         InputError: Its version is another one.
     """
-    version = importlib.metadata.version("lerobot")
+    version = _installed("lerobot")
     if version != LEROBOT:
-        raise InputError(f"data build: knows the writer of lerobot {LEROBOT}, {version} is installed")
+        given = version or "one without a version"
+        raise InputError(f"data build: knows the writer of lerobot {LEROBOT}, {given} is installed")
+
+
+def _installed(name: str) -> str | None:
+    """Version of a distribution; None where it can be imported but was not installed, as from PYTHONPATH."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 @contextlib.contextmanager
@@ -430,7 +439,7 @@ def _origin(chosen: Chosen, kind: Layout, labels: str) -> dict[str, object]:
         "seed_ranges": sorted({str(episode["seed_range"]) for episode in episodes}),
         "trackers": sorted({str(episode["tracker"]) for episode in episodes}),
         "policies": sorted({str(episode["policy"]) for episode in episodes}),
-        "versions": {name: importlib.metadata.version(name) for name in LIBRARIES},
+        "versions": {"arena-newton": __version__, **{name: _installed(name) for name in LIBRARIES}},
         "configurations": dict(sorted(configurations.items())),
         "episodes": episodes,
     }

@@ -12,7 +12,7 @@ from pathlib import Path
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files import PARTIAL
 
-__all__ = ["link", "new_folder"]
+__all__ = ["link", "new_folder", "scratch_folder"]
 
 LOCK = f"{PARTIAL}.lock"
 """Ending of the file that is locked while the folder grows."""
@@ -21,6 +21,21 @@ LOCK = f"{PARTIAL}.lock"
 @contextlib.contextmanager
 def new_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
     """An empty folder `<out>.part` to write in; it gets its name at the end of the block, and is removed on an error.
+
+    What a killed process left of it is removed by the next one.
+
+    Raises:
+        InputError: `out` exists, or another process writes it.
+        ArenaError: It cannot be written.
+    """
+    with scratch_folder(out, flag) as part:
+        yield part
+        os.rename(part, out)
+
+
+@contextlib.contextmanager
+def scratch_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
+    """An empty folder `<out>.part`, which is removed at the end of the block.
 
     What a killed process left of it is removed by the next one.
 
@@ -47,7 +62,6 @@ def new_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
             part.mkdir()
             try:
                 yield part
-                os.rename(part, out)
             finally:
                 shutil.rmtree(part, ignore_errors=True)
                 lock.unlink(missing_ok=True)

@@ -7,7 +7,8 @@ action that was decided), not copied from those that `build` used.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ from arena_newton.data.image_statistics import QUANTILES, VALUES, statistics
 from arena_newton.data.label_protocols import encode_v4
 from arena_newton.data.layouts import FPS, LAYOUTS, Column, Layout, described_protocol, modality
 from arena_newton.data.row_statistics import aggregated, quantile_name, row_statistics
-from arena_newton.data.video_checks import DatasetMismatch, check_videos
+from arena_newton.data.video_checks import CameraVideos, DatasetMismatch, check_videos
 from arena_newton.errors import InputError
 from arena_newton.text import counted
 
@@ -39,6 +40,8 @@ STATISTICS_TOLERANCE = 1e-6
 FOREIGN_TOLERANCE = 0.02
 """The same for datasets that LeRobot itself or another tool wrote, relative to the range of the numbers: LeRobot's
 statistics are made in single precision."""
+MOST_JOBS = 256
+"""Most threads: each keeps a decoder and up to 12 compared pictures in memory."""
 COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Columns that LeRobot adds."""
 MOMENTS = ("min", "max", "mean", "std", "count")
@@ -81,10 +84,13 @@ def verify(folders: Sequence[Path], options: VerifyOptions) -> int:
     """
     if len(folders) != 1:
         raise InputError(f"verify: name one dataset, not {len(folders)}")
+    if not 0 <= options.jobs <= MOST_JOBS:
+        raise InputError(f"--jobs {options.jobs}: expected 0 to {MOST_JOBS}")
     files = DatasetFiles(folders[0])
     recorded = list(opened(episode_files(options.recordings))) if options.recordings else []
+    jobs = options.jobs or len(os.sched_getaffinity(0))
     try:
-        lines = _verified(files, recorded)
+        lines = _verified(files, recorded, jobs)
     except InputError as error:
         if any(str(error).startswith(str(folder)) for folder in options.recordings):
             raise
@@ -93,7 +99,7 @@ def verify(folders: Sequence[Path], options: VerifyOptions) -> int:
     return 0
 
 
-def _verified(files: DatasetFiles, recorded: Sequence[EpisodeFile]) -> list[str]:
+def _verified(files: DatasetFiles, recorded: Sequence[EpisodeFile], jobs: int) -> list[str]:
     """Check all of it.
 
     Returns:
@@ -105,24 +111,22 @@ def _verified(files: DatasetFiles, recorded: Sequence[EpisodeFile]) -> list[str]
     sources = _sources(subject, recorded)
     stats, means, warnings = _check_rows(subject, sources)
     _check_aggregate(subject, stats)
-    total = 0
-    bar = tqdm(total=files.frames * len(files.video_keys), unit="frame", desc="verify", disable=None)
-    with bar:
-        for key in files.video_keys:
-            camera = _camera(subject, key)
-            videos = {index: episode.video(camera) for index, episode in sources.items() if camera in episode.cameras}
-            total += check_videos(files, key, means[key], videos, _advance(bar))
+    cameras = []
+    for key in files.video_keys:
+        camera = _camera(subject, key)
+        videos = {index: episode.video(camera) for index, episode in sources.items() if camera in episode.cameras}
+        cameras.append(CameraVideos(key, means[key], videos))
+    with tqdm(total=files.frames * len(cameras), unit="frame", desc="verify", disable=None) as bar:
+
+        def progress(decoded: int) -> None:
+            bar.update(decoded - bar.n)
+
+        total = check_videos(files, cameras, jobs=jobs, progress=progress)
     against = f"equal to {counted(len(sources), 'recorded episode')}" if sources else (
         "not compared with recordings (--recordings names them)"
     )  # fmt: skip
     what = f"{counted(files.episodes, 'episode')}, {files.frames} rows, {counted(total, 'decoded frame')}"
     return [*warnings, f"{files.root}: {what}: sound, {against}"]
-
-
-def _advance(bar: tqdm[None]) -> Iterator[None]:
-    while True:
-        bar.update(1)
-        yield
 
 
 def _subject(files: DatasetFiles) -> _Subject:

@@ -1,8 +1,14 @@
-"""Decodes every frame of a dataset's videos and holds them against the tables and the recorded MP4s."""
+"""Decodes every frame of a dataset's videos and holds them against the tables and the recorded MP4s.
+
+Files are decoded by threads: FFmpeg works without Python's lock. Which mismatch is reported does not depend on their
+number: it is the first one of the first file that has one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +19,7 @@ from arena_newton.data.dataset_files import DatasetFiles, EpisodeRow, VideoPart
 from arena_newton.data.frame_reader import OpenVideo
 from arena_newton.errors import ArenaError, InputError
 
-__all__ = ["DatasetMismatch", "check_videos"]
+__all__ = ["CameraVideos", "DatasetMismatch", "check_videos"]
 
 MEAN_TOLERANCE = 3.0
 """Largest difference [grey levels] between the mean of decoded frames and that of the statistics, which were taken
@@ -25,6 +31,8 @@ TIME_TOLERANCE = 1e-3
 """Largest difference of a frame's time from its number, in frames."""
 COMPARED = 12
 """Frames of an episode that are compared with the recorded MP4's, bit for bit: its first, its last, some between."""
+REPORT_SECONDS = 0.2
+"""Time [s] between two reports of how far the threads are."""
 
 
 class DatasetMismatch(ArenaError):
@@ -46,6 +54,18 @@ class DatasetMismatch(ArenaError):
 
 
 @dataclass(frozen=True)
+class CameraVideos:
+    """What the videos of a camera are held against."""
+
+    key: str
+    """Feature of the camera."""
+    means: Sequence[np.ndarray]
+    """Mean of each episode's pictures by its statistics, 0 to 1, shape [3]."""
+    sources: Mapping[int, Path]
+    """Recorded MP4 of each episode, where there is one."""
+
+
+@dataclass(frozen=True)
 class _Source:
     """Frames of a recorded MP4 that are compared."""
 
@@ -53,60 +73,115 @@ class _Source:
     frames: Mapping[int, np.ndarray]
 
 
+@dataclass(frozen=True)
+class _Video:
+    """One file and the episodes in it, in the order of their frames."""
+
+    camera: CameraVideos
+    path: Path
+    parts: Sequence[tuple[EpisodeRow, VideoPart]]
+
+
+class _NotWanted(Exception):
+    """An earlier file has a mismatch, or the check was interrupted."""
+
+
 def check_videos(
     files: DatasetFiles,
-    key: str,
-    means: Sequence[np.ndarray],
-    sources: Mapping[int, Path],
-    progress: Iterator[None] | None = None,
+    cameras: Sequence[CameraVideos],
+    *,
+    jobs: int = 1,
+    progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Decode all frames of a camera.
+    """Decode all frames of some cameras.
 
     Args:
         files: The dataset.
-        key: Feature of the camera.
-        means: Mean of each episode's pictures by its statistics, 0 to 1, shape [3].
-        sources: Recorded MP4 of each episode, where there is one.
-        progress: Advanced once per frame.
+        cameras: Its cameras, in the order in which mismatches are reported.
+        jobs: Threads; each decodes one file at a time.
+        progress: Is given the number of frames decoded so far, now and then.
 
     Returns:
         Number of frames.
 
     Raises:
         DatasetMismatch: A video is not what the tables say.
+        InputError: A recorded MP4 cannot be read.
+    """
+    videos = [video for camera in cameras for video in _videos(files, camera)]
+    decoded = [0] * len(videos)
+    lock, failed = threading.Lock(), len(videos)
+
+    def check(number: int) -> None:
+        nonlocal failed
+
+        def advance() -> None:
+            decoded[number] += 1
+            if number > failed:
+                raise _NotWanted
+
+        try:
+            if number <= failed:
+                _check_file(files, videos[number], advance)
+        except _NotWanted:
+            pass
+        except BaseException:
+            with lock:
+                failed = min(failed, number)
+            raise
+
+    with ThreadPoolExecutor(jobs, thread_name_prefix="decoder") as pool:
+        try:
+            for future in [pool.submit(check, number) for number in range(len(videos))]:
+                while wait([future], timeout=REPORT_SECONDS).not_done:
+                    if progress is not None:
+                        progress(sum(decoded))
+                future.result()
+        finally:
+            failed = -1  # a file that is still decoded ends at its next frame
+            pool.shutdown(cancel_futures=True)
+    if progress is not None:
+        progress(sum(decoded))
+    return sum(decoded)
+
+
+def _videos(files: DatasetFiles, camera: CameraVideos) -> list[_Video]:
+    """The files of a camera, after what the tables say of them was checked.
+
+    Raises:
+        DatasetMismatch: Episodes overlap or leave gaps, a number of frames is wrong, or a file is nobody's.
     """
     by_file: dict[Path, list[tuple[EpisodeRow, VideoPart]]] = {}
     for row in files.episode_rows:
-        part = files.video(row, key)
+        part = files.video(row, camera.key)
         if part.frames != row.length:
             raise DatasetMismatch(part.path, f"{part.frames} frames for {row.length} rows", episode=row.index)
-        by_file.setdefault(part.path, []).append((row, part))
-    stray = sorted(set((files.root / "videos" / key).rglob("*.mp4")) - set(by_file))
+        parts = by_file.setdefault(part.path, [])
+        expected = parts[-1][1].first + parts[-1][1].frames if parts else 0
+        if part.first != expected:
+            raise DatasetMismatch(part.path, f"begins at frame {part.first}, expected {expected}", episode=row.index)
+        parts.append((row, part))
+    stray = sorted(set((files.root / "videos" / camera.key).rglob("*.mp4")) - set(by_file))
     if stray:
         raise DatasetMismatch(stray[0], "no episode has frames in it")
-    total = 0
-    for path, parts in by_file.items():
-        expected = 0
-        for row, part in parts:
-            if part.first != expected:
-                raise DatasetMismatch(path, f"begins at frame {part.first}, expected {expected}", episode=row.index)
-            expected += part.frames
-        try:
-            total += _check_file(files, key, path, parts, means, sources, progress)
-        except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
-            raise DatasetMismatch(path, f"cannot be decoded ({type(error).__name__})") from error
-    return total
+    return [_Video(camera, path, parts) for path, parts in by_file.items()]
 
 
-def _check_file(
-    files: DatasetFiles,
-    key: str,
-    path: Path,
-    parts: Sequence[tuple[EpisodeRow, VideoPart]],
-    means: Sequence[np.ndarray],
-    sources: Mapping[int, Path],
-    progress: Iterator[None] | None,
-) -> int:
+def _check_file(files: DatasetFiles, video: _Video, advance: Callable[[], None]) -> None:
+    """Decode one file; `advance` is called after each frame.
+
+    Raises:
+        DatasetMismatch: It is not what the tables say.
+        InputError: A recorded MP4 cannot be read.
+    """
+    try:
+        _check_frames(files, video, advance)
+    except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
+        raise DatasetMismatch(video.path, f"cannot be decoded ({type(error).__name__})") from error
+
+
+def _check_frames(files: DatasetFiles, video: _Video, advance: Callable[[], None]) -> None:
+    key, path = video.camera.key, video.path
     info = files.features[key].get("info")
     about = info if isinstance(info, dict) else {}
     shape = files.features[key].get("shape")
@@ -118,8 +193,8 @@ def _check_file(
         _check_stream(path, codec, stream, about, shape, files.fps)
         codec.thread_count = 1
         frames = _decoded(container, stream, path, files.fps, about)
-        for row, part in parts:
-            source = _source(sources.get(row.index), part, row)
+        for row, part in video.parts:
+            source = _source(video.camera.sources.get(row.index), part, row)
             sums = np.zeros(3)
             for number in range(part.frames):
                 frame = next(frames, None)
@@ -131,16 +206,14 @@ def _check_file(
                     if not np.array_equal(picture, source.frames[number]):
                         message = f"{key} differs from frame {number} of {source.path}"
                         raise DatasetMismatch(path, message, episode=row.index, row=number)
-                if progress is not None:
-                    next(progress, None)
-            apart = np.abs(sums / part.frames - 255.0 * np.asarray(means[row.index]).reshape(3)).max()
+                advance()
+            apart = np.abs(sums / part.frames - 255.0 * np.asarray(video.camera.means[row.index]).reshape(3)).max()
             if not apart <= MEAN_TOLERANCE:
                 message = f"{key}: mean of the pictures is {apart:.1f} grey levels from that of the statistics"
                 raise DatasetMismatch(path, message, episode=row.index)
         if next(frames, None) is not None:
             message = f"{key}: the video goes on after the last episode's last frame"
-            raise DatasetMismatch(path, message, episode=parts[-1][0].index)
-    return sum(part.frames for _, part in parts)
+            raise DatasetMismatch(path, message, episode=video.parts[-1][0].index)
 
 
 def _mean(frame: av.VideoFrame) -> np.ndarray:

@@ -1,6 +1,7 @@
 """`data build`: LeRobot v3.0 datasets from recorded episodes."""
 
 import hashlib
+import importlib.metadata
 import inspect
 import json
 import os
@@ -9,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +25,7 @@ from lerobot.datasets.aggregate import aggregate_datasets  # noqa: E402
 from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
 from lerobot.datasets.video_utils import StreamingVideoEncoder  # noqa: E402
 
+import arena_newton  # noqa: E402
 from arena_newton import robot, seeding, trackers  # noqa: E402
 from arena_newton.data import lerobot_dataset  # noqa: E402
 from arena_newton.data.__main__ import main  # noqa: E402
@@ -220,8 +223,14 @@ def build_and_kill(recordings, out, delay):
     return time.monotonic() - begin, part.exists()
 
 
-def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_path):
-    """Killed at random moments, a build leaves no dataset or a whole one; the next one sweeps its remains."""
+def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_path, tmp_path_factory, monkeypatch):
+    """Killed at random moments, a build leaves no dataset or a whole one; the next one sweeps its remains.
+
+    LeRobot's temporary folders are among those: in the system's folder for such nothing is left.
+    """
+    system = tmp_path_factory.mktemp("system")
+    monkeypatch.setenv("TMPDIR", str(system))
+    monkeypatch.setattr(tempfile, "tempdir", str(system))
     whole, chance, out = content(dataset), random.Random(5), tmp_path / "d"
     duration, _ = build_and_kill(recordings, out, None)
     assert content(out) == whole
@@ -237,6 +246,33 @@ def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_pa
     assert unfinished, "no kill met a build at work"
     written(recordings, out)
     assert content(out) == whole and sorted(os.listdir(tmp_path)) == ["d"]
+    assert not list(system.iterdir())
+
+
+def test_a_package_that_is_not_installed_has_no_version(recordings, tmp_path, monkeypatch):
+    """From PYTHONPATH alone this package builds too and tells its own version; versions that nobody tells are null."""
+    version = importlib.metadata.version
+
+    def told(absent):
+        def find(name):
+            if name in absent:
+                raise importlib.metadata.PackageNotFoundError(name)
+            return version(name)
+
+        return find
+
+    monkeypatch.setattr(importlib.metadata, "version", told({"arena-newton", "pandas"}))
+    first = written(recordings, tmp_path / "first")
+    versions = json.loads((first / "meta" / "info.json").read_text())["arena"]["versions"]
+    assert versions["arena-newton"] == arena_newton.__version__ and versions["pandas"] is None
+    assert versions["lerobot"] == lerobot_dataset.LEROBOT
+    consistent_episode(tmp_path / "r", repeat=8)
+    second = written(tmp_path / "r", tmp_path / "second")
+    assert main(["merge", str(first), str(second), "--out", str(tmp_path / "both")]) == 0
+    assert json.loads((tmp_path / "both" / "meta" / "info.json").read_text())["arena"]["versions"] == versions
+    monkeypatch.setattr(importlib.metadata, "version", told({"lerobot"}))
+    with pytest.raises(InputError, match="one without a version is installed"):
+        written(recordings, tmp_path / "third")
 
 
 def test_a_full_disk_is_one_error(recordings, tmp_path, monkeypatch):

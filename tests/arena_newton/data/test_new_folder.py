@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from arena_newton.data.new_folder import LOCK, link, new_folder
+from arena_newton.data.new_folder import LOCK, link, new_folder, scratch_folder
 from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
 
@@ -39,6 +39,18 @@ def test_an_error_leaves_nothing(tmp_path):
         (folder / "a").write_text("a")
         raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
+
+
+def test_a_scratch_folder_is_removed(tmp_path):
+    """It is empty at first, and gone after the block; what a killed process left of it is swept."""
+    for _ in range(2):
+        with scratch_folder(tmp_path / "out") as folder:
+            assert folder.name == f"out{PARTIAL}" and not list(folder.iterdir())
+            (folder / "a").write_text("a")
+        assert not list(tmp_path.iterdir())
+        (tmp_path / f"out{PARTIAL}").mkdir()
+        (tmp_path / f"out{PARTIAL}" / "old").write_text("old")
+        (tmp_path / f"out{LOCK}").write_text("")
 
 
 def test_a_killed_process_leaves_no_folder_and_the_next_one_sweeps(tmp_path):

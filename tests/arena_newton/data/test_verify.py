@@ -4,6 +4,9 @@ import json
 import os
 import random
 import shutil
+import tempfile
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +17,18 @@ pytest.importorskip("pyarrow")
 import pyarrow as pa  # noqa: E402
 import pyarrow.parquet as pq  # noqa: E402
 
+from arena_newton.data import video_checks  # noqa: E402
 from arena_newton.data.__main__ import main  # noqa: E402
 from arena_newton.data.data_options import VerifyOptions  # noqa: E402
+from arena_newton.data.dataset_files import DatasetFiles  # noqa: E402
 from arena_newton.data.episode import EpisodeFile, episode_files  # noqa: E402
 from arena_newton.data.layouts import LAYOUTS  # noqa: E402
 from arena_newton.data.lerobot_dataset import choose, write_dataset  # noqa: E402
 from arena_newton.data.verification import rebuilt_state, verify  # noqa: E402
-from arena_newton.data.video_checks import DatasetMismatch  # noqa: E402
+from arena_newton.data.video_checks import CameraVideos, DatasetMismatch, check_videos  # noqa: E402
 from arena_newton.errors import ArenaError  # noqa: E402
 from arena_newton.pictures.video import VideoWriter  # noqa: E402
+from tests.arena_newton.data import made_episodes  # noqa: E402
 from tests.arena_newton.data.consistent import ROWS, consistent_episode  # noqa: E402
 from tests.fuzz.mutants import damaged  # noqa: E402
 
@@ -106,19 +112,19 @@ def video_of(dataset, pick):
             writer.write(frame)
 
 
-def without_last_frame(dataset):
+def without_last_frame(dataset, video=VIDEO):
     """Copy the video's packets but one."""
     import av
 
     short = dataset / "short.mp4"
-    with av.open(str(dataset / VIDEO)) as source, av.open(str(short), "w") as target:
+    with av.open(str(dataset / video)) as source, av.open(str(short), "w") as target:
         stream = source.streams.video[0]
         copy = target.add_stream_from_template(stream)
         packets = [packet for packet in source.demux(stream) if packet.dts is not None]
         for packet in packets[:-1]:
             packet.stream = copy
             target.mux(packet)
-    short.rename(dataset / VIDEO)
+    short.rename(dataset / video)
 
 
 def two_tasks(dataset):
@@ -271,6 +277,75 @@ def test_frames_that_nobody_has(dataset):
     video_of(dataset, lambda frames: [*frames, frames[0]])
     with pytest.raises(DatasetMismatch, match="episode 2: .*goes on after the last episode's last frame"):
         check(dataset)
+
+
+@pytest.fixture(scope="module")
+def many_files(tmp_path_factory):
+    """A dataset whose four episodes have a video file each, and its recordings."""
+    folder, out = tmp_path_factory.mktemp("recordings"), tmp_path_factory.mktemp("built") / "d"
+    with pytest.MonkeyPatch.context() as patch:
+
+        def noise(rows, size, seed):
+            return np.random.default_rng(seed + 10 * rows).integers(0, 255, (rows, size, size, 3), np.uint8)
+
+        patch.setattr(made_episodes, "pictures", noise)
+        for repeat in range(4):
+            consistent_episode(folder, ROWS, repeat=repeat, size=224)
+    write_dataset(choose(episode_files([folder])), out, kind=LAYOUTS["arena"], file_mb=1)
+    return out, folder
+
+
+def test_the_first_mismatch_is_that_of_any_number_of_threads(many_files, tmp_path):
+    """Of a late fault in an early file and early ones in later files the former is named, however many threads work."""
+    sound, recordings = many_files
+    videos = [f"videos/observation.images.front/chunk-000/file-{number:03d}.mp4" for number in range(4)]
+    assert all((sound / video).is_file() for video in videos)
+    spoiled = Path(shutil.copytree(sound, tmp_path / "d"))
+    without_last_frame(spoiled, videos[1])
+    for video in videos[2:]:
+        (spoiled / video).write_bytes(b"no video")
+    for jobs in (1, 2, 8, 8, 8):
+        verify([sound], VerifyOptions(recordings=(recordings,), jobs=jobs))
+        with pytest.raises(DatasetMismatch, match=r"file-001\.mp4, episode 1, row 39: the video has no frame for it"):
+            verify([spoiled], VerifyOptions(recordings=(recordings,), jobs=jobs))
+
+
+def test_an_interruption_ends_the_threads(many_files, monkeypatch):
+    """Ctrl-C while videos are decoded ends every thread at its next frame."""
+    files = DatasetFiles(many_files[0])
+    decoded = []
+
+    def slow(frame):
+        time.sleep(0.02)
+        return np.full(3, 127.5)
+
+    def interrupt(count):
+        decoded.append(count)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(video_checks, "_mean", slow)
+    monkeypatch.setattr(video_checks, "REPORT_SECONDS", 0.05)
+    camera = CameraVideos("observation.images.front", [np.full(3, 0.5)] * 4, {})
+    with pytest.raises(KeyboardInterrupt):
+        check_videos(files, [camera], jobs=2, progress=interrupt)
+    assert len(decoded) == 1 and decoded[0] < 2 * ROWS
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("decoder")]
+
+
+def test_it_writes_nothing(sound, recordings, tmp_path, monkeypatch):
+    """Neither the dataset nor the folder of temporary files changes, so that a killed check leaves nothing behind."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = {file: (file.stat().st_mtime_ns, file.stat().st_size) for file in sound.rglob("*")}
+    check(sound, recordings)
+    assert {file: (file.stat().st_mtime_ns, file.stat().st_size) for file in sound.rglob("*")} == before
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("jobs", [-1, 257])
+def test_a_wrong_number_of_threads_is_refused(sound, capsys, jobs):
+    """One line names the flag; the exit code is 2."""
+    assert main(["verify", str(sound), "--jobs", str(jobs)]) == 2
+    assert f"--jobs {jobs}: expected 0 to 256" in capsys.readouterr().err
 
 
 def test_the_exit_code_is_one(dataset, recordings, capsys):
