@@ -62,8 +62,8 @@ class _Recording:
             recorders: list[Recorder] = [noise]
             files = None
             if cameras is not None:
-                threads = recording.encoding_threads()
-                files = DemonstrationRecorder(folder, cameras=cameras, threads=threads)
+                threads, processes = recording.encoding_threads(), recording.encoding_processes()
+                files = DemonstrationRecorder(folder, cameras=cameras, threads=threads, processes=processes)
                 recorders.append(files)
             on_tick = None if files is None else (lambda active: saved.extend(files.saved()))
             saved: list[object] = []

@@ -19,7 +19,7 @@ from arena_newton import seeding
 from arena_newton.canonical import ACTION, HAND_CLOSED, STATE
 from arena_newton.data.encoding import Filming, FilmThreads, Pictured, Reel
 from arena_newton.data.episode import SCHEMA_VERSION, VIDEO_FOLDER, vision, write_episode
-from arena_newton.data.film import CRF, FilmFacts, key_frames
+from arena_newton.data.episode_film import CRF, FilmFacts, key_frames
 from arena_newton.data.film_pool import FilmPool
 from arena_newton.errors import ArenaError
 from arena_newton.files import PARTIAL, file_label

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from arena_newton.data.film import Film, FilmFacts
+from arena_newton.data.episode_film import Film, FilmFacts
 
 __all__ = [
     "Encoders",

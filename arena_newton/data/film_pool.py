@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from arena_newton.data.encoding import Encoders, Filming, Finished, Job, Pictured, Reel, copy_pictures, slots_of
-from arena_newton.data.film import FilmFacts
+from arena_newton.data.episode_film import FilmFacts
 from arena_newton.data.film_process import SlotMemory, packed, unpacked
 from arena_newton.errors import ArenaError
 from arena_newton.files import PARTIAL

@@ -21,7 +21,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from arena_newton.data.film import Film, FilmFacts
+from arena_newton.data.episode_film import Film, FilmFacts
 
 __all__ = ["SlotMemory", "main", "packed", "unpacked"]
 

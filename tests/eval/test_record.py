@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from arena_newton import policies
-from arena_newton.data import demonstration
+from arena_newton.data import demonstration, film_pool
 from arena_newton.data.episode import EpisodeFile, episode_files
+from arena_newton.eval import recording
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.journal import read_journal
 from arena_newton.eval.results import load_run
@@ -96,6 +97,41 @@ def test_bytes_do_not_depend_on_worlds(recorded, tmp_path):
     other = tmp_path / "one"
     assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "1", "--out", str(other)]) == 0
     same(recorded, other)
+
+
+def test_bytes_do_not_depend_on_who_encodes(recorded, tmp_path, monkeypatch):
+    """Processes write the same bytes as threads."""
+    monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
+    other = tmp_path / "processes"
+    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "2", "--out", str(other)]) == 0
+    same(recorded, other)
+
+
+def test_a_killed_encoder_stops_the_run(recorded, tmp_path, monkeypatch, capsys):
+    """Kill -9 of a process that encodes is one error, exit code not 0, without partial files; resumed, all is there."""
+    folder, started, frames = tmp_path / "killed", [], []
+    popen, add = subprocess.Popen, film_pool.FilmPool.add
+
+    def start(*command, **options):
+        started.append(popen(*command, **options))
+        return started[-1]
+
+    def kill(self, *pictures):
+        add(self, *pictures)
+        frames.append(1)
+        if len(frames) == 20:
+            started[0].kill()
+
+    monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
+    monkeypatch.setattr(film_pool.subprocess, "Popen", start)
+    monkeypatch.setattr(film_pool.FilmPool, "add", kill)
+    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]) != 0
+    said = capsys.readouterr().err
+    assert "a process that encodes pictures ended (SIGKILL; out of memory?)" in said and "Traceback" not in said
+    assert len(started) == 2 and not list(folder.rglob("*.part"))
+    monkeypatch.undo()
+    assert main(["resume", str(folder)]) == 0
+    same(recorded, folder)
 
 
 def test_kills_lose_at_most_what_was_running(recorded, tmp_path):
