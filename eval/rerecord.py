@@ -21,7 +21,7 @@ import torch
 
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.data.demonstration import DemonstrationRecorder, RecordedEpisode
-from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, episode_files, opened, vision
+from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, camera_fields, episode_files, opened, vision
 from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import recording
@@ -311,9 +311,9 @@ class _Replay:
         for name in ("arena_qpos", "arena_final_qpos"):
             self._compare(source, name, source.array(name), arrays[name])
         cameras = [name for name in CAMERAS if vision(name, "rgb_video_path") in arrays]
-        remade = [f"{start}{CAMERAS[name]}vision_" for name in cameras for start in ("", "arena_")]
+        remade = {field for name in cameras for field in camera_fields(name)}
         once, last = self._successes.pop(episode.index)
-        changes = {name: array for name, array in arrays.items() if name.startswith(tuple(remade))}
+        changes = {name: array for name, array in arrays.items() if name in remade}
         changes |= {
             "rerecord_any_success": np.array(once),
             "rerecord_final_reward": np.array(last, np.float64),
@@ -322,7 +322,7 @@ class _Replay:
         for name in source.cameras:
             if name not in cameras:
                 _copy(source.video(name), self.out / EPISODES / VIDEO_FOLDER / source.video(name).name)
-        dropped = [name for name in source.names if name.startswith(tuple(remade)) and name not in changes]
+        dropped = [name for name in source.names if name in remade and name not in changes]
         return source.copy_of({name: np.asanyarray(array) for name, array in changes.items()}, dropped)
 
     def _compare(self, source: EpisodeFile, name: str, recorded: np.ndarray, played: np.ndarray) -> None:

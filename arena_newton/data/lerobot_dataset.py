@@ -209,8 +209,8 @@ def choose(
 
 
 def _rate(episode: EpisodeFile) -> int:
-    """Rows per second."""
-    rate = float(episode.array("system_control_frequency"))
+    """Rows per second: the median, as the original's converter takes it."""
+    rate = float(np.median(episode.array("system_control_frequency", episode.rows)))
     if not 1.0 <= rate <= 1000.0:
         raise InputError(f"{episode.path}: system_control_frequency is {rate}, expected 1 to 1000")
     return round(rate)

@@ -407,7 +407,7 @@ def torn(folder):
 BAD = {
     "an evaluation seed": (judged, "judge policies"),
     "another rate": (
-        lambda folder: consistent_episode(folder, repeat=9, system_control_frequency=np.float64(30)),
+        lambda folder: consistent_episode(folder, repeat=9, system_control_frequency=np.full(40, 30.0)),
         "30 rows per second",
     ),
     "another size": (lambda folder: consistent_episode(folder, repeat=9, size=48), "48x48"),
