@@ -25,7 +25,7 @@ from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, camera
 from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import recording
-from arena_newton.eval.config import DRIVES, RunConfig, plain_facts, resolve
+from arena_newton.eval.config import DRIVES, RunConfig, plain_facts, recorded_cameras, resolve
 from arena_newton.eval.folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.identity import differing_key
 from arena_newton.eval.journal import StorageError
@@ -116,6 +116,8 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
             raise InputError(f"--{name.replace('_', '-')}: is in the recording; drop it beside --from")
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")
+    pictures = RunOptions(record_cameras=options.cameras, record_size=options.size, record_depth=options.depth)
+    recorded_cameras(pictures, "--")
     out = Path(options.out).expanduser()
     if out.resolve() == source.resolve() or source.resolve().is_relative_to(out.resolve()):
         raise InputError(f"--out {out}: is the source, which stays as it is; choose another folder")

@@ -64,7 +64,12 @@ FIELDS = (
     Field("schema_version", "", "text", f"`{SCHEMA_VERSION}`"),
     Field("task", "", "text", "the task's Gym id, as the original spells it"),
     Field("num_frames", "", "int64", "T, the number of rows"),
-    Field("robot_qpos_before_decimation", "T, 29", "float32", "joint positions [rad], TWIST2 (MuJoCo) order with every tracker"),
+    Field(
+        "robot_qpos_before_decimation",
+        "T, 29",
+        "float32",
+        "joint positions [rad], TWIST2 order with every tracker",
+    ),
     Field("robot_qvel_before_decimation", "T, 29", "float32", "joint velocities [rad/s], the same order"),
     Field("robot_root_position", "T, 3", "float32", "root in the world [m]"),
     Field("robot_root_orientation", "T, 4", "float32", "root in the world, wxyz"),

@@ -92,12 +92,12 @@ def test_pictures_of_the_sensors_shape_have_no_bars():
 @pytest.mark.parametrize(
     "changes, says",
     [
-        ({"size": "224"}, "--record-size 224"),
+        ({"size": "224"}, "--size 224:"),
         ({"size": "225x225"}, "even numbers"),
         ({"size": "9999x9999"}, "even numbers"),
-        ({"cameras": ("back",)}, "--record-cameras back"),
+        ({"cameras": ("back",)}, "--cameras back"),
         ({"cameras": ("front", "front")}, "given twice"),
-        ({"cameras": (), "depth": True}, "--record-depth"),
+        ({"cameras": (), "depth": True}, "--depth:"),
         ({"episodes": 0}, "--episodes 0"),
         ({"seed_series": -1}, "--seed-series -1"),
         ({"accept_differences": True}, "--accept-differences"),
