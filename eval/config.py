@@ -185,7 +185,7 @@ def recording_run(options: RecordOptions) -> RunOptions:
         raise InputError("--accept-differences: belongs to --from, which is not given")
     shared = {f.name for f in dataclasses.fields(RunOptions)} & {f.name for f in dataclasses.fields(options)}
     attempts = options.episodes * (rounds.ATTEMPTS if options.only_success else 1)
-    return RunOptions(
+    run = RunOptions(
         **{name: getattr(options, name) for name in shared},
         seeds=(options.seed_series,),
         repeats=attempts,
@@ -196,6 +196,8 @@ def recording_run(options: RecordOptions) -> RunOptions:
         series=options.seed_series,
         keep=options.episodes if options.only_success else None,
     )
+    recorded_cameras(run, "--")
+    return run
 
 
 def resolve(options: RunOptions) -> RunConfig:
@@ -342,8 +344,12 @@ def _size(given: str | None) -> tuple[int, int] | None:
     return video_sizes((int(numbers[1]), int(numbers[2])))["world"]
 
 
-def recorded_cameras(options: RunOptions) -> dict[str, CameraConfig]:
+def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, CameraConfig]:
     """Recorded cameras by name.
+
+    Args:
+        options: Cameras, their size, and whether depth is recorded.
+        flag: How the flags begin that messages name: those of `eval run`, or `--`, those of `eval record`.
 
     Pictures of the sensor's own shape (4:3) show what it shows; in others, such as squares, it has black bars as in the
     pictures of policies. The world camera has no sensor to keep to.
@@ -356,17 +362,17 @@ def recorded_cameras(options: RunOptions) -> dict[str, CameraConfig]:
     low, high = SIZE_LIMITS
     if not all(low <= n <= high and n % 2 == 0 for n in (width, height)):
         raise InputError(
-            f"--record-size {options.record_size}: expected width x height, even numbers from {low} to {high}, such as "
+            f"{flag}size {options.record_size}: expected width x height, even numbers from {low} to {high}, such as "
             "224x224 or 640x480"
         )
     if options.record_depth and not options.record_cameras:
-        raise InputError("--record-depth: belongs to cameras, none is recorded")
+        raise InputError(f"{flag}depth: belongs to cameras, none is recorded")
     found = {}
     for name in options.record_cameras:
         if name not in CAMERAS:
-            raise InputError(f"--record-cameras {plain_text(name)}: unknown, choose from {' '.join(CAMERAS)}")
+            raise InputError(f"{flag}cameras {plain_text(name)}: unknown, choose from {' '.join(CAMERAS)}")
         if name in found:
-            raise InputError(f"--record-cameras {name}: given twice")
+            raise InputError(f"{flag}cameras {name}: given twice")
         fit: Fit = "native" if name == "world" or 3 * width == 4 * height else "pad"
         found[name] = CameraConfig(width=width, height=height, prim="ego" if name == "front" else name, fit=fit)
     return found

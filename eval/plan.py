@@ -72,7 +72,9 @@ def expand(
     """
     rule_set = rule_sets.get(rules)
     names = tasks.names() if list(task_names) == ["all"] else tuple(task_names)
-    for flag, values in (("--task", names), ("--tracker", trackers), ("--mode", modes), ("--seeds", seeds)):
+    recorded = seed_range == seeding.DEMONSTRATION
+    seeds_flag = "--seed-series" if recorded else "--seeds"
+    for flag, values in (("--task", names), ("--tracker", trackers), ("--mode", modes), (seeds_flag, seeds)):
         if not values:
             raise InputError(f"{flag}: nothing given, at least one value is needed")
         twice = next((v for v in values if list(values).count(v) > 1), None)
@@ -80,7 +82,7 @@ def expand(
             raise InputError(f"{flag} {twice}: given twice")
     high = max(seeds)
     if high > MAX_SEED:
-        raise InputError(f"--seeds {_cut(high)}: expected at most {MAX_SEED}")
+        raise InputError(f"{seeds_flag} {_cut(high)}: expected at most {MAX_SEED}")
     for mode in modes:
         if mode not in MODES:
             raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)}")
@@ -93,7 +95,8 @@ def expand(
     total = len(names) * len(trackers) * len(modes) * len(seeds) * repeats
     if total > MAX_EPISODES:
         made = f"{total:,} episodes" if total < 10**12 else "too many episodes"
-        raise InputError(f"--repeats {_cut(repeats)}: makes {made}, at most {MAX_EPISODES:,} are planned at once")
+        given = "--episodes" if recorded else f"--repeats {_cut(repeats)}"
+        raise InputError(f"{given}: makes {made}, at most {MAX_EPISODES:,} are planned at once")
     episodes: list[Episode] = []
     for name in names:
         spec = tasks.get(name)

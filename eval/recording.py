@@ -156,4 +156,6 @@ def outcome_lines(config: RunConfig, folder: Path, records: Sequence[EpisodeReco
             for group in planned
             if groups[group] < keep
         ]
+    if not kept:
+        return found
     return [*found, f"dataset: python -m arena_newton.data build {folder} --out <dataset>"]

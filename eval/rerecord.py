@@ -21,11 +21,11 @@ import torch
 
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.data.demonstration import DemonstrationRecorder, RecordedEpisode
-from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, episode_files, opened, vision
+from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, camera_fields, episode_files, opened, vision
 from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import recording
-from arena_newton.eval.config import DRIVES, RunConfig, plain_facts, resolve
+from arena_newton.eval.config import DRIVES, RunConfig, plain_facts, recorded_cameras, resolve
 from arena_newton.eval.folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.identity import differing_key
 from arena_newton.eval.journal import StorageError
@@ -116,6 +116,8 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
             raise InputError(f"--{name.replace('_', '-')}: is in the recording; drop it beside --from")
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")
+    pictures = RunOptions(record_cameras=options.cameras, record_size=options.size, record_depth=options.depth)
+    recorded_cameras(pictures, "--")
     out = Path(options.out).expanduser()
     if out.resolve() == source.resolve() or source.resolve().is_relative_to(out.resolve()):
         raise InputError(f"--out {out}: is the source, which stays as it is; choose another folder")
@@ -311,9 +313,9 @@ class _Replay:
         for name in ("arena_qpos", "arena_final_qpos"):
             self._compare(source, name, source.array(name), arrays[name])
         cameras = [name for name in CAMERAS if vision(name, "rgb_video_path") in arrays]
-        remade = [f"{start}{CAMERAS[name]}vision_" for name in cameras for start in ("", "arena_")]
+        remade = {field for name in cameras for field in camera_fields(name)}
         once, last = self._successes.pop(episode.index)
-        changes = {name: array for name, array in arrays.items() if name.startswith(tuple(remade))}
+        changes = {name: array for name, array in arrays.items() if name in remade}
         changes |= {
             "rerecord_any_success": np.array(once),
             "rerecord_final_reward": np.array(last, np.float64),
@@ -322,7 +324,7 @@ class _Replay:
         for name in source.cameras:
             if name not in cameras:
                 _copy(source.video(name), self.out / EPISODES / VIDEO_FOLDER / source.video(name).name)
-        dropped = [name for name in source.names if name.startswith(tuple(remade)) and name not in changes]
+        dropped = [name for name in source.names if name in remade and name not in changes]
         return source.copy_of({name: np.asanyarray(array) for name, array in changes.items()}, dropped)
 
     def _compare(self, source: EpisodeFile, name: str, recorded: np.ndarray, played: np.ndarray) -> None:

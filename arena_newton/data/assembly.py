@@ -19,6 +19,7 @@ import pyarrow.parquet
 from tqdm import tqdm
 
 from arena_newton.data.dataset_files import DATA_PATH, VIDEO_PATH, DatasetFiles, EpisodeRow, VideoPart, read_json
+from arena_newton.data.layouts import REFERENCE_SOURCES
 from arena_newton.data.row_statistics import HAND_NAME, aggregated, row_statistics
 from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
@@ -404,6 +405,10 @@ def _protocol(selections: Sequence[Selection]) -> dict[str, object] | None:
     backends = [part for block in known for part in str(block.get("backend_source", "")).split("+") if part]
     if backends:
         same["backend_source"] = "+".join(dict.fromkeys(backends))
+    for key in (f"{name}_reference_source" for name in REFERENCE_SOURCES):
+        if any(key in block for block in known):  # a set of another tracker names none
+            said = [part for block in known for part in str(block.get(key) or "").split("+") if part]
+            same[key] = "+".join(dict.fromkeys(said)) or None
     return same
 
 

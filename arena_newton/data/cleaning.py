@@ -1,8 +1,9 @@
 """``data clean``: drop rows of recordings that a stalled or jumping source spoiled, by the original's five rules.
 
 Rules and thresholds are those of the original's `sonic2lerobot_clean_64_40`. A rule compares a row with the one
-recorded immediately before it, dropped or not; the first row always stays. Simulated experts break none of them:
-they are for teleoperation, and for the original's own recordings, whose fields are read where ours are missing.
+recorded immediately before it, dropped or not; the first row always stays. They are for teleoperation, and for the
+original's own recordings, whose fields are read where ours are missing. Policies break none of them: they decide every
+tick, so that one whose action stays stands, and the rule of held actions does not judge it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import av
 import numpy as np
 from tqdm import tqdm
 
+from arena_newton import seeding
 from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, episode_files, vision, write_episode
 from arena_newton.data.image_statistics import VALUES, add_picture
 from arena_newton.data.new_folder import link, new_folder
@@ -45,9 +47,14 @@ MOVING = 0.02
 """Joints of which one moves by this or more within a row are moving [rad] (original's rule)."""
 MAX_BYTES = 2**31
 """Size of a recording that is read."""
-ACTIONS = ("arena_action", "vla_action", "robot_action_mimic")
+ACTIONS = ("arena_executed_action", "arena_action", "vla_action", "robot_action_mimic")
 JOINTS = ("robot_qpos_before_decimation", "robot_qpos", "robot_joint_pos")
-"""Fields, the first that a recording has: ours, and the original's of TWIST2 and SONIC."""
+"""Fields, the first that a recording has: ours, and the original's of TWIST2 and SONIC. What was executed moves the
+joints: a label may repeat under a disturbance."""
+POLICIES = (seeding.DEMONSTRATION, seeding.EVALUATION)
+"""Ranges of seeds of policies, whose actions no source holds."""
+MARKER = "raw_frame_index"
+"""Frame index of the source in the original's SONIC recordings, which have others beside it."""
 ONCE = ("arena_phase_names", "arena_final_qpos", "schema_version", "task")
 """Fields that are not rows, whatever their length."""
 DEFAULT_GOP, SMALL_GOP, SMALL = 2, 10, 256
@@ -108,6 +115,7 @@ def rows_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Rows:
         return None, ""
 
     markers = sorted(name for name in arrays if "frame_ind" in name and "vision" not in name)
+    markers.sort(key=lambda name: name != MARKER)
     clocks = sorted(name for name in arrays if "realtime" in name or "monotonic" in name)
     found = {
         "frame": first([*markers, "vision_frame_indices"], False, "iu"),
@@ -115,6 +123,8 @@ def rows_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Rows:
         "action": first(ACTIONS, True, "f"),
         "joints": first(JOINTS, True, "f"),
     }
+    if str(arrays.get("arena_seed_range")) in POLICIES:
+        found["action"] = None, ""
     arrived = {name: array for name, (array, _) in found.items()}
     used = {name: field for name, (_, field) in found.items() if field}
     return Rows(**arrived, step=_control_step(path, arrays), fields=used)
@@ -215,7 +225,7 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
         frames = arrays[index][stays] if index in arrays else np.flatnonzero(stays)
         target = folder / VIDEO_FOLDER / video.name
         changed = _encoded_again(file, arrays, camera, video, target, frames)
-        kept |= {index: np.arange(rows), vision(camera, "num_frames"): np.asarray(np.int64(rows))} | changed
+        kept |= {index: np.arange(rows), vision(camera, "rgb_video_num_frames"): np.asarray(np.int64(rows))} | changed
     counts = {name: int(broken.sum()) for name, broken in found.items()}
     source = hashlib.sha256(read_bytes(file, MAX_BYTES)).hexdigest()
     told = {"dropped": int((~stays).sum()), "rules": counts, "source": file.name, "sha256": source}
@@ -227,7 +237,8 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
 
 def _is_rows(name: str, array: np.ndarray, count: int) -> bool:
     """Whether an array has one entry per row."""
-    if name in ONCE or name.startswith(("episode_", "meta_")) or name.endswith(("_histogram", "vision_size")):
+    once = name in ONCE or name.startswith(("episode_", "meta_"))
+    if once or name.startswith("arena_vision_") and name.endswith(("_histogram", "_size")):
         return False
     return array.ndim > 0 and len(array) == count
 
@@ -253,9 +264,9 @@ def _encoded_again(
     try:
         codec = json.loads(str(arrays[name])) if name in arrays else {}
         gop, crf, b_frames = int(codec.get("g", 0)), int(codec.get("crf", 20)), bool(codec.get("bf", 0))
-        rate = float(arrays[vision(camera, "rgb_fps")])
+        rate = float(arrays[vision(camera, "rgb_video_fps")])
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"{file}: {name} or {vision(camera, 'rgb_fps')} is unfit") from error
+        raise InputError(f"{file}: {name} or {vision(camera, 'rgb_video_fps')} is unfit") from error
     size = arrays.get(f"arena_{vision(camera, 'size')}")
     histogram = np.zeros((3, VALUES), np.int64)
     writer = None

@@ -231,6 +231,9 @@ class DemonstrationRecorder(Recorder):
         for name, body in self._bodies.items():
             initial[f"episode_init_env_obj_{name}_position"] = self._xpos[world, body].cpu().numpy().copy()
             initial[f"episode_init_env_obj_{name}_orientation"] = self._xquat[world, body].cpu().numpy().copy()
+            # A reset puts things down at rest.
+            for motion in ("linear", "angular"):
+                initial[f"episode_init_env_obj_{name}_{motion}_velocity"] = np.zeros(3, np.float32)
         label, worker = episode_label(episode), self._filming.join()
         reels = {}
         for name in self.cameras:
@@ -419,9 +422,9 @@ class DemonstrationRecorder(Recorder):
             "pico_left_grip_binary": hands[:, 0],
             "pico_right_grip_binary": hands[:, 1],
             "vla_state": raw_state,
-            "system_control_frequency": np.float64(FPS),
-            "system_decimation": np.int64(str(facts["substeps"])),
-            "system_physics_dt": np.float64(str(facts["physics_dt"])),
+            "system_control_frequency": np.full(rows, FPS, np.float64),
+            "system_decimation": np.full(rows, int(str(facts["substeps"])), np.int64),
+            "system_physics_dt": np.full(rows, float(str(facts["physics_dt"])), np.float64),
             "system_timestamp": np.arange(rows) * g1.TICK,
         }
         for number, name in enumerate(self._bodies):
@@ -459,7 +462,6 @@ class DemonstrationRecorder(Recorder):
             "arena_seed_range": np.str_(self.seeds or seeding.seed_range(episode.episode_seed)),
             "arena_group_seed": np.int64(episode.group_seed),
             "arena_repeat": np.int64(episode.repeat),
-            "arena_index": np.int64(episode.index),
             "arena_episode_seed": np.uint64(episode.episode_seed),
             "arena_outcome": np.str_(result.outcome),
             "arena_reason": np.str_(result.reason),
@@ -505,8 +507,8 @@ def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str,
         vision(name, "storage_format"): np.str_("video_v1"),
         vision(name, "frame_indices"): np.arange(rows),
         vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{reel.video.name}"),
-        vision(name, "rgb_fps"): np.float64(FPS),
-        vision(name, "num_frames"): np.int64(film.frames),
+        vision(name, "rgb_video_fps"): np.float64(FPS),
+        vision(name, "rgb_video_num_frames"): np.int64(film.frames),
     }
     if film.depth_shape:
         shape = (rows, *film.depth_shape)

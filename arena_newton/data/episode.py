@@ -1,7 +1,8 @@
 """The file of one episode: an NPZ whose fields are those of the original's recordings where it has them.
 
-Names without prefix and their meaning are the original's (its recordings of TWIST2, `twist2_episode_v3_multicam`, and
-of SONIC); what it lacks begins with `arena_`. Rows are 50 Hz ticks: a row holds the state and the pictures before the
+Names without prefix, and their meaning where the table names no departure, are the original's (its recordings of
+TWIST2, `twist2_episode_v3_multicam`, and of SONIC, `sonic_episode_v4_multicam`); what it lacks begins with `arena_`.
+Not all of its fields are here. Rows are 50 Hz ticks: a row holds the state and the pictures before the
 tick, the action decided on them, and what was executed. Pictures are MP4s next to the file, one frame a row.
 
 The bytes depend on the episode alone: not on the number of worlds, on when or where it was recorded.
@@ -29,15 +30,19 @@ from arena_newton.foreign import check_size, numbers, read_arrays
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["CAMERAS", "FIELDS", "SCHEMA_VERSION", "VIDEO_FOLDER", "EpisodeFile", "Field", "episode_files"]
-__all__ += ["fields_table", "opened", "vision", "write_episode"]
+__all__ = ["CAMERAS", "FIELDS", "SCHEMA_VERSION", "VIDEO_FOLDER", "EpisodeFile", "Field", "camera_fields"]
+__all__ += ["episode_files", "fields_table", "opened", "vision", "write_episode"]
 
 SCHEMA_VERSION = "arena_episode_v1"
 """Version of the fields."""
 VIDEO_FOLDER = "videos"
 """Folder of the MP4s, next to the NPZ files."""
 CAMERAS = {"front": "", "left_wrist": "left_wrist_", "right_wrist": "right_wrist_", "world": "world_"}
-"""Camera as datasets name it → prefix of its fields; the head camera's have none, as in the original."""
+"""Camera as datasets name it → its part of a field's name; the head camera's have none, as in the original."""
+PICTURES = ("storage_format", "frame_indices", "rgb_video_path", "rgb_video_fps", "rgb_video_num_frames", "depth")
+"""Fields of a camera, as the original names them after `vision_<camera>`."""
+OWN_PICTURES = ("size", "codec", "histogram")
+"""Our own fields of a camera, after `arena_vision_<camera>`."""
 MAX_ROWS = 10_000
 """Rows of an episode: the original's cap."""
 _STEM = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
@@ -59,7 +64,12 @@ FIELDS = (
     Field("schema_version", "", "text", f"`{SCHEMA_VERSION}`"),
     Field("task", "", "text", "the task's Gym id, as the original spells it"),
     Field("num_frames", "", "int64", "T, the number of rows"),
-    Field("robot_qpos_before_decimation", "T, 29", "float32", "joint positions [rad], TWIST2 (MuJoCo) order"),
+    Field(
+        "robot_qpos_before_decimation",
+        "T, 29",
+        "float32",
+        "joint positions [rad], TWIST2 order with every tracker",
+    ),
     Field("robot_qvel_before_decimation", "T, 29", "float32", "joint velocities [rad/s], the same order"),
     Field("robot_root_position", "T, 3", "float32", "root in the world [m]"),
     Field("robot_root_orientation", "T, 4", "float32", "root in the world, wxyz"),
@@ -69,16 +79,16 @@ FIELDS = (
     Field("robot_root_ang_vel_local", "T, 3", "float32", "[rad/s], frame of the root"),
     Field("robot_action_mimic", "T, 35", "float32", "mimic command that was executed"),
     Field("robot_twist2_inference_qpos", "T, 29", "float32", "joint targets [rad], TWIST2 order; of tracker twist2"),
-    Field("final_body_action_29dof", "T, 29", "float32", "joint targets [rad], TWIST2 order; of other trackers"),
+    Field("final_body_action_29dof", "T, 29", "float32", "joint targets [rad], TWIST2 order too; of other trackers"),
     Field("human_body_pos", "T, 3", "float32", "root of the reference that was executed, in the world [m]"),
     Field("human_body_quat_w", "T, 4", "float32", "its orientation, wxyz"),
     Field("human_joint_pos", "T, 29", "float32", "its joints [rad], canonical order"),
     Field("pico_left_grip_binary", "T", "bool", "the left hand is to be closed"),
     Field("pico_right_grip_binary", "T", "bool", "the right hand is to be closed"),
     Field("vla_state", "T, 64", "float32", "canonical state, but the orientation is in the world"),
-    Field("system_control_frequency", "", "float64", "ticks per second"),
-    Field("system_decimation", "", "int64", "physics steps of a tick"),
-    Field("system_physics_dt", "", "float64", "physics step [s]"),
+    Field("system_control_frequency", "T", "float64", "ticks per second"),
+    Field("system_decimation", "T", "int64", "physics steps of a tick"),
+    Field("system_physics_dt", "T", "float64", "physics step [s]"),
     Field("system_timestamp", "T", "float64", "simulated time since step 0 [s]"),
     Field("env_obj_<object>_position", "T, 3", "float32", "[m]"),
     Field("env_obj_<object>_orientation", "T, 4", "float32", "wxyz"),
@@ -86,17 +96,19 @@ FIELDS = (
     Field("env_obj_<object>_angular_velocity", "T, 3", "float32", "[rad/s], world; zero for fixtures"),
     Field("episode_init_env_obj_<object>_position", "3", "float32", "as it was placed at the reset [m]"),
     Field("episode_init_env_obj_<object>_orientation", "4", "float32", "as it was placed at the reset, wxyz"),
+    Field("episode_init_env_obj_<object>_linear_velocity", "3", "float32", "at the reset [m/s], world; zero: it rests"),
+    Field("episode_init_env_obj_<object>_angular_velocity", "3", "float32", "at the reset [rad/s], world; zero"),
     Field("episode_object_seed", "", "uint64", "master seed of the objects"),
     Field("episode_object_seed_source", "", "text", "how it was made"),
-    Field("<camera>vision_storage_format", "", "text", "`video_v1`"),
-    Field("<camera>vision_frame_indices", "T", "int64", "frame of each row: 0 to T - 1"),
-    Field("<camera>vision_rgb_video_path", "", "text", "MP4, relative to the file's folder"),
-    Field("<camera>vision_rgb_fps", "", "float64", "frames per second"),
-    Field("<camera>vision_num_frames", "", "int64", "T"),
-    Field("<camera>vision_depth", "T, H, W", "float16", "distance along the ray [m], 0 where nothing is met; optional"),
-    Field("arena_<camera>vision_size", "2", "int64", "width and height [px]"),
-    Field("arena_<camera>vision_codec", "", "text", "JSON: codec and its options, as used"),
-    Field("arena_<camera>vision_histogram", "3, 256", "int64", "pixels of all frames by channel and value, unencoded"),
+    Field("vision_<camera>storage_format", "", "text", "`video_v1`"),
+    Field("vision_<camera>frame_indices", "T", "int64", "frame of each row: 0 to T - 1"),
+    Field("vision_<camera>rgb_video_path", "", "text", "MP4, relative to the file's folder"),
+    Field("vision_<camera>rgb_video_fps", "", "float64", "frames per second"),
+    Field("vision_<camera>rgb_video_num_frames", "", "int64", "T"),
+    Field("vision_<camera>depth", "T, H, W", "float16", "distance along the ray [m], 0 where nothing is met; optional"),
+    Field("arena_vision_<camera>size", "2", "int64", "width and height [px]"),
+    Field("arena_vision_<camera>codec", "", "text", "JSON: codec and its options, as used"),
+    Field("arena_vision_<camera>histogram", "3, 256", "int64", "pixels of all frames by channel and value, unencoded"),
     Field("arena_state", "T, 64", "float32", "canonical state as a policy sees it"),
     Field("arena_action", "T, 40", "float32", "canonical action v3.1 that was decided: the label"),
     Field("arena_executed_action", "T, 40", "float32", "what was executed: the label and the disturbance"),
@@ -115,7 +127,6 @@ FIELDS = (
     Field("arena_seed_range", "", "text", "evaluation, demonstration or teleoperation"),
     Field("arena_group_seed", "", "int64", "number of the series"),
     Field("arena_repeat", "", "int64", "number in the series"),
-    Field("arena_index", "", "int64", "number in the plan"),
     Field("arena_episode_seed", "", "uint64", "everything random about the episode follows from it"),
     Field("arena_outcome", "", "text", "success, fall or timeout"),
     Field("arena_reason", "", "text", "finer cause"),
@@ -127,7 +138,7 @@ FIELDS = (
     Field("arena_cleaned", "", "text", "JSON: rows that `data clean` dropped, by rule, and their source; else absent"),
     Field("arena_source_rows", "T", "int64", "row of the source of each row that `data clean` left; else absent"),
 )
-"""All arrays; `<object>` is an object's name in the original's records, `<camera>` a prefix of `CAMERAS`."""
+"""All arrays; `<object>` is an object's name in the original's records, `<camera>` a part of `CAMERAS`."""
 
 
 def fields_table() -> str:
@@ -138,7 +149,13 @@ def fields_table() -> str:
 
 def vision(camera: str, name: str) -> str:
     """Name of a camera's field: `front`, `rgb_video_path` → `vision_rgb_video_path`."""
-    return f"{CAMERAS[camera]}vision_{name}"
+    return f"vision_{CAMERAS[camera]}{name}"
+
+
+def camera_fields(camera: str) -> frozenset[str]:
+    """Names of all fields that a camera may have."""
+    own = (f"arena_{vision(camera, name)}" for name in OWN_PICTURES)
+    return frozenset([*(vision(camera, name) for name in PICTURES), *own])
 
 
 def write_episode(path: Path, arrays: Mapping[str, np.ndarray], *, sync: bool = True) -> None:

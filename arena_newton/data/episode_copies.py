@@ -45,7 +45,6 @@ def copy_episodes(episodes: Sequence[EpisodeFile], folder: Path, count: int) -> 
             "arena_seed_range": np.str_(seeding.DEMONSTRATION),
             "arena_group_seed": np.int64(0),
             "arena_repeat": np.int64(repeat),
-            "arena_index": np.int64(repeat),
             "arena_episode_seed": np.uint64(seed),
             "episode_object_seed": np.uint64(seeding.object_seed(seed)),
         }

@@ -48,6 +48,8 @@ class LabelProtocol:
     name: str
     robot_type: str
     """Name in LeRobot's `info.json`; policy servers check that of v3.1."""
+    schema: str
+    """Name in the block `vla_protocol` of `info.json`."""
     slots: Mapping[str, slice]
     sentence: str
 
@@ -82,9 +84,15 @@ class LabelProtocol:
 
 LABELS: dict[str, LabelProtocol] = {
     "v3.1": LabelProtocol(
-        "v3.1", "unitree_g1_refpose_v3_1", ACTION, "root displacement of a tick and orientation, as they are executed"
+        "v3.1",
+        "unitree_g1_refpose_v3_1",
+        "unitree_g1_gmt_refpose_v3_1",
+        ACTION,
+        "root displacement of a tick and orientation, as they are executed",
     ),
-    "v4": LabelProtocol("v4", "unitree_g1_cmd_v4", V4, "root velocity, roll, pitch and yaw rate"),
+    "v4": LabelProtocol(
+        "v4", "unitree_g1_cmd_v4", "unitree_g1_gmt_cmd_v4", V4, "root velocity, roll, pitch and yaw rate"
+    ),
 }
 """Protocols by the name that `--labels` takes."""
 _NAMES = {

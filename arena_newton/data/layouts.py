@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from arena_newton import robot
-from arena_newton.canonical import ACTION, HAND_CLOSED, STATE, STATE_WIDTH
+from arena_newton.canonical import ACTION, HAND_CLOSED, STATE
 from arena_newton.data.episode import EpisodeFile
 from arena_newton.data.label_protocols import action_names, encode_v4, protocol
 from arena_newton.errors import InputError
 
-__all__ = ["FPS", "LAYOUTS", "Column", "Layout", "described_protocol", "layout", "modality", "state_names"]
+__all__ = ["FPS", "LAYOUTS", "REFERENCE_SOURCES", "Column", "Layout", "described_protocol", "described_slots"]
+__all__ += ["layout", "modality", "state_names"]
 
 FPS = round(1 / robot.TICK)
 """Frames per second of every dataset: one per tick."""
@@ -264,32 +265,54 @@ def modality(kind: Layout, labels: str, cameras: tuple[str, ...]) -> dict[str, o
     return dict(found)
 
 
+REFERENCE_SOURCES = ("twist2", "sonic")
+"""Trackers whose source of reference poses `vla_protocol` names."""
+_MEANING: Mapping[str, Mapping[str, str]] = {
+    "v3.1": {
+        "action_layout": "root_xy_delta_z_rot6d_joints29_hands2",
+        "rotation_6d_layout": "row",
+        "action_semantics": "reference_pose_not_robot_current_residual",
+        "root_xy_delta_frame": "current_reference_base_frame",
+        "root_rotation_frame": "episode_reference_frame",
+    },
+    "v4": {
+        "action_layout": "root_xy_velocity_z_roll_pitch_yaw_rate_reserved3_joints29_hands2",
+        "action_semantics": "reference_velocity_command",
+        "root_velocity_frame": "current_reference_base_frame",
+    },
+}
+"""What the original's converter says of v3.1 (`write_v31_protocol_metadata`), and as much of v4."""
+
+
 def described_protocol(labels: str, trackers: list[str]) -> dict[str, object]:
-    """Block `vla_protocol` of `meta/info.json`, as the original's converter writes it.
+    """Block `vla_protocol` of `meta/info.json`, with the keys that the original's converter writes.
 
     Args:
         labels: `v3.1` or `v4`.
         trackers: Trackers that executed the actions, without repeats.
     """
     kind = protocol(labels)
-    root = "reference root, from the decided action"
+    # The original takes references from recordings of its trackers; here they are the actions that were decided.
+    sources = {f"{name}_reference_source": "decided_action" if name in trackers else None for name in REFERENCE_SOURCES}
     return {
-        "schema": kind.robot_type,
+        "schema": kind.schema,
         "version": kind.name.removeprefix("v"),
-        "state_dim": STATE_WIDTH,
         "action_dim": len(action_names(labels)),
-        "state_layout": {name: [part.start, part.stop] for name, part in STATE.items()},
-        "action_layout": {name: [part.start, part.stop] for name, part in kind.slots.items()},
-        "rot6d_layout": "row",
-        "state_frame": "heading of the robot at the start of the episode removed",
-        "action_frame": {
-            "v3.1": "displacement in the current reference root frame; orientation as the state's",
-            "v4": "velocity in the current reference root frame; yaw rate about z",
-        }[labels],
-        "joint_order": list(_JOINTS),
-        "fps": FPS,
+        **_MEANING[labels],
+        "fps": float(FPS),
         "control_dt": robot.TICK,
+        "dt_source": "system_control_frequency_or_metadata",
         "backend_source": "+".join(trackers),
-        "root_reference_source": root,
-        "joint_reference_source": "reference joints, from the decided action",
+        **sources,
+    }
+
+
+def described_slots(labels: str) -> dict[str, object]:
+    """Where state and action hold what, for the block `arena` of `meta/info.json`: [first, end] of each part."""
+    slots = protocol(labels).slots
+    return {
+        "state": {name: [part.start, part.stop] for name, part in STATE.items()},
+        "action": {name: [part.start, part.stop] for name, part in slots.items()},
+        "joints": list(_JOINTS),
+        "state_frame": "heading of the robot at the start of the episode removed",
     }

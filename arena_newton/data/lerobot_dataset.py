@@ -32,7 +32,7 @@ from arena_newton import __version__, seeding
 from arena_newton.data.dataset_files import read_json
 from arena_newton.data.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.image_statistics import statistics
-from arena_newton.data.layouts import Layout, described_protocol, layout, modality
+from arena_newton.data.layouts import Layout, described_protocol, described_slots, layout, modality
 from arena_newton.data.new_folder import new_folder
 from arena_newton.data.row_statistics import row_statistics
 from arena_newton.data.source_videos import SourceVideo, source_video
@@ -209,8 +209,8 @@ def choose(
 
 
 def _rate(episode: EpisodeFile) -> int:
-    """Rows per second."""
-    rate = float(episode.array("system_control_frequency"))
+    """Rows per second: the median, as the original's converter takes it."""
+    rate = float(np.median(episode.array("system_control_frequency", episode.rows)))
     if not 1.0 <= rate <= 1000.0:
         raise InputError(f"{episode.path}: system_control_frequency is {rate}, expected 1 to 1000")
     return round(rate)
@@ -365,7 +365,11 @@ class _Closing:
         self._dataset = dataset
 
     def close(self) -> None:
-        self._dataset.finalize()
+        try:
+            self._dataset.finalize()
+        finally:
+            # Where it fails LeRobot tries once more when it is collected, and would make the removed folder again.
+            self._dataset.meta._finalized = self._dataset.writer._finalized = True
 
 
 def _encoder(video: SourceVideo) -> RGBEncoderConfig:
@@ -435,6 +439,7 @@ def _origin(chosen: Chosen, kind: Layout, labels: str) -> dict[str, object]:
         "schema": SCHEMA,
         "layout": kind.name,
         "labels": labels,
+        **({"slots": described_slots(labels)} if kind.name == "arena" else {}),
         "cameras": {kind.image_key(camera): camera for camera in chosen.cameras},
         "seed_ranges": sorted({str(episode["seed_range"]) for episode in episodes}),
         "trackers": sorted({str(episode["tracker"]) for episode in episodes}),

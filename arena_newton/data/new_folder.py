@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
 
 __all__ = ["link", "new_folder", "scratch_folder"]
@@ -25,8 +25,7 @@ def new_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
     What a killed process left of it is removed by the next one.
 
     Raises:
-        InputError: `out` exists, or another process writes it.
-        ArenaError: It cannot be written.
+        InputError: `out` exists, another process writes it, or it cannot be written: the disk may be full.
     """
     with scratch_folder(out, flag) as part:
         yield part
@@ -40,8 +39,7 @@ def scratch_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
     What a killed process left of it is removed by the next one.
 
     Raises:
-        InputError: `out` exists, or another process writes it.
-        ArenaError: It cannot be written.
+        InputError: `out` exists, another process writes it, or it cannot be written: the disk may be full.
     """
     if not out.name or out.name in (".", ".."):
         raise InputError(f"{flag} {out}: is no name of a folder")
@@ -66,7 +64,7 @@ def scratch_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
                 shutil.rmtree(part, ignore_errors=True)
                 lock.unlink(missing_ok=True)
     except OSError as error:
-        raise ArenaError(f"{flag} {out}: cannot be written ({error})") from error
+        raise InputError(f"{flag} {out}: cannot be written ({error})") from error
 
 
 def link(source: Path, target: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arena_newton import seeding
 from arena_newton.data.episode import VIDEO_FOLDER, EpisodeFile, episode_files
 from arena_newton.data.new_folder import link, new_folder
 from arena_newton.errors import InputError
@@ -15,6 +16,7 @@ from arena_newton.text import counted
 
 if TYPE_CHECKING:
     from arena_newton.data.data_options import MergeOptions, SplitOptions
+    from arena_newton.data.dataset_files import DatasetFiles
 
 __all__ = ["held_out", "merge", "split"]
 
@@ -55,7 +57,23 @@ def merge(folders: Sequence[Path], options: MergeOptions) -> int:
         assembly.write_selection([assembly.Selection(files, range(files.episodes)) for files in sources], folder)
     episodes, rows = sum(files.episodes for files in sources), sum(files.frames for files in sources)
     print(f"{options.out}: {counted(episodes, 'episode')}, {rows} rows of {len(sources)} datasets")
+    judged = _mixed(sources)
+    if judged:
+        print(
+            f"note: {judged} of them are on seeds of evaluations, the others are not; what is trained on this set must "
+            "not be judged on those seeds"
+        )
     return 0
+
+
+def _mixed(sources: Sequence[DatasetFiles]) -> int:
+    """Number of episodes on seeds of evaluations, where others are not; 0 where they are alike or not known."""
+    from arena_newton.data import assembly
+
+    listed = [assembly.described(files) for files in sources]
+    ranges = [str(episode.get("seed_range")) for episodes in listed for episode in episodes or ()]
+    judged = ranges.count(seeding.EVALUATION)
+    return judged if judged < len(ranges) else 0
 
 
 def split(folders: Sequence[Path], options: SplitOptions) -> int:

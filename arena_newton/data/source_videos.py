@@ -45,7 +45,7 @@ def source_video(episode: EpisodeFile, camera: str) -> SourceVideo:
     path = episode.video(camera)
     size = episode.array(f"arena_{vision(camera, 'size')}", 2)
     histogram = episode.array(f"arena_{vision(camera, 'histogram')}", 3, VALUES)
-    fps = float(episode.array(vision(camera, "rgb_fps")))
+    fps = float(episode.array(vision(camera, "rgb_video_fps")))
     found = SourceVideo(
         path, int(size[0]), int(size[1]), fps, episode.json(f"arena_{vision(camera, 'codec')}"), histogram
     )

@@ -22,7 +22,7 @@ from arena_newton.data.dataset_files import DatasetFiles, EpisodeRow, read_json
 from arena_newton.data.episode import EpisodeFile, episode_files, opened, vision
 from arena_newton.data.image_statistics import QUANTILES, VALUES, statistics
 from arena_newton.data.label_protocols import encode_v4
-from arena_newton.data.layouts import FPS, LAYOUTS, Column, Layout, described_protocol, modality
+from arena_newton.data.layouts import FPS, LAYOUTS, Column, Layout, described_protocol, described_slots, modality
 from arena_newton.data.row_statistics import aggregated, quantile_name, row_statistics
 from arena_newton.data.video_checks import CameraVideos, DatasetMismatch, check_videos
 from arena_newton.errors import InputError
@@ -187,6 +187,8 @@ def _check_features(subject: _Subject) -> None:
                 shown = f"is {str(told.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
                 raise DatasetMismatch(subject.info, f"vla_protocol: {name} {shown}")
     if subject.arena is not None:
+        if subject.kind.name == "arena" and subject.arena.get("slots") != described_slots(subject.labels):
+            raise DatasetMismatch(subject.info, "arena: slots are not those of state and action")
         path = files.root / "meta" / "modality.json"
         if read_json(path) != modality(subject.kind, subject.labels, tuple(cameras)):
             raise DatasetMismatch(path, "does not name the features' slices")

@@ -63,7 +63,7 @@ def test_every_row_has_its_frame_and_the_label_is_clean(recorded):
     for file in map(EpisodeFile, files):
         with av.open(str(file.video("front"))) as video:
             pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
-        assert len(pictures) == file.rows == file.integer("vision_num_frames")
+        assert len(pictures) == file.rows == file.integer("vision_rgb_video_num_frames")
         assert pictures[0].shape == (64, 64, 3) and not pictures[0][:7].max() > 40  # black bars of a square
         histogram = file.array("arena_vision_histogram", 3, 256)
         mean = (histogram * np.arange(256)).sum(axis=1) / histogram.sum(axis=1)

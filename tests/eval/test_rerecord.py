@@ -55,7 +55,7 @@ def test_cameras_are_added_and_nothing_else_changes(bare, filmed):
         for camera in file.cameras:
             with av.open(str(file.video(camera))) as video:
                 assert sum(1 for _ in video.decode(video=0)) == file.rows
-        depth = file.array("world_vision_depth")
+        depth = file.array("vision_world_depth")
         assert depth.dtype == np.float16 and depth.shape == (file.rows, 48, 64)
         assert 0.5 < np.median(depth) < 20 and np.isfinite(depth).all()
         assert bool(file.array("rerecord_any_success")) and float(file.array("rerecord_final_reward")) == 1.0

@@ -13,6 +13,7 @@ from original_dataset import ACTION_NAMES, features, write_dataset
 from arena_newton import extras, policies, seeding, trackers
 from arena_newton.canonical import STAND_ACTION
 from arena_newton.data.label_protocols import encode_v4
+from arena_newton.data.lerobot_reader import DatasetActions
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
@@ -71,6 +72,21 @@ def test_the_originals_data_move_the_robot(played, tmp_path):
     (again,) = Rollout(env, policy, episodes[1:], recorder=kept).run()
     assert (again.outcome, again.steps) == ("success", results[1].steps)
     np.testing.assert_array_equal(np.stack(kept.rows[episodes[1].episode_seed]), actions[1])
+
+
+OLDER = {
+    "schema": "unitree_g1_refpose_v3_1",
+    "version": "3.1",
+    "rot6d_layout": "row",
+    "action_layout": {"hands": [38, 40]},
+}
+
+
+@pytest.mark.parametrize("block", [OLDER, None], ids=["older keys", "no block"])
+def test_other_descriptions_of_the_protocol_are_read(block, standing, tmp_path):
+    """A set whose block has other keys beside its version, or none, gives the same actions."""
+    root = write_dataset(tmp_path / "set", standing, info={"vla_protocol": block})
+    np.testing.assert_array_equal(DatasetActions(root).actions(1), standing[1].astype(np.float32))
 
 
 def test_each_episode_finds_its_own_recording(played, tmp_path):

@@ -1,5 +1,6 @@
 """`data build`: LeRobot v3.0 datasets from recorded episodes."""
 
+import gc
 import hashlib
 import importlib.metadata
 import inspect
@@ -22,6 +23,7 @@ pytest.importorskip("pyarrow")
 
 from lerobot.datasets import dataset_writer  # noqa: E402
 from lerobot.datasets.aggregate import aggregate_datasets  # noqa: E402
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: E402
 from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
 from lerobot.datasets.video_utils import StreamingVideoEncoder  # noqa: E402
 
@@ -97,7 +99,23 @@ def test_names_are_those_of_the_released_data(dataset):
     ]
     assert action["names"][-2:] == ["action.hand_binary.left", "action.hand_binary.right"]
     protocol = info["vla_protocol"]
-    assert (protocol["version"], protocol["control_dt"], protocol["backend_source"]) == ("3.1", 0.02, "twist2")
+    assert protocol == {
+        "schema": "unitree_g1_gmt_refpose_v3_1",
+        "version": "3.1",
+        "action_dim": 40,
+        "action_layout": "root_xy_delta_z_rot6d_joints29_hands2",
+        "rotation_6d_layout": "row",
+        "action_semantics": "reference_pose_not_robot_current_residual",
+        "root_xy_delta_frame": "current_reference_base_frame",
+        "root_rotation_frame": "episode_reference_frame",
+        "fps": 50.0,
+        "control_dt": 0.02,
+        "dt_source": "system_control_frequency_or_metadata",
+        "backend_source": "twist2",
+        "twist2_reference_source": "decided_action",
+        "sonic_reference_source": None,
+    }
+    assert info["arena"]["slots"]["action"]["root_rot6d"] == [3, 9]
 
 
 def test_the_codec_is_told_as_it_was_used(dataset):
@@ -275,6 +293,20 @@ def test_a_package_that_is_not_installed_has_no_version(recordings, tmp_path, mo
         written(recordings, tmp_path / "third")
 
 
+def test_a_disk_that_is_full_at_the_end_leaves_nothing(recordings, tmp_path, monkeypatch, capsys):
+    """Where the table of episodes cannot be written: exit code 2, and nothing writes into the removed folder later."""
+    with monkeypatch.context() as patch:
+
+        def full(_):
+            raise OSError(28, "No space left on device")
+
+        patch.setattr(LeRobotDatasetMetadata, "_flush_metadata_buffer", full)
+        assert main(["build", str(recordings), "--out", str(tmp_path / "d")]) == 2
+    gc.collect()
+    assert "No space left" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_full_disk_is_one_error(recordings, tmp_path, monkeypatch):
     """Where a video cannot be copied the error names the dataset, and nothing of it stays."""
 
@@ -295,6 +327,8 @@ def test_private_names_of_lerobot():
     assert "ep_dataset = embed_images(ep_dataset)" in source
     assert "compute_episode_stats(non_video_buffer, non_video_features)" in source
     assert "self._streaming_encoder.finish_episode()" in source and "get_task_index(task) for task in tasks" in source
+    for kind in (dataset_writer.DatasetWriter, LeRobotDatasetMetadata):
+        assert 'if getattr(self, "_finalized", False):' in inspect.getsource(kind.finalize)
     assert "shutil.rmtree(str(ep_path.parent))" in source, "hands over a copy, alone in its folder"
     for name in ("finish_episode", "cancel_episode", "close"):
         own = inspect.signature(getattr(FinishedVideos, name))
@@ -407,7 +441,7 @@ def torn(folder):
 BAD = {
     "an evaluation seed": (judged, "judge policies"),
     "another rate": (
-        lambda folder: consistent_episode(folder, repeat=9, system_control_frequency=np.float64(30)),
+        lambda folder: consistent_episode(folder, repeat=9, system_control_frequency=np.full(40, 30.0)),
         "30 rows per second",
     ),
     "another size": (lambda folder: consistent_episode(folder, repeat=9, size=48), "48x48"),

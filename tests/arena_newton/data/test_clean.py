@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_episodes import make_episode
 
+from arena_newton import seeding
 from arena_newton.data.__main__ import main
 from arena_newton.data.cleaning import RULES, Rows, broken_rules
 from arena_newton.data.episode import EpisodeFile
@@ -107,7 +108,7 @@ def test_rows_and_frames_are_dropped_together(spoiled, tmp_path, capsys):
     np.testing.assert_array_equal(after.array("arena_phase"), before.array("arena_phase")[stays])
     np.testing.assert_array_equal(after.array("vision_frame_indices"), np.arange(36))
     np.testing.assert_array_equal(after.array("arena_final_qpos"), before.array("arena_final_qpos"))
-    assert after.json("arena_cleaned")["rules"] == {"nonmonotonic": 1, "gap": 2, "backward": 1, "slow": 0, "held": 0}
+    assert after.json("arena_cleaned")["rules"] == {"nonmonotonic": 1, "gap": 2, "backward": 1, "slow": 0}
     was, now = frames(before.video("front")), frames(after.video("front"))
     assert len(now) == 36 and np.abs(was[stays] - now).mean(axis=(1, 2, 3)).max() < 3
     assert np.abs(was[stays][1:] - now[:-1]).mean(axis=(1, 2, 3)).min() > 5, "pictures tell which frame they are"
@@ -136,7 +137,7 @@ def test_rules_are_turned_off_and_a_second_cleaning_drops_no_more(spoiled, tmp_p
 
 
 def test_the_originals_own_recordings(tmp_path):
-    """An NPZ of the original's SONIC schema, with its own names, is cleaned by the same rules."""
+    """An NPZ of the original's SONIC schema is cleaned by the same rules; of its frame indices the raw one counts."""
     folder = tmp_path / "raw"
     folder.mkdir()
     n = 30
@@ -146,7 +147,9 @@ def test_the_originals_own_recordings(tmp_path):
         "schema_version": np.str_("sonic_episode_v3"),
         "num_frames": np.int64(n),
         "meta_control_dt": np.full(n, 0.02),
-        "gmr_frame_index": np.arange(n) + 100,
+        "consumed_frame_index": np.arange(n) // 2,
+        "gmr_frame_index": np.arange(n) * 3,
+        "raw_frame_index": np.arange(n) + 100,
         "realtime_timestamp": time,
         "vla_action": np.cumsum(np.ones((n, 40)), axis=0),
         "robot_qpos_before_decimation": np.zeros((n, 29)),
@@ -157,6 +160,31 @@ def test_the_originals_own_recordings(tmp_path):
     with np.load(tmp_path / "out" / "task_sonic_1.npz") as kept:
         np.testing.assert_array_equal(kept["encoder_input"][:, 0], np.delete(np.arange(n), 20))
         assert len(kept["meta_control_dt"]) == n and int(kept["num_frames"]) == n - 1
+
+
+def still(folder, *, executed, repeat=0, seeds=seeding.TELEOPERATION):
+    """A recording whose labels repeat while joints move; what was executed repeats too, or does not."""
+    label = np.zeros((40, 40), np.float32)
+    joints = 0.03 * np.arange(40, dtype=np.float32)[:, None] * np.ones((1, 29), np.float32)
+    fields = {"arena_action": label, "arena_executed_action": executed, "robot_qpos_before_decimation": joints}
+    return make_episode(folder, repeat=repeat, cameras=(), arena_seed_range=np.str_(seeds), **fields)
+
+
+def test_a_repeated_label_is_no_held_action(tmp_path, capsys):
+    """What was executed is judged, not the label; a policy that stands is not, and a stalled source is."""
+    folder, held = tmp_path / "recorded", np.zeros((40, 40), np.float32)
+    moving = np.arange(40, dtype=np.float32)[:, None] * np.ones((1, 40), np.float32)
+    sound = [
+        still(folder, executed=moving, repeat=0, seeds=seeding.DEMONSTRATION),
+        still(folder, executed=moving, repeat=1),
+        still(folder, executed=held, repeat=2, seeds=seeding.DEMONSTRATION),
+        still(folder, executed=held, repeat=3, seeds=seeding.EVALUATION),
+    ]
+    stalled = still(folder, executed=held, repeat=4)
+    assert main(["clean", str(folder), "--out", str(tmp_path / "out")]) == 0
+    assert "| 39 | 39 | 1 |" in capsys.readouterr().out
+    assert [EpisodeFile(tmp_path / "out" / file.name).rows for file in sound] == [40] * 4
+    assert EpisodeFile(tmp_path / "out" / stalled.name).rows == 1
 
 
 def test_bad_input_is_one_clear_error(tmp_path, capsys):
@@ -175,7 +203,7 @@ def test_bad_input_is_one_clear_error(tmp_path, capsys):
         {
             "num_frames": None,
             "system_timestamp": np.zeros(3),
-            "arena_action": np.full((4, 40), np.nan, np.float32),
+            "arena_executed_action": np.full((4, 40), np.nan, np.float32),
             "system_control_frequency": np.float64(0),
             "robot_qpos_before_decimation": np.array(["a"] * 4),
         }.items()

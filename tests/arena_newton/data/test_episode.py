@@ -10,7 +10,16 @@ import pytest
 
 from arena_newton import policies, seeding, trackers
 from arena_newton.data.demonstration import DemonstrationRecorder, episode_label
-from arena_newton.data.episode import CAMERAS, FIELDS, EpisodeFile, episode_files, fields_table, vision, write_episode
+from arena_newton.data.episode import (
+    CAMERAS,
+    FIELDS,
+    EpisodeFile,
+    camera_fields,
+    episode_files,
+    fields_table,
+    vision,
+    write_episode,
+)
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
@@ -85,6 +94,15 @@ def test_the_table_in_the_docs_is_the_one_of_the_code():
     """docs/recording.md lists every field with type, shape and sentence."""
     page = (ROOT / "docs" / "recording.md").read_text()
     assert fields_table() in page
+
+
+def test_a_cameras_fields_are_its_own():
+    """The fields of each camera are those of the table, named as the original names them, and no other camera's."""
+    named = [field.name for field in FIELDS if "<camera>" in field.name]
+    for camera, part in CAMERAS.items():
+        assert camera_fields(camera) == {name.replace("<camera>", part) for name in named}
+    assert vision("left_wrist", "rgb_video_fps") == "vision_left_wrist_rgb_video_fps"
+    assert sum(len(camera_fields(camera)) for camera in CAMERAS) == len(frozenset().union(*map(camera_fields, CAMERAS)))
 
 
 def test_equal_arrays_are_equal_bytes(folder, tmp_path):

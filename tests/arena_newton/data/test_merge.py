@@ -81,6 +81,18 @@ def test_merged_is_built_together(built, tmp_path):
     assert (out / "meta" / "modality.json").read_bytes() == (built / "both" / "meta" / "modality.json").read_bytes()
 
 
+def test_seeds_of_evaluations_among_others_are_told(built, tmp_path, capsys):
+    """A set that joins episodes on which policies are judged with others says how many; one of a kind says nothing."""
+    judged = tmp_path / "judged"
+    make_episode(tmp_path / "r", 12, arena_seed_range=np.str_("evaluation"), arena_episode_seed=np.uint64(7))
+    assert main(["build", str(tmp_path / "r"), "--allow-evaluation-seeds", "--out", str(judged)]) == 0
+    capsys.readouterr()
+    assert main(["merge", str(built / "a"), str(judged), "--out", str(tmp_path / "mixed")]) == 0
+    assert "note: 1 of them are on seeds of evaluations" in capsys.readouterr().out
+    assert main(["merge", str(built / "a"), str(built / "b"), "--out", str(tmp_path / "alike")]) == 0
+    assert "note" not in capsys.readouterr().out
+
+
 def test_merged_passes_verify(built, tmp_path, capsys):
     """`data verify` finds no fault in a merged set, nor in either side of a split."""
     pytest.importorskip("arena_newton.data.verification")
