@@ -273,7 +273,7 @@ def described_protocol(labels: str, trackers: list[str]) -> dict[str, object]:
     """
     kind = protocol(labels)
     root = "reference root, from the decided action"
-    return {
+    found: dict[str, object] = {
         "schema": kind.robot_type,
         "version": kind.name.removeprefix("v"),
         "state_dim": STATE_WIDTH,
@@ -293,3 +293,6 @@ def described_protocol(labels: str, trackers: list[str]) -> dict[str, object]:
         "root_reference_source": root,
         "joint_reference_source": "reference joints, from the decided action",
     }
+    if kind.name == "v4":  # the draft demands where the period comes from (§4.3)
+        found["control_dt_source"] = "fixed control tick of arena_newton (robot.TICK)"
+    return found
