@@ -210,7 +210,7 @@ def _controlled(controller: object) -> bool | None:
         return binary
     for button, closes in (("index_trig", True), ("grip", False)):
         pressed = controller.get(button)
-        if type(pressed) in (int, float) and pressed > PRESSED:
+        if isinstance(pressed, int | float) and not isinstance(pressed, bool) and pressed > PRESSED:
             return closes
     return None
 
