@@ -33,7 +33,10 @@ _REPORTING = """__main__ bench bench_figure bench_recording certify config conso
     html_report identity journal options original_format progress recording records report rerecord
     results rounds stats success_film tables wording"""
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
+_DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
+    lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
 UNHASHED = (
+    *(f"data/{name}.py" for name in _DATASETS.split()),
     *(f"eval/{name}.py" for name in _REPORTING.split()),
     *(f"eval/certification/{name}.py" for name in _CHECKS.split()),
     "viewing.py",

@@ -500,7 +500,7 @@ def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str,
     """
     if film.frames != rows:
         raise ArenaError(f"{reel.video}: {film.frames} frames for {rows} rows")
-    codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0}
+    codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0, "mbtree": 0}
     found: dict[str, np.ndarray | np.generic] = {
         vision(name, "storage_format"): np.str_("video_v1"),
         vision(name, "frame_indices"): np.arange(rows),

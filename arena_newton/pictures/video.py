@@ -100,7 +100,8 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         # One encoder thread: videos are written during a simulation that uses every core.
         self._stream.codec_context.thread_count = 1
-        self._stream.options = {"crf": str(crf), "preset": "veryfast"}
+        # Without mbtree: it reads memory that nobody wrote, so that equal frames give different bytes now and then.
+        self._stream.options = {"crf": str(crf), "preset": "veryfast", "mbtree": "0"}
         if gop is not None:
             self._stream.options |= {"g": str(gop), "keyint_min": str(gop), "sc_threshold": "0"}
         if not b_frames:

@@ -82,7 +82,7 @@ def make_episode(
         "episode_object_seed": np.uint64(seeding.object_seed(seed)),
         "episode_object_seed_source": np.str_("arena_episode_seed"),
     }
-    codec = {"vcodec": "h264", "g": 10, "crf": 20, "preset": "veryfast", "bf": 0}
+    codec = {"vcodec": "h264", "g": 10, "crf": 20, "preset": "veryfast", "bf": 0, "mbtree": 0}
     for number, camera in enumerate(cameras):
         shown, histogram = pictures(rows, size, number), np.zeros((3, VALUES), np.int64)
         file = folder / "videos" / f"{stem}_{camera}_rgb.mp4"

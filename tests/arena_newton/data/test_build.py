@@ -105,7 +105,7 @@ def test_the_codec_is_told_as_it_was_used(dataset):
     about = json.loads((dataset / "meta" / "info.json").read_text())["features"]["observation.images.front"]
     assert about["shape"] == [32, 32, 3] and about["dtype"] == "video"
     told = {name: about["info"][f"video.{name}"] for name in ("codec", "g", "crf", "preset", "extra_options")}
-    assert told == {"codec": "h264", "g": 10, "crf": 20, "preset": "veryfast", "extra_options": {"bf": 0}}
+    assert told == {"codec": "h264", "g": 10, "crf": 20, "preset": "veryfast", "extra_options": {"bf": 0, "mbtree": 0}}
 
 
 def test_where_episodes_come_from_is_stored(dataset, recordings):
