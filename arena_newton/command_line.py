@@ -1,5 +1,7 @@
 """What a command line answers when its work fails."""
 
+import atexit
+import gc
 import os
 import sys
 from collections.abc import Callable
@@ -23,6 +25,10 @@ def exit_code(work: Callable[[], int | None]) -> int:
         What the work returned: 0 done, or a code of its own; after an error its `exit_code`: 1 failed, 2 bad input; 130
         interrupted. Whoever closes the output has seen enough: 0.
     """
+    # An interpreter that ends looks for garbage three times among the millions of objects that compiled kernels leave,
+    # which takes seconds after the last line is printed; what is frozen is not looked at. Once, however often called.
+    atexit.unregister(gc.freeze)
+    atexit.register(gc.freeze)
     try:
         return work() or 0
     except ArenaError as error:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.registry import Registry
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
     from arena_newton.interfaces import World
@@ -128,6 +127,8 @@ names = POLICIES.names
 
 def world_mask(mask: Mask, worlds: int) -> np.ndarray:
     """A mask as bool array of shape [worlds]."""
+    import numpy as np  # here, so that --help does not wait for it
+
     if mask is None:
         return np.ones(worlds, dtype=bool)
     values = mask if isinstance(mask, Sequence | np.ndarray) else mask.detach().cpu()

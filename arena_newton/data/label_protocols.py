@@ -3,7 +3,11 @@
 A v3.1 action names the reference's orientation relative to the episode's heading, and its displacement of a tick. A v4
 action names velocities and leaves the heading to whoever executes it: it is integrated from the yaw rate, beginning at
 the episode's heading. The original's authors drafted v4 because the orientation labels of two trackers differ more than
-their motions (`UNITREE_G1_GMT_CMD_V4_DATA_PROTOCOL.md`, humanoidarena); no data of it were published.
+their motions (`isaaclab_twist2_g1/docs/UNITREE_G1_GMT_CMD_V4_DATA_PROTOCOL.md` of github.com/Allenhetl/HumanoidArena at
+70f0148); no data of it were published. Names, units and the first row are the draft's. Two things differ, so that
+an episode's actions come back: velocities are in the frame of the reference root, the draft's in that of the measured
+base, and the yaw rate is the difference of the reference's yaws (ZYX), the draft's the z component of its angular
+velocity in the measured base.
 """
 
 from __future__ import annotations
@@ -91,7 +95,7 @@ LABELS: dict[str, LabelProtocol] = {
         "root displacement of a tick and orientation, as they are executed",
     ),
     "v4": LabelProtocol(
-        "v4", "unitree_g1_cmd_v4", "unitree_g1_gmt_cmd_v4", V4, "root velocity, roll, pitch and yaw rate"
+        "v4", "unitree_g1_gmt_cmd_v4", "unitree_g1_gmt_cmd_v4", V4, "root velocity, roll, pitch and yaw rate"
     ),
 }
 """Protocols by the name that `--labels` takes."""
@@ -101,11 +105,11 @@ _NAMES = {
         *(f"action.root_ref_rot6d.{i}" for i in range(6)),
     ),
     "v4": (
-        *("action.root_velocity.x", "action.root_velocity.y", "action.root_z", "action.root_roll"),
-        *("action.root_pitch", "action.root_yaw_rate", *(f"action.reserved.{i}" for i in range(3))),
+        *("action.root_base_local_vx", "action.root_base_local_vy", "action.root_z", "action.root_roll"),
+        *("action.root_pitch", "action.root_yaw_rate", *(f"action.reserved_{i}" for i in range(3))),
     ),
 }
-"""Names of the first nine slots in LeRobot's datasets; those of v3.1 are the original's."""
+"""Names of the first nine slots in LeRobot's datasets; those of v3.1 are the original's, of v4 the draft's (§5.2)."""
 
 
 def protocol(name: str) -> LabelProtocol:
@@ -125,15 +129,19 @@ def action_names(name: str) -> list[str]:
     return [*_NAMES[protocol(name).name], *joints, "action.hand_binary.left", "action.hand_binary.right"]
 
 
-def encode_v4(actions: np.ndarray, yaw0: float = 0.0) -> np.ndarray:
+def encode_v4(actions: np.ndarray, yaw0: float | None = None) -> np.ndarray:
     """Labels of v4 of an episode.
+
+    The first row of an episode has no velocity and no yaw rate (§6.3 of the draft); the second one's rate takes the
+    heading from where the episode begins, so that only the first row's displacement and heading do not come back.
 
     Args:
         actions: Actions of v3.1, tick by tick, shape [T, 40].
-        yaw0: Yaw of the reference before the first tick, in the episode's frame [rad]: 0 where the episode begins.
+        yaw0: Yaw of the reference before the first of these ticks, in the episode's frame [rad], of rows that continue
+            an episode; none where the episode begins with them, at yaw 0.
 
     Returns:
-        float32, shape [T, 40]; `decode_v4` gives the actions back, with an orthonormal orientation.
+        float32, shape [T, 40]; `decode_v4` gives all actions but the first back, with an orthonormal orientation.
 
     Raises:
         InputError: The actions are unfit.
@@ -147,14 +155,19 @@ def encode_v4(actions: np.ndarray, yaw0: float = 0.0) -> np.ndarray:
     y = columns[..., 1] - x * (x * columns[..., 1]).sum(axis=1, keepdims=True)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     z = np.cross(x, y)
-    yaw = np.unwrap(np.concatenate([[yaw0], np.arctan2(x[:, 1], x[:, 0])]))
+    begins, before = yaw0 is None, yaw0 or 0.0
+    yaw = np.unwrap(np.concatenate([[before], np.arctan2(x[:, 1], x[:, 0])]))
+    if begins:
+        yaw[1:2] = before
     labels[:, V4["velocity_xy"]] = given[:, ACTION["root_xy_delta"]].astype(np.float64) / robot.TICK
     labels[:, V4["roll_pitch"]] = np.stack(
         [np.arctan2(y[:, 2], z[:, 2]), np.arctan2(-x[:, 2], np.hypot(x[:, 0], x[:, 1]))], axis=1
     )
     # Differences of rounded yaws, not rounded differences: errors do not add up.
-    steps = np.diff(np.rint((yaw - yaw0) / (robot.TICK * RATE_STEP)))
+    steps = np.diff(np.rint((yaw - before) / (robot.TICK * RATE_STEP)))
     labels[:, V4["yaw_rate"]] = steps[:, None] * RATE_STEP
+    if begins:
+        labels[:1, V4["velocity_xy"]] = 0.0
     labels[:, V4["reserved"]] = 0.0
     labels[:, V4["roll_pitch"]] += 0.0  # no minus zero
     return labels
@@ -165,7 +178,7 @@ def decode_v4(labels: np.ndarray, yaw0: float = 0.0) -> np.ndarray:
 
     Args:
         labels: shape [T, 40].
-        yaw0: As for `encode_v4`.
+        yaw0: Yaw before the first of these ticks [rad].
 
     Returns:
         float32, shape [T, 40]; a row with a number that is not finite has no finite orientation.

@@ -303,6 +303,8 @@ def described_protocol(labels: str, trackers: list[str]) -> dict[str, object]:
         "control_dt": robot.TICK,
         "dt_source": "system_control_frequency_or_metadata",
         "backend_source": "+".join(trackers),
+        # The draft of v4 demands where the period comes from (§4.3).
+        **({"control_dt_source": "fixed control tick of arena_newton (robot.TICK)"} if labels == "v4" else {}),
         **sources,
     }
 

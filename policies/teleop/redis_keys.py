@@ -59,7 +59,12 @@ ACTION_HANDS = (f"action_hand_left{SUFFIX}", f"action_hand_right{SUFFIX}")
 """7 numbers each: joint targets of a hand [rad]."""
 ACTION_NECK = f"action_neck{SUFFIX}"
 CONTROLLERS = "controller_data"
-"""`LeftController` and `RightController` with, among others, `grip_binary`: the hand is to close."""
+"""`LeftController` and `RightController` with, among others, `grip_binary`: the hand is to close; `index_trig` and
+`grip`, 0 to 1, are its trigger and grip."""
+SIDES = ("Left", "Right")
+"""Hands in the order of our actions, as the controllers are named."""
+PRESSED = 0.5
+"""A trigger or grip beyond this is pressed (the original's sender)."""
 RECORDING_CONTROL = f"recording_control{SUFFIX}"
 """`active`, `command`, `sequence`, `timestamp_ms`, `source`; a command counts when its sequence changes."""
 T_ACTION = "t_action"
@@ -173,28 +178,41 @@ def closed_hands(controllers: bytes, hands: tuple[bytes, bytes]) -> np.ndarray |
     """Which hands are to close, left and right: 0 or 1, float32, shape [2].
 
     Args:
-        controllers: Value of `CONTROLLERS`; its `grip_binary` decides, as in the original's labels.
-        hands: Values of `ACTION_HANDS`, which decide where there is no controller: nearer to closed than to open.
+        controllers: Value of `CONTROLLERS`. Of each hand its `grip_binary` decides, as in the original's labels;
+            without one `index_trig` above `PRESSED` closes, else `grip` above it opens, as in the original's sender.
+        hands: Values of `ACTION_HANDS`; each decides where its controller says nothing: nearer to closed than to open.
 
     Returns:
-        None where neither says anything.
+        None where nothing is said of either hand; a hand of which alone nothing is said is open.
 
     Raises:
         InputError: A value is something else than it must be.
     """
-    if controllers:
-        found = parse(CONTROLLERS, controllers)
-        sides = [found.get(f"{side}Controller") if isinstance(found, dict) else None for side in ("Left", "Right")]
-        grips = [side.get("grip_binary") if isinstance(side, dict) else None for side in sides]
-        if all(isinstance(grip, bool) for grip in grips):
-            return np.array(grips, dtype=np.float32)
-    if not all(hands):
+    found = parse(CONTROLLERS, controllers) if controllers else None
+    closed: list[bool | None] = []
+    for side, key, raw, close in zip(SIDES, ACTION_HANDS, hands, (HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT), strict=True):
+        said = _controlled(found.get(f"{side}Controller")) if isinstance(found, dict) else None
+        if said is None and raw:
+            target = np.asarray(close)
+            said = bool(numbers(key, raw, len(close)) @ target > 0.5 * target @ target)
+        closed.append(said)
+    if closed == [None, None]:
         return None
-    closed = []
-    for key, raw, close in zip(ACTION_HANDS, hands, (HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT), strict=True):
-        target = np.asarray(close)
-        closed.append(float(numbers(key, raw, 7) @ target > 0.5 * target @ target))
-    return np.array(closed, dtype=np.float32)
+    return np.array([bool(said) for said in closed], dtype=np.float32)
+
+
+def _controlled(controller: object) -> bool | None:
+    """Whether a controller closes its hand; None where it says nothing."""
+    if not isinstance(controller, dict):
+        return None
+    binary = controller.get("grip_binary")
+    if isinstance(binary, bool):
+        return binary
+    for button, closes in (("index_trig", True), ("grip", False)):
+        pressed = controller.get(button)
+        if isinstance(pressed, int | float) and not isinstance(pressed, bool) and pressed > PRESSED:
+            return closes
+    return None
 
 
 @dataclass(frozen=True)

@@ -84,3 +84,17 @@ def test_installed_commands_run_from_any_folder(start, tmp_path):
     assert done.returncode == 0 and "arena-newton trackers train" in done.stdout and not done.stderr
     wrong = subprocess.run([*start, "nothing"], capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
+
+
+def test_a_command_ends_without_a_search_for_garbage():
+    """What a command leaves is frozen at the interpreter's end: among a simulation's objects a search takes seconds."""
+    code = (
+        "import atexit, gc\n"
+        "from arena_newton.command_line import exit_code\n"
+        "before = gc.get_freeze_count()\n"
+        "atexit.register(lambda: print(gc.get_freeze_count() > before + 1000))\n"
+        "assert exit_code(lambda: None) == exit_code(lambda: 0) == 0\n"
+        "assert gc.get_freeze_count() == before\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert (done.stdout, done.returncode) == ("True\n", 0), done.stderr

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import av
 import numpy as np
@@ -160,6 +161,35 @@ def test_kills_lose_at_most_what_was_running(recorded, tmp_path):
     assert main(["resume", str(folder)]) == 0
     same(recorded, folder)
     assert not list(folder.rglob("*.part"))
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_ctrl_c_leaves_nothing_behind(recorded, tmp_path, processes):
+    """Ctrl-C while pictures are encoded: code 130, no process or partial file stays; resumed, the bytes are equal."""
+    folder = tmp_path / "interrupted"
+    program = (
+        "import sys\n"
+        "from arena_newton.eval import recording\n"
+        "from arena_newton.eval.__main__ import main\n"
+        f"recording.encoding_processes = lambda: {processes}\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    command = [sys.executable, "-c", program, "record", *SMALL, "--episodes", str(COUNT), "--worlds", "2"]
+    run = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    began = time.monotonic()
+    while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 120 and run.poll() is None:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+    run.send_signal(signal.SIGINT)
+    output, complaint = run.communicate(timeout=60)
+    assert run.returncode == 130, complaint
+    assert "resume" in output + complaint and "Traceback" not in complaint
+    assert len(children) == processes and not any(Path(f"/proc/{child}").exists() for child in children)
+    assert not list(folder.rglob("*.part"))
+    assert len(read_journal(folder / "episodes.jsonl")[0]) < COUNT
+    assert main(["resume", str(folder)]) == 0
+    same(recorded, folder)
 
 
 def test_missing_and_torn_files_are_recorded_again(recorded, copied, capsys):

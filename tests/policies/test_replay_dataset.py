@@ -20,7 +20,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.interfaces import Recorder
 from arena_newton.rollout import Rollout
 
-V4 = {"robot_type": "unitree_g1_cmd_v4", "vla_protocol": {"version": "4"}}
+V4 = {"robot_type": "unitree_g1_gmt_cmd_v4", "vla_protocol": {"version": "4"}}
 
 
 class Acted(Recorder):

@@ -383,7 +383,7 @@ def test_labels(recordings, tmp_path, labels):
     expected = episode.action if labels == "v3.1" else encode_v4(episode.action)
     got = np.stack([read.hf_dataset[i]["action"].numpy() for i in range(episode.rows)])
     np.testing.assert_array_equal(got, expected)
-    assert info["robot_type"] == {"v3.1": "unitree_g1_refpose_v3_1", "v4": "unitree_g1_cmd_v4"}[labels]
+    assert info["robot_type"] == {"v3.1": "unitree_g1_refpose_v3_1", "v4": "unitree_g1_gmt_cmd_v4"}[labels]
     assert info["vla_protocol"]["version"] == labels[1:]
     assert ("action.root_yaw_rate" in info["features"]["action"]["names"]) == (labels == "v4")
 

@@ -518,3 +518,36 @@ def test_no_server_is_one_clear_error(capsys):
         connect("127.0.0.1", port, 0)
     assert main(["redis", "--port", str(port)]) == 2
     assert f"--port {port}" in capsys.readouterr().err
+
+
+CLOSED_LEFT, OPEN = json.dumps(list(HAND_CLOSE_LEFT)).encode(), json.dumps([0.0] * 7).encode()
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "hands", "expected"),
+    [
+        ({"grip_binary": True}, {"grip_binary": False}, (b"", b""), [1, 0]),
+        ({"grip_binary": True}, {}, (b"", b""), [1, 0]),
+        ({"grip_binary": False}, {"index_trig": 0.6}, (b"", b""), [0, 1]),
+        ({"grip_binary": False, "index_trig": 1.0}, {"grip_binary": True, "grip": 1.0}, (b"", b""), [0, 1]),
+        ({"index_trig": 0.6, "grip": 1.0}, {"index_trig": 0.5, "grip": 0.0}, (b"", b""), [1, 0]),
+        ({"grip": 0.6}, {"grip_binary": None}, (CLOSED_LEFT, b""), [0, 0]),
+        ({"grip": 0.4}, {"grip_binary": True}, (CLOSED_LEFT, OPEN), [1, 1]),
+        ({"grip_binary": "true", "index_trig": True}, None, (b"", OPEN), [0, 0]),
+        ({"grip_binary": 1, "index_trig": float("nan")}, "broken", (b"", b""), None),
+        ({}, {}, (b"", b""), None),
+    ],
+)
+def test_each_hand_is_decided_by_what_is_said_of_it(left, right, hands, expected):
+    """Its grip_binary, else its trigger and grip as in the original's sender, else its targets, else it is open."""
+    said = json.dumps({"LeftController": left, "RightController": right}).encode()
+    found = keys.closed_hands(said, hands)
+    assert (None if found is None else found.tolist()) == expected
+
+
+def test_hands_without_controllers():
+    """A hand's targets alone decide for it, and 6 numbers are refused by name."""
+    assert keys.closed_hands(b"", (CLOSED_LEFT, b"")).tolist() == [1, 0]
+    assert keys.closed_hands(b"", (b"", b"")) is None
+    with pytest.raises(InputError, match=r"action_hand_left.*6 numbers, expected 7"):
+        keys.closed_hands(b"", (json.dumps([0.0] * 6).encode(), OPEN))
