@@ -15,7 +15,13 @@ SCRIPT = Path(sys.executable).with_name("arena-newton")
 
 def test_every_program_of_the_package_has_a_command():
     """What `python -m` runs has a command; builders, examples, the reader's other process and the front doors aside."""
-    doors = {"arena_newton/__main__.py", "arena_newton/probe.py", "trackers/__main__.py", "usd_scenes/g1/build.py"}
+    doors = {
+        "arena_newton/__main__.py",
+        "arena_newton/probe.py",
+        "arena_newton/data/film_process.py",
+        "trackers/__main__.py",
+        "usd_scenes/g1/build.py",
+    }
     programs = set()
     for folder in ("arena_newton", "kernels", "trackers", "policies", "eval", "usd_scenes"):
         for path in (ROOT / folder).rglob("*.py"):
