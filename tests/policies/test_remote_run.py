@@ -90,10 +90,11 @@ def test_flags_reach_the_policy(tmp_path):
     out = ["--out", str(tmp_path / "o")]
     assert main([*SHORT, "--policy", "remote:https://host", *flags, *out], factories(policy=policy)) == 0
     assert main(["resume", str(tmp_path / "o")], factories(policy=policy)) == 0
-    assert made == [{"timeout": 7.5, "retries": 0, "sequential": True, "verify_ssl": False}] * 2
+    wanted = {"timeout": 7.5, "retries": 0, "sequential": True, "verify_ssl": False, "labels": "v3.1"}
+    assert made == [wanted] * 2
     other = ["--out", str(tmp_path / "other")]
     assert main([*SHORT, "--policy", "remote:https://host", *other], factories(policy=policy)) == 0
-    assert made[2] == {"timeout": 60.0, "retries": 4, "sequential": False, "verify_ssl": True}
+    assert made[2] == {"timeout": 60.0, "retries": 4, "sequential": False, "verify_ssl": True, "labels": "v3.1"}
 
 
 def test_number_of_worlds_counts_unless_the_server_honours_seeds(tmp_path, monkeypatch, capsys):

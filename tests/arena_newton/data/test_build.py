@@ -362,11 +362,11 @@ def test_files_are_as_small_as_asked(tmp_path, monkeypatch):
         return np.random.default_rng(seed).integers(0, 255, (rows, size, size, 3), np.uint8)
 
     monkeypatch.setattr(made_episodes, "pictures", noise)
-    for repeat in range(3):
+    for repeat in range(4):
         consistent_episode(tmp_path / "r", ROWS, repeat=repeat, size=224)
     (size,) = {round(file.stat().st_size / 2**20, 1) for file in (tmp_path / "r" / "videos").iterdir()}
     assert 0.67 < size < 1.0
-    for file_mb, files in ((1, 3), (2, 2), (100, 1)):
+    for file_mb, files in ((1, 4), (2, 2), (100, 1)):
         built = written(tmp_path / "r", tmp_path / f"d{file_mb}", file_mb=file_mb)
         assert len(list((built / "videos").rglob("*.mp4"))) == files
         read = LeRobotDataset("local/many", root=built, return_uint8=True, video_backend="pyav")
