@@ -65,13 +65,17 @@ def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
     return f"these arguments cannot be read together: {' '.join(arguments)}; see {prog} --help"
 
 
-def folders_named(arguments: list[str], command: str, prog: str) -> list[Path]:
+def folders_named(
+    arguments: list[str], command: str, prog: str, *, noun: str = "a folder", shown: str = "<folder>"
+) -> list[Path]:
     """Take the folders or files that a command begins with out of its arguments, each once.
 
     Args:
         arguments: What was typed after the command; they are removed from it.
         command: The command, such as `report`.
         prog: How the program is called.
+        noun: What the message of a missing one asks for.
+        shown: How its line shows one.
 
     Raises:
         InputError: None is named, or one twice.
@@ -80,7 +84,7 @@ def folders_named(arguments: list[str], command: str, prog: str) -> list[Path]:
     while arguments and not arguments[0].startswith("-"):
         found.append(Path(arguments.pop(0)).expanduser())
     if not found:
-        raise InputError(f"{command}: name a folder: {prog} {command} <folder>")
+        raise InputError(f"{command}: name {noun}: {prog} {command} {shown}")
     for number, folder in enumerate(found):
         if folder.resolve() in [other.resolve() for other in found[:number]]:
             raise InputError(f"{command} {folder}: is named twice")

@@ -21,7 +21,7 @@ from arena_newton.eval.options import (
     ReportOptions,
     RunOptions,
 )
-from arena_newton.flags import parse_flags
+from arena_newton.flags import folders_named, parse_flags
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -70,13 +70,7 @@ def _folder(arguments: list[str], command: str) -> Path:
 
 def _folders(arguments: list[str], command: str) -> list[Path]:
     """One results folder or several, each once."""
-    folders = [_folder(arguments, command)]
-    while arguments and not arguments[0].startswith("-"):
-        folders.append(_folder(arguments, command))
-    for number, folder in enumerate(folders):
-        if folder.resolve() in [other.resolve() for other in folders[:number]]:
-            raise InputError(f"{command} {folder}: is named twice")
-    return folders
+    return folders_named(arguments, command, PROG, noun="the results folder", shown="<out>")
 
 
 def _wants_help(arguments: Sequence[str]) -> bool:
