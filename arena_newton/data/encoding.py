@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from arena_newton.data.episode_film import Film, FilmFacts
+from arena_newton.interrupts import Uninterrupted
 
 __all__ = [
     "Encoders",
@@ -161,6 +162,7 @@ class Encoders:
         self._unfinished = 0
         self._errors: deque[BaseException] = deque()
         self._changed = threading.Condition()
+        self._whole = Uninterrupted()
         self._threads = [
             threading.Thread(target=self._work, args=(jobs,), name=f"encoder-{number}", daemon=True)
             for number, jobs in enumerate(self._queues)
@@ -186,9 +188,10 @@ class Encoders:
         if not self._queues:
             self._do(job)
             return
-        with self._changed:
-            self._unfinished += 1
-        self._queues[number].put(job)
+        with self._whole:  # a job that is counted and not queued would be waited for without end
+            with self._changed:
+                self._unfinished += 1
+            self._queues[number].put(job)
 
     def check(self) -> None:
         """Raise the first exception of a job since the last call."""

@@ -31,6 +31,7 @@ from arena_newton.data.episode_film import FilmFacts
 from arena_newton.data.film_process import SlotMemory, packed, unpacked
 from arena_newton.errors import ArenaError
 from arena_newton.files import PARTIAL
+from arena_newton.interrupts import Uninterrupted
 
 __all__ = ["FilmPool"]
 
@@ -130,6 +131,8 @@ class FilmPool(Filming):
         self._unsent: deque[tuple[torch.cuda.Event | None, Sequence[tuple[_Worker, bytes]]]] = deque()
         self._endings: dict[int, _Ending] = {}
         self._errors: deque[BaseException] = deque()
+        self._whole = Uninterrupted()
+        """Around whatever a Ctrl-C would tear apart: a message half sent or lost is waited for without end."""
 
     def bind(self, cameras: Mapping[str, Pictured], device: torch.device) -> None:
         """Allocate the slots and start the processes."""
@@ -174,22 +177,24 @@ class FilmPool(Filming):
         """A film of an episode."""
         reel = Reel(next(self._numbers), worker, video, depth)
         about = {"film": reel.number, "video": str(video), "depth": str(depth), "fps": float(fps)}
-        self._send(self._workers[worker], about)
+        with self._whole:
+            self._send(self._workers[worker], about)
         return reel
 
     def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
         """Append a picture to each film; waits while all slots are taken."""
         slots = self._cameras[camera]
         slot = self._free(slots)
-        event = slots.fill(slot, pictures, depths)
-        if slots.reels is not reels:
-            slots.reels, slots.messages = reels, {}
-        if slot not in slots.messages:
-            slots.messages[slot] = self._messages(slots, slot)
-        messages = slots.messages[slot]
-        slots.users[slot] = {worker.number for worker, _ in messages if worker.alive}
-        self._unsent.append((event, messages))
-        self._flush()
+        with self._whole:
+            event = slots.fill(slot, pictures, depths)
+            if slots.reels is not reels:
+                slots.reels, slots.messages = reels, {}
+            if slot not in slots.messages:
+                slots.messages[slot] = self._messages(slots, slot)
+            messages = slots.messages[slot]
+            slots.users[slot] = {worker.number for worker, _ in messages if worker.alive}
+            self._unsent.append((event, messages))
+            self._flush()
 
     def _free(self, slots: _Slots) -> int:
         """A slot that nobody uses; waits until there is one."""
@@ -218,12 +223,13 @@ class FilmPool(Filming):
 
     def _end(self, number: int, reels: Mapping[str, Reel], then: Finished, what: str) -> None:
         worker, ending = self._workers[number], _Ending(reels, then, {reel.number for reel in reels.values()})
-        for reel in reels.values():
-            self._endings[reel.number] = ending
-            if worker.alive:
-                self._send(worker, {what: reel.number})
-            else:
-                self._answered(reel.number, None, whole=False)
+        with self._whole:
+            for reel in reels.values():
+                self._endings[reel.number] = ending
+                if worker.alive:
+                    self._send(worker, {what: reel.number})
+                else:
+                    self._answered(reel.number, None, whole=False)
 
     def _answered(self, number: int, facts: FilmFacts | None, *, whole: bool) -> None:
         """A film is finished or gone; the last one of an episode leads to what follows."""
@@ -296,9 +302,10 @@ class FilmPool(Filming):
                 if not wait:
                     return
                 event.synchronize()
-            self._unsent.popleft()
-            for worker, message in messages:
-                self._transmit(worker, message)
+            with self._whole:
+                self._unsent.popleft()
+                for worker, message in messages:
+                    self._transmit(worker, message)
 
     def _transmit(self, worker: _Worker, message: bytes) -> None:
         left = memoryview(message)
@@ -316,7 +323,8 @@ class FilmPool(Filming):
     def _receive(self, patience: float) -> None:
         """Read what processes have said, waiting for the first of it so long [s]."""
         for key, _ in self._selector.select(patience):
-            self._read(key.data)
+            with self._whole:
+                self._read(key.data)
 
     def _read(self, worker: _Worker) -> None:
         try:

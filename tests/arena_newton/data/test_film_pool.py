@@ -180,3 +180,39 @@ def test_no_process_outlives_a_killed_recorder(tmp_path):
     while any(os.path.exists(f"/proc/{one}") for one in encoders) and time.monotonic() < until:
         time.sleep(0.05)
     assert not [one for one in encoders if os.path.exists(f"/proc/{one}")]
+
+
+@pytest.mark.parametrize("torn", ["_transmit", "_hear"])
+def test_an_interrupt_tears_no_message(tmp_path, monkeypatch, torn):
+    """Ctrl-C in the middle of a message to or from a process: every film is finished, none is waited for in vain."""
+    whole, pending = getattr(FilmPool, torn), []
+
+    def interrupted(pool, *about):
+        if pending:  # one for each step: the second one in a row comes through at once
+            signal.raise_signal(pending.pop())
+        whole(pool, *about)
+
+    def late(number, frame):
+        raise TimeoutError("the pool waits for a message that was lost")
+
+    pool, facts, interrupts = FilmPool(2, 1), [], 0
+    reels = begin(pool, tmp_path)
+    monkeypatch.setattr(FilmPool, torn, interrupted)
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(60)
+    try:
+        steps = [lambda: pool.add("front", reels, *pictures(0))] * 3
+        steps += [lambda r=reel: pool.finish(r.worker, {"front": r}, facts.append) for reel in reels]
+        for step in [*steps, pool.wait]:
+            pending[:] = [signal.SIGINT]
+            try:
+                step()
+            except KeyboardInterrupt:
+                interrupts += 1
+        pending.clear()
+        pool.wait()
+        assert interrupts and len(facts) == WORLDS and all(films["front"].frames == 3 for films in facts)
+        pool.close()
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
