@@ -10,8 +10,11 @@ __all__ = ["EXTRAS", "require"]
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "data": ("pyarrow", "datasets", "pandas"),
-    "plots": ("matplotlib",),
+    "gr00t": ("zmq", "msgpack"),
+    "plots": ("matplotlib", "sklearn"),
+    "policies": ("diffusers", "transformers", "scipy"),
     "rerun": ("rerun",),
+    "serve": ("websockets", "msgpack"),
     "teleop": ("viser", "websockets", "redis"),
     "train": ("accelerate", "wandb"),
 }

@@ -1,0 +1,1 @@
+"""Policies of LeRobot: what a checkpoint says of itself, and running it for all worlds at once."""

@@ -1,0 +1,144 @@
+"""What a checkpoint says beside what LeRobot's own files say: how its actions are read and what it was trained on.
+
+A checkpoint is a folder as LeRobot writes it (`config.json`, `model.safetensors`, the processors' files), which a stock
+LeRobot loads, with one more file, `arena_policy.json`. One without it is somebody else's: its actions are v3.1.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+from arena_newton.data.label_protocols import protocol
+from arena_newton.errors import InputError
+from arena_newton.files import replace_atomically
+from arena_newton.pictures.settings import CameraConfig
+
+__all__ = ["CONFIG_FILE", "FACTS_FILE", "CheckpointFacts", "checkpoint_folder"]
+
+FACTS_FILE = "arena_policy.json"
+"""File of a checkpoint that holds its `CheckpointFacts`."""
+CONFIG_FILE = "config.json"
+"""File by which a folder is known to be a checkpoint of LeRobot."""
+FORMAT = 1
+"""Version of the file."""
+INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model", "last/pretrained_model")
+"""Where a checkpoint lies in the folder of a training, in the order in which it is looked for."""
+
+
+@dataclass(frozen=True)
+class CheckpointFacts:
+    """How a policy's pictures and actions are meant, and where it comes from."""
+
+    labels: str = "v3.1"
+    """Protocol of its actions (`data.label_protocols`)."""
+    realign: float = 0.0
+    """Fraction of the gap between the commanded and the measured heading that is closed each tick; of v4 only."""
+    width: int = 224
+    """Width of the head camera's picture [px]."""
+    height: int = 224
+    """Height of the head camera's picture [px]."""
+    fit: str = "pad"
+    """`pad` or `native`, as in `CameraConfig`."""
+    task_vector: tuple[str, ...] = ()
+    """Tasks in the order of the one-hot vector that the policy is given as `observation.environment_state`; none: it
+    is given no such vector."""
+    family: str = ""
+    """`act`, `diffusion`, `flow`, `pi05`."""
+    recipe: str = ""
+    """Name of the recipe, such as `fast`."""
+    tasks: tuple[str, ...] = ()
+    """Tasks of its demonstrations."""
+    trackers: tuple[str, ...] = ()
+    """Trackers through which they were recorded."""
+    steps: int = 0
+    """Optimizer steps."""
+    seed: int = 0
+    minutes: float = 0.0
+    """Time of the training [min]."""
+    device: str = ""
+    """Where it was trained, such as `NVIDIA H200`."""
+    datasets: tuple[Mapping[str, object], ...] = ()
+    """Of each dataset: `name`, `hash` of its `meta/info.json`, `episodes`, `frames`."""
+    options: Mapping[str, object] = field(default_factory=dict)
+    """The training's resolved options."""
+
+    @property
+    def camera(self) -> CameraConfig:
+        """The picture that the policy wants."""
+        return CameraConfig(width=self.width, height=self.height, fit="native" if self.fit == "native" else "pad")
+
+    def write(self, folder: Path) -> None:
+        """Write the file of a checkpoint."""
+        text = json.dumps({"format": FORMAT} | asdict(self), indent=2, sort_keys=True) + "\n"
+        with replace_atomically(folder / FACTS_FILE, sync=True) as file:
+            file.write(text.encode())
+
+    @classmethod
+    def read(cls, folder: Path) -> CheckpointFacts | None:
+        """Facts of a checkpoint; None where it has none of ours.
+
+        Raises:
+            InputError: The file is damaged, or of a later version.
+        """
+        path = folder / FACTS_FILE
+        if not path.is_file():
+            return None
+        try:
+            content = json.loads(path.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{path}: not readable as JSON ({error})") from None
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise InputError(f"{path}: expected an object with format {FORMAT}")
+        values: dict[str, object] = {}
+        for one in fields(cls):
+            if one.name in content:
+                values[one.name] = _checked(path, one.name, one.default, content[one.name])
+        facts = cls(**values)  # type: ignore[arg-type]  # each is of its default's kind
+        if facts.fit not in ("pad", "native"):
+            raise InputError(f"{path}: fit is {facts.fit!r}, expected pad or native")
+        if not 0.0 <= facts.realign <= 1.0:
+            raise InputError(f"{path}: realign is {facts.realign}, expected 0 to 1")
+        if not all(16 <= n <= 4096 for n in (facts.width, facts.height)):
+            raise InputError(f"{path}: a picture of {facts.width}x{facts.height} pixels, expected 16 to 4096 each")
+        try:
+            protocol(facts.labels)
+        except InputError:
+            raise InputError(f"{path}: labels is {facts.labels!r}, a protocol that is not known") from None
+        return facts
+
+
+def _checked(path: Path, name: str, default: object, value: object) -> object:
+    """A value of the file, of the kind that the record's default is."""
+    match value:
+        case list() if name == "datasets" and all(isinstance(one, dict) for one in value):
+            return tuple(value)
+        case list() if name != "datasets" and default == () and all(isinstance(one, str) for one in value):
+            return tuple(value)
+        case dict() if name == "options":
+            return value
+        case bool():
+            pass
+        case str() if isinstance(default, str):
+            return value
+        case int() if isinstance(default, int):
+            return value
+        case int() | float() if isinstance(default, float) and abs(value) < 1e12:
+            return float(value)
+    raise InputError(f"{path}: {name} is {str(value)[:80]!r}, which it cannot be")
+
+
+def checkpoint_folder(path: Path, flag: str = "--policy lerobot") -> Path:
+    """The checkpoint at a path: a folder with `config.json`, or the last checkpoint of a training's folder.
+
+    Raises:
+        InputError: There is none.
+    """
+    if not path.is_dir():
+        raise InputError(f"{flag}:{path}: no such folder")
+    for folder in (path, *(path / inside for inside in INSIDE)):
+        if (folder / CONFIG_FILE).is_file():
+            return folder
+    raise InputError(f"{flag}:{path}: holds no checkpoint of LeRobot (no {CONFIG_FILE}, also not in {INSIDE[1]})")

@@ -1,0 +1,1 @@
+"""A policy answers over the network, in the formats of several benchmarks."""

@@ -1,0 +1,1 @@
+"""Trains policies of LeRobot from datasets of demonstrations."""
