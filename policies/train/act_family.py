@@ -11,7 +11,7 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Stats
-from arena_newton.policies.train.policy_model import ACTION, FRONT, PAD, Model, new_policy, prepared
+from arena_newton.policies.train.policy_model import ACTION, FRONT, PAD, TrainableModel, new_policy, prepared
 from arena_newton.policies.train.resnet_weights import load_resnet
 
 __all__ = ["ActModel", "build", "with_batch_norm"]
@@ -20,10 +20,10 @@ _COUNTER = "num_batches_tracked"
 """A number of `BatchNorm2d` that `FrozenBatchNorm2d` has not."""
 
 
-class ActModel(Model):
+class ActModel(TrainableModel):
     """ACT and its loss."""
 
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
         """L1 of the actions that are not padding, and the weighted divergence of the latent (`ACTPolicy.forward`)."""
         actions, pad = batch[ACTION], batch[PAD]
         assert isinstance(actions, torch.Tensor) and isinstance(pad, torch.Tensor)

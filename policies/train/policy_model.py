@@ -21,7 +21,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Scaling, Stats, scalings, usable_stats
 
-__all__ = ["ACTION", "FRONT", "PAD", "STATE", "TASK_VECTOR", "WEIGHTS_FILE", "Model", "configuration"]
+__all__ = ["ACTION", "FRONT", "PAD", "STATE", "TASK_VECTOR", "WEIGHTS_FILE", "TrainableModel", "configuration"]
 
 FRONT = "observation.images.front"
 """Key of the head camera's picture, float32 [B, 3, H, W]."""
@@ -78,7 +78,7 @@ def configuration(recipe: TrainingRecipe, stats: Stats, device: torch.device) ->
         quiet.setLevel(level)
 
 
-class Model(abc.ABC):
+class TrainableModel(abc.ABC):
     """A policy of LeRobot with what training it needs."""
 
     capturable: ClassVar[bool] = True
@@ -126,16 +126,16 @@ class Model(abc.ABC):
         return self.scalings[feature].normalise(value)
 
     @abc.abstractmethod
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
         """Loss of a normalised batch, a scalar on the device; the host does not wait.
 
         Args:
             batch: As the module's `families` says.
-            noise: What `noise` returns. Dropout, and ACT's latent, draw from torch's own generator, which a CUDA graph
-                advances.
+            noise: What `noise` returns; drawn here where it is not given. Dropout, and ACT's latent, draw from torch's
+                own generator, which a CUDA graph advances.
         """
 
-    def noise(self, batch_size: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
+    def noise(self, rows: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
         """Random numbers of a batch's loss, on the device; safe in a CUDA graph that knows the generator."""
         return {}
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from arena_newton.policies.train.families import Model
+from arena_newton.policies.train.families import TrainableModel
 
 STATE, ACTION = 64, 40
 
@@ -24,7 +24,7 @@ def made_stats(tasks: int = 0) -> dict[str, dict[str, torch.Tensor]]:
     return found
 
 
-def made_batch(model: Model, rows: int = 2, tasks: int = 0, seed: int = 1) -> dict[str, object]:
+def made_batch(model: TrainableModel, rows: int = 2, tasks: int = 0, seed: int = 1) -> dict[str, object]:
     """A normalised batch whose last sample ends in padding."""
     generator = torch.Generator().manual_seed(seed)
     size, count = model.recipe.picture, len(model.samples)
