@@ -48,8 +48,15 @@ class RunOptions:
     policy: str = "expert"
     """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>,
     replay:<LeRobot dataset>#<episode, or all>, remote:<url>."""
-    labels: str = "v3.1"
-    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4."""
+    labels: str | None = None
+    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
+    itself when none is named, and v3.1 where it says nothing."""
+    replan: int | None = None
+    """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
+    ensemble: bool = False
+    """For --policy lerobot: look at every tick and execute the mean of all chunks that cover it."""
+    latency_ticks: int = 0
+    """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
@@ -128,6 +135,8 @@ class RunOptions:
     """Successes to record of each task, tracker and mode; None: all episodes of the plan."""
     disturb: Annotated[bool, tyro.conf.Suppress] = False
     """Disturb what is executed; the recorded action is the policy's own."""
+    disturb_scale: Annotated[float, tyro.conf.Suppress] = 1.0
+    """Factor of the disturbance, beside that of each task (`TaskSpec.disturbance`)."""
 
 
 def is_quick(options: RunOptions) -> bool:
@@ -164,6 +173,8 @@ class RecordOptions:
     """Keep so many successes, with at most twice as many attempts; what fails is counted and not kept."""
     disturb: bool = True
     """Add slow noise to what is executed, not to the recorded action, so that recoveries are recorded."""
+    disturb_scale: float = 1.0
+    """Factor of the noise, beside that of each task (0.5 in pp_box and double_desk, which grasp; 1 in the others)."""
     seed_series: int = 0
     """Number of the series of seeds: another one gives other episodes."""
     cameras: tuple[str, ...] = ("front",)
