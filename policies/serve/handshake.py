@@ -1,7 +1,7 @@
 """What a policy server declares of its policy, compared with what the robot takes before the first episode.
 
-The record is JSON: openpi's metadata frame holds it, vla-eval's HELLO under `arena`, and `GET /config` answers it in every
-protocol. What a server does not declare is None here: nobody can compare it, and the robot says so.
+The record is JSON: openpi's metadata frame holds it, vla-eval's HELLO under `arena`, and `GET /config` answers it in
+every protocol. What a server does not declare is None here: nobody can compare it, and the robot says so.
 """
 
 from __future__ import annotations

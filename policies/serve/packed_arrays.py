@@ -1,8 +1,8 @@
 """MessagePack with NumPy arrays in it, as policy servers of robots exchange it, read within strict limits.
 
-Two styles differ in the keys of an array's map only: openpi writes them as bytes (`b"__ndarray__"`), vla-eval as text. A
-message is scanned before it is unpacked, so that a small one cannot become a large number of Python objects. Nothing is
-ever unpickled: arrays hold booleans, integers and floats of known sizes, and have exactly the bytes that their shape needs.
+Two styles differ in the keys of an array's map only: openpi writes them as bytes (`b"__ndarray__"`), vla-eval as text.
+A message is scanned before it is unpacked, so that a small one cannot become a large number of Python objects. Nothing
+is ever unpickled: arrays hold booleans, integers and floats of known sizes, in just the bytes that their shape needs.
 """
 
 from __future__ import annotations
@@ -205,8 +205,10 @@ def checked_array(data: object, dtype: object, shape: object, where: str) -> np.
         size = len(data) if isinstance(data, bytes) else 0
         raise WireError(f"{where}: an array of shape {list(shape)} of {kind} with {size} bytes")
     if kind.kind == "b":  # a byte that is neither 0 nor 1 is no bool
-        return np.frombuffer(data, np.uint8).reshape(shape) != 0
-    return np.frombuffer(data, kind).reshape(shape).astype(kind.newbyteorder("="))
+        return np.array(np.frombuffer(data, np.uint8).reshape(shape), dtype=bool)
+    native: np.ndarray = np.empty(shape, kind.newbyteorder("="))
+    native[...] = np.frombuffer(data, kind).reshape(shape)
+    return native
 
 
 def _known(dtype: str) -> bool:
