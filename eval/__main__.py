@@ -17,6 +17,7 @@ from arena_newton.eval.options import (
     CertifyOptions,
     EngineOptions,
     FilmOptions,
+    LoopOptions,
     RecordOptions,
     ReportOptions,
     RunOptions,
@@ -36,6 +37,7 @@ OVERVIEW = f"""commands:
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} list [flags] [--json]   show the plan, run nothing
+  {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
@@ -186,6 +188,16 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     return 0
 
 
+def _loop(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(LoopOptions, arguments, f"{PROG} loop")
+    from arena_newton.extras import require
+
+    require("data", "eval loop")
+    from arena_newton.eval import learning_loop
+
+    return learning_loop.run(options, factories)
+
+
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
@@ -213,6 +225,7 @@ _COMMANDS = {
     "resume": _resume,
     "report": _report,
     "film": _film,
+    "loop": _loop,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,
