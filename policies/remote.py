@@ -26,15 +26,10 @@ from arena_newton.extras import require
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json, Observation
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, read_address
-from arena_newton.policies.remote_client import (
-    MAX_CHUNK,
-    MAX_FAILURES,
-    MAX_REPLY,
-    AskAgain,
-    Link,
-    RemoteClient,
-    RemoteError,
-)
+from arena_newton.policies.remote_client import MAX_CHUNK, MAX_FAILURES, MAX_REPLY, RemoteClient
+from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink
+from arena_newton.policies.serve.handshake import ServedFacts, read_facts
+from arena_newton.policies.serve.packed_arrays import WireError
 
 __all__ = ["MAX_CHUNK", "MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
 
@@ -52,7 +47,7 @@ type _Reply = tuple[int, bytes]
 """Status and content."""
 
 
-class _Connection(Link[bytes, _Reply]):
+class _Connection(ServerLink[bytes, _Reply]):
     """One kept-alive connection."""
 
     transient = (AskAgain, ConnectionError, http.client.RemoteDisconnected, http.client.BadStatusLine, socket.gaierror)
@@ -79,12 +74,16 @@ class _Connection(Link[bytes, _Reply]):
     def alive(self, timeout: float) -> bool:
         """Whether the server answers a request that changes nothing; any answer counts but a gateway's."""
         try:
-            status, _ = self._exchange("GET", "/health", None, time.monotonic() + timeout)
+            status, _ = self.get("/health", timeout)
         except (OSError, http.client.HTTPException, ValueError):
             return False
         finally:
             self.close()
         return status not in _RETRY_STATUS
+
+    def get(self, route: str, timeout: float) -> _Reply:
+        """Status and content of a page that the server may have."""
+        return self._exchange("GET", route, None, time.monotonic() + timeout)
 
     def _exchange(self, method: str, route: str, body: bytes | None, end: float) -> tuple[int, bytes]:
         if self._http is not None and self._dropped():
@@ -164,9 +163,31 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         replies, errors = self._gather(self.reset_kind, {0: json.dumps({"seed": 0, "world": 0}).encode()}, _object)
         if errors:
             raise self.refusal(errors[0])
+        declared = self._declared()
+        if declared != ServedFacts():
+            self.take(declared)
         self._seeded = replies[0].get("seeded") is True
         served = replies[0].get("policy")
         self._served = self.one_line(served) if isinstance(served, str) else ""
+
+    def _declared(self) -> ServedFacts:
+        """What `GET /config` answers; the original's server does not know it, and its protocol says all but the policy.
+
+        Raises:
+            InputError: The record is damaged, or of a later version.
+        """
+        connection = self._connect()
+        try:
+            status, data = connection.get("/config", self.timeout)
+            content = json.loads(data) if status == 200 else {}
+        except (OSError, http.client.HTTPException, ValueError, RecursionError):
+            content = {}
+        finally:
+            connection.close()
+        try:
+            return read_facts(content if isinstance(content, dict) else {}, f"{self.url}/config")
+        except WireError as error:
+            raise InputError(f"--policy remote: {self.masked(str(error))}") from None
 
     def _connect(self) -> _Connection:
         server = (self.address.host, self.address.port)

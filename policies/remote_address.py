@@ -38,7 +38,7 @@ DOORS: dict[str, tuple[str, str, int]] = {
     "gr00t": ("gr00t", "tcp", 5555),
     "gr00t+tcp": ("gr00t", "tcp", 5555),
 }
-"""What stands in front of `://` → protocol, transport and the protocol's usual port. A web address has its scheme's, the
+"""What stands in front of `://` → protocol, transport and usual port. A web address has its scheme's, the
 others have the default of the servers themselves (openpi, RoboArena and vla-eval 8000, GR00T 5555)."""
 _ESCAPES = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|.)?", re.DOTALL)
 """What a terminal interprets as a command (ECMA-48: CSI and OSC sequences, and ESC with one more)."""

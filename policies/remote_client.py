@@ -14,25 +14,26 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
 
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION, STATE, STATE_WIDTH
-from arena_newton.data.label_protocols import protocol
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.data.label_protocols import LABELS, protocol
+from arena_newton.errors import InputError
+from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
+from arena_newton.policies.remote_link import RemoteError, ServerLink
+from arena_newton.policies.serve.handshake import RATE, ServedFacts, compare_facts, expected_facts
+from arena_newton.policies.serve.packed_arrays import WireError
 
 __all__ = [
     "MAX_CHUNK",
     "MAX_FAILURES",
     "MAX_REPLY",
-    "AskAgain",
-    "Link",
     "RemoteClient",
-    "RemoteError",
     "standing_state",
 ]
 
@@ -44,106 +45,6 @@ MAX_CONNECTIONS = 32
 """Requests that are under way at once."""
 MAX_FAILURES = 10
 """Requests in a row, over all worlds, without a usable answer to any, after which the run stops."""
-
-
-class RemoteError(ArenaError):
-    """One request got no usable reply; the message names the address and what is wrong."""
-
-    def __init__(self, message: str, *, silent: bool = False, lost: bool = False):
-        """Say what is wrong.
-
-        Args:
-            message: One line.
-            silent: There was no whole reply, or it was a gateway's.
-            lost: The server no longer knows the episode that is running.
-        """
-        super().__init__(message)
-        self.silent = silent
-        self.lost = lost
-
-
-class AskAgain(Exception):
-    """An exchange failed in a way that may pass; the text says how."""
-
-
-class Link[Q, R]:
-    """One connection to a server, of one world; `abort` may be called from another thread."""
-
-    transient: ClassVar[tuple[type[Exception], ...]] = (AskAgain, ConnectionError, socket.gaierror)
-    """What a repeated attempt may cure."""
-    final: ClassVar[tuple[type[Exception], ...]] = (OSError, ValueError)
-    """What it does not."""
-
-    def __init__(self, url: str):
-        """Name the server; nothing is sent yet."""
-        self.url = url
-        self.aborted = False
-        self.busy = False
-
-    def ask(self, kind: str, request: Q, *, timeout: float, retries: int, backoff: float) -> R:
-        """Send a request and return its reply.
-
-        Args:
-            kind: What is asked, as errors name it behind the address.
-            request: The request.
-            timeout: Deadline of all attempts together [s].
-            retries: Repeated attempts.
-            backoff: Pause before the first of them [s]; it doubles each time.
-
-        Raises:
-            RemoteError: No whole reply in that time and number of attempts.
-        """
-        self.aborted, self.busy = False, True
-        try:
-            return self._attempts(kind, request, timeout, retries, backoff)
-        finally:
-            self.busy = False
-
-    def _attempts(self, kind: str, request: Q, timeout: float, retries: int, backoff: float) -> R:
-        end, where = time.monotonic() + timeout, self.url + kind
-        for attempt in range(retries + 1):
-            try:
-                reply = self.exchange(kind, request, end)
-                reason = self.busy_signal(reply)
-                if not reason or attempt == retries:
-                    return reply
-            except TimeoutError as error:
-                self.close()
-                raise RemoteError(f"{where}: no reply within {timeout:g} s", silent=True) from error
-            except self.transient as error:
-                self.close()
-                reason = cause(error)
-            except self.final as error:
-                self.close()
-                if self.aborted:
-                    raise RemoteError(f"{where}: no reply within {timeout:g} s", silent=True) from error
-                raise RemoteError(f"{where}: {cause(error)}", silent=True) from error
-            pause = backoff * 2**attempt
-            if self.aborted or time.monotonic() + pause >= end:
-                raise RemoteError(f"{where}: no reply within {timeout:g} s, last: {reason}", silent=True)
-            if attempt < retries:
-                time.sleep(pause)
-        raise RemoteError(f"{where}: {reason} (tried {retries + 1} times)", silent=True)
-
-    def exchange(self, kind: str, request: Q, end: float) -> R:
-        """One attempt, until `end` of the monotonic clock [s]; connects where there is no connection."""
-        raise TypeError(f"{type(self).__name__} defines no exchange()")
-
-    def busy_signal(self, reply: R) -> str:
-        """Why the same should be asked again later; an empty text where the reply is one."""
-        return ""
-
-    def alive(self, timeout: float) -> bool:
-        """Whether the server answers a request that changes nothing."""
-        raise TypeError(f"{type(self).__name__} defines no alive()")
-
-    def abort(self) -> None:
-        """Break off the exchange that another thread waits for, or close an idle connection."""
-        raise TypeError(f"{type(self).__name__} defines no abort()")
-
-    def close(self) -> None:
-        """Close the connection; the next exchange opens a new one."""
-        raise TypeError(f"{type(self).__name__} defines no close()")
 
 
 class RemoteClient[Q, R](Policy):
@@ -198,11 +99,15 @@ class RemoteClient[Q, R](Policy):
         if self.address.secure:
             self.context = ssl.create_default_context() if verify_ssl else ssl._create_unverified_context()
         self.token = read_token()
-        self._connections: dict[int, Link[Q, R]] = {}
+        self._connections: dict[int, ServerLink[Q, R]] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._lock, self._reading = threading.Lock(), threading.Lock()
+        self.batched = False
+        self.stateful = False
+        self.told = ServedFacts()
         self._seeded = False
         self._served = ""
+        self._assumed: Json = {}
         self._failures = 0
         # World → seed of its episode, number of actions received, actions not handed over yet.
         self._seeds: dict[int, int] = {}
@@ -222,7 +127,7 @@ class RemoteClient[Q, R](Policy):
 
     # What a protocol defines.
 
-    def _connect(self) -> Link[Q, R]:
+    def _connect(self) -> ServerLink[Q, R]:
         """A link that is not connected yet."""
         raise TypeError(f"{type(self).__name__} defines no _connect()")
 
@@ -249,6 +154,18 @@ class RemoteClient[Q, R](Policy):
             RemoteError: It holds none.
         """
         raise TypeError(f"{type(self).__name__} defines no _rows()")
+
+    def _batch(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]) -> Q:
+        """Request for the actions of several worlds, along a leading axis."""
+        raise TypeError(f"{type(self).__name__} defines no _batch()")
+
+    def _batch_rows(self, content: object, worlds: int) -> np.ndarray:
+        """Actions of the answer to `_batch`, shape [worlds, n, 40].
+
+        Raises:
+            RemoteError: It holds none.
+        """
+        raise TypeError(f"{type(self).__name__} defines no _batch_rows()")
 
     # What all have in common.
 
@@ -279,9 +196,73 @@ class RemoteClient[Q, R](Policy):
             message += f"; a token is taken from the environment variable {TOKEN_VARIABLE}"
         return InputError(f"--policy remote: no {self.said.removeprefix('a ')}: {message}")
 
-    def warn(self, line: str) -> None:
-        """Print a line for the person who runs this."""
-        print(f"--policy remote:{self.url}: {line}", file=sys.stderr, flush=True)
+    def take(self, facts: ServedFacts) -> None:
+        """Compare what a server declares with what this robot takes, and follow it where either is possible.
+
+        Raises:
+            InputError: They differ; the message names both values.
+        """
+        where = f"--policy remote:{self.url}"
+        # `--labels v4` is a statement; v3.1 is also what is meant where nothing is said.
+        asked = self.protocol.name if self.protocol is not LABELS["v3.1"] else None
+        compare_facts(facts, expected_facts(asked or facts.labels or self.protocol.name), where)
+        self.told = facts
+        if facts.labels is not None:
+            self.protocol, self.labels = LABELS[facts.labels], facts.labels
+        if facts.needs_picture is not None:
+            self.needs_image = facts.needs_picture
+        if facts.picture is not None:
+            fit: Literal["native", "pad"] = "native" if facts.picture.fit == "native" else "pad"
+            self.camera = CameraConfig(width=facts.picture.width, height=facts.picture.height, fit=fit)
+        self.chunk_size = facts.chunk_length or self.chunk_size
+        self.batched, self._seeded = facts.batched, facts.seeded
+        self._served = self.one_line(facts.policy)
+
+    def assume(self) -> None:
+        """Say once, on stderr, what the server does not declare, and keep for `describe` what is taken instead."""
+        missing = self.told.undeclared()
+        if not missing:
+            return
+        camera = self.camera or CameraConfig()
+        taken: Json = {
+            "label protocol": self.protocol.name,
+            "action names": f"the {ACTION_WIDTH} of {self.protocol.name}",
+            "state names": f"the canonical {STATE_WIDTH}",
+            "chunk length": "as it comes",
+            "rate": f"{RATE:g} Hz",
+            "picture": f"{camera.width}x{camera.height} {camera.fit}",
+        }
+        self._assumed = {name: taken[name] for name in missing}
+        said = ", ".join(f"{name} ({value})" for name, value in self._assumed.items())
+        print(
+            f"--policy remote:{self.url}: the server does not declare its {said}: what stands in brackets is assumed",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def probe(self) -> None:
+        """Ask for one chunk, for a robot that stands before a grey picture, where the server declares no actions.
+
+        Raises:
+            InputError: The answer is none for this robot.
+        """
+        camera = self.camera or CameraConfig()
+        image = np.full((1, camera.height, camera.width, 3), 127, dtype=np.uint8) if self.needs_image else None
+        seen = Observation(
+            torch.from_numpy(standing_state()[None]), None, np.ones(1, dtype=bool), "", "", "Stand still."
+        )
+        self._seeds[0], self._steps[0] = 0, 0
+        _, errors = self._try(self.infer_kind, self._beginning(0, ""), lambda content: content, reset=True)
+        if not errors:
+            if self.batched:
+                request = self._batch(seen, host(seen.state), image, [0])
+            else:
+                request = self._request(seen, host(seen.state), image, 0)
+            _, errors = self._try(self.infer_kind, request, self._probed)
+        self._seeds.clear()
+        self._steps.clear()
+        if errors:
+            raise InputError(f"--policy remote: the server's answer to a robot that stands: {errors[0]}")
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Send the seed of each beginning episode; a world whose reset fails gets that error at its next `act`.
@@ -329,16 +310,51 @@ class RemoteClient[Q, R](Policy):
             self._queues[world] = self._queues[world][length:]
         return Chunk(actions, errors)
 
+    def _probed(self, content: object) -> object:
+        """Check the answer to `probe`."""
+        if not self.batched:
+            return self._actions(content)
+        chunk = self._batch_rows(content, 1)
+        return self.checked(chunk[0])
+
+    def _try[T](
+        self, kind: str, request: Q | None, read: Callable[[object], T], *, reset: bool = False
+    ) -> tuple[dict[int, T], dict[int, RemoteError]]:
+        """One request of world 0 before the first episode; without a request nothing happens."""
+        if request is None:
+            return {}, {}
+        return self._gather(self.reset_kind if reset else kind, {0: request}, read)
+
     def _infer(
         self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]
     ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
         """Chunks and errors of the worlds that need a new one."""
-        requests = {world: self._request(seen, state, image, world) for world in worlds}
-        return self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
+        if not self.batched:
+            requests = {world: self._request(seen, state, image, world) for world in worlds}
+            return self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
+        if not worlds:
+            return {}, {}
+        request = self._batch(seen, state, image, worlds)
+        got, failed = self._ask(
+            self.infer_kind,
+            {0: request},
+            lambda content: self._batch_rows(content, len(worlds)),
+            sequential=True,
+            weight=len(worlds),
+        )
+        if failed:
+            return {}, dict.fromkeys(worlds, failed[0])
+        chunks, errors = {}, {}
+        for world, rows in zip(worlds, got[0], strict=True):
+            try:
+                chunks[world] = self.checked(rows)
+            except RemoteError as error:
+                errors[world] = str(error)
+        return chunks, errors
 
     def describe(self) -> Json:
         """Address, order of the requests, and what the server says of itself; complete after `check`."""
-        return {
+        facts: Json = {
             "name": self.name,
             "url": self.url,
             "server": self._served,
@@ -346,6 +362,10 @@ class RemoteClient[Q, R](Policy):
             "seeding": "per_request" if self._seeded else "undeclared",
             "worlds_matter": self.depends_on_worlds,
         }
+        declared = self.told.to_json() if self.told != ServedFacts() else {}
+        shown = ("labels", "chunk_length", "rate_hz", "picture", "batched", "facts")
+        more = {"declared": {name: declared[name] for name in shown if name in declared}, "assumed": self._assumed}
+        return facts | {name: value for name, value in more.items() if value}
 
     def close(self) -> None:
         """Close all connections; requests that are under way are broken off."""
@@ -380,9 +400,16 @@ class RemoteClient[Q, R](Policy):
         return actions
 
     def _ask[T](
-        self, kind: str, requests: dict[int, Q], read: Callable[[object], T], *, sequential: bool
+        self, kind: str, requests: dict[int, Q], read: Callable[[object], T], *, sequential: bool, weight: int = 1
     ) -> tuple[dict[int, T], dict[int, str]]:
         """Send one request per world; the replies as `read` gives them, and errors, by world.
+
+        Args:
+            kind: What is asked.
+            requests: By world.
+            read: Reads the content of a reply.
+            sequential: One after another.
+            weight: Worlds that a request speaks for.
 
         Raises:
             PolicyUnavailable: The server is gone.
@@ -391,12 +418,12 @@ class RemoteClient[Q, R](Policy):
         errors: dict[int, str] = {}
         for batch in [{w: request} for w, request in requests.items()] if sequential else [requests]:
             got, failed = self._gather(kind, batch, read)
-            self._judge(kind, len(got), failed)
+            self._judge(kind, len(got), failed, weight)
             replies.update(got)
             errors.update({w: str(error) for w, error in failed.items()})
         return replies, errors
 
-    def _judge(self, kind: str, usable: int, failed: dict[int, RemoteError]) -> None:
+    def _judge(self, kind: str, usable: int, failed: dict[int, RemoteError], weight: int) -> None:
         """Stop the run where failures are the server's and not one world's."""
         if usable and kind == self.infer_kind:
             self._failures = 0
@@ -409,7 +436,7 @@ class RemoteClient[Q, R](Policy):
             if error.lost:
                 raise PolicyUnavailable(f"--policy remote: {error}; the episodes that were running stay unplayed")
         if not usable:
-            self._failures += len(failed)
+            self._failures += len(failed) * weight
         if self._failures >= MAX_FAILURES:
             raise PolicyUnavailable(
                 f"--policy remote: {self._failures} requests in a row brought no usable answer, last: {last}"
@@ -468,7 +495,7 @@ class RemoteClient[Q, R](Policy):
     def _send[T](
         self,
         world: int,
-        connection: Link[Q, R],
+        connection: ServerLink[Q, R],
         kind: str,
         request: Q,
         read: Callable[[object], T],
@@ -476,14 +503,20 @@ class RemoteClient[Q, R](Policy):
     ) -> T:
         with self._lock:
             started[world] = time.monotonic()
-        reply = connection.ask(kind, request, timeout=self.timeout, retries=self.retries, backoff=self.backoff)
-        with self._reading:  # one reply at a time: as Python objects it is many times as large
-            return read(self._read(kind, reply))
+        try:
+            reply = connection.ask(kind, request, timeout=self.timeout, retries=self.retries, backoff=self.backoff)
+            with self._reading:  # one reply at a time: as Python objects it is many times as large
+                return read(self._read(kind, reply))
+        except WireError as error:  # from a codec; it names the address
+            raise RemoteError(self.masked(str(error))) from error
 
     def one_line(self, said: object) -> str:
         """What a server said, on one line and without the token."""
-        text = str(said)
-        return one_line(text.replace(self.token, "***") if self.token else text)
+        return one_line(self.masked(str(said)))
+
+    def masked(self, text: str) -> str:
+        """A text without the token."""
+        return text.replace(self.token, "***") if self.token else text
 
 
 def standing_state() -> np.ndarray:
