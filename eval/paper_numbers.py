@@ -182,9 +182,9 @@ def _distinct[K, V](where: str, found: dict[K, V], key: K, value: V) -> None:
     found[key] = value
 
 
-def _complete(path: Path, found: Mapping[tuple[str, ...], object], wanted: int) -> None:
-    if len(found) != wanted:
-        raise InputError(f"{path}: has {len(found)} cells, the paper's table has {wanted}")
+def _complete(path: Path, found: int, wanted: int) -> None:
+    if found != wanted:
+        raise InputError(f"{path}: has {found} cells, the paper's table has {wanted}")
 
 
 def _rates(
@@ -223,9 +223,9 @@ def read_paper(folder: Path = FOLDER) -> PaperNumbers:
 
     columns = len(suites()["ALL_AVG"]) + len(AVERAGES)
     rates = _rates(folder / "in_gmt.csv", "tracker", in_gmt)
-    _complete(folder / "in_gmt.csv", rates, len(TRACKERS) * len(MODES) * len(FAMILIES) * columns)
+    _complete(folder / "in_gmt.csv", len(rates), len(TRACKERS) * len(MODES) * len(FAMILIES) * columns)
     joined = _rates(folder / "merge_all.csv", "training_set", merged)
-    _complete(folder / "merge_all.csv", joined, len(TRAINING_SETS) * len(FAMILIES) * columns)
+    _complete(folder / "merge_all.csv", len(joined), len(TRAINING_SETS) * len(FAMILIES) * columns)
     by_mode = {(t, m, f, task): rate for (t, m, f, task), rate in rates.items()}
     by_set = {(s, f, task): rate for (s, f, task), rate in joined.items()}
     return PaperNumbers(by_mode, _transfers(folder / "cross_gmt.csv", by_mode), by_set)
@@ -249,7 +249,7 @@ def _transfers(
             )
         cell = PaperTransfer(family, trained_on, tracker, task, drop, retention, _fraction(where, row, "task_afr_pct"))
         _distinct(where, found, (trained_on, tracker, family, task), cell)
-    _complete(path, found, len(directions) * len(FAMILIES) * len(suites()["ALL_AVG"]))
+    _complete(path, len(found), len(directions) * len(FAMILIES) * len(suites()["ALL_AVG"]))
     return found
 
 

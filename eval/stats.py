@@ -255,7 +255,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
     if 2 * fewer == discordant:
         return 1.0
     tail = sum(math.comb(discordant, k) for k in range(fewer + 1))
-    return min(1.0, 2 * tail / 2**discordant)
+    return min(1.0, tail / (1 << discordant) * 2)
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
