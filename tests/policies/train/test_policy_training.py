@@ -44,10 +44,10 @@ def narrow(monkeypatch):
     narrow_network.install(monkeypatch.setattr)
 
 
-def options(dataset, out, **changes):
+def options(data, out, **changes):
     """Flags of a small training without a bar."""
-    given = PolicyTrainOptions(recipe="small", dataset=(dataset,), out=out, device="cpu", steps=STEPS, quiet=True)
-    return dataclasses.replace(given, **changes)
+    given = {"recipe": "small", "dataset": (data,), "out": out, "device": "cpu", "steps": STEPS, "quiet": True}
+    return PolicyTrainOptions(**(given | changes))
 
 
 def weights(folder):
@@ -148,6 +148,12 @@ def test_a_stopped_training_goes_on_to_the_same_bits(dataset, whole, tmp_path, m
     assert same(weights(out), weights(whole))
     assert [row["step"] for row in rows(out)] == ["2", "4", "6", "8"]
     assert [row["loss"] for row in rows(out)] == [row["loss"] for row in rows(whole)]
+
+
+def test_a_finished_training_is_not_repeated(whole, monkeypatch):
+    """Resumed, it gives its checkpoint at once, without reading the data; with more steps it goes on."""
+    monkeypatch.setattr(training, "read_rows", lambda *_: pytest.fail("reads the data"))
+    assert train(PolicyTrainOptions(resume=whole)) == whole / "checkpoints" / "000008" / "pretrained_model"
 
 
 def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_path, monkeypatch):
