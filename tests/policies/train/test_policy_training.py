@@ -159,7 +159,7 @@ def test_a_stopped_training_goes_on_to_the_same_bits(dataset, whole, tmp_path, m
 
 
 def test_a_finished_training_is_not_repeated(whole, monkeypatch):
-    """Resumed, it gives its checkpoint at once, without reading the data; with more steps it goes on."""
+    """Resumed, it gives its checkpoint at once, without reading the data."""
     monkeypatch.setattr(training, "read_rows", lambda *_: pytest.fail("reads the data"))
     assert train(PolicyTrainOptions(resume=whole)) == whole / "checkpoints" / "000008" / "pretrained_model"
 
