@@ -2,7 +2,7 @@
 
 import json
 
-from rows import full
+from rows import full, record
 from test_report import document_of
 
 from arena_newton import seeding, tasks
@@ -16,7 +16,6 @@ from arena_newton.eval.suite_records import (
     journal_file,
     suite_json,
 )
-from rows import record
 
 SEEDS, REPEATS = (0, 1, 2), 20
 
