@@ -27,9 +27,9 @@ from arena_newton.policies.serve.arena_codec import (
     unpack_look,
 )
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME
 from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 from arena_newton.text import plain_text
 
 __all__ = ["HttpDoor"]

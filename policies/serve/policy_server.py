@@ -32,9 +32,9 @@ from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.serve.handshake import RATE, ServedFacts, ServedPicture
-from arena_newton.policies.serve.packed_arrays import WireError
 from arena_newton.policies.serve.picture_fit import fitted_picture
 from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.serve.wire_error import WireError
 from arena_newton.text import plain_text
 
 __all__ = ["Answer", "PolicyServer", "Refused", "ServerCounts"]
@@ -215,6 +215,7 @@ class PolicyServer:
         self._facts = ServedFacts(
             policy=f"{self.policy.name} {digest}",
             labels=labels,
+            realign=float(getattr(self.policy, "realign", 0.0)) if labels == "v4" else None,
             action_names=tuple(action_names(labels)),
             state_names=tuple(state_names()),
             chunk_length=int(chunk.actions.shape[1]),
