@@ -465,7 +465,7 @@ class PolicyServer:
             self._check_shape(chunk.actions)
             chosen = torch.as_tensor(chunk.actions)[rows].detach().cpu().numpy()
         except Exception as error:
-            refusal = self._refusal(error)
+            refusal = self._refusal(error, "policy")
             for job, _ in asking:  # what the policy remembers of them is not known
                 self._drop((job.owner, job.session))
                 job.done.set_exception(refusal)
@@ -480,7 +480,7 @@ class PolicyServer:
                 session.answer = self.protocol.validate(made, f"policy {self.policy.name}").copy()
                 job.done.set_result(Answer(session.answer, 1000 * (time.monotonic() - job.came)))
             except Exception as error:
-                job.done.set_exception(self._refusal(error))
+                job.done.set_exception(self._refusal(error, "policy"))
 
     def _check_shape(self, actions: torch.Tensor | np.ndarray) -> None:
         shape = tuple(actions.shape)
@@ -488,7 +488,7 @@ class PolicyServer:
             wanted = f"[{self.max_sessions}, n, {ACTION_WIDTH}]"
             raise InputError(f"policy {self.policy.name}: a chunk of shape {list(shape)}, expected {wanted}")
 
-    def _refusal(self, error: Exception) -> Refused:
+    def _refusal(self, error: Exception, reason: Reason = "unfit") -> Refused:
         """What the client is told of an error; the console is told all of it where it is not a client's fault."""
         self.counts.refused += 1
         match error:
@@ -497,6 +497,6 @@ class PolicyServer:
             case PolicyUnavailable():
                 return Refused("policy", str(error))
             case WireError() | InputError():
-                return Refused("unfit", str(error))
+                return Refused(reason, str(error))
         print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
         return Refused("policy", f"the policy failed ({type(error).__name__}); the server's console says more")
