@@ -1,7 +1,7 @@
 """openpi's websocket protocol, and RoboArena's, which adds `endpoint` and `session_id`: bytes to records and back.
 
-A server sends its metadata first. A request is a flat map, the answer `{"actions": [n, 40], "server_timing": {...}}`; a text
-frame is an error. RoboArena's requests name an endpoint, `infer` or `reset`; the answer to `reset` is a text frame too.
+A server sends its metadata first. A request is a flat map, the answer `{"actions": [n, 40], "server_timing": {...}}`; a
+text frame is an error. RoboArena's requests name an endpoint, `infer` or `reset`, which is answered by a text frame.
 Sources: `openpi_client/websocket_client_policy.py` and `openpi/serving/websocket_policy_server.py` of
 github.com/Physical-Intelligence/openpi at 15a9616, `roboarena/policy_server.py` of github.com/robo-arena/roboarena at
 06f0a82. `task`, `seed` and `step` are ours; other servers do not read them.

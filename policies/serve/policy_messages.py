@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
-from arena_newton.policies.serve.packed_arrays import WireError
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = [
     "LONGEST_CHUNK",
@@ -111,9 +111,8 @@ def read_actions(value: object, where: str) -> np.ndarray:
     if array.ndim == 1:
         array = array[None]
     if array.ndim != 2 or array.shape[1] != ACTION_WIDTH or not 1 <= len(array) <= LONGEST_CHUNK:
-        raise WireError(
-            f"{where}: actions have shape {list(array.shape)}, expected [n, {ACTION_WIDTH}] with n of 1 to {LONGEST_CHUNK}"
-        )
+        expected = f"expected [n, {ACTION_WIDTH}] with n of 1 to {LONGEST_CHUNK}"
+        raise WireError(f"{where}: actions have shape {list(array.shape)}, {expected}")
     return array
 
 

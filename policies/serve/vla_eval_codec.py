@@ -1,8 +1,8 @@
 """vla-eval's websocket protocol: every frame is a map of `type`, `payload`, `seq` and `timestamp`.
 
 The robot says `hello` and is answered by one; then `episode_start`, `observation` (each answered by an `action` or an
-`error` of the same `seq`) and `episode_end`. Pictures are PNG, JPEG or raw. A server of that harness answers one action a
-look and keeps the rest of its chunk; a robot whose `hello` names the capability `chunks` is given whole ones by ours.
+`error` of the same `seq`) and `episode_end`. Pictures are PNG, JPEG or raw. A server of that harness answers one action
+a look and keeps the rest of its chunk; a robot whose `hello` names the capability `chunks` is given whole ones by ours.
 Sources: `vla_eval/protocol/{messages,numpy_codec,image_codec}.py`, `vla_eval/model_servers/serve.py` of
 github.com/allenai/vla-evaluation-harness at e1ee9ad. `task`, `seed`, `step` and `session` are ours.
 """
