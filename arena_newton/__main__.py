@@ -38,6 +38,7 @@ COMMANDS = (
     Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
+    Command("policies serve", "arena_newton.policies.serve.__main__", "answer over the network: openpi, vla-eval, HTTP"),
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),

@@ -36,6 +36,7 @@ OVERVIEW = f"""commands:
   {PROG} record [flags]          record demonstrations for datasets, or more cameras with --from <out>
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
+  {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} bench [--what ...]      measure this machine against the figures to reach
@@ -219,6 +220,18 @@ def _certify(arguments: list[str], factories: Factories | None) -> int:
     return certify.run(options, factories)
 
 
+def _tables(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.table_options import TablesOptions
+
+    if _wants_help(arguments):
+        parse_flags(TablesOptions, ["--help"], f"{PROG} tables <out> [<out> ...]")
+    folders = _folders(arguments, "tables")
+    options = parse_flags(TablesOptions, arguments, f"{PROG} tables")
+    from arena_newton.eval import tables_command
+
+    return tables_command.run(folders, options)
+
+
 _COMMANDS = {
     "run": _run,
     "record": _record,
@@ -226,6 +239,7 @@ _COMMANDS = {
     "report": _report,
     "film": _film,
     "loop": _loop,
+    "tables": _tables,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,

@@ -16,7 +16,16 @@ from arena_newton.data.lerobot_reader import DatasetActions
 from arena_newton.data.row_statistics import aggregated, row_statistics
 from arena_newton.errors import InputError
 
-__all__ = ["ACTION_KEY", "CAMERA_KEY", "STATE_KEY", "VECTOR_KEY", "DatasetRows", "EpisodeRows", "read_rows", "statistics"]
+__all__ = [
+    "ACTION_KEY",
+    "CAMERA_KEY",
+    "STATE_KEY",
+    "VECTOR_KEY",
+    "DatasetRows",
+    "EpisodeRows",
+    "read_rows",
+    "statistics",
+]
 
 STATE_KEY, ACTION_KEY = "observation.state", "action"
 """LeRobot's names of state and action."""

@@ -126,8 +126,8 @@ def check_memory(frames: int, height: int, width: int, device: torch.device) -> 
     if needed > free:
         raise InputError(
             f"--dataset: {frames} pictures of {width}x{height} need {needed / 1e9:.1f} GB of memory on {device}, "
-            f"{max(0, free) / 1e9:.1f} GB are free beside the network: name fewer datasets, record smaller pictures, or "
-            "use a device with more memory"
+            f"{max(0, free) / 1e9:.1f} GB are free beside the network: name fewer datasets, record smaller pictures, "
+            "or use a device with more memory"
         )
 
 
@@ -155,8 +155,8 @@ def load_frames(
     for dataset in datasets[1:]:
         if (dataset.height, dataset.width) != (height, width):
             raise InputError(
-                f"--dataset {dataset.root}: pictures of {dataset.width}x{dataset.height} pixels, {datasets[0].root} has "
-                f"{width}x{height}"
+                f"--dataset {dataset.root}: pictures of {dataset.width}x{dataset.height} pixels, "
+                f"{datasets[0].root} has {width}x{height}"
             )
     for dataset in datasets:
         if hold_out >= len(dataset.episodes):

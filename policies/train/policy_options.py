@@ -42,8 +42,8 @@ class PolicyTrainOptions:
     """Folder of a training to go on with, with its own options; only --device, --minutes, --save-every and the like
     may differ."""
     labels: str = ""
-    """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted in
-    memory."""
+    """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted
+    in memory."""
     task_vector: bool = False
     """Give the policy a one-hot vector of its tasks; recipes that need one have it without this flag."""
     batch_size: int = field(default=0, metadata=bounds(0, 65536))

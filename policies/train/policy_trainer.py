@@ -10,17 +10,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from arena_newton.errors import ArenaError
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
-
-if TYPE_CHECKING:
-    from arena_newton.policies.recipes.training_recipe import TrainingRecipe
-    from arena_newton.policies.train.families import Model
+from arena_newton.policies.train.policy_model import TrainableModel
 
 __all__ = ["PolicyTrainer"]
 
@@ -38,7 +35,7 @@ class PolicyTrainer:
 
     def __init__(
         self,
-        model: Model,
+        model: TrainableModel,
         batches: BatchMaker,
         recipe: TrainingRecipe,
         *,
@@ -152,6 +149,11 @@ class PolicyTrainer:
             else:
                 torch.cat(gradients, out=self._flat)
 
+    def _whole(self) -> None:
+        """A step of a single process."""
+        self._descend()
+        self._update()
+
     def _average(self) -> None:
         """Mean of the gradients of all processes."""
         assert self._flat is not None
@@ -192,9 +194,7 @@ class PolicyTrainer:
                 tensor.copy_(before[name])
         _restore_moments(self.optimizer, moments)
         self.optimizer.zero_grad(set_to_none=True)
-        parts: list[Callable[[], None]] = [self._descend, self._update]
-        if self.ranks == 1:
-            parts = [lambda: (self._descend(), self._update())[0]]
+        parts: list[Callable[[], None]] = [self._descend, self._update] if self.ranks > 1 else [self._whole]
         pool = torch.cuda.graph_pool_handle()
         for part in parts:
             graph = torch.cuda.CUDAGraph()
@@ -229,7 +229,7 @@ class PolicyTrainer:
 
 
 @contextlib.contextmanager
-def _evaluating(model: Model) -> Iterator[None]:
+def _evaluating(model: TrainableModel) -> Iterator[None]:
     """The policy in evaluation mode."""
     model.policy.eval()
     try:
@@ -244,7 +244,7 @@ def _gradient(parameter: torch.Tensor) -> torch.Tensor:
 
 
 def _optimizer(
-    model: Model, recipe: TrainingRecipe, device: torch.device
+    model: TrainableModel, recipe: TrainingRecipe, device: torch.device
 ) -> tuple[torch.optim.Optimizer, list[float]]:
     """The optimizer, and the highest learning rate of each of its groups."""
     made = model.groups()

@@ -1,8 +1,8 @@
 """Checkpoints of a training: LeRobot's folders, whole or not there at all, and what a resumed training needs.
 
-`<out>/checkpoints/<step>/pretrained_model` is the policy, `training_state` next to it LeRobot's files of optimizer, random
-numbers and step, and one of ours; `<out>/checkpoints/last` is a relative link. A folder grows under a temporary name and
-is renamed when all of it is on the disk: whatever kills a training leaves the last whole checkpoint.
+`<out>/checkpoints/<step>/pretrained_model` is the policy, `training_state` next to it LeRobot's files of optimizer,
+random numbers and step, and one of ours; `<out>/checkpoints/last` is a relative link. A folder grows under a temporary
+name and is renamed when all of it is on the disk: whatever kills a training leaves the last whole checkpoint.
 """
 
 from __future__ import annotations
@@ -34,7 +34,15 @@ from arena_newton.files import PARTIAL, replace_atomically
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 
-__all__ = ["PROGRESS_FILE", "TrainingProgress", "last_checkpoint", "remove_older", "restore", "write_checkpoint"]
+__all__ = [
+    "PROGRESS_FILE",
+    "TrainingProgress",
+    "checkpoint_name",
+    "last_checkpoint",
+    "remove_older",
+    "restore",
+    "write_checkpoint",
+]
 
 PROGRESS_FILE = "arena_training.json"
 """File of a training state that holds its `TrainingProgress`."""
@@ -104,6 +112,11 @@ class TrainingProgress:
             file.write(text.encode())
 
 
+def checkpoint_name(step: int) -> str:
+    """Name of the folder of a step."""
+    return f"{step:0{FEWEST_DIGITS}d}"
+
+
 def last_checkpoint(out: Path, flag: str = "--resume") -> Path:
     """The last whole checkpoint of a training.
 
@@ -116,7 +129,9 @@ def last_checkpoint(out: Path, flag: str = "--resume") -> Path:
     for step in reversed(steps):
         if (named[step] / TRAINING_STATE_DIR).is_dir() and (named[step] / PRETRAINED_MODEL_DIR).is_dir():
             return named[step]
-    raise InputError(f"{flag} {out}: holds no checkpoint of a training (no {CHECKPOINTS_DIR}/<step>/{TRAINING_STATE_DIR})")
+    raise InputError(
+        f"{flag} {out}: holds no checkpoint of a training (no {CHECKPOINTS_DIR}/<step>/{TRAINING_STATE_DIR})"
+    )
 
 
 def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, progress: TrainingProgress) -> Path:
@@ -129,7 +144,7 @@ def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, 
         ArenaError: It cannot be written.
     """
     parent = out / CHECKPOINTS_DIR
-    final = parent / f"{progress.step:0{FEWEST_DIGITS}d}"
+    final = parent / checkpoint_name(progress.step)
     growing = parent / f"{final.name}{PARTIAL}"
     try:
         shutil.rmtree(growing, ignore_errors=True)
