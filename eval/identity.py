@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -122,8 +123,14 @@ def code_files(root: Path = PACKAGE) -> list[Path]:
 
 
 def code_hash(root: Path = PACKAGE) -> str:
-    """Hash of the code that a run executes, by names and contents."""
-    return hash_paths(root, code_files(root))
+    """Hash of the code that a run executes, by names and contents; of this package it is taken once in a process."""
+    return _running_code() if root == PACKAGE else hash_paths(root, code_files(root))
+
+
+@functools.cache
+def _running_code() -> str:
+    """Hash of the code that was loaded: what is edited later does not run in this process."""
+    return hash_paths(PACKAGE, code_files(PACKAGE))
 
 
 def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> list[Path]:
