@@ -21,6 +21,7 @@ from arena_newton.eval.options import (
     ReportOptions,
     RunOptions,
 )
+from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.flags import folders_named, parse_flags
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ OVERVIEW = f"""commands:
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
   {PROG} list [flags] [--json]   show the plan, run nothing
+  {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
@@ -187,6 +189,26 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     return 0
 
 
+def _matrix(arguments: list[str], factories: Factories | None) -> int:
+    if _wants_help(arguments):
+        parse_flags(MatrixOptions, ["--help"], f"{PROG} matrix <suite>")
+    if not arguments or arguments[0].startswith("-"):
+        raise InputError(f"matrix: name the suite file: {PROG} matrix <suite.toml>")
+    given = arguments.pop(0)
+    options = parse_flags(MatrixOptions, arguments, f"{PROG} matrix")
+    from arena_newton.eval.suite_call import plan_call
+
+    call = plan_call(given, options)
+    if options.dry_run:
+        print(call.table(), flush=True)
+        if call.problem is not None:
+            raise call.problem
+        return 0
+    from arena_newton.eval import suite_run
+
+    return suite_run.run(call, factories)
+
+
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
@@ -227,6 +249,7 @@ _COMMANDS = {
     "report": _report,
     "film": _film,
     "tables": _tables,
+    "matrix": _matrix,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,

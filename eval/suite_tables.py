@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate
 from arena_newton.eval.stats import contrast, holm, paired_rates, suites
-from arena_newton.eval.suite_cells import EvaluatedCell
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.table_entries import (
     UNDEFINED,
     SuiteTable,
