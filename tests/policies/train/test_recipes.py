@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import draccus
+import lerobot.policies  # noqa: F401  # registers the configurations of policies
 import numpy as np
 import pytest
 import torch
