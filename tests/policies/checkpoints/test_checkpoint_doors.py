@@ -21,6 +21,8 @@ from watched import WatchedEnv
 
 TICKS = 30
 """Step budget of an episode."""
+PLAYED = []
+"""Hashes of the ticks of each setting."""
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,8 @@ def test_a_v4_checkpoint_through_lerobot_eval(fast, realign, tmp_path, monkeypat
     eval_main()
     assert all(len(ticks) == 50 + TICKS for ticks in ours.values())
     assert WatchedEnv.history == ours
+    assert all(played != ours for played in PLAYED)  # realignment does something
+    PLAYED.append(ours)
     info = json.loads((tmp_path / "eval_info.json").read_text())
     assert [result.outcome == "success" for result in results] == info["per_task"][0]["metrics"]["successes"]
 
