@@ -30,8 +30,8 @@ __all__ = [
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
 _REPORTING = """__main__ bench bench_figure bench_recording certify config console document engines folder
-    html_report identity journal options original_format progress recording records report rerecord
-    results rounds stats success_film tables wording"""
+    html_report identity journal learning_loop loop_report options original_format progress recording records report
+    rerecord results rounds stats success_film suite_records tables wording"""
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
