@@ -1,4 +1,4 @@
-"""Suites with known outcomes for tests: written with the product's own writers, so that every number has a closed form."""
+"""Suites with known outcomes for tests, by the product's own writers: every number has a closed form."""
 
 import json
 
