@@ -60,7 +60,7 @@ def pack_gr00t(content: object) -> bytes:
 
     def npy(array: np.ndarray) -> Mapping[str, object]:
         file = io.BytesIO()
-        np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+        np.save(file, array, allow_pickle=False)
         return {ARRAY_KEY: True, "as_npy": file.getvalue()}
 
     return pack(content, TEXT_KEYS, npy)
