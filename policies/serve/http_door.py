@@ -38,6 +38,8 @@ IDLE_CONNECTION = 600.0
 """Time without a request after which a connection is closed [s]."""
 BODY_SECONDS = 60.0
 """Time that a client has to send the body of a request [s]."""
+POLL = 0.05
+"""Time after which a door notices that it is closed [s]."""
 MOST_WORLDS = 4096
 """Most worlds whose episode is remembered."""
 _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500}
@@ -229,7 +231,7 @@ class HttpDoor:
         self.port = int(listening.getsockname()[1])
         listening.listen(_Listener.request_queue_size)
         self._listener = _Listener(listening, server, guard, tls)
-        self._thread = threading.Thread(target=self._listener.serve_forever, name="door", daemon=True)
+        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="door", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
