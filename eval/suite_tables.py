@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate
 from arena_newton.eval.stats import contrast, holm, paired_rates, suites
-from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.table_entries import (
     UNDEFINED,
     SuiteTable,

@@ -15,9 +15,9 @@ from made_suites import cell_of, outcomes, write_cell, write_suite
 from arena_newton.errors import InputError
 from arena_newton.eval import paper_claims, table_text
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.evaluated_cells import read_cells
 from arena_newton.eval.paper_numbers import paper_numbers
 from arena_newton.eval.stats import contrast, holm, mcnemar, suites, wilson
-from arena_newton.eval.evaluated_cells import read_cells
 from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.eval.suite_tables import suite_tables
 from arena_newton.eval.table_entries import SuiteTable, interval_text, points, probability
