@@ -17,6 +17,7 @@ from arena_newton.eval.options import (
     CertifyOptions,
     EngineOptions,
     FilmOptions,
+    LoopOptions,
     RecordOptions,
     ReportOptions,
     RunOptions,
@@ -39,6 +40,7 @@ OVERVIEW = f"""commands:
   {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
   {PROG} tsne [flags]            map what one policy answers to the observations of two datasets
   {PROG} list [flags] [--json]   show the plan, run nothing
+  {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
@@ -190,6 +192,16 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     return 0
 
 
+def _loop(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(LoopOptions, arguments, f"{PROG} loop")
+    from arena_newton.extras import require
+
+    require("data", "eval loop")
+    from arena_newton.eval import learning_loop
+
+    return learning_loop.run(options, factories)
+
+
 def _matrix(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
         parse_flags(MatrixOptions, ["--help"], f"{PROG} matrix <suite>")
@@ -262,6 +274,7 @@ _COMMANDS = {
     "resume": _resume,
     "report": _report,
     "film": _film,
+    "loop": _loop,
     "tables": _tables,
     "tsne": _tsne,
     "matrix": _matrix,

@@ -207,7 +207,7 @@ def dealt(cells: Sequence[SuiteCell], shard: int, shards: int) -> list[SuiteCell
     """
     kept: set[str] = set()
     number = 0
-    for task in dict.fromkeys(cell.task for cell in cells):
+    for task in sorted({cell.task for cell in cells}):
         names = [cell.id for cell in cells if cell.task == task]
         for name in sorted(names, key=lambda text: hashlib.sha256(text.encode()).digest()):
             if number % shards == shard - 1:

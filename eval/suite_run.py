@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import gc
 import io
 import shlex
 import time
@@ -80,6 +81,9 @@ class _Matrix:
         if self.options.limit is not None:
             todo = todo[: self.options.limit]
         self._measure_before(cells)
+        # Each run looks for garbage at its end, among millions of objects of loaded libraries: seconds a cell.
+        gc.collect()
+        gc.freeze()
         try:
             for number, name in enumerate(todo):
                 if not self._play_cell(name, number, todo):
