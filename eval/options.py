@@ -47,7 +47,7 @@ class RunOptions:
     """Weights of the one tracker named: a .safetensors or official .onnx file (SONIC: a folder or two files with a
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
-    """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>,
+    """Policy that decides it: expert, stand, lerobot:<checkpoint or training>, replay:<clip, or actions of --actions>,
     replay:<LeRobot dataset>#<episode, or all>, remote:<url>."""
     labels: str | None = None
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of

@@ -13,7 +13,7 @@ from typing import Literal
 
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers
 from arena_newton.eval.stats import Contrast, Outcomes, contrast, holm, paired_rates, suites
-from arena_newton.eval.suite_cells import EvaluatedCell
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.table_entries import points, probability
 from arena_newton.eval.wording import escaped
 

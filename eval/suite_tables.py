@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate
 from arena_newton.eval.stats import contrast, holm, paired_rates, suites
-from arena_newton.eval.suite_cells import EvaluatedCell
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.table_entries import (
     UNDEFINED,
     SuiteTable,
@@ -56,7 +56,13 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[Su
         _latency(cells),
         _labels(prompt),
     ]
-    return [table for table in found if table is not None]
+    return [_with_rules(table) for table in found if table is not None]
+
+
+def _with_rules(table: SuiteTable) -> SuiteTable:
+    """The table without groups that have no row."""
+    begun = dict.fromkeys(number for number in table.groups if number < len(table.rows))
+    return dataclasses.replace(table, groups=tuple(begun))
 
 
 def tracker_order(names: set[str]) -> list[str]:

@@ -22,8 +22,8 @@ def read_by(policy: Policy, labels: str) -> Policy:
     """The policy as the world understands it.
 
     Args:
-        policy: Whose actions are of its own protocol, or of `labels` where it names none.
-        labels: Name of the protocol; v3.1, the default of the flag, leaves a policy its own one.
+        policy: Whose actions are of `labels`.
+        labels: Name of the protocol.
 
     Returns:
         The policy itself where it answers v3.1, else one that decodes its chunks.
@@ -34,9 +34,7 @@ def read_by(policy: Policy, labels: str) -> Policy:
     wanted = protocol(labels)
     own = getattr(policy, "labels", None)  # a plug-in need not know of protocols
     if own is not None and own != wanted.name:
-        if wanted is not LABELS["v3.1"]:
-            raise InputError(f"--labels {labels}: policy {policy.name} gives actions of {own}; leave the flag out")
-        wanted = protocol(own)
+        raise InputError(f"--labels {labels}: policy {policy.name} gives actions of {own}; leave the flag out")
     return policy if wanted is LABELS["v3.1"] else V4Policy(policy)
 
 

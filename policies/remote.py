@@ -36,6 +36,7 @@ __all__ = ["MAX_CHUNK", "MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIAB
 ROBOT_TYPE = LABELS["v3.1"].robot_type
 """Robot type that the original's server checks: actions of v3.1; those of other protocols have their own."""
 _RETRY_STATUS = (502, 503, 504)
+_UNKNOWN_EPISODE = 409
 _OTHERS = {
     "openpi": ("remote_openpi", "serve", ("websockets", "msgpack")),
     "roboarena": ("remote_openpi", "serve", ("websockets", "msgpack")),
@@ -244,7 +245,8 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
             said = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
-            raise RemoteError(f"{where}: status {status}{said}", silent=silent)
+            # Our server refuses so an episode that began before it was started again.
+            raise RemoteError(f"{where}: status {status}{said}", silent=silent, lost=status == _UNKNOWN_EPISODE)
         if not isinstance(content, dict):
             raise RemoteError(f"{where}: the reply is not a JSON object")
         return content

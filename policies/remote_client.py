@@ -109,6 +109,7 @@ class RemoteClient[Q, R](Policy):
         self._served = ""
         self._assumed: Json = {}
         self._failures = 0
+        self._closing = False
         # World → seed of its episode, number of actions received, actions not handed over yet.
         self._seeds: dict[int, int] = {}
         self._steps: dict[int, int] = {}
@@ -369,6 +370,7 @@ class RemoteClient[Q, R](Policy):
 
     def close(self) -> None:
         """Close all connections; requests that are under way are broken off."""
+        self._closing = True
         for connection in self._connections.values():
             connection.abort()
         if self._pool is not None:
@@ -416,6 +418,7 @@ class RemoteClient[Q, R](Policy):
         """
         replies: dict[int, T] = {}
         errors: dict[int, str] = {}
+        self._closing = False
         for batch in [{w: request} for w, request in requests.items()] if sequential else [requests]:
             got, failed = self._gather(kind, batch, read)
             self._judge(kind, len(got), failed, weight)
@@ -444,6 +447,8 @@ class RemoteClient[Q, R](Policy):
 
     def _alive(self) -> bool:
         """Whether the server answers at all, asked over a new connection."""
+        if self._closing:
+            return False
         connection = self._connect()
         answer = self._threads().submit(connection.alive, self.timeout)
         try:
@@ -508,7 +513,8 @@ class RemoteClient[Q, R](Policy):
             with self._reading:  # one reply at a time: as Python objects it is many times as large
                 return read(self._read(kind, reply))
         except WireError as error:  # from a codec; it names the address
-            raise RemoteError(self.masked(str(error))) from error
+            text = self.masked(str(error))
+            raise RemoteError(text if text.startswith(self.url) else f"{self.url}{kind}: {text}") from error
 
     def one_line(self, said: object) -> str:
         """What a server said, on one line and without the token."""

@@ -96,7 +96,7 @@ class OpenpiPolicy(SocketClient):
         Raises:
             InputError: No server of the protocol answers, or not one for this robot.
         """
-        link, facts = self.greet()
+        facts = self.greet()
         if self.roboarena:
             self._cameras()
             page = http_page(self, "/config")

@@ -61,6 +61,11 @@ class VlaEvalLink(SocketLink):
             self.close()
         return answer, seq
 
+    def unasked(self, frame: bytes | str) -> object:
+        """What went wrong at the beginning of the episode is the answer to its first look."""
+        message = vla_eval_codec.unpack_message(frame)
+        return (message, message.seq) if message.type == "error" else None
+
     def _number(self) -> None:
         self.seq += 1
 
@@ -81,7 +86,7 @@ class VlaEvalPolicy(SocketClient):
         Raises:
             InputError: No server of the protocol answers, or not one for this robot.
         """
-        _, facts = self.greet()
+        facts = self.greet()
         self.take(facts)
         self.batched = False  # a connection is one session
         self.assume()

@@ -26,8 +26,8 @@ from arena_newton.policies.lerobot.networks import PolicyNetwork
 
 __all__ = ["ENSEMBLE_TICKS", "LeRobotPolicy", "from_spec"]
 
-ENSEMBLE_TICKS = 2
-"""Ticks between two looks where chunks are averaged and no number is given; as measured for our first policies."""
+ENSEMBLE_TICKS = 1
+"""Ticks between two looks where chunks are averaged and no number is given, as LeRobot's ensembling has it."""
 CUDA_ROWS = {"act": 64, "diffusion": 64, "flow": 64, "pi05": 8}
 """Family → rows of every forward pass on a GPU: one size always, so that no kernels are chosen again and a row's
 answer does not depend on how many others ask. 64 holds the 60 episodes of a cell; pi0.5 costs what its rows cost."""
@@ -58,7 +58,7 @@ class LeRobotPolicy(Policy):
         Args:
             folder: A checkpoint, or the folder of a training, whose last one is taken.
             replan: Actions of an answer that are executed before the next look; as many as the checkpoint says by
-                default, 2 with `ensemble`.
+                default, 1 with `ensemble`.
             ensemble: Execute at each tick the mean of all answers that cover it.
             device: Torch device of the network; that of the observations by default.
 
@@ -69,7 +69,7 @@ class LeRobotPolicy(Policy):
         self.checkpoint: Checkpoint = read_checkpoint(Path(folder))
         facts, predicted = self.checkpoint.facts, self.checkpoint.predicted
         if replan is None:
-            replan = min(ENSEMBLE_TICKS, predicted) if ensemble else self.checkpoint.executed
+            replan = ENSEMBLE_TICKS if ensemble else self.checkpoint.executed
         elif not 1 <= replan <= predicted:
             raise InputError(f"--replan {replan}: expected 1 to {predicted}, which {self.checkpoint.folder} predicts")
         self.needs_image = self.checkpoint.camera is not None

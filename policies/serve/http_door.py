@@ -27,9 +27,9 @@ from arena_newton.policies.serve.arena_codec import (
     unpack_look,
 )
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME
 from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 from arena_newton.text import plain_text
 
 __all__ = ["HttpDoor"]
@@ -38,6 +38,8 @@ IDLE_CONNECTION = 600.0
 """Time without a request after which a connection is closed [s]."""
 BODY_SECONDS = 60.0
 """Time that a client has to send the body of a request [s]."""
+POLL = 0.05
+"""Time after which a door notices that it is closed [s]."""
 MOST_WORLDS = 4096
 """Most worlds whose episode is remembered."""
 _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500}
@@ -229,7 +231,7 @@ class HttpDoor:
         self.port = int(listening.getsockname()[1])
         listening.listen(_Listener.request_queue_size)
         self._listener = _Listener(listening, server, guard, tls)
-        self._thread = threading.Thread(target=self._listener.serve_forever, name="door", daemon=True)
+        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="door", daemon=True)
         self._thread.start()
 
     def close(self) -> None:

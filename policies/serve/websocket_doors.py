@@ -26,9 +26,9 @@ from arena_newton.errors import ArenaError
 from arena_newton.policies.serve import openpi_codec, vla_eval_codec
 from arena_newton.policies.serve.arena_codec import pack_config, pack_failure
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME
 from arena_newton.policies.serve.policy_messages import Begin, End, Look
 from arena_newton.policies.serve.policy_server import PolicyServer
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 from arena_newton.text import plain_text
 
 __all__ = ["WebsocketDoor", "WebsocketProtocol"]

@@ -2,8 +2,8 @@
 
 A batch is a dict of normalised tensors on the device: `observation.images.front` [B, 3, H, W], `observation.state`
 [B, 64], for recipes with a task vector `observation.environment_state` [B, tasks], `action` [B, n, 40] at the offsets
-`TrainableModel.samples` from the observation's tick, `action_is_pad` bool [B, n]; for families that read the instruction either
-`task`, a list of strings, or its tokens (`TrainableModel.tokens`).
+`samples` of the model from the observation's tick, `action_is_pad` bool [B, n]; for families that read the instruction
+either `task`, a list of strings, or its tokens (`tokens` of the model).
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from arena_newton.policies.recipes.training_recipe import FAMILIES, TrainingReci
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.policy_model import TrainableModel
 
-__all__ = ["TrainableModel", "build"]
+__all__ = ["Model", "build"]
+
+Model = TrainableModel
+"""What `build` returns."""
 
 _MODULES = {family: f"arena_newton.policies.train.{family}_family" for family in FAMILIES}
 

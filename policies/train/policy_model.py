@@ -21,7 +21,19 @@ from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Scaling, Stats, scalings, usable_stats
 
-__all__ = ["ACTION", "FRONT", "PAD", "STATE", "TASK_VECTOR", "WEIGHTS_FILE", "TrainableModel", "configuration"]
+__all__ = [
+    "ACTION",
+    "FRONT",
+    "PAD",
+    "STATE",
+    "TASK_VECTOR",
+    "WEIGHTS_FILE",
+    "TrainableModel",
+    "configuration",
+    "new_policy",
+    "prepared",
+    "with_time_axis",
+]
 
 FRONT = "observation.images.front"
 """Key of the head camera's picture, float32 [B, 3, H, W]."""
@@ -55,6 +67,9 @@ def configuration(recipe: TrainingRecipe, stats: Stats, device: torch.device) ->
         network["pretrained_backbone_weights"] = None  # loaded by us, and a checkpoint needs no second copy
     modes = network.get("normalization_mapping", {})
     assert isinstance(modes, Mapping)
+    if "dtype" in network:
+        network["dtype"] = recipe.precision
+    network = {name: tuple(value) if isinstance(value, list) else value for name, value in network.items()}
     network["normalization_mapping"] = {kind: NormalizationMode(mode) for kind, mode in modes.items()}
     inputs = {
         FRONT: PolicyFeature(FeatureType.VISUAL, (3, recipe.picture, recipe.picture)),
@@ -155,6 +170,15 @@ class TrainableModel(abc.ABC):
         groups = [{"params": rest, "lr": self.recipe.lr}, {"params": backbone, "lr": self.recipe.lr_backbone}]
         return [group for group in groups if group["params"]]
 
+    def mean_error(self, errors: torch.Tensor, batch: Mapping[str, object]) -> torch.Tensor:
+        """Mean of errors [B, n, 40]; where LeRobot's configuration says so, of those that are not padding."""
+        if not self.policy.config.do_mask_loss_for_padding:
+            return errors.mean()
+        pad = batch[PAD]
+        assert isinstance(pad, torch.Tensor)
+        valid = ~pad.unsqueeze(-1)
+        return (errors * valid).sum() / (valid.sum() * errors.shape[-1]).clamp_min(1)
+
     def is_backbone(self, parameter: str) -> bool:
         """Whether a parameter, by name, belongs to the vision encoder and has the recipe's `lr_backbone`."""
         return False
@@ -214,6 +238,24 @@ class TrainableModel(abc.ABC):
 def new_policy(config: PreTrainedConfig) -> PreTrainedPolicy:
     """A policy of LeRobot with new weights."""
     return get_policy_class(config.type)(config)
+
+
+def with_time_axis(config: PreTrainedConfig, batch: Mapping[str, object]) -> dict[str, object]:
+    """A batch as families with an axis of observed ticks take it, pictures of all cameras stacked.
+
+    Returns:
+        `observation.state` [B, 1, 64], `observation.images` [B, 1, 1, 3, H, W] and so on; with the axis in the batch,
+        its own number of ticks.
+    """
+    found = dict(batch)
+    for name, dims in ((STATE, 2), (TASK_VECTOR, 2), *((name, 4) for name in config.image_features)):
+        value = found.get(name)
+        if isinstance(value, torch.Tensor) and value.dim() == dims:
+            found[name] = value.unsqueeze(1)
+    if config.image_features:
+        pictures = [value for name in config.image_features if isinstance(value := found[name], torch.Tensor)]
+        found["observation.images"] = torch.stack(pictures, dim=-4)
+    return found
 
 
 def prepared(recipe: TrainingRecipe, stats: Stats, device: torch.device) -> tuple[PreTrainedConfig, Stats]:

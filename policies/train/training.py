@@ -58,6 +58,8 @@ def train(options: PolicyTrainOptions) -> Path:
         progress = TrainingProgress.read(checkpoint)
         options = resumed(options, progress.options, checkpoint)
         check_numbers(options)
+        if 0 < (options.steps or progress.steps) <= progress.step:  # it came to its end
+            return checkpoint / PRETRAINED_MODEL_DIR
     settings = chosen_recipe(options)
     out = options.out or default_folder(options)
     if options.resume is None and any(one.name.isdigit() for one in out.glob("checkpoints/*")):

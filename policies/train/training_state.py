@@ -123,12 +123,10 @@ def last_checkpoint(out: Path, flag: str = "--resume") -> Path:
     Raises:
         InputError: There is none.
     """
-    folder = out / CHECKPOINTS_DIR
-    steps = sorted(int(one.name) for one in folder.glob("*") if one.name.isdigit() and one.is_dir())
-    named = {int(one.name): one for one in folder.glob("*") if one.name.isdigit()}
-    for step in reversed(steps):
-        if (named[step] / TRAINING_STATE_DIR).is_dir() and (named[step] / PRETRAINED_MODEL_DIR).is_dir():
-            return named[step]
+    named = [one for one in (out / CHECKPOINTS_DIR).glob("*") if one.name.isdecimal()]
+    for folder in sorted(named, key=lambda one: int(one.name), reverse=True):
+        if (folder / TRAINING_STATE_DIR).is_dir() and (folder / PRETRAINED_MODEL_DIR).is_dir():
+            return folder
     raise InputError(
         f"{flag} {out}: holds no checkpoint of a training (no {CHECKPOINTS_DIR}/<step>/{TRAINING_STATE_DIR})"
     )
@@ -178,7 +176,7 @@ def remove_older(out: Path, keep: int) -> None:
     for left in folder.glob(f"*{PARTIAL}"):
         shutil.rmtree(left, ignore_errors=True)
     if keep:
-        whole = sorted((one for one in folder.glob("*") if one.name.isdigit()), key=lambda one: int(one.name))
+        whole = sorted((one for one in folder.glob("*") if one.name.isdecimal()), key=lambda one: int(one.name))
         for old in whole[:-keep]:
             shutil.rmtree(old, ignore_errors=True)
 

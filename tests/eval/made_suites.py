@@ -1,8 +1,8 @@
-"""Suites with known outcomes for tests: written with the product's own writers, so that every number has a closed form."""
+"""Suites with known outcomes for tests, by the product's own writers: every number has a closed form."""
 
 import json
 
-from rows import full
+from rows import full, record
 from test_report import document_of
 
 from arena_newton import seeding, tasks
@@ -16,7 +16,6 @@ from arena_newton.eval.suite_records import (
     journal_file,
     suite_json,
 )
-from rows import record
 
 SEEDS, REPEATS = (0, 1, 2), 20
 

@@ -7,7 +7,6 @@ from made_checkpoints import CHUNK, FRONT, STATE, facts, follow, save, seen
 
 from arena_newton import policies
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot import checkpoint_policy
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 
 FAMILIES = ("act", "diffusion", "flow", "two")
@@ -155,7 +154,7 @@ def test_ensembling_is_the_mean_of_all_chunks_that_cover_a_tick(checkpoints):
     policy.reset([12, 12], ["boxing"] * 2, np.array([False, True]))
     answer = policy.act(seen([11, 12], [15, 0]))
     assert torch.equal(answer.actions[1], rows[12][:3])
-    assert LeRobotPolicy(checkpoints["act"], ensemble=True).chunk_size == checkpoint_policy.ENSEMBLE_TICKS
+    assert LeRobotPolicy(checkpoints["act"], ensemble=True).chunk_size == 1
 
 
 def test_a_world_that_cannot_be_served_is_named(made):

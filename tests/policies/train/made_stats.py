@@ -2,7 +2,7 @@
 
 import torch
 
-from arena_newton.policies.train.families import TrainableModel
+from arena_newton.policies.train.policy_model import TrainableModel
 
 STATE, ACTION = 64, 40
 
@@ -39,6 +39,6 @@ def made_batch(model: TrainableModel, rows: int = 2, tasks: int = 0, seed: int =
     if tasks:
         batch["observation.environment_state"] = torch.eye(tasks)[torch.arange(rows) % tasks]
     if model.reads_task:
-        words = ["Walk to the sign.", "Hit the green boxing bag."]
+        words = ["Open the door.", "Sit on the sofa."]
         batch |= model.tokens([words[i % 2] for i in range(rows)], batch["observation.state"])
     return batch

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file, save_file
 from torchvision.models import resnet18
 
@@ -14,6 +14,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import families
 from tests.policies.train.made_stats import made_batch, made_stats
+from tests.policies.train.stock_lerobot import opened, raw_observation
 
 SMALL = recipe("act", "small")
 
@@ -22,23 +23,6 @@ SMALL = recipe("act", "small")
 def model():
     torch.manual_seed(0)
     return families.build(SMALL, made_stats(), "cpu")
-
-
-def stock(folder):
-    """Policy and processors as a stock LeRobot loads them, strictly."""
-    config = PreTrainedConfig.from_pretrained(folder)
-    policy = get_policy_class(config.type).from_pretrained(folder, config=config, strict=True)
-    return policy, *make_pre_post_processors(config, pretrained_path=str(folder))
-
-
-def raw_observation(size=64, rows=2):
-    """An observation as LeRobot's processors take it."""
-    generator = torch.Generator().manual_seed(3)
-    return {
-        "observation.images.front": torch.rand(rows, 3, size, size, generator=generator),
-        "observation.state": torch.randn(rows, 64, generator=generator) * 0.3,
-        "task": ["Walk to the sign.", "Hit the green boxing bag."][:rows],
-    }
 
 
 def test_loss_is_lerobots(model):
@@ -74,7 +58,7 @@ def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
         model.loss(made_batch(model), {}).backward()
         optimizer.step()
     model.save(tmp_path, CheckpointFacts(tasks=("boxing",), steps=2))
-    policy, before, after = stock(tmp_path)
+    policy, before, after = opened(tmp_path)
     observation = raw_observation()
     model.policy.eval()
     ours = model.postprocess(model.policy.predict_action_chunk(model.preprocess(dict(observation))))
@@ -108,7 +92,7 @@ def test_half_precision(model, tmp_path):
     model.save(tmp_path / "half", CheckpointFacts(), precision="float16")
     sizes = [(tmp_path / name / "model.safetensors").stat().st_size for name in ("full", "half")]
     assert sizes[1] < 0.51 * sizes[0]
-    policy, before, after = stock(tmp_path / "half")
+    policy, before, after = opened(tmp_path / "half")
     assert {p.dtype for p in policy.parameters()} == {torch.float32}
     observation = raw_observation()
     ours = model.policy.predict_action_chunk(model.preprocess(dict(observation)))
@@ -141,7 +125,7 @@ def test_task_vector(tmp_path):
     first, second = model.policy.predict_action_chunk(same)
     assert not torch.allclose(first, second)
     model.save(tmp_path, CheckpointFacts(task_vector=tuple("abcdefg")))
-    policy, before, _ = stock(tmp_path)
+    policy, before, _ = opened(tmp_path)
     vector = before(raw_observation() | {"observation.environment_state": torch.eye(7)[:2]})
     assert torch.equal(vector["observation.environment_state"], torch.eye(7)[:2])
     assert torch.allclose(policy.predict_action_chunk(same)[0], first, atol=1e-6)
