@@ -55,7 +55,8 @@ class RunOptions:
     replan: int | None = None
     """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
     ensemble: bool = False
-    """For --policy lerobot: look at every tick and execute the mean of all chunks that cover it."""
+    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; looks every 2 ticks, or as
+    --replan says."""
     latency_ticks: int = 0
     """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
     mode: tuple[str, ...] = ()
