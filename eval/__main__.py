@@ -22,6 +22,7 @@ from arena_newton.eval.options import (
     ReportOptions,
     RunOptions,
 )
+from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.flags import folders_named, parse_flags
 
 if TYPE_CHECKING:
@@ -37,8 +38,10 @@ OVERVIEW = f"""commands:
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
+  {PROG} tsne [flags]            map what one policy answers to the observations of two datasets
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
+  {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
@@ -199,6 +202,26 @@ def _loop(arguments: list[str], factories: Factories | None) -> int:
     return learning_loop.run(options, factories)
 
 
+def _matrix(arguments: list[str], factories: Factories | None) -> int:
+    if _wants_help(arguments):
+        parse_flags(MatrixOptions, ["--help"], f"{PROG} matrix <suite>")
+    if not arguments or arguments[0].startswith("-"):
+        raise InputError(f"matrix: name the suite file: {PROG} matrix <suite.toml>")
+    given = arguments.pop(0)
+    options = parse_flags(MatrixOptions, arguments, f"{PROG} matrix")
+    from arena_newton.eval.suite_call import plan_call
+
+    call = plan_call(given, options)
+    if options.dry_run:
+        print(call.table(), flush=True)
+        if call.problem is not None:
+            raise call.problem
+        return 0
+    from arena_newton.eval import suite_run
+
+    return suite_run.run(call, factories)
+
+
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
@@ -232,6 +255,19 @@ def _tables(arguments: list[str], factories: Factories | None) -> int:
     return tables_command.run(folders, options)
 
 
+def _tsne(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.table_options import TsneOptions
+
+    options = parse_flags(TsneOptions, arguments, f"{PROG} tsne")
+    from arena_newton.extras import require
+
+    require("plots", "eval tsne")
+    require("data", "eval tsne", ("pyarrow",))
+    from arena_newton.eval import tsne_command
+
+    return tsne_command.run(options)
+
+
 _COMMANDS = {
     "run": _run,
     "record": _record,
@@ -240,6 +276,8 @@ _COMMANDS = {
     "film": _film,
     "loop": _loop,
     "tables": _tables,
+    "tsne": _tsne,
+    "matrix": _matrix,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,

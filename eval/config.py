@@ -26,7 +26,7 @@ from arena_newton.eval.records import JsonObject
 from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
-from arena_newton.policies.base import DATASET_FILE, dataset_target
+from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
 
@@ -38,7 +38,7 @@ __all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "recorded_ca
 
 DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
-POLICY_PATH_SCHEMES = ("replay",)
+POLICY_PATH_SCHEMES = ("lerobot", "replay")
 """Policies whose text after the colon is a path."""
 DRIVES: Mapping[str, DriveGains | None] = {
     "auto": None,
@@ -243,7 +243,7 @@ def resolve(options: RunOptions) -> RunConfig:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
-    if scheme in POLICY_PATH_SCHEMES and target:
+    if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at)), "" if episode is None else f"#{episode}"
     else:
@@ -280,7 +280,7 @@ def resolve(options: RunOptions) -> RunConfig:
     )
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
-    policy_hash = hash_path(_decisive(policy_path)) if policy_path else None
+    policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
     engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     return RunConfig(
@@ -340,10 +340,6 @@ def _check_chunks(options: RunOptions) -> None:
         raise InputError(f"--replan {replan}: expected at least 1")
     if late < 0:
         raise InputError(f"--latency-ticks {late}: expected at least 0")
-    if options.ensemble and replan is not None:
-        raise InputError("--ensemble: looks at every tick; drop it or --replan")
-    if late and options.ensemble:
-        raise InputError(f"--latency-ticks {late}: a chunk must be longer; --ensemble executes one action of each")
     if replan is not None and 0 < replan <= late:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
 
@@ -461,15 +457,22 @@ def _policy_options(options: RunOptions) -> JsonObject:
 
 
 def _shown(path: Path) -> str:
-    """Name of what is replayed: that of the run for its folder `actions`."""
+    """Name of what is played: of a run for its folder `actions`, of a training and its step for a checkpoint."""
+    inner = path.parent if path.name == "pretrained_model" else path
+    if inner.parent.name == "checkpoints":
+        return f"{inner.parents[1].name}-{inner.name}"
     return path.parent.name if path.name == "actions" and path.parent.name else path.name
 
 
-def _decisive(path: Path) -> Path:
-    """What of a policy's path counts by content: of a dataset, which may be large, its description.
+def _decisive(scheme: str, path: Path) -> Path:
+    """What of a policy's path counts by content: of a training the checkpoint, of a dataset its description.
 
     The policy itself says the hash of the actions that it plays.
     """
+    if scheme == "lerobot":
+        from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder  # imports torch
+
+        return checkpoint_folder(path)
     return path / DATASET_FILE if (path / DATASET_FILE).is_file() else path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -29,9 +30,15 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
-_REPORTING = """__main__ bench bench_figure bench_recording certify config console document engines folder
-    html_report identity journal learning_loop loop_report options original_format progress recording records report
-    rerecord results rounds stats success_film suite_records tables wording"""
+_REPORTING = """__main__ action_map bench bench_figure bench_recording certify config console cost_table document
+    engines evaluated_cells folder html_report identity journal learning_loop loop_report options
+    original_format paper_claims paper_numbers predicted_actions progress recording records report
+    rerecord results rounds stats"""__main__ action_map bench bench_figure bench_policy bench_recording bench_start certify config console
+    document engines evaluated_cells folder html_report identity journal learning_loop loop_report options
+    original_format paper_claims paper_numbers predicted_actions progress recording records report rerecord results rounds stats
+    success_film suite_call suite_cells suite_figures suite_file suite_folder suite_options
+    suite_records suite_run suite_tables table_entries table_options table_text tables tables_command
+    tsne_command wording"""
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
@@ -121,8 +128,14 @@ def code_files(root: Path = PACKAGE) -> list[Path]:
 
 
 def code_hash(root: Path = PACKAGE) -> str:
-    """Hash of the code that a run executes, by names and contents."""
-    return hash_paths(root, code_files(root))
+    """Hash of the code that a run executes, by names and contents; of this package it is taken once in a process."""
+    return _running_code() if root == PACKAGE else hash_paths(root, code_files(root))
+
+
+@functools.cache
+def _running_code() -> str:
+    """Hash of the code that was loaded: what is edited later does not run in this process."""
+    return hash_paths(PACKAGE, code_files(PACKAGE))
 
 
 def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> list[Path]:

@@ -8,10 +8,10 @@ import fcntl
 import json
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.records import (
@@ -35,7 +35,16 @@ from arena_newton.files import replace_atomically
 from arena_newton.interfaces import EpisodeEvent
 from arena_newton.text import counted
 
-__all__ = ["JOURNAL_FILE", "SCHEMA", "EpisodeRecord", "Journal", "StorageError", "read_journal", "write_atomic"]
+__all__ = [
+    "JOURNAL_FILE",
+    "SCHEMA",
+    "EpisodeRecord",
+    "Journal",
+    "LockedLines",
+    "StorageError",
+    "read_journal",
+    "write_atomic",
+]
 
 JOURNAL_FILE = "episodes.jsonl"
 SCHEMA = 2
@@ -178,15 +187,15 @@ def read_journal(path: Path) -> tuple[list[EpisodeRecord], int]:
     return records, start
 
 
-class Journal:
-    """Append-only journal, locked against a second writer.
+class LockedLines:
+    """Append-only file of lines, locked against a second writer.
 
-    Opening cuts a torn last line. `append` returns after the line is on disk; when the disk is full it takes the
+    Opening cuts a torn last line. `append_line` returns after the line is on disk; when the disk is full it takes the
     partial line back, so that the file stays whole.
     """
 
-    def __init__(self, path: Path):
-        """Open or create the journal at `path`.
+    def __init__(self, path: Path, whole: Callable[[Path], int]):
+        """Open or create the file at `path`; `whole` reads it and gives the length of its whole lines [bytes].
 
         Raises:
             InputError: Another process writes it, or it is damaged.
@@ -208,7 +217,7 @@ class Journal:
             os.close(self._file)
             raise InputError(f"{path}: another run is writing this journal") from None
         try:
-            self.records, self._size = read_journal(path)
+            self._size = whole(path)
             self.torn_bytes = os.fstat(self._file).st_size - self._size
             if self.torn_bytes:
                 os.ftruncate(self._file, self._size)
@@ -220,9 +229,12 @@ class Journal:
             os.close(self._file)
             raise
 
-    def append(self, record: EpisodeRecord) -> None:
-        """Write one record and wait until it is on disk."""
-        line = json.dumps(record.to_json(), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+    def append_line(self, line: bytes, kept: str) -> None:
+        """Write one line, its end included, and wait until it is on disk; `kept` says what an error leaves.
+
+        Raises:
+            StorageError: It cannot be written.
+        """
         try:
             written = 0
             while written < len(line):
@@ -233,10 +245,8 @@ class Journal:
                 os.ftruncate(self._file, self._size)
             except OSError:
                 pass  # the torn line is cut by the next opening
-            kept = len({record.index for record in self.records})
-            raise _explain(error, self.path, f"kept: {counted(kept, 'episode')}") from None
+            raise _explain(error, self.path, kept) from None
         self._size += len(line)
-        self.records.append(record)
 
     def close(self) -> None:
         """Release the file and its lock."""
@@ -244,13 +254,38 @@ class Journal:
             os.close(self._file)
             self._file = -1
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> Self:
         """Use as a context."""
         return self
 
     def __exit__(self, *exc: object) -> None:
         """Close."""
         self.close()
+
+
+class Journal(LockedLines):
+    """The journal of a run."""
+
+    def __init__(self, path: Path):
+        """Open or create the journal at `path`.
+
+        Raises:
+            InputError: Another process writes it, or it is damaged.
+            StorageError: It cannot be created.
+        """
+        self.records: list[EpisodeRecord] = []
+        super().__init__(path, self._read)
+
+    def _read(self, path: Path) -> int:
+        self.records, size = read_journal(path)
+        return size
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Write one record and wait until it is on disk."""
+        line = json.dumps(record.to_json(), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        kept = len({record.index for record in self.records})
+        self.append_line(line, f"kept: {counted(kept, 'episode')}")
+        self.records.append(record)
 
 
 def write_atomic(path: Path, text: str) -> None:

@@ -100,7 +100,7 @@ def _bars(table: SuiteTable, panel: str = "tracker") -> Figure | None:
                     _bar(axes, x, width, mine[0], colour, label=None if said else policy)
                     said = True
                 paper = theirs.get((name, family, task))
-                if paper is not None and paper.sr is not None:
+                if mine and paper is not None and paper.sr is not None:
                     _diamond(axes, x, paper)
         axes.set_title(name.replace("+", " + "), loc="left", fontsize=11)
         axes.set_xticks(range(len(tasks)), [_short(task) for task in tasks], fontsize=9)
@@ -258,8 +258,8 @@ def _map(
     title: str,
     names: Sequence[str] | None = None,
 ) -> None:
-    colours = LinearSegmentedColormap.from_list("retention", ("#b2182b", "#f7f7f7", "#2166ac"))
-    colours.set_bad("#e8e8e8")
+    between = LinearSegmentedColormap.from_list("retention", ("#b2182b", "#f7f7f7", "#2166ac"))
+    colours = between.with_extremes(bad="#e8e8e8")
     values = [[math.nan] * max(1, len(columns)) for _ in tasks]
     for y, task in enumerate(tasks):
         for x, column in enumerate(columns):

@@ -42,9 +42,10 @@ __all__ = [
     "JOURNAL_PATTERN",
     "SUITE_FILE",
     "SUITE_SCHEMA",
+    "CellEnding",
     "CellEvent",
     "CellState",
-    "Suite",
+    "SuitePlan",
     "SuiteCell",
     "event_line",
     "journal_file",
@@ -139,6 +140,8 @@ class SuiteCell:
         return len(self.trained_tasks) > 1 or len(self.trained_on) > 1
 
 
+type CellEnding = Literal["done", "failed", "interrupted", "killed"]
+"""How a call left a cell."""
 PROGRESS_FIELDS = ("status", "finished", "successes", "errors", "wall_s", "device", "error")
 """Fields of a cell that its events decide."""
 
@@ -149,7 +152,7 @@ class CellEvent:
 
     schema: Positive = SUITE_SCHEMA
     cell: Folder
-    event: Literal["begun", "done", "failed", "interrupted", "killed", "reopened"]
+    event: Literal["begun", "reopened"] | CellEnding
     """`killed` is written by the next call for a cell that has begun and not ended; `reopened`: its results were set
     aside or are gone, what came before counts no more."""
     at: Annotated[str, Fit("a time", lambda value: len(value) < 64)]
@@ -167,7 +170,7 @@ class CellEvent:
 
 
 @dataclass(frozen=True)
-class Suite:
+class SuitePlan:
     """A suite's folder, read and checked."""
 
     folder: Path
@@ -196,7 +199,7 @@ def journal_file(shard: int, shards: int) -> str:
     return f"suite.{shard}-of-{shards}.jsonl"
 
 
-def suite_json(suite: Suite) -> JsonObject:
+def suite_json(suite: SuitePlan) -> JsonObject:
     """Content of `suite.json`."""
     return {
         "schema": SUITE_SCHEMA,
@@ -207,7 +210,7 @@ def suite_json(suite: Suite) -> JsonObject:
     }
 
 
-def read_suite(folder: Path) -> Suite:
+def read_suite(folder: Path) -> SuitePlan:
     """Read a suite: the plan of `suite.json`, and how far its cells are from the journals next to it.
 
     Raises:
@@ -232,7 +235,7 @@ def read_suite(folder: Path) -> Suite:
         if cell.id in seen:
             raise InputError(f"{path}: cell {cell.id} is listed twice")
         seen.add(cell.id)
-    plan = Suite(folder, content["name"], content["source"], content["hash"], tuple(cells))
+    plan = SuitePlan(folder, content["name"], content["source"], content["hash"], tuple(cells))
     return with_events(plan, read_events(folder))
 
 
@@ -309,7 +312,7 @@ def event_line(event: CellEvent) -> bytes:
     return json.dumps(dataclasses.asdict(event), separators=(",", ":"), allow_nan=False).encode() + b"\n"
 
 
-def with_events(suite: Suite, events: Iterable[CellEvent]) -> Suite:
+def with_events(suite: SuitePlan, events: Iterable[CellEvent]) -> SuitePlan:
     """The suite with what its journals say; events of cells that are no longer in the plan are passed over."""
     by_cell: dict[str, list[CellEvent]] = {}
     for event in events:
@@ -339,7 +342,7 @@ def _played(cell: SuiteCell, events: Sequence[CellEvent]) -> SuiteCell:
     return dataclasses.replace(cell, **state)
 
 
-def load_cell(suite: Suite, cell: SuiteCell) -> RunRecord:
+def load_cell(suite: SuitePlan, cell: SuiteCell) -> RunRecord:
     """The results folder of a cell, checked against what the suite says of it.
 
     Raises:

@@ -27,7 +27,7 @@ from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, P
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
 from arena_newton.policies.remote_link import RemoteError, ServerLink
 from arena_newton.policies.serve.handshake import RATE, ServedFacts, compare_facts, expected_facts
-from arena_newton.policies.serve.packed_arrays import WireError
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = [
     "MAX_CHUNK",
@@ -109,6 +109,7 @@ class RemoteClient[Q, R](Policy):
         self._served = ""
         self._assumed: Json = {}
         self._failures = 0
+        self._closing = False
         # World → seed of its episode, number of actions received, actions not handed over yet.
         self._seeds: dict[int, int] = {}
         self._steps: dict[int, int] = {}
@@ -215,6 +216,7 @@ class RemoteClient[Q, R](Policy):
             fit: Literal["native", "pad"] = "native" if facts.picture.fit == "native" else "pad"
             self.camera = CameraConfig(width=facts.picture.width, height=facts.picture.height, fit=fit)
         self.chunk_size = facts.chunk_length or self.chunk_size
+        self.realign = facts.realign or 0.0
         self.batched, self._seeded = facts.batched, facts.seeded
         self._served = self.one_line(facts.policy)
 
@@ -363,12 +365,13 @@ class RemoteClient[Q, R](Policy):
             "worlds_matter": self.depends_on_worlds,
         }
         declared = self.told.to_json() if self.told != ServedFacts() else {}
-        shown = ("labels", "chunk_length", "rate_hz", "picture", "batched", "facts")
+        shown = ("labels", "realign", "chunk_length", "rate_hz", "picture", "batched", "facts")
         more = {"declared": {name: declared[name] for name in shown if name in declared}, "assumed": self._assumed}
         return facts | {name: value for name, value in more.items() if value}
 
     def close(self) -> None:
         """Close all connections; requests that are under way are broken off."""
+        self._closing = True
         for connection in self._connections.values():
             connection.abort()
         if self._pool is not None:
@@ -416,6 +419,7 @@ class RemoteClient[Q, R](Policy):
         """
         replies: dict[int, T] = {}
         errors: dict[int, str] = {}
+        self._closing = False
         for batch in [{w: request} for w, request in requests.items()] if sequential else [requests]:
             got, failed = self._gather(kind, batch, read)
             self._judge(kind, len(got), failed, weight)
@@ -444,6 +448,8 @@ class RemoteClient[Q, R](Policy):
 
     def _alive(self) -> bool:
         """Whether the server answers at all, asked over a new connection."""
+        if self._closing:  # nobody waits for the answer any more
+            return True
         connection = self._connect()
         answer = self._threads().submit(connection.alive, self.timeout)
         try:
@@ -508,7 +514,8 @@ class RemoteClient[Q, R](Policy):
             with self._reading:  # one reply at a time: as Python objects it is many times as large
                 return read(self._read(kind, reply))
         except WireError as error:  # from a codec; it names the address
-            raise RemoteError(self.masked(str(error))) from error
+            text = self.masked(str(error))
+            raise RemoteError(text if text.startswith(self.url) else f"{self.url}{kind}: {text}") from error
 
     def one_line(self, said: object) -> str:
         """What a server said, on one line and without the token."""

@@ -12,8 +12,8 @@ import numpy as np
 
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json
-from arena_newton.policies.remote_link import RemoteError
-from arena_newton.policies.remote_websocket import UNKNOWN_EPISODE, SocketClient, SocketLink, SocketRequest
+from arena_newton.policies.remote_link import RemoteError, episode_lost
+from arena_newton.policies.remote_websocket import SocketClient, SocketLink, SocketRequest
 from arena_newton.policies.serve import vla_eval_codec
 from arena_newton.policies.serve.handshake import ServedFacts
 from arena_newton.policies.serve.policy_messages import Begin, End
@@ -61,6 +61,11 @@ class VlaEvalLink(SocketLink):
             self.close()
         return answer, seq
 
+    def unasked(self, frame: bytes | str) -> object:
+        """What went wrong at the beginning of the episode is the answer to its first look."""
+        message = vla_eval_codec.unpack_message(frame)
+        return (message, message.seq) if message.type == "error" else None
+
     def _number(self) -> None:
         self.seq += 1
 
@@ -81,7 +86,7 @@ class VlaEvalPolicy(SocketClient):
         Raises:
             InputError: No server of the protocol answers, or not one for this robot.
         """
-        _, facts = self.greet()
+        facts = self.greet()
         self.take(facts)
         self.batched = False  # a connection is one session
         self.assume()
@@ -101,7 +106,7 @@ class VlaEvalPolicy(SocketClient):
         message, seq = reply
         if isinstance(message, VlaEvalMessage) and message.type == "error":
             said = self.one_line(message.payload.get("error", "nothing"))
-            raise RemoteError(f"{self.url}{kind}: the server says {said}", lost=UNKNOWN_EPISODE in said)
+            raise RemoteError(f"{self.url}{kind}: the server says {said}", lost=episode_lost(said))
         return message, seq
 
     def _rows(self, content: object) -> np.ndarray:

@@ -17,19 +17,19 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from arena_newton.canonical import STATE_WIDTH
+from arena_newton.errors import InputError
 from arena_newton.policies.base import Observation
 from arena_newton.policies.remote_address import cause
 from arena_newton.policies.remote_client import MAX_REPLY, RemoteClient
 from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink
 from arena_newton.policies.serve.handshake import ServedFacts
 from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.serve.wire_error import WireError
 
-__all__ = ["GATEWAY_STATUS", "UNKNOWN_EPISODE", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
+__all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
 
 GATEWAY_STATUS = (502, 503, 504)
 """Status of a gateway whose server is not there."""
-UNKNOWN_EPISODE = "unknown episode"
-"""What our servers say of a running episode that began elsewhere, or before they were started again."""
 CLOSING = 0.5
 """How long the closing handshake may take [s]."""
 MOST_PAGE = 2**20
@@ -80,6 +80,10 @@ class SocketLink(ServerLink[SocketRequest, object]):
         """Show what a world sees; the reply."""
         raise TypeError(f"{type(self).__name__} defines no look()")
 
+    def unasked(self, frame: bytes | str) -> object:
+        """The reply that a frame is for which nobody asked; None: it is none, and the connection is given up."""
+        return None
+
     # What all have in common.
 
     def exchange(self, kind: str, request: SocketRequest, end: float) -> object:
@@ -88,8 +92,13 @@ class SocketLink(ServerLink[SocketRequest, object]):
         Raises:
             RemoteError: The connection that knew the episode is gone, or another policy answers than the one checked.
         """
-        if self._socket is not None and not self._idle():
-            self.close()
+        if self._socket is not None:
+            idle, unasked = self._waiting()
+            reply = None if unasked is None or isinstance(request.message, Begin) else self.unasked(unasked)
+            if not idle:
+                self.close()
+            if reply is not None:
+                return reply
         if self._socket is None:
             facts = self.open(end)
             reason = self.owner.refused(facts)
@@ -213,17 +222,18 @@ class SocketLink(ServerLink[SocketRequest, object]):
             raise AskAgain("the connection is closed")
         return self._socket
 
-    def _idle(self) -> bool:
-        """Whether the connection is open and holds no frame that nobody asked for: it would answer what comes next."""
-        if self._socket is None:
-            return False
+    def _waiting(self) -> tuple[bool, bytes | str | None]:
+        """Whether the connection is open without a frame that nobody asked for, which would answer what comes next.
+
+        Returns:
+            That, and the frame.
+        """
         try:
-            self._socket.recv(timeout=0)
+            return False, self._open_socket().recv(timeout=0)
         except TimeoutError:
-            return True
+            return True, None
         except ConnectionClosed:
-            pass
-        return False
+            return False, None
 
 
 class SocketClient(RemoteClient[SocketRequest, object]):
@@ -243,24 +253,33 @@ class SocketClient(RemoteClient[SocketRequest, object]):
         """A link that is not connected yet."""
         raise TypeError(f"{type(self).__name__} defines no _connect()")
 
-    def greet(self) -> tuple[SocketLink, ServedFacts]:
+    def greet(self) -> ServedFacts:
         """Connect world 0 and read the server's greeting.
 
         Raises:
             InputError: No server of the protocol answers.
         """
-        self.reach()
-        link = self._connect()
-        self._connections[0] = link
-        try:
-            self.greeting = link.open(time.monotonic() + self.timeout)
-        except (TimeoutError, AskAgain, *link.final, RemoteError) as error:
-            link.close()
-            late = isinstance(error, TimeoutError)
-            text = f"no greeting within {self.timeout:g} s" if late else self.masked(cause(error))
-            raise self.refusal(RemoteError(text if self.url in text else f"{self.url}: {text}")) from None
+        link = self._connections[0] = self._connect()
+        for attempt in range(self.retries + 1):
+            try:
+                self.greeting = link.open(time.monotonic() + self.timeout)
+                break
+            except TimeoutError:
+                link.close()
+                raise self.refusal(RemoteError(f"{self.url}: no greeting within {self.timeout:g} s")) from None
+            except (ConnectionError, socket.gaierror, AskAgain) as error:
+                link.close()
+                reason = self.one_line(cause(error))
+                if attempt == self.retries:
+                    message = f"--policy remote:{self.url}: no server answers there ({reason})"
+                    raise InputError(message) from None
+                time.sleep(self.backoff * 2**attempt)
+            except (*link.final, WireError) as error:
+                link.close()
+                text = self.masked(str(error) if isinstance(error, WireError) else cause(error))
+                raise self.refusal(RemoteError(text if self.url in text else f"{self.url}: {text}")) from None
         self._checked = True
-        return link, self.greeting
+        return self.greeting
 
     def _begin(self, world: int, task: str = "") -> Begin:
         return Begin(session=str(world), seed=self._seeds.get(world), task=task)

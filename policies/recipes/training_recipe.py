@@ -328,9 +328,9 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
     ("pi05", "small"): {
         "network": {
             "image_resolution": [64, 64],
-            "dtype": "float32",
             "num_inference_steps": 2,
             "gradient_checkpointing": False,
+            "tokenizer_max_length": 384,
             "gemma": {"width": 32, "depth": 1, "mlp": 64, "head": 8, "vision": 32},
         },
     },

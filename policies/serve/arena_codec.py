@@ -15,7 +15,6 @@ import math
 import numpy as np
 
 from arena_newton.policies.serve.handshake import ServedFacts, read_facts
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME, WireError, checked_array
 from arena_newton.policies.serve.policy_messages import (
     MAX_SEED,
     MAX_STEP,
@@ -27,6 +26,8 @@ from arena_newton.policies.serve.policy_messages import (
     read_state,
     read_text,
 )
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME, checked_array
+from arena_newton.policies.serve.wire_error import WireError
 from arena_newton.text import plain_text
 
 __all__ = [

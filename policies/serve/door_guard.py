@@ -29,7 +29,7 @@ class DoorGuard:
 
         Args:
             connections: Most at once.
-            token: What clients must send as `Authorization: Bearer`, empty for none; that of the environment by default.
+            token: What clients must send as `Authorization: Bearer`; empty for none, the environment's by default.
 
         Raises:
             InputError: A token that no HTTP header can carry; it is not printed.

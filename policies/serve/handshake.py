@@ -13,8 +13,8 @@ from arena_newton import robot
 from arena_newton.data.label_protocols import LABELS, action_names
 from arena_newton.data.layouts import state_names
 from arena_newton.errors import InputError
-from arena_newton.policies.serve.packed_arrays import WireError
 from arena_newton.policies.serve.policy_messages import LONGEST_CHUNK, PICTURE_SIDES
+from arena_newton.policies.serve.wire_error import WireError
 from arena_newton.text import plain_text
 
 __all__ = ["HANDSHAKE_VERSION", "RATE", "ServedFacts", "ServedPicture", "compare_facts", "expected_facts", "read_facts"]
@@ -47,6 +47,9 @@ class ServedFacts:
     """What results are known by: the policy's name and a hash of its description."""
     labels: str | None = None
     """Protocol of its actions (`data.label_protocols`)."""
+    realign: float | None = None
+    """Fraction of the gap between the commanded and the measured heading that whoever decodes actions of v4 closes each
+    tick; of v4 only."""
     action_names: tuple[str, ...] | None = None
     """Names of the numbers of an action, in their order."""
     state_names: tuple[str, ...] | None = None
@@ -73,6 +76,7 @@ class ServedFacts:
             "arena": HANDSHAKE_VERSION,
             "policy": self.policy,
             "labels": self.labels,
+            "realign": self.realign,
             "action_names": self.action_names and list(self.action_names),
             "state_names": self.state_names and list(self.state_names),
             "chunk_length": self.chunk_length,
@@ -132,9 +136,15 @@ def read_facts(content: object, where: str) -> ServedFacts:
         raise _unfit(where, "facts", facts)
     if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < 1e6):
         raise _unfit(where, "rate_hz", rate)
+    realign = content.get("realign")
+    if realign is not None and (
+        isinstance(realign, bool) or not isinstance(realign, int | float) or not 0 <= realign <= 1
+    ):
+        raise _unfit(where, "realign", realign)
     return ServedFacts(
         policy=plain_text(policy, 200),
         labels=labels,
+        realign=None if realign is None else float(realign),
         action_names=_names(content, "action_names", where),
         state_names=_names(content, "state_names", where),
         chunk_length=_whole(content, "chunk_length", where, 0, LONGEST_CHUNK),

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import socket
 import ssl
+import sys
 import threading
 import time
+import traceback
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -27,9 +31,9 @@ from arena_newton.policies.serve.arena_codec import (
     unpack_look,
 )
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME
 from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 from arena_newton.text import plain_text
 
 __all__ = ["HttpDoor"]
@@ -38,9 +42,11 @@ IDLE_CONNECTION = 600.0
 """Time without a request after which a connection is closed [s]."""
 BODY_SECONDS = 60.0
 """Time that a client has to send the body of a request [s]."""
+POLL = 0.05
+"""Time after which a door notices that it is closed [s]."""
 MOST_WORLDS = 4096
 """Most worlds whose episode is remembered."""
-_STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500}
+_STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "closing": 503}
 """Reason of a refusal → HTTP status; clients ask again after 503."""
 
 
@@ -56,7 +62,7 @@ class _Handler(BaseHTTPRequestHandler):
     def handle(self) -> None:
         """Serve until the client leaves; one connection too many is told so."""
         self.begun: dict[str, str] = {}
-        with self.server.guard.inside() as self.room:
+        with self.server.guard.inside() as self.room, self.server.listed(self.connection):
             super().handle()
 
     def do_GET(self) -> None:  # noqa: N802 (the name that http.server calls)
@@ -173,6 +179,7 @@ class _Listener(ThreadingHTTPServer):
         self.policy, self.guard, self.tls = policy, guard, tls
         self._worlds: OrderedDict[tuple[str, str], str] = OrderedDict()
         """Client's address and world → session that was begun there last."""
+        self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
 
     def get_request(self) -> tuple[socket.socket, tuple[str, int]]:
@@ -183,7 +190,28 @@ class _Listener(ThreadingHTTPServer):
         return connection, address
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A connection broke off, which is no news."""
+        """A connection broke off, which is no news; anything else is."""
+        error = sys.exception()
+        if not isinstance(error, OSError):
+            print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
+
+    @contextmanager
+    def listed(self, connection: socket.socket) -> Iterator[None]:
+        """Remember a connection while it lasts."""
+        with self._lock:
+            self._open.add(connection)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._open.discard(connection)
+
+    def hang_up(self) -> None:
+        """Close all connections: clients that keep one would go on asking."""
+        with self._lock:
+            for connection in self._open:
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def begin(self, address: str, begin: Begin, begun: dict[str, str]) -> None:
         """Begin the episode of a world, and end the one that this connection began there before."""
@@ -229,11 +257,12 @@ class HttpDoor:
         self.port = int(listening.getsockname()[1])
         listening.listen(_Listener.request_queue_size)
         self._listener = _Listener(listening, server, guard, tls)
-        self._thread = threading.Thread(target=self._listener.serve_forever, name="door", daemon=True)
+        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="door", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the door; connections end with the program."""
+        """End the door and its connections."""
         self._listener.shutdown()
+        self._listener.hang_up()
         self._listener.server_close()
         self._thread.join(timeout=2.0)

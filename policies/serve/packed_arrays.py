@@ -7,15 +7,14 @@ is ever unpickled: arrays hold booleans, integers and floats of known sizes, in 
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable, Mapping
 from typing import cast
 
 import msgpack
 import numpy as np
 
-from arena_newton.errors import ArenaError
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME, checked_array, is_number_type
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = [
     "MAX_DEPTH",
@@ -36,8 +35,6 @@ __all__ = [
 type Value = None | bool | int | float | str | bytes | np.ndarray | list[Value] | dict[str, Value]
 """What a message holds."""
 
-MAX_FRAME = 16 * 2**20
-"""Longest message that is read [bytes]; a picture of 1920x1080 is 6.2 MB."""
 MAX_OBJECTS = 65536
 """Most values in a message, those inside others counted; bytes of an array are one."""
 MAX_LENGTH = 8192
@@ -46,16 +43,6 @@ MAX_TEXT = 65536
 """Longest text [bytes of UTF-8]."""
 MAX_DEPTH = 16
 """Most maps and lists inside each other."""
-MAX_DIMENSIONS = 8
-"""Most dimensions of an array."""
-_DTYPE = re.compile(r"[|<>=]?(?:b1|[iu][1248]|f[248])")
-"""Types of arrays as `numpy.dtype.str` writes them: bool, integers and floats, in either byte order."""
-_NAMED = frozenset("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 float32 float64".split())
-"""The same by their names, which some clients write."""
-
-
-class WireError(ArenaError):
-    """Bytes that came from elsewhere are not a message of the protocol; one line says why."""
 
 
 class ArrayKeys:
@@ -98,11 +85,11 @@ def pack(
     """
 
     def other(item: object) -> object:
-        if isinstance(item, np.generic) and _known(item.dtype.str):
+        if isinstance(item, np.generic) and is_number_type(item.dtype.str):
             if not keys.scalars:
                 return item.item()
             return {keys.scalar: True, keys.data: item.item(), keys.dtype: item.dtype.str}
-        if isinstance(item, np.ndarray) and _known(item.dtype.str):
+        if isinstance(item, np.ndarray) and is_number_type(item.dtype.str):
             made = special(item) if special is not None else None
             if made is not None:
                 return made
@@ -180,45 +167,10 @@ def unpack(
         raise WireError(f"{where}: not MessagePack ({type(error).__name__})") from None
 
 
-def checked_array(data: object, dtype: object, shape: object, where: str) -> np.ndarray:
-    """An array from its parts, in the machine's byte order.
-
-    Args:
-        data: Its bytes, C order.
-        dtype: As `numpy.dtype.str` writes it, or a name such as `float32`.
-        shape: List of sizes.
-        where: What errors name as the origin.
-
-    Raises:
-        WireError: Another type than bool, integer or float, or bytes and shape do not fit.
-    """
-    if isinstance(dtype, bytes):
-        dtype = dtype.decode(errors="replace")
-    if not isinstance(dtype, str) or not _known(dtype):
-        raise WireError(f"{where}: an array of type {str(dtype)[:40]!r}, expected bool, integers or floats")
-    if not isinstance(shape, list | tuple) or len(shape) > MAX_DIMENSIONS:
-        raise WireError(f"{where}: an array without a shape of at most {MAX_DIMENSIONS} dimensions")
-    if not all(isinstance(n, int) and not isinstance(n, bool) and 0 <= n <= MAX_FRAME for n in shape):
-        raise WireError(f"{where}: an array of shape {str(list(shape))[:80]}")
-    kind = np.dtype(dtype)
-    if not isinstance(data, bytes) or math.prod(shape) * kind.itemsize != len(data):
-        size = len(data) if isinstance(data, bytes) else 0
-        raise WireError(f"{where}: an array of shape {list(shape)} of {kind} with {size} bytes")
-    if kind.kind == "b":  # a byte that is neither 0 nor 1 is no bool
-        return np.array(np.frombuffer(data, np.uint8).reshape(shape), dtype=bool)
-    native: np.ndarray = np.empty(shape, kind.newbyteorder("="))
-    native[...] = np.frombuffer(data, kind).reshape(shape)
-    return native
-
-
-def _known(dtype: str) -> bool:
-    return _DTYPE.fullmatch(dtype) is not None or dtype in _NAMED
-
-
 def _scalar(data: object, dtype: object, where: str) -> bool | int | float:
     if isinstance(dtype, bytes):
         dtype = dtype.decode(errors="replace")
-    if not isinstance(dtype, str) or not _known(dtype) or not isinstance(data, bool | int | float):
+    if not isinstance(dtype, str) or not is_number_type(dtype) or not isinstance(data, bool | int | float):
         raise WireError(f"{where}: a number of type {str(dtype)[:40]!r}, expected bool, integer or float")
     return data
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.policies.serve.packed_arrays import WireError
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = ["fitted_picture"]
 

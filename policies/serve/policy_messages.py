@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
-from arena_newton.policies.serve.packed_arrays import WireError
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = [
     "LONGEST_CHUNK",

@@ -32,9 +32,9 @@ from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.serve.handshake import RATE, ServedFacts, ServedPicture
-from arena_newton.policies.serve.packed_arrays import WireError
 from arena_newton.policies.serve.picture_fit import fitted_picture
 from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.serve.wire_error import WireError
 from arena_newton.text import plain_text
 
 __all__ = ["Answer", "PolicyServer", "Refused", "ServerCounts"]
@@ -46,8 +46,8 @@ IDLE = 30.0
 WARM_UP_SEED = 0
 """Seed of the look before the first one, which nobody is answered."""
 
-type Reason = Literal["unfit", "unknown_episode", "full", "policy"]
-"""Why a request is refused: what it says, an episode that is not known, no free row, or the policy failed."""
+type Reason = Literal["unfit", "unknown_episode", "full", "policy", "closing"]
+"""Why a request is refused: what it says, an unknown episode, no free row, the policy failed, or the server ends."""
 
 
 class Refused(ArenaError):
@@ -215,6 +215,7 @@ class PolicyServer:
         self._facts = ServedFacts(
             policy=f"{self.policy.name} {digest}",
             labels=labels,
+            realign=float(getattr(self.policy, "realign", 0.0)) if labels == "v4" else None,
             action_names=tuple(action_names(labels)),
             state_names=tuple(state_names()),
             chunk_length=int(chunk.actions.shape[1]),
@@ -270,7 +271,7 @@ class PolicyServer:
     def _put(self, job: _Job) -> None:
         with self._news:
             if self._closed:
-                job.done.set_exception(Refused("policy", "the server is closing"))
+                job.done.set_exception(Refused("closing", "the server is closing"))
                 return
             self._jobs.append(job)
             self._news.notify_all()
@@ -295,7 +296,7 @@ class PolicyServer:
                 continue
             self._answer(self._batch(job))
         for job in self._jobs:
-            job.done.set_exception(Refused("policy", "the server is closing"))
+            job.done.set_exception(Refused("closing", "the server is closing"))
 
     def _batch(self, first: _Job) -> list[_Job]:
         """Looks that are answered together; what begins or ends meanwhile is done at once, unless it is theirs."""
@@ -464,7 +465,7 @@ class PolicyServer:
             self._check_shape(chunk.actions)
             chosen = torch.as_tensor(chunk.actions)[rows].detach().cpu().numpy()
         except Exception as error:
-            refusal = self._refusal(error)
+            refusal = self._refusal(error, "policy")
             for job, _ in asking:  # what the policy remembers of them is not known
                 self._drop((job.owner, job.session))
                 job.done.set_exception(refusal)
@@ -479,7 +480,7 @@ class PolicyServer:
                 session.answer = self.protocol.validate(made, f"policy {self.policy.name}").copy()
                 job.done.set_result(Answer(session.answer, 1000 * (time.monotonic() - job.came)))
             except Exception as error:
-                job.done.set_exception(self._refusal(error))
+                job.done.set_exception(self._refusal(error, "policy"))
 
     def _check_shape(self, actions: torch.Tensor | np.ndarray) -> None:
         shape = tuple(actions.shape)
@@ -487,7 +488,7 @@ class PolicyServer:
             wanted = f"[{self.max_sessions}, n, {ACTION_WIDTH}]"
             raise InputError(f"policy {self.policy.name}: a chunk of shape {list(shape)}, expected {wanted}")
 
-    def _refusal(self, error: Exception) -> Refused:
+    def _refusal(self, error: Exception, reason: Reason = "unfit") -> Refused:
         """What the client is told of an error; the console is told all of it where it is not a client's fault."""
         self.counts.refused += 1
         match error:
@@ -496,6 +497,6 @@ class PolicyServer:
             case PolicyUnavailable():
                 return Refused("policy", str(error))
             case WireError() | InputError():
-                return Refused("unfit", str(error))
+                return Refused(reason, str(error))
         print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
         return Refused("policy", f"the policy failed ({type(error).__name__}); the server's console says more")

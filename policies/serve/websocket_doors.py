@@ -10,8 +10,10 @@ import http
 import logging
 import socket
 import ssl
+import sys
 import threading
 import time
+import traceback
 from collections import deque
 from typing import Literal
 
@@ -26,9 +28,9 @@ from arena_newton.errors import ArenaError
 from arena_newton.policies.serve import openpi_codec, vla_eval_codec
 from arena_newton.policies.serve.arena_codec import pack_config, pack_failure
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME
 from arena_newton.policies.serve.policy_messages import Begin, End, Look
 from arena_newton.policies.serve.policy_server import PolicyServer
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 from arena_newton.text import plain_text
 
 __all__ = ["WebsocketDoor", "WebsocketProtocol"]
@@ -133,6 +135,9 @@ class WebsocketDoor:
                     self._serve_openpi(connection, owner)
         except (ConnectionClosed, OSError):
             pass  # the robot has left
+        except Exception:
+            print(traceback.format_exc(), file=sys.stderr, flush=True)
+            connection.close(INTERNAL_ERROR, "the server failed; its console says more")
         finally:
             self._policy.leave(owner)
             with self._lock:

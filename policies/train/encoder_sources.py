@@ -183,6 +183,8 @@ def read_clip(folder: Path) -> ClipShape:
     Raises:
         InputError: There is none.
     """
+    if not (folder / "config.json").is_file():
+        raise InputError(f"{folder}: holds no CLIP (no config.json)")
     try:
         config = CLIPConfig.from_pretrained(folder, local_files_only=True)
     except (OSError, ValueError, TypeError, KeyError) as error:

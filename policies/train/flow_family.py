@@ -10,6 +10,7 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 from transformers import CLIPTextModel, CLIPVisionModel, PreTrainedModel, PreTrainedTokenizerBase
+from transformers.utils import logging as transformers_logging
 
 from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
@@ -165,10 +166,14 @@ def _check(clip: ClipShape, tokens: int, recipe: TrainingRecipe, folder: Path) -
 
 def _whole(kind: type[PreTrainedModel], folder: Path) -> torch.nn.Module:
     """A part of CLIP all of whose weights are in the folder; transformers would draw those that are missing."""
+    said_before = transformers_logging.get_verbosity()
+    transformers_logging.set_verbosity_error()  # it would warn about the half of CLIP that the other encoder takes
     try:
         loaded: object = kind.from_pretrained(folder, local_files_only=True, output_loading_info=True)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: holds no weights of CLIP ({str(error).splitlines()[0]})") from None
+    finally:
+        transformers_logging.set_verbosity(said_before)
     assert isinstance(loaded, tuple)
     model, said = loaded
     missing = sorted({*said["missing_keys"], *(one[0] for one in said.get("mismatched_keys", ()))})

@@ -19,6 +19,7 @@ from websockets.sync.server import serve
 
 from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.data.label_protocols import action_names
+from arena_newton.data.layouts import state_names
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies import Chunk, Observation, Policy, world_mask
 from arena_newton.policies.serve import openpi_codec, vla_eval_codec
@@ -41,6 +42,7 @@ def facts(**other):
         "policy": "noise 1",
         "labels": "v3.1",
         "action_names": names,
+        "state_names": tuple(state_names()),
         "chunk_length": CHUNK,
         "rate_hz": 50.0,
         "needs_picture": True,
@@ -193,6 +195,8 @@ class SocketServer(Recorder):
         elif kind == "text":
             socket.send(TRACEBACK)
             socket.close(1011, "Internal server error. Traceback included in previous frame.")
+        elif kind == "unknown":
+            socket.send("unknown episode")
         elif kind == "escapes":
             socket.send("\x1b[31mred\x1b[0m \x1b]0;title\x07" + self.tokens[-1].split()[-1] + "\n")
         elif kind == "garbage":
@@ -240,6 +244,8 @@ class SocketServer(Recorder):
             kind = self.fault(request)
             if kind == "text":
                 socket.send(vla_eval_codec.pack_error("RuntimeError: CUDA out of memory", message.seq, 0.0))
+            elif kind == "unknown":
+                socket.send(vla_eval_codec.pack_error("unknown episode", message.seq, 0.0))
             elif kind == "late":
                 rows = answer(request.state, request.image, 0, 0)
                 socket.send(vla_eval_codec.pack_action(rows, message.seq - 1, 0.0))

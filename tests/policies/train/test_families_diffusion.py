@@ -26,8 +26,7 @@ def lerobots(model, batch):
     return {**batch, **{name: batch[name].unsqueeze(1) for name in names}}
 
 
-@pytest.mark.parametrize("mask", [False, True])
-@pytest.mark.parametrize("prediction", ["epsilon", "sample"])
+@pytest.mark.parametrize(("prediction", "mask"), [("epsilon", False), ("sample", True)])
 def test_loss_is_lerobots(model, monkeypatch, mask, prediction):
     """With the same random numbers the loss and its gradients are those of `DiffusionPolicy.forward`."""
     monkeypatch.setattr(model.policy.config, "do_mask_loss_for_padding", mask)

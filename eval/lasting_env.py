@@ -1,0 +1,59 @@
+"""Environments for runs that follow each other: one that is asked for again is handed out again, not built again.
+
+Building an environment takes seconds, for runs of a minute. An episode begins from its seed alone, so what ran before
+in the same environment does not change it; a test compares them bit for bit.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+from typing import Any
+
+from arena_newton.env import ArenaEnv
+from arena_newton.trackers.base import Tracker
+
+__all__ = ["EnvironmentKeeper", "LastingEnv"]
+
+
+class LastingEnv(ArenaEnv):
+    """An environment that its run does not release."""
+
+    def close(self) -> None:
+        """End the episodes; the physics stays for the next run."""
+        self.active[:] = False
+
+    def end(self) -> None:
+        """Release the physics' threads; the environment steps no more."""
+        super().close()
+
+
+class EnvironmentKeeper:
+    """Makes environments (`Factories.env`) and keeps the last one."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._key: object = None
+        self._env: LastingEnv | None = None
+        self.built = 0
+        """Environments built so far."""
+
+    def __call__(self, task: str, *, tracker: Tracker, **options: Any) -> LastingEnv:
+        """The environment of a run, whose arguments are those of `ArenaEnv`.
+
+        A tracker that says the same of itself as the last one's is taken to be the same.
+        """
+        said = json.dumps(tracker.describe(), sort_keys=True, default=str)
+        key = (task, type(tracker), said, tuple(sorted(options.items(), key=lambda item: item[0])))
+        if self._env is None or self._key != key:
+            self.drop()
+            self._env = LastingEnv(task, tracker=tracker, **options)
+            self._key, self.built = key, self.built + 1
+        return self._env
+
+    def drop(self) -> None:
+        """Release the last environment: it is not needed any more, or what ran in it broke down."""
+        if self._env is not None:
+            self._env.end()
+        self._key = self._env = None
+        gc.collect()

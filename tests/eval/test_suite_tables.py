@@ -1,0 +1,414 @@
+"""The paper's tables from suites: numbers in closed form, paired tests, text that stays text, the same bytes again."""
+
+import csv
+import dataclasses
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+
+import pytest
+from made_suites import cell_of, outcomes, write_cell, write_suite
+
+from arena_newton.errors import InputError
+from arena_newton.eval import paper_claims, table_text
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.evaluated_cells import read_cells
+from arena_newton.eval.paper_numbers import paper_numbers
+from arena_newton.eval.stats import contrast, holm, mcnemar, suites, wilson
+from arena_newton.eval.suite_records import SUITE_FILE
+from arena_newton.eval.suite_tables import suite_tables
+from arena_newton.eval.table_entries import SuiteTable, interval_text, points, probability
+
+HOI, HSI = suites()["HOI_AVG"], suites()["HSI_AVG"]
+
+
+def plan():
+    """Cells of a suite: two families on HOI, swaps, modes, merged training, latency, both label protocols."""
+    cells = []
+    for number, task in enumerate(HOI):
+        cells.append((cell_of("act", "act", "twist2", task), outcomes(30 + 6 * number, falls=3)))
+        cells.append((cell_of("dp", "diffusion", "twist2", task), outcomes(12 + 6 * number, offset=3)))
+        cells.append((cell_of("act", "act", "sonic", task), outcomes(48)))
+        cells.append((cell_of("act", "act", "twist2", task, mode="visual"), outcomes(15 + 6 * number)))
+        cells.append((cell_of("act", "act", "twist2", task, mode="semantic"), outcomes(30 + 6 * number)))
+        for tracker, won in (("twist2", 20), ("sonic", 40)):
+            both = cell_of("all", "act", tracker, task, trained_on=("sonic", "twist2"), tasks_of=HOI + HSI)
+            cells.append((both, outcomes(won)))
+    cells.append((cell_of("act", "act", "sonic", "football", trained_on=("twist2",)), outcomes(5, falls=12)))
+    cells.append((cell_of("dp", "diffusion", "sonic", "football", trained_on=("twist2",)), outcomes(0)))
+    cells.append((cell_of("act", "act", "twist2", "football", trained_on=("sonic",)), outcomes(40)))
+    cells.append((cell_of("pi", "pi05", "twist2", "boxing"), outcomes(0)))
+    cells.append((cell_of("pi", "pi05", "sonic", "boxing", trained_on=("twist2",)), outcomes(0)))
+    cells.append((cell_of("act", "act", "twist2", "football", latency=10), outcomes(20)))
+    cells.append((cell_of("act", "act", "twist2", "football", labels="v4"), outcomes(45)))
+    cells.append((cell_of("expert", "expert", "twist2", "football", trained_on=(), tasks_of=()), outcomes(60)))
+    cells.append((cell_of("act", "act", "twist2", "vis_navi"), None))
+    return cells
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory):
+    """The suite's folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)  # thousands of journal lines
+        return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
+
+
+@pytest.fixture(scope="module")
+def cells(suite):
+    """Its cells."""
+    return read_cells([suite])
+
+
+@pytest.fixture(scope="module")
+def tables(cells):
+    """Its tables by name."""
+    return {table.name: table for table in suite_tables(cells.cells, paper_numbers())}
+
+
+def entry(table, **wanted):
+    """The one entry with these values."""
+    (found,) = [e for e in table.entries if all(getattr(e, key) == value for key, value in wanted.items())]
+    return found
+
+
+def row(table, *start):
+    """The one row that begins with these texts, by its head."""
+    (found,) = [r for r in table.rows if r[: len(start)] == start]
+    return dict(zip(table.head, found, strict=True))
+
+
+def test_every_kind_of_table_is_made(tables):
+    """All tables that the cells can fill are there, and each row has a text for each column."""
+    names = "in_gmt in_gmt_visual in_gmt_semantic best families perturbation cross_gmt merge_all latency labels cost"
+    assert list(tables) == names.split()
+    for table in tables.values():
+        assert all(len(r) == len(table.head) for r in table.rows)
+        assert all(group < len(table.rows) for group in table.groups)
+
+
+def test_in_gmt_by_the_conventions_of_the_paper(tables):
+    """Means and population std of seeds, falls of all episodes of a row, Wilson's interval, the paper's row below."""
+    table = tables["in_gmt"]
+    first = entry(table, policy="act v3.1", tracker="twist2", task="football")
+    # 30 successes of the first 60 episodes: seeds with 20, 10 and 0 of 20.
+    assert (first.successes, first.episodes, first.sr) == (30, 60, 0.5)
+    assert first.sr_std == pytest.approx((1 / 6) ** 0.5)
+    assert [first.low, first.high] == pytest.approx(wilson(30, 60))
+    shown = row(table, "twist2", "act v3.1", "ours")
+    assert shown["AFR"] == "5.00" and shown["n"] == "60"
+    assert shown["Football"] == "50.0 ± 40.8 (38 to 62)"
+    assert shown["Boxing"] == "" and not {"VisNavi", "HSI avg"} & set(shown)
+    average = entry(table, policy="act v3.1", tracker="twist2", task="HOI_AVG")
+    rates = [1, 0.5, 0, 1, 0.8, 0, 1, 1, 0.1]
+    mean = sum(rates) / 9
+    assert average.sr == pytest.approx(mean) and average.episodes == 180
+    assert average.sr_std == pytest.approx((sum((r - mean) ** 2 for r in rates) / 9) ** 0.5)
+    assert average.low < mean < average.high
+    theirs = row(table, "twist2", "ACT", "paper")
+    assert theirs["Football"] == "26.7 ± 6.2 (17 to 39)" and theirs["HOI avg"] == "28.33 ± 13.94"
+    assert (
+        theirs["AFR"] == "6.43" and entry(table, source="paper", family="act", tracker="twist2", task="boxing").derived
+    )
+    assert row(table, "twist2", "expert", "ours")["Football"] == "100.0 ± 0.0 (94 to 100)"
+    assert not [r for r in table.rows if r[1] == "all"]
+
+
+def test_best_next_to_the_best_of_the_paper(tables):
+    """The highest of ours, the highest of the paper with its family, and whether the intervals are apart."""
+    shown = row(tables["best"], "twist2", "Football")
+    assert shown["best of ours"] == "act v4" and shown["best of the paper"] == "FM"
+    assert row(tables["best"], "twist2", "Boxing")["ours is"] == "not higher"
+    assert row(tables["best"], "sonic", "DoubleDesk")["ours is"] == "apart"
+    assert row(tables["best"], "twist2", "P&PBox")["ours is"] in ("higher", "apart")
+
+
+def test_cross_gmt_is_paired(tables):
+    """Drop, retention and exact test over the same episodes; undefined where nothing succeeded matched."""
+    table = tables["cross_gmt"]
+    swap = entry(table, source="ours", policy="act v3.1", trained_on="twist2", task="football")
+    assert (swap.matched_sr, swap.sr, swap.drop) == (0.5, 5 / 60, pytest.approx(25 / 60))
+    assert swap.retention == pytest.approx(5 / 30)
+    assert (swap.pairs, swap.unpaired, swap.only_first, swap.only_second) == (60, 0, 25, 0)
+    assert swap.p == mcnemar(25, 0) and swap.afr == 0.2
+    tests = [e.p for e in table.entries if e.source == "ours"]
+    assert [e.p_holm for e in table.entries if e.source == "ours"] == pytest.approx(holm(tests))
+    pi = row(table, "twist2 → sonic", "Boxing", "pi")
+    assert pi["Ret %"] == "—" and pi["p"] == "1.000"
+    dp = row(table, "twist2 → sonic", "Football", "dp")
+    assert dp["Ret %"] == "0.0" and dp["paper Ret %"] == "46.5" and dp["paper Δ"] == "+25.0"
+    assert row(table, "sonic → twist2", "Football", "act v3.1")["matched %"] == "80.0"
+    theirs = entry(table, source="paper", family="act", trained_on="twist2", task="football")
+    assert (theirs.drop, theirs.retention) == (0.267, 0.0)
+
+
+def test_families_are_compared_on_the_same_episodes(tables):
+    """Every pair of policies of a tracker and task has discordant pairs and an adjusted p."""
+    shown = row(tables["families"], "twist2", "Football", "act v3.1", "dp")
+    # act succeeds in episodes 0 to 29, dp in 3 to 14.
+    assert (
+        shown["alone"] == "18/0" and shown["n"] == "60" and shown["first %"] == "50.0" and shown["second %"] == "20.0"
+    )
+    (found,) = [
+        e for e in tables["families"].entries if (e.policy, e.task) == ("dp", "football") and e.only_first == 18
+    ]
+    assert found.p == mcnemar(18, 0) <= found.p_holm
+
+
+def test_perturbation_profile(tables):
+    """Averages over the tasks that every mode has, and the paired change from base."""
+    shown = row(tables["perturbation"], "twist2", "act v3.1", "ours", "HOI")
+    assert shown["base"] == "60.0" and shown["semantic"].startswith("60.0, 0.0 (")
+    assert shown["visual"].startswith("35.0, −25.0 (")
+    drop = entry(tables["perturbation"], source="ours", policy="act v3.1", task="HOI_AVG", mode="visual")
+    one = [dict(enumerate([True] * won + [False] * (60 - won))) for won in (30, 36, 42, 15, 21, 27)]
+    found = contrast([[(1 / 3, one[k]), (-1 / 3, one[k + 3])] for k in range(3)])
+    assert (drop.drop, drop.drop_low, drop.drop_high) == pytest.approx((found.value, found.low, found.high))
+    assert drop.pairs == 180
+    assert row(tables["perturbation"], "twist2", "ACT", "paper", "HOI")["visual"] == "14.4, −13.9"
+
+
+def test_merged_training_pools_both_trackers(tables):
+    """A policy of both trackers' demonstrations has 120 episodes a task, next to the paper's x14."""
+    shown = row(tables["merge_all"], "TWIST2+SONIC ×14", "all", "ours")
+    assert shown["n"] == "120" and shown["Football"].startswith("50.0 ± 50.0 (")
+    theirs = row(tables["merge_all"], "TWIST2+SONIC ×14", "ACT", "paper")
+    assert theirs["Football"].startswith("32.5 ± 18.4") and theirs["n"] == "100 to 120"
+
+
+def test_latency_and_labels(tables):
+    """A delay is compared with none, v4 with v3.1, over the same episodes."""
+    shown = row(tables["latency"], "twist2", "act v3.1", "Football")
+    assert shown["0 ms"] == "50.0 (38 to 62)" and shown["200 ms"] == "33.3 (23 to 46), p 0.002"
+    assert mcnemar(10, 0) == pytest.approx(0.00195, abs=1e-5)
+    shown = row(tables["labels"], "twist2", "twist2", "matched", "Football")
+    assert shown["v3.1 %"] == "50.0" and shown["v4 %"] == "75.0" and shown["alone"] == "0/15"
+
+
+def test_time_is_summed(tables):
+    """Minutes of the cells by policy and tracker, as the suite's journal says."""
+    shown = row(tables["cost"], "act v3.1", "sonic", "sonic", "cpu")
+    assert shown["cells"] == "3" and shown["episodes"] == "180"
+    assert shown["evaluation min"] == "4.5" and shown["min per cell"] == "1.50" and shown["training min"] == ""
+
+
+def test_trainings_count_once(tmp_path):
+    """Minutes of a training are in the first row that uses its weights."""
+    for tracker in ("twist2", "sonic"):
+        facts = {"family": "act", "trackers": ["twist2"], "tasks": ["boxing"], "weights": "aa", "minutes": 3.5}
+        write_cell(tmp_path / tracker, cell_of("x", "x", tracker, "boxing"), outcomes(9), policy_facts=facts)
+    found = read_cells([tmp_path / "twist2", tmp_path / "sonic"])
+    (table,) = [t for t in suite_tables(found.cells, paper_numbers()) if t.name == "cost"]
+    assert row(table, "act", "twist2", "twist2")["training min"] == "3.5"
+    assert row(table, "act", "twist2", "sonic")["training min"] == "above"
+
+
+def test_what_is_missing_is_said(cells, suite):
+    """Cells that were not played are a note, and no row."""
+    assert f"{suite}: 1 cell of {len(plan())} not played yet." in cells.notes
+    assert f"{60 * (len(plan()) - 1):,} episodes in {len(plan()) - 1} cells.".replace(",", "") in [
+        note.replace(",", "") for note in cells.notes
+    ]
+
+
+def test_unequal_seeds_are_never_compared_as_pairs(tmp_path):
+    """Of two cells of which one is incomplete only common episodes are compared, and the others are counted."""
+    matched, swapped = (
+        cell_of("act", "act", tracker, "football", trained_on=("twist2",)) for tracker in ("twist2", "sonic")
+    )
+    write_suite(tmp_path / "suite", [(matched, outcomes(30)), (swapped, None)])
+    write_cell(tmp_path / "suite" / swapped.folder, swapped, outcomes(10), played=20)
+    found = read_cells([tmp_path / "suite"])
+    assert f"{tmp_path / 'suite' / swapped.folder} is incomplete: 20 of 60 episodes." in found.notes
+    (table,) = [t for t in suite_tables(found.cells, paper_numbers()) if t.name == "cross_gmt"]
+    mine = entry(table, source="ours")
+    assert (mine.pairs, mine.unpaired, mine.matched_sr, mine.drop) == (20, 40, 1.0, 0.5)
+
+
+def test_plain_folders_without_a_suite(tmp_path):
+    """Results folders of `eval run` fill the tables with what their policy said of itself."""
+    for tracker, won in (("twist2", 30), ("sonic", 6)):
+        cell = cell_of("x", "x", tracker, "boxing")
+        facts = {
+            "family": "act",
+            "facts": {"recipe": "fast", "trackers": ["twist2"], "tasks": ["boxing"], "labels": "v4"},
+        }
+        write_cell(tmp_path / tracker, cell, outcomes(won), policy_facts=facts, labels="v4")
+    write_cell(tmp_path / "stand", dataclasses.replace(cell_of("x", "x", "pd", "boxing"), spec="stand"), outcomes(0))
+    found = read_cells([tmp_path / "twist2", tmp_path / "sonic", tmp_path / "stand"])
+    made = {t.name: t for t in suite_tables(found.cells, paper_numbers())}
+    assert row(made["in_gmt"], "twist2", "act fast", "ours")["Boxing"].startswith("50.0")
+    assert row(made["cross_gmt"], "twist2 → sonic", "Boxing", "act fast")["Ret %"] == "20.0"
+    assert row(made["in_gmt"], "pd", "stand", "ours")["Boxing"].startswith("0.0")
+    assert entry(made["cross_gmt"], source="ours").labels == "v4"
+
+
+def test_other_rules_are_left_out(tmp_path):
+    """Episodes of another rule set are counted in a note; without any of the rules asked for it is an error."""
+    cell = cell_of("act", "act", "twist2", "boxing")
+    write_cell(tmp_path / "a", cell, outcomes(30))
+    write_cell(tmp_path / "b", cell, outcomes(9), rules="released")
+    found = read_cells([tmp_path / "a", tmp_path / "b"])
+    assert "60 episodes under the rules released left out." in found.notes and len(found.cells) == 1
+    with pytest.raises(InputError, match="no episode under the rules paper, only released"):
+        read_cells([tmp_path / "b"])
+
+
+def test_cells_that_one_table_must_not_mix(tmp_path):
+    """The same cell twice and other step budgets are refused, with both folders."""
+    cell = cell_of("act", "act", "twist2", "boxing")
+    write_cell(tmp_path / "a", cell, outcomes(30))
+    write_cell(tmp_path / "b", cell, outcomes(9))
+    write_cell(tmp_path / "c", cell_of("act", "act", "twist2", "football"), outcomes(9), max_steps=1300)
+    with pytest.raises(InputError, match=f"{tmp_path / 'b'}: cell .* is in {tmp_path / 'a'} too"):
+        read_cells([tmp_path / "a", tmp_path / "b"])
+    with pytest.raises(InputError, match="max_steps is 1300, in"):
+        read_cells([tmp_path / "a", tmp_path / "c"])
+
+
+def test_command_writes_the_same_bytes_again(suite, tmp_path, capsys):
+    """The command writes every form, and two calls write equal bytes; the CSV holds each number once."""
+    pytest.importorskip("matplotlib")
+    for name in ("a", "b"):
+        assert main(["tables", str(suite), "--out", str(tmp_path / name), "--findings"]) == 0
+    out = capsys.readouterr().out
+    assert "tables: in_gmt, in_gmt_visual" in out and "## perturbation: visual drop: reproduces" in out
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert {"tables.md", "tables.tex", "cells.csv", "findings.md", "in_gmt.png", "cross_gmt.png"} <= set(names)
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    assert (tmp_path / "a" / "in_gmt.png").read_bytes()[:4] == b"\x89PNG"
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "a" / "cells.csv").read_text())))
+    mine = [r for r in rows if r["table"] == "cross_gmt" and r["source"] == "ours" and r["policy"] == "act v3.1"]
+    assert mine[0]["retention"] == "0.166667" and mine[0]["drop"] == "0.416667"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["tables"], "name the results folder"),
+        (["tables", "{suite}", "--format", "docx"], "--format docx: known are md tex csv png"),
+        (["tables", "{suite}", "--rules", "house"], "house"),
+        (["tables", "/nowhere"], "no results folder"),
+        (["tables", "{suite}", "{suite}"], "is named twice"),
+    ],
+)
+def test_wrong_calls_are_one_error(suite, tmp_path, capsys, arguments, message):
+    """Each wrong call ends with exit code 2 and one line, and writes nothing."""
+    out = tmp_path / "out"
+    assert main([a.format(suite=suite) for a in arguments] + ["--out", str(out)] * (len(arguments) > 1)) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+
+
+def hostile(text):
+    """A table whose policy and notes say this."""
+    return SuiteTable("x", "Title", f"caption {text}", ("policy", "rate"), 1, ((text, "1"),), (0,), ())
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a_b & 50 % #1 {x} \\input{/etc/passwd} $1$ ~ ^", "| <b>x</b> `y` [z](w)", "π0.5 ± 1 → — “猫”", "a\x1b[31m\nb"],
+)
+def test_text_stays_text(text):
+    """Names of a results folder can be no element, no command and no further column in any form."""
+    table = hostile(text)
+    latex = table_text.as_latex([table], [text])
+    assert balanced(latex) == []
+    assert latex.isascii() and "\\input" not in latex
+    (line,) = [line for line in latex.splitlines() if line.endswith("& 1 \\\\")]
+    assert len(re.findall(r"(?<!\\)&", line)) == 1
+    markdown = table_text.as_markdown([table], [text])
+    assert "<b>" not in markdown.replace("\\<", "") and "\x1b" not in markdown
+
+
+def balanced(latex):
+    """What a LaTeX text lacks: environments or braces that do not close, columns that a row lacks."""
+    found, stack = [], []
+    for kind, name in re.findall(r"\\(begin|end)\{(\w+)\}", latex):
+        if kind == "begin":
+            stack.append(name)
+        elif not stack or stack.pop() != name:
+            found.append(f"end of {name}")
+    found += [f"{name} is open" for name in stack]
+    bare = re.sub(r"\\[{}]", "", latex)
+    found += ["braces"] if bare.count("{") != bare.count("}") else []
+    found += ["dollars"] if len(re.findall(r"(?<!\\)\$", latex)) % 2 else []
+    for columns, body in re.findall(r"\\begin\{tabular\}\{([lr]+)\}(.*?)\\end\{tabular\}", latex, re.S):
+        for line in body.splitlines():
+            if line.endswith(r" \\") and len(re.findall(r"(?<!\\)&", line)) + 1 != len(columns):
+                found.append(f"columns of {line}")
+    found += [f"bare {c}" for c in "#_^~" if re.search(rf"(?<!\\)\{c}", bare.replace("$\\pm$", ""))]
+    return found
+
+
+def test_latex_is_whole(suite, tmp_path):
+    """The document of all tables closes what it opens and has a text for every column; where LaTeX is, it compiles."""
+    assert main(["tables", str(suite), "--out", str(tmp_path), "--format", "tex"]) == 0
+    text = (tmp_path / "tables.tex").read_text()
+    assert balanced(text) == [] and text.count(r"\toprule") == 11
+    assert balanced(text.replace(r"\bottomrule", r"\begin{x}", 1)) != []
+    if shutil.which("pdflatex"):
+        command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "tables.tex"]
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+        assert (tmp_path / "tables.pdf").stat().st_size > 1000
+
+
+def verdicts(found):
+    """Verdict by name of the finding."""
+    return {one.name: one.verdict for one in found}
+
+
+def test_findings_follow_the_data(cells):
+    """Claims that the made outcomes hold by far reproduce, those without data are not measured."""
+    found = {one.name: one for one in paper_claims.findings(cells.cells, paper_numbers())}
+    assert found["perturbation: visual drop"].verdict == "reproduces"
+    assert found["perturbation: visual drop"].ours.startswith("+25.0 points (")
+    assert found["perturbation: visual drop"].paper == "+9.2 points"
+    assert found["perturbation: visual against execution"].verdict == "not measured"
+    assert found["cross-GMT: twist2 → sonic"].verdict == "reproduces"
+    assert found["cross-GMT: twist2 → sonic"].paper == "+39.9 points on average; nothing left in 22 of 28 cells"
+    assert found["tracker-conditioned: SONIC ahead on HSI"].verdict == "not measured"
+    assert found["tracker-conditioned: SONIC ahead on HOI"].paper == "+16.1 points"
+    assert "## cross-GMT: twist2 → sonic: reproduces" in paper_claims.findings_text(list(found.values()))
+
+
+def test_a_claim_that_fails_does_not_reproduce(tmp_path, monkeypatch):
+    """Where visual perturbations change nothing and swaps cost nothing, the verdict says so."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+    plan = []
+    for task in (*HOI, *HSI):
+        for tracker, other in (("twist2", "sonic"), ("sonic", "twist2")):
+            plan.append((cell_of("act", "act", tracker, task), outcomes(45)))
+            plan.append((cell_of("act", "act", tracker, task, mode="visual"), outcomes(45)))
+            plan.append((cell_of("act", "act", other, task, trained_on=(tracker,)), outcomes(45)))
+    found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
+    said = verdicts(found)
+    assert said["perturbation: visual drop"] == said["cross-GMT: sonic → twist2"] == "does not"
+    assert said["cross-GMT: asymmetric drop"] == said["cross-GMT: asymmetric falls"] == "does not"
+    assert said["tracker-conditioned: same family"] == "does not"
+    assert said["SR and AFR disagree: sonic"] == "not measured"
+
+
+def test_damaged_suites_are_refused(suite, tmp_path):
+    """A suite whose file names another cell's folder, or is no JSON, is one error."""
+    copy = tmp_path / "suite"
+    shutil.copytree(suite, copy)
+    content = json.loads((copy / SUITE_FILE).read_text())
+    content["cells"][0]["folder"], content["cells"][1]["folder"] = (content["cells"][k]["folder"] for k in (1, 2))
+    (copy / SUITE_FILE).write_text(json.dumps(content))
+    with pytest.raises(InputError):
+        read_cells([copy])
+    (copy / SUITE_FILE).write_text("{")
+    with pytest.raises(InputError, match=SUITE_FILE):
+        read_cells([copy])
+
+
+def test_texts_of_numbers():
+    """Signs, intervals and small p-values are written the one way."""
+    assert points(-0.25) == "−25.0" and points(0.0) == points(-1e-9) == "0.0" and points(0.1) == "+10.0"
+    assert interval_text(-0.004, 0.5) == "(0 to 50)" and interval_text(-0.31, 0.5) == "(−31 to 50)"
+    assert probability(0.0004) == "<0.001" and probability(0.05) == "0.050" and probability(None) == ""
