@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import json
+
 from arena_newton.env import ArenaEnv
 from arena_newton.trackers.base import Tracker
 

@@ -19,10 +19,10 @@ from arena_newton.eval.config import RunConfig, resolve
 from arena_newton.eval.folder import ResultsFolder, iso, setting
 from arena_newton.eval.journal import StorageError
 from arena_newton.eval.lasting_env import EnvironmentKeeper
+from arena_newton.eval.matrix_cells import matrix_table, run_options
 from arena_newton.eval.progress import duration
 from arena_newton.eval.run import Factories, RunStopped, execute
 from arena_newton.eval.suite_call import SuiteCall
-from arena_newton.eval.suite_cells import matrix_table, run_options
 from arena_newton.eval.suite_file import SuiteFile
 from arena_newton.eval.suite_folder import SuiteFolder
 from arena_newton.eval.suite_options import MatrixOptions

@@ -1,4 +1,4 @@
-"""One environment for runs that follow each other: episodes are the same to the last bit, another one is built again."""
+"""One environment for runs that follow each other: episodes are the same to the last bit."""
 
 import json
 

@@ -9,7 +9,7 @@ import pytest
 from arena_newton.data.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.suite_cells import check_policies, expand_cells
+from arena_newton.eval.matrix_cells import check_policies, expand_cells
 from arena_newton.eval.suite_file import LABELS as KNOWN_LABELS
 from arena_newton.eval.suite_file import SHIPPED, read_suite_file, suite_path
 from arena_newton.eval.suite_records import (
@@ -208,7 +208,7 @@ def test_checkpoints_are_looked_at_first(checkpoints, change, said):
 
 
 def test_a_dry_run_shows_what_is_absent(checkpoints, tmp_path, capsys):
-    """A dry run prints the matrix, then what is absent, with code 2; --only asks for the checkpoints of its own cells."""
+    """A dry run prints the matrix, then what is absent, with code 2; --only asks for its own cells' alone."""
     (tmp_path / "both").rename(tmp_path / "moved")
     command = ["matrix", str(checkpoints), "--dry-run", "--out", str(tmp_path / "out")]
     assert main(command) == 2
