@@ -21,6 +21,7 @@ from arena_newton.canonical import STAND_ACTION, STATE_WIDTH
 from arena_newton.devices import resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeEvent, Observation, Spawn, Verdict
+from arena_newton.kernel_loading import loading
 from arena_newton.kernels import canonical, fall, reset
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
@@ -90,13 +91,27 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
+        with loading(self.engine, device, camera=camera is not None):
+            self._build(tracker, device, variant_file, fast_physics, drive, camera, threads)
+
+    def _build(
+        self,
+        tracker: Tracker,
+        device: str,
+        variant_file: str | None,
+        fast_physics: bool,
+        drive: DriveGains | None,
+        camera: CameraConfig | None,
+        threads: int | None,
+    ) -> None:
+        """Build scene and physics, and bind everything to them."""
         original = tracker.original_drive if self.rules.original_drive else None
         self.drive = drive or original or tracker.drive
         self.scene = load_scene(
-            task,
-            worlds=worlds,
+            self.spec.name,
+            worlds=self.worlds,
             device=device,
-            variant=None if variant_file and mode != "semantic" else self.spec.variant(mode, self.rules),
+            variant=None if variant_file and self.mode != "semantic" else self.spec.variant(self.mode, self.rules),
             rules=self.rules,
             drive=self.drive,
             variant_file=variant_file,
@@ -113,17 +128,17 @@ class ArenaEnv:
         """What turns actions into actuator targets."""
         self.startup_ticks: int = self.rules.startup.ticks
         """Length of the start-up [ticks]."""
-        self.tick = np.zeros(worlds, dtype=np.int64)
+        self.tick = np.zeros(self.worlds, dtype=np.int64)
         """Ticks since each world's step 0; negative during its start-up."""
-        self.active = np.zeros(worlds, dtype=bool)
+        self.active = np.zeros(self.worlds, dtype=bool)
         """Worlds that run an episode."""
         self.budget = self.spec.max_steps(self.rules)
         """Step budget of the rule set [ticks]."""
-        self.draws: list[Draws | None] = [None] * worlds
+        self.draws: list[Draws | None] = [None] * self.worlds
         """What was drawn for each world's episode."""
-        self._anchored = np.zeros(worlds, dtype=bool)
+        self._anchored = np.zeros(self.worlds, dtype=bool)
         self._stand = torch.tensor(STAND_ACTION, device=self.torch_device)
-        self._chosen, self._stepping = WorldMask(worlds, self.device), WorldMask(worlds, self.device)
+        self._chosen, self._stepping = WorldMask(self.worlds, self.device), WorldMask(self.worlds, self.device)
         self._lights: WorldLights | None = None
         self._newton_state: newton.State | None = None
         self.camera: Camera | None = None

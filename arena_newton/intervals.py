@@ -2,9 +2,9 @@
 
 import math
 
-__all__ = ["wilson"]
+__all__ = ["Z95", "wilson"]
 
-_Z95 = 1.959963984540054
+Z95 = 1.959963984540054
 """97.5 % quantile of the normal distribution."""
 
 
@@ -15,7 +15,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     """
     if trials == 0:
         return 0.0, 1.0
-    rate, z2 = successes / trials, _Z95 * _Z95
+    rate, z2 = successes / trials, Z95 * Z95
     centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z95 * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials * trials)) / (1 + z2 / trials)
+    half = Z95 * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials * trials)) / (1 + z2 / trials)
     return (0.0 if successes == 0 else centre - half), (1.0 if successes == trials else centre + half)

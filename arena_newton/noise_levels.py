@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 __all__ = ["NoiseLevels"]
+
+DEVIATIONS = ("joints", "velocity", "yaw_rate")
+"""Levels that are standard deviations; the others are times."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,11 @@ class NoiseLevels:
     """Time constant [s]."""
     yaw_leak: float = 10.0
     """Time in which the turn that has accumulated decays by 1/e [s]."""
+
+    def scaled(self, factor: float) -> NoiseLevels:
+        """The same noise with every standard deviation times a factor, as slow as before."""
+        deviations = {name: factor * getattr(self, name) for name in DEVIATIONS}
+        return replace(self, **deviations)
 
     def describe(self) -> dict[str, object]:
         """What a result must record to name the disturbance exactly, as JSON."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH
+from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import (
     Chunk,
@@ -28,6 +28,7 @@ from arena_newton.interfaces import (
 )
 from arena_newton.kernels import tick as codes
 from arena_newton.robot import TICK
+from arena_newton.text import counted
 
 __all__ = ["Rollout", "ending"]
 
@@ -81,6 +82,7 @@ class Rollout:
         recorder: Recorder | Sequence[Recorder] = (),
         disturbance: Disturbance | None = None,
         max_steps: int | None = None,
+        latency: int = 0,
         spawn: Spawn | None = None,
         on_finish: Callable[[EpisodeResult], None] | None = None,
         on_tick: Callable[[int], None] | None = None,
@@ -94,6 +96,9 @@ class Rollout:
             recorder: One recorder or several, which are called in their order.
             disturbance: Makes the executed actions of a tick from the policy's; recorders see the policy's.
             max_steps: Step budget instead of the rule set's [ticks].
+            latency: Ticks from a policy's look to the first action of its chunk. Meanwhile the chunk before goes on, so
+                that the policy looks again when so many actions of it are left; in an episode's first ticks the robot
+                stands.
             spawn: The robot's pose at a reset instead of the task's spawn pose.
             on_finish: Called with each result, in the order of ending.
             on_tick: Called each tick with the number of active worlds.
@@ -103,13 +108,16 @@ class Rollout:
         self.disturbance, self.spawn = disturbance, spawn
         self.budget = max_steps or env.budget
         self.on_finish, self.on_tick = on_finish, on_tick
+        self.latency = latency
         self._observing = any(one.wants_observation for one in self.recorders)
         self._waiting = deque(enumerate(episodes))
         self._running: dict[int, _Running] = {}
         self._results: dict[int, EpisodeResult] = {}
         self._chunk = torch.zeros((env.worlds, 1, ACTION_WIDTH), device=env.torch_device)
         self._next, self._length = np.zeros(env.worlds, np.int64), np.zeros(env.worlds, np.int64)
-        """Next action of each world's chunk, and the chunk's length."""
+        """Next action of each world's chunk, and its length; it begins with what is left of the chunk before."""
+        self._stand = torch.tensor(STAND_ACTION, device=env.torch_device).expand(env.worlds, latency, ACTION_WIDTH)
+        """What is played before an episode's first chunk begins, shape [worlds, latency, 40]."""
         self._rows = torch.arange(env.worlds, device=env.torch_device)
 
     def run(self) -> list[EpisodeResult]:
@@ -125,7 +133,7 @@ class Rollout:
         self.policy.attach(env)
         self._assign(range(env.worlds))
         while env.active.any():
-            asks = env.active & (env.tick >= 0) & (self._next >= self._length)
+            asks = env.active & (env.tick >= 0) & (self._next + self.latency >= self._length)
             observation = None
             if asks.any():
                 observation = env.observe(asks, image=self.policy.needs_image)
@@ -166,7 +174,7 @@ class Rollout:
             phase = None if answer.phases is None else answer.phases[world]
             phases = self._running[world].phases
             if phase is not None and (not phases or phases[-1][0] != phase):
-                phases.append((phase, int(self.env.tick[world])))
+                phases.append((phase, int(self.env.tick[world]) + self.latency))
         for world, message in failed.items():
             self._finish(world, "error", "policy", message)
         return list(failed)
@@ -180,12 +188,24 @@ class Rollout:
                 f"policy {self.policy.name}: a chunk of shape {list(actions.shape)}, expected "
                 f"[{worlds}, n, {ACTION_WIDTH}] with n of at least 1"
             )
+        if self.latency:
+            actions = torch.cat([self._left(actions.shape[1]), actions], dim=1)
         longer = actions.shape[1] - self._chunk.shape[1]
         if longer > 0:
             self._chunk = torch.nn.functional.pad(self._chunk, (0, 0, 0, longer))
         rows = torch.from_numpy(asks).to(self.env.torch_device)
         self._chunk[rows, : actions.shape[1]] = actions[rows]
         self._next[asks], self._length[asks] = 0, actions.shape[1]
+
+    def _left(self, length: int) -> torch.Tensor:
+        """What every world plays until a chunk of a length begins, shape [worlds, latency, 40]."""
+        if length <= self.latency:
+            late = f"--latency-ticks {self.latency}: policy {self.policy.name} gives chunks of"
+            raise InputError(f"{late} {counted(length, 'action')}; expected fewer ticks than that")
+        ticks = np.clip(self._next[:, None] + np.arange(self.latency), 0, self._chunk.shape[1] - 1)
+        left = self._chunk[self._rows[:, None], torch.from_numpy(ticks).to(self.env.torch_device)]
+        first = torch.from_numpy(self._length == 0).to(self.env.torch_device)
+        return torch.where(first[:, None, None], self._stand, left)
 
     def _tick(self, observation: Observation | None) -> np.ndarray:
         """Play the next action of every chunk; `observation` is what the policy saw at this tick, if it was asked."""
@@ -228,7 +248,7 @@ class Rollout:
             sim_s=float((tick + env.startup_ticks) * TICK),
             wall_s=time.perf_counter() - running.began,
             error=error,
-            phases=tuple(running.phases),
+            phases=tuple((name, first) for name, first in running.phases if not self.latency or first < tick),
             predicates=verdict.predicates,
             progress=1.0 if outcome == "success" else verdict.progress,
             events=verdict.events,

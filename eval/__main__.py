@@ -17,6 +17,7 @@ from arena_newton.eval.options import (
     CertifyOptions,
     EngineOptions,
     FilmOptions,
+    LoopOptions,
     RecordOptions,
     ReportOptions,
     RunOptions,
@@ -36,8 +37,10 @@ OVERVIEW = f"""commands:
   {PROG} record [flags]          record demonstrations for datasets, or more cameras with --from <out>
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
+  {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
+  {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
@@ -208,6 +211,16 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
     return suite_run.run(call, factories)
 
 
+def _loop(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(LoopOptions, arguments, f"{PROG} loop")
+    from arena_newton.extras import require
+
+    require("data", "eval loop")
+    from arena_newton.eval import learning_loop
+
+    return learning_loop.run(options, factories)
+
+
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
@@ -229,6 +242,18 @@ def _certify(arguments: list[str], factories: Factories | None) -> int:
     return certify.run(options, factories)
 
 
+def _tables(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.table_options import TablesOptions
+
+    if _wants_help(arguments):
+        parse_flags(TablesOptions, ["--help"], f"{PROG} tables <out> [<out> ...]")
+    folders = _folders(arguments, "tables")
+    options = parse_flags(TablesOptions, arguments, f"{PROG} tables")
+    from arena_newton.eval import tables_command
+
+    return tables_command.run(folders, options)
+
+
 _COMMANDS = {
     "run": _run,
     "record": _record,
@@ -236,6 +261,8 @@ _COMMANDS = {
     "report": _report,
     "film": _film,
     "matrix": _matrix,
+    "loop": _loop,
+    "tables": _tables,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,

@@ -26,7 +26,7 @@ from arena_newton.eval.records import JsonObject
 from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
-from arena_newton.policies.base import DATASET_FILE, dataset_target
+from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
 
@@ -38,7 +38,7 @@ __all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "recorded_ca
 
 DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
-POLICY_PATH_SCHEMES = ("replay",)
+POLICY_PATH_SCHEMES = ("lerobot", "replay")
 """Policies whose text after the colon is a path."""
 DRIVES: Mapping[str, DriveGains | None] = {
     "auto": None,
@@ -46,6 +46,10 @@ DRIVES: Mapping[str, DriveGains | None] = {
     "humanoidarena": TWIST2_HUMANOIDARENA_DRIVE,
 }
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
+CHUNK_FLAGS = ("replan", "ensemble", "latency_ticks")
+"""Flags that say how a policy's chunks are executed."""
+MOST_DISTURBANCE = 10.0
+"""Largest factor of the noise; no robot stands far less."""
 LABELS = ("v3.1", "v4")
 """Label protocols, `data.label_protocols.LABELS`, which loads torch."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
@@ -86,6 +90,8 @@ class RunConfig:
     """The package's own code that moves and judges, by content."""
     recording: Mapping[str, CameraConfig] | None = None
     """Recorded cameras by name; None where nothing is recorded."""
+    labels: str = "v3.1"
+    """Protocol of the policy's actions; final when the policy was made."""
     camera: CameraConfig | None = None
     """Camera that the policy asks for; None for one that does not see."""
     worlds_matter: bool = False
@@ -111,7 +117,7 @@ class RunConfig:
             "checkpoint": dict(self.checkpoint_hashes),
             "policy": self.policy_label,
             "policy_file": self.policy_hash,
-            "labels": flags.labels,
+            "labels": self.labels,
             "worlds": flags.worlds if self.worlds_matter else None,
             "rules": flags.rules,
             "rules_hash": self.rules_hash,
@@ -127,15 +133,26 @@ class RunConfig:
             "code": self.code_hash,
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
+            **self._chunks(),
             **self._demonstrations(),
         }
+
+    def _chunks(self) -> Identity:
+        """How chunks are executed, as far as it is not the usual: whole, at once, one after the other."""
+        given = {name: getattr(self.flags, name) for name in CHUNK_FLAGS}
+        return {name: value for name, value in given.items() if value}  # type: ignore[return-value]  # a part of one
 
     def _demonstrations(self) -> Identity:
         """What tells a run of `eval record` from an evaluation; nothing for one."""
         if self.flags.series is None:
             return {}  # type: ignore[typeddict-item]  # a part of one
-        noise = NoiseLevels().describe() if self.flags.disturb else None
+        scales = {task: self.noise_scale(task) for task in self.flags.task}
+        noise = NoiseLevels().describe() | {"scale": scales} if self.flags.disturb else None
         return {"seed_range": seeding.DEMONSTRATION, "disturbance": noise, "keep": self.flags.keep}  # type: ignore[typeddict-item]
+
+    def noise_scale(self, task: str) -> float:
+        """Factor of the noise that disturbs a task's demonstrations; 0 where nothing does."""
+        return self.flags.disturb_scale * task_specs.get(task).disturbance if self.flags.disturb else 0.0
 
     @property
     def hash(self) -> str:
@@ -153,6 +170,7 @@ class RunConfig:
         return dataclasses.replace(
             self,
             camera=(policy.camera or CameraConfig()) if policy.needs_image else None,
+            labels=self.flags.labels or getattr(policy, "labels", None) or "v3.1",
             worlds_matter=policy.depends_on_worlds,
             tracker_facts={name: _facts(tracker) for name, tracker in made.items()},
             policy_facts=_facts(policy),
@@ -181,6 +199,10 @@ def recording_run(options: RecordOptions) -> RunOptions:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
     if options.seed_series < 0:
         raise InputError(f"--seed-series {options.seed_series}: expected at least 0")
+    if not 0.0 <= options.disturb_scale <= MOST_DISTURBANCE:
+        raise InputError(f"--disturb-scale {options.disturb_scale:g}: expected 0 to {MOST_DISTURBANCE:g}")
+    if not options.disturb and options.disturb_scale != 1.0:
+        raise InputError("--disturb-scale: belongs to disturbed execution; drop it or --no-disturb")
     if options.accept_differences:
         raise InputError("--accept-differences: belongs to --from, which is not given")
     shared = {f.name for f in dataclasses.fields(RunOptions)} & {f.name for f in dataclasses.fields(options)}
@@ -221,7 +243,7 @@ def resolve(options: RunOptions) -> RunConfig:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
     scheme, _, target = options.policy.partition(":")
-    if scheme in POLICY_PATH_SCHEMES and target:
+    if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at)), "" if episode is None else f"#{episode}"
     else:
@@ -258,7 +280,7 @@ def resolve(options: RunOptions) -> RunConfig:
     )
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
-    policy_hash = hash_path(_decisive(policy_path)) if policy_path else None
+    policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
     engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     return RunConfig(
@@ -291,8 +313,9 @@ def _check_flags(options: RunOptions) -> None:
                 raise InputError(f"{_flag(field.name)} {plain_text(text)}: has control characters in it")
     if options.drive not in DRIVES:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
-    if options.labels not in LABELS:
+    if options.labels not in (None, *LABELS):
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
+    _check_chunks(options)
     if options.video_episodes is not None and options.video_episodes < 1:
         raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
     for name in ("video_episodes", "video_size", "follow"):
@@ -308,6 +331,21 @@ def _check_flags(options: RunOptions) -> None:
         raise InputError(f"--seeds {min(options.seeds)}: expected numbers of at least 0")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
+
+
+def _check_chunks(options: RunOptions) -> None:
+    """Refuse ways to execute chunks that contradict each other; chunks that are too short show at the first look."""
+    replan, late = options.replan, options.latency_ticks
+    if replan is not None and replan < 1:
+        raise InputError(f"--replan {replan}: expected at least 1")
+    if late < 0:
+        raise InputError(f"--latency-ticks {late}: expected at least 0")
+    if options.ensemble and replan is not None:
+        raise InputError("--ensemble: looks at every tick; drop it or --replan")
+    if late and options.ensemble:
+        raise InputError(f"--latency-ticks {late}: a chunk must be longer; --ensemble executes one action of each")
+    if replan is not None and 0 < replan <= late:
+        raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
 
 
 def _check_viewer(options: RunOptions) -> None:
@@ -403,31 +441,42 @@ def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, 
 
 
 def _policy_options(options: RunOptions) -> JsonObject:
-    """What --policy remote is made with; the flags are refused with another policy."""
-    if options.policy.partition(":")[0] == "remote":
+    """What a policy is made with besides its spec; flags of another policy are refused."""
+    scheme = options.policy.partition(":")[0]
+    for name in ("replan", "ensemble"):
+        if getattr(options, name) and scheme != "lerobot":
+            raise InputError(f"{_flag(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
+    if scheme == "remote":
         return {
             "timeout": options.remote_timeout,
             "retries": options.remote_retries,
             "sequential": options.remote_sequential,
             "verify_ssl": not options.remote_insecure,
-            "labels": options.labels,
+            "labels": options.labels or "v3.1",
         }
     for field in dataclasses.fields(options):
         if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
             raise InputError(f"{_flag(field.name)}: belongs to --policy remote:<url>, not {options.policy}")
-    return {}
+    return {"replan": options.replan, "ensemble": options.ensemble} if scheme == "lerobot" else {}
 
 
 def _shown(path: Path) -> str:
-    """Name of what is replayed: that of the run for its folder `actions`."""
+    """Name of what is played: of a run for its folder `actions`, of a training and its step for a checkpoint."""
+    inner = path.parent if path.name == "pretrained_model" else path
+    if inner.parent.name == "checkpoints":
+        return f"{inner.parents[1].name}-{inner.name}"
     return path.parent.name if path.name == "actions" and path.parent.name else path.name
 
 
-def _decisive(path: Path) -> Path:
-    """What of a policy's path counts by content: of a dataset, which may be large, its description.
+def _decisive(scheme: str, path: Path) -> Path:
+    """What of a policy's path counts by content: of a training the checkpoint, of a dataset its description.
 
     The policy itself says the hash of the actions that it plays.
     """
+    if scheme == "lerobot":
+        from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder  # imports torch
+
+        return checkpoint_folder(path)
     return path / DATASET_FILE if (path / DATASET_FILE).is_file() else path
 
 

@@ -73,6 +73,10 @@ class Identity(_Identity, total=False):
     policy: Name
     policy_file: Hash
     labels: Name
+    replan: Positive
+    """Absent, as the next two, where chunks are executed as usual."""
+    ensemble: bool
+    latency_ticks: Positive
     worlds: Annotated[float | None, Fit("a number or null")]
     rules_hash: Name
     engine: Name

@@ -114,7 +114,7 @@ class ResultsFolder:
             if (folder / name).is_symlink():
                 raise InputError(f"{folder / name}: is a link; a run writes inside its own folder only")
         stored = read_document(folder)
-        unknown = () if self.config.tracker_facts is not None else ("tracker_facts", "policy_facts", "worlds")
+        unknown = () if self.config.tracker_facts is not None else ("tracker_facts", "policy_facts", "worlds", "labels")
         difference = differing_key(stored["config"], self.config.identity(), unknown)
         if difference is not None:
             key, was, now = difference

@@ -31,9 +31,9 @@ __all__ = [
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
 _REPORTING = """__main__ bench bench_figure bench_recording certify config console document engines folder
-    html_report identity journal options original_format progress recording records report rerecord
-    results rounds stats success_film suite_call matrix_cells suite_file
-    suite_folder suite_options suite_records suite_run tables wording"""
+    html_report identity journal learning_loop loop_report matrix_cells options original_format progress recording
+    records report rerecord results rounds stats success_film suite_call suite_file suite_folder suite_options
+    suite_records suite_run tables wording"""
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""

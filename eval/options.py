@@ -15,6 +15,7 @@ __all__ = [
     "CertifyOptions",
     "EngineOptions",
     "FilmOptions",
+    "LoopOptions",
     "RecordOptions",
     "ReportOptions",
     "RunOptions",
@@ -46,10 +47,17 @@ class RunOptions:
     """Weights of the one tracker named: a .safetensors or official .onnx file (SONIC: a folder or two files with a
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
-    """Policy that decides it: expert, stand, replay:<clip, or actions of --actions>,
+    """Policy that decides it: expert, stand, lerobot:<checkpoint or training>, replay:<clip, or actions of --actions>,
     replay:<LeRobot dataset>#<episode, or all>, remote:<url>."""
-    labels: str = "v3.1"
-    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4."""
+    labels: str | None = None
+    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
+    itself when none is named, and v3.1 where it says nothing."""
+    replan: int | None = None
+    """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
+    ensemble: bool = False
+    """For --policy lerobot: look at every tick and execute the mean of all chunks that cover it."""
+    latency_ticks: int = 0
+    """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
     mode: tuple[str, ...] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
@@ -128,6 +136,8 @@ class RunOptions:
     """Successes to record of each task, tracker and mode; None: all episodes of the plan."""
     disturb: Annotated[bool, tyro.conf.Suppress] = False
     """Disturb what is executed; the recorded action is the policy's own."""
+    disturb_scale: Annotated[float, tyro.conf.Suppress] = 1.0
+    """Factor of the disturbance, beside that of each task (`TaskSpec.disturbance`)."""
 
 
 def is_quick(options: RunOptions) -> bool:
@@ -164,6 +174,8 @@ class RecordOptions:
     """Keep so many successes, with at most twice as many attempts; what fails is counted and not kept."""
     disturb: bool = True
     """Add slow noise to what is executed, not to the recorded action, so that recoveries are recorded."""
+    disturb_scale: float = 1.0
+    """Factor of the noise, beside that of each task (0.5 in pp_box and double_desk, which grasp; 1 in the others)."""
     seed_series: int = 0
     """Number of the series of seeds: another one gives other episodes."""
     cameras: tuple[str, ...] = ("front",)
@@ -192,6 +204,49 @@ class RecordOptions:
     """Play the recorded episodes of this folder again, and write them with these cameras to --out."""
     accept_differences: bool = False
     """With --from: go on although code, tracker, rules or scene are not those of the recording."""
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Record demonstrations, build a dataset, train a policy, evaluate it, and report: the whole loop in one command.
+
+    Each stage resumes: after an interruption the same command continues, and what is finished is not repeated.
+    """
+
+    task: tuple[str, ...] = ("vis_navi",)
+    """Tasks, which one policy learns together."""
+    tracker: str = "twist2"
+    """Tracker that records and executes."""
+    policy: str = "act"
+    """Family: act, diffusion, flow or pi05."""
+    recipe: str | None = None
+    """Settings of the training: fast (when none is named), paper, compact."""
+    minutes: float | None = None
+    """Time of the training [min]; the schedule is fitted to it. The recipe's number of steps when none is given."""
+    steps: int | None = None
+    """Optimizer steps instead of the recipe's."""
+    episodes: int | None = None
+    """Successes to record of each task: 100, or 3 episodes under --small."""
+    repeats: int | None = None
+    """Episodes of the evaluation for each of the group seeds 0 1 2: 20, or 1 under --small."""
+    seed: int = 0
+    """Seed of the training, and series of the recorded seeds."""
+    worlds: int | None = None
+    """Episodes simulated at once: 100 on CUDA and 20 on the CPU when none is given."""
+    engine: str = "auto"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine, networks and training: cpu, cuda, cuda:1."""
+    size: str | None = None
+    """Size of the recorded pictures, which is what the policy sees: 224x224, or 64x64 under --small [px]."""
+    max_steps: int | None = None
+    """Cap on the step budget of the rule set [ticks of 0.02 s]."""
+    weights: str | None = None
+    """Pretrained weights for the training: a name on the hub or a local folder."""
+    small: bool = False
+    """A loop for tests of the machinery: few episodes, small pictures, the recipe `small`; it learns nothing."""
+    out: str | None = None
+    """Folder; results/loop_<tasks>_<tracker>_<policy>_<recipe> when none is named."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.records import JsonObject
 from arena_newton.interfaces import EpisodeResult
+from arena_newton.noise_levels import NoiseLevels
 from arena_newton.text import counted
 
 __all__ = [
@@ -63,6 +64,7 @@ def facts_of(
         "scenes": hash_paths(PACKAGE, scene_files(PACKAGE, (task,), task_specs.names())),
         "environment": comparable,
         "versions": moving_versions(dict(versions)) | {"av": av.__version__},
+        **({"disturbance": noise.describe()} if (noise := disturbance_of(config, task, 1)) is not None else {}),
     }
 
 
@@ -92,9 +94,9 @@ def encoding_processes() -> int:
     return 0 if cores < PROCESS_CORES else min(MOST_ENCODERS, cores - 1)
 
 
-def disturbance_of(config: RunConfig, ticks: int) -> ActionNoise | None:
-    """What disturbs the execution of episodes of so many ticks at most; None where nothing does."""
-    return ActionNoise(ticks) if config.flags.disturb else None
+def disturbance_of(config: RunConfig, task: str, ticks: int) -> ActionNoise | None:
+    """What disturbs the execution of a task's episodes of so many ticks at most; None where nothing does."""
+    return ActionNoise(ticks, NoiseLevels().scaled(config.noise_scale(task))) if config.flags.disturb else None
 
 
 def is_recorded(config: RunConfig, folder: Path, record: EpisodeRecord, episode: Episode) -> bool:

@@ -114,6 +114,13 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     if "seed_range" in results["config"]:
         noise = " and disturbed execution" if results["config"].get("disturbance") else ""
         found.append(f"Demonstrations with seeds of their own range{noise}: no benchmark result.")
+    late, replan = results["config"].get("latency_ticks", 0), results["config"].get("replan")
+    if late:
+        found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's look.")
+    if replan:
+        found.append(f"The policy looks again after {counted(replan, 'action')} of each chunk.")
+    if results["config"].get("ensemble"):
+        found.append("The policy looks at every tick; the mean of all chunks that cover it is executed.")
     cap = results["config"]["max_steps"]
     if cap is not None:
         found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")

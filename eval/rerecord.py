@@ -110,7 +110,14 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
     if options.out is None:
         raise InputError("record --from: name a folder for the new files with --out")
     given = {"task": (), "tracker": (), "mode": (), "policy": "expert", "rules": "paper", "episodes": 100}
-    given |= {"only_success": False, "disturb": True, "seed_series": 0, "max_steps": None, "drive": "auto"}
+    given |= {
+        "only_success": False,
+        "disturb": True,
+        "disturb_scale": 1.0,
+        "seed_series": 0,
+        "max_steps": None,
+        "drive": "auto",
+    }
     for name, default in given.items():
         if getattr(options, name) != default:
             raise InputError(f"--{name.replace('_', '-')}: is in the recording; drop it beside --from")

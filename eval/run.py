@@ -116,7 +116,11 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
         policy.check_task(task, mode, [episode.episode_seed for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
-    return config.with_parts(made, policy), read_by(policy, config.flags.labels)
+    config = config.with_parts(made, policy)
+    late, chunk = config.flags.latency_ticks, getattr(policy, "chunk_size", 1)
+    if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show
+        raise InputError(f"--latency-ticks {late}: expected fewer ticks than the policy's chunk of {chunk} has")
+    return config, read_by(policy, config.labels)
 
 
 def _play(
@@ -292,7 +296,7 @@ class _Run:
             if self.viewer is not None:
                 self.viewer.open(env, group)
                 recorders.append(self.viewer)
-            noise = recording.disturbance_of(config, episodes[0].max_steps)
+            noise = recording.disturbance_of(config, task, episodes[0].max_steps)
             recorders += [] if noise is None else [noise]
             described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
             files = recording.demonstration_recorder(config, self.folder.path, described)
@@ -322,6 +326,7 @@ class _Run:
                     recorder=recorders,
                     disturbance=noise,
                     max_steps=episodes[0].max_steps,
+                    latency=flags.latency_ticks,
                     on_finish=on_finish,
                     on_tick=on_tick,
                 ).run()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypedDict
 
 from arena_newton import intervals, tasks
@@ -13,21 +14,30 @@ from arena_newton.text import plain_text
 
 __all__ = [
     "Aggregate",
+    "Contrast",
     "ResultCell",
     "ErrorReason",
     "Figures",
+    "PairedRates",
     "PooledFigures",
     "Suite",
     "aggregate",
     "cell",
+    "contrast",
     "error_reasons",
+    "holm",
+    "mcnemar",
     "outside_suites",
+    "paired_rates",
     "pooled",
     "population_std",
     "seed_rates",
     "suites",
     "wilson",
 ]
+
+type Outcomes = Mapping[Hashable, bool]
+"""Whether something held (a success, a fall) in each episode, by what names the episode in both of two conditions."""
 
 
 class Figures(TypedDict):
@@ -214,3 +224,116 @@ def aggregate(records: Iterable[EpisodeRecord]) -> Aggregate:
             if figures is not None:
                 averages.append({"suite": name, "tracker": tracker, "policy": policy, "mode": mode, **figures})
     return {"cells": cells, "suites": averages}
+
+
+@dataclass(frozen=True)
+class PairedRates:
+    """Two conditions over the episodes that both played."""
+
+    pairs: int
+    """Episodes of both; others do not count."""
+    unpaired: int
+    """Episodes of one condition only."""
+    first: float | None
+    """Rate of the first condition over the pairs."""
+    second: float | None
+    """Rate of the second condition over the pairs."""
+    only_first: int
+    """Pairs in which it held under the first condition alone."""
+    only_second: int
+    """Pairs in which it held under the second condition alone."""
+    p: float | None
+    """Exact McNemar test, two-sided; None without pairs."""
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """Exact two-sided McNemar test: the probability of discordant pairs at least as uneven as these by chance.
+
+    McNemar, Q. (1947), Psychometrika 12; the exact form is a binomial test of the discordant pairs against 1/2.
+    """
+    discordant, fewer = only_first + only_second, min(only_first, only_second)
+    if 2 * fewer == discordant:
+        return 1.0
+    tail = sum(math.comb(discordant, k) for k in range(fewer + 1))
+    return min(1.0, tail / (1 << discordant) * 2)
+
+
+def holm(probabilities: Sequence[float]) -> list[float]:
+    """p-values adjusted for their number, in the order given.
+
+    Holm, S. (1979): A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6.
+    """
+    adjusted, highest = [0.0] * len(probabilities), 0.0
+    for rank, number in enumerate(sorted(range(len(probabilities)), key=lambda i: probabilities[i])):
+        highest = max(highest, min(1.0, (len(probabilities) - rank) * probabilities[number]))
+        adjusted[number] = highest
+    return adjusted
+
+
+def paired_rates(first: Outcomes, second: Outcomes) -> PairedRates:
+    """Compare two conditions over the episodes that both have; the others are counted and left out."""
+    common = [key for key in first if key in second]
+    only_first = sum(first[key] and not second[key] for key in common)
+    only_second = sum(second[key] and not first[key] for key in common)
+    n = len(common)
+    return PairedRates(
+        pairs=n,
+        unpaired=len(first) + len(second) - 2 * n,
+        first=sum(first[key] for key in common) / n if n else None,
+        second=sum(second[key] for key in common) / n if n else None,
+        only_first=only_first,
+        only_second=only_second,
+        p=mcnemar(only_first, only_second) if n else None,
+    )
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A weighted sum of rates, such as a mean difference, and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    strata: int
+    """Groups of paired episodes, usually tasks."""
+    episodes: int
+    """Paired episodes over all groups; each was played under every condition of its group."""
+    unpaired: int
+    """Episodes that some condition of their group lacks; they are left out."""
+
+
+def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | None:
+    """Sum of weight x rate over conditions whose episodes are paired within a stratum, and its interval.
+
+    The interval is normal, from the spread of the episodes' own sums within each stratum, so conditions that share
+    episodes may correlate. Two made episodes a stratum, whose outcomes are as those of fair coins, keep it from closing
+    where nothing varies: of one difference of two rates that is the interval of Agresti, A. and Min, Y. (2005),
+    Simple improved confidence intervals for comparing matched proportions, Statistics in Medicine 24.
+
+    Args:
+        strata: Of each group of paired episodes its conditions: weight and outcomes.
+
+    Returns:
+        None where a stratum has no episode that all its conditions played.
+    """
+    value = variance = 0.0
+    episodes = unpaired = 0
+    for conditions in strata:
+        common = set.intersection(*(set(outcomes) for _, outcomes in conditions)) if conditions else set()
+        if not common:
+            return None
+        sums = [sum(weight * outcomes[key] for weight, outcomes in conditions) for key in common]
+        n = len(sums)
+        mean = math.fsum(sums) / n
+        shrunk = (n * mean + math.fsum(weight for weight, _ in conditions)) / (n + 2)
+        coin = math.fsum(weight * weight for weight, _ in conditions) / 4
+        centre = math.fsum(weight for weight, _ in conditions) / 2
+        squares = math.fsum((one - shrunk) ** 2 for one in sums) + 2 * (coin + (centre - shrunk) ** 2)
+        value += mean
+        variance += squares / (n + 2) ** 2
+        episodes += n
+        unpaired += len(set().union(*(set(outcomes) for _, outcomes in conditions))) - n
+    if not strata:
+        return None
+    half = intervals.Z95 * math.sqrt(variance)
+    return Contrast(value, value - half, value + half, len(strata), episodes, unpaired)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 
@@ -53,17 +54,28 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
     return f"{table}\n{_conditions(runs, policies, weights)}\n" + "".join(f"{note}\n" for note in _notes(runs, records))
 
 
+def _played(run: RunRecord) -> list[EpisodeRecord]:
+    """A run's episodes; how it executed chunks, where that is not the usual, belongs to the policy's name."""
+    late, replan = run.config.get("latency_ticks"), run.config.get("replan")
+    said = [f"looks every {counted(replan, 'tick')}"] if replan else []
+    said += ["ensembled"] if run.config.get("ensemble") else []
+    said += [f"{counted(late, 'tick')} late"] if late else []
+    return [dataclasses.replace(r, policy=", ".join([r.policy, *said])) for r in run.records] if said else run.records
+
+
 def _records(runs: Sequence[RunRecord]) -> list[EpisodeRecord]:
     """All episodes; none may be in two runs."""
     found: dict[tuple[object, ...], RunRecord] = {}
+    episodes = []
     for run in runs:
-        for r in run.records:
+        for r in _played(run):
             key = (r.task, r.tracker, r.policy, r.mode, r.group_seed, r.repeat)
             other = found.setdefault(key, run)
             if other is not run:
                 name = " ".join(map(plain, key[:4])) + f" seed {r.group_seed} repeat {r.repeat}"
                 raise InputError(f"{run.folder}: episode {name} is in {other.folder} too; leave one of them out")
-    return [record for run in runs for record in run.records]
+            episodes.append(r)
+    return episodes
 
 
 def _weights(runs: Sequence[RunRecord]) -> dict[str, str]:

@@ -33,7 +33,7 @@ __all__ = [
 
 MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head camera", "world": "world camera"}
 """Media of an episode that the page knows → what they show."""
-REPLAYED = ("policy", "checkpoint", "rules", "drive", "engine", "device", "variant", "max_steps")
+REPLAYED = ("policy", "checkpoint", "labels", "replan", "rules", "drive", "engine", "device", "variant", "max_steps")
 """Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
 REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
 """Flags that belong to a policy server → their defaults; others are named in the command."""
@@ -101,6 +101,10 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
             words += ["--" + name.replace("_", "-")]
         elif value is not False and value != default:
             words += ["--" + name.replace("_", "-"), value]
+    late, scale = options.get("latency_ticks"), options.get("disturb_scale")
+    words += ["--latency-ticks", late] if late else []
+    words += ["--ensemble"] if options.get("ensemble") is True else []
+    words += ["--disturb-scale", scale] if series is not None and scale not in (None, 1.0) else []
     words += ["--worlds", worlds] if worlds is not None else []
     words += ["--fast-physics"] if options.get("fast_physics") is True else []
     words += [] if series is not None else ["--video", "--strip"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ __all__ = [
     "check_spec",
     "dataset_target",
     "get",
+    "hub_name",
     "names",
     "register",
     "world_mask",
@@ -67,6 +69,8 @@ class Policy:
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
     labels: str | None = None
     """Protocol of its actions (`data.label_protocols`), where they are of one always; None: as `--labels` says."""
+    realign: float = 0.0
+    """Fraction of the gap between commanded and measured heading that is closed each tick, by who decodes v4."""
     chunk_size: int = 1
     """Actions per chunk, where the policy knows it in advance."""
     depends_on_worlds: bool = False
@@ -115,6 +119,7 @@ POLICIES: Registry[Policy] = Registry(
     lambda: Policy,
     {
         "expert": "arena_newton.policies.experts:from_spec",
+        "lerobot": "arena_newton.policies.lerobot.checkpoint_policy:from_spec",
         "remote": "arena_newton.policies.remote:from_spec",
         "replay": "arena_newton.policies.replay:from_spec",
         "stand": "arena_newton.policies.stand:from_spec",
@@ -141,6 +146,11 @@ def dataset_target(argument: str) -> tuple[Path, str | None]:
         return Path(argument), None
     path, hash_sign, episode = argument.rpartition("#")
     return (Path(path), episode) if hash_sign else (Path(argument), None)
+
+
+def hub_name(argument: str) -> bool:
+    """Whether text names a repository of the Hugging Face hub, `owner/name`, and no file or folder here."""
+    return bool(re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", argument)) and not Path(argument).expanduser().exists()
 
 
 def check_spec(spec: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH
+from arena_newton.canonical import ACTION_WIDTH, STATE
 from arena_newton.data.label_protocols import LABELS, V4Decoder, protocol
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
@@ -15,7 +15,7 @@ from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, w
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
 
-__all__ = ["V4Policy", "read_by"]
+__all__ = ["V4Policy", "measured_yaw", "read_by"]
 
 
 def read_by(policy: Policy, labels: str) -> Policy:
@@ -38,10 +38,17 @@ def read_by(policy: Policy, labels: str) -> Policy:
     return policy if wanted is LABELS["v3.1"] else V4Policy(policy)
 
 
+def measured_yaw(state: torch.Tensor) -> torch.Tensor:
+    """Heading of the robot in its episode's frame (yaw, ZYX) [rad], shape [worlds], of states [worlds, 64]."""
+    rot6d = state[:, STATE["root_rot6d"]].double()
+    return torch.atan2(rot6d[:, 2], rot6d[:, 0])  # R10 and R00: rows of the first two columns
+
+
 class V4Policy(Policy):
     """Decodes the v4 actions of another policy per world; an episode's heading is that of its own start.
 
-    A chunk must be executed to its end before the next one is asked for, as `rollout.Rollout` does.
+    A chunk must be executed to its end before the next one is asked for, as `rollout.Rollout` does. Where the policy
+    has a `realign`, the heading is measured whenever it looks.
     """
 
     labels = "v3.1"
@@ -52,6 +59,7 @@ class V4Policy(Policy):
         self.name = policy.name
         self.needs_image, self.camera = policy.needs_image, policy.camera
         self.chunk_size = policy.chunk_size
+        self._realign = float(getattr(policy, "realign", 0.0))
         self._decoder: V4Decoder | None = None
 
     @property
@@ -70,7 +78,7 @@ class V4Policy(Policy):
     def attach(self, env: World) -> None:
         """Take the worlds whose headings are integrated."""
         self.policy.attach(env)
-        self._decoder = V4Decoder(env.worlds, env.torch_device)
+        self._decoder = V4Decoder(env.worlds, env.torch_device, realign=self._realign)
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Begin new episodes at their heading."""
@@ -91,7 +99,12 @@ class V4Policy(Policy):
             shape = f"a chunk of shape {list(actions.shape)}, expected [{worlds}, n, {ACTION_WIDTH}]"
             raise InputError(f"policy {self.name}: {shape} with n of at least 1")
         if self._decoder is None:  # used without an environment, as a policy server does
-            self._decoder = V4Decoder(worlds, actions.device)
+            self._decoder = V4Decoder(worlds, actions.device, realign=self._realign)
+        if self._realign:
+            # A policy that gives a chunk in pieces looks at the first one only; which those are depends on others.
+            looked = getattr(self.policy, "looked", None)
+            measured = observation.mask if looked is None else observation.mask & looked
+            self._decoder.measure(measured_yaw(observation.state), measured)
         return Chunk(self._decoder.decode(actions, observation.mask), answer.errors, answer.phases)
 
     def describe(self) -> Json:

@@ -29,7 +29,8 @@ STARTS = (
     "trackers.train.__main__",
 )
 STARTS += ("trackers.train.__main__", "trackers.motions.__main__", "usd_scenes.__main__")
-STARTS += ("trackers.tracker_check", "policies.policy_check", "policies.teleop.__main__")
+STARTS += ("policies.train.__main__",)
+STARTS += ("trackers.tracker_check", "policies.policy_check", "policies.teleop.__main__", "policies.serve.__main__")
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
 PLANNING = ("eval.config", "eval.folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are

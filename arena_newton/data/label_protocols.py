@@ -193,23 +193,50 @@ def decode_v4(labels: np.ndarray, yaw0: float = 0.0) -> np.ndarray:
 
 
 class V4Decoder:
-    """Turns chunks of v4 into v3.1 for a batch of worlds; it remembers each world's yaw."""
+    """Turns chunks of v4 into v3.1 for a batch of worlds; it remembers each world's yaw.
 
-    def __init__(self, worlds: int, device: str | torch.device = "cpu", *, yaw0: float = 0.0):
+    With `realign` the commanded yaw follows the measured one: of the gap between them at the last measurement a
+    fraction is closed each tick, so that after k ticks (1 - realign)^k of it is left. It is rounded as rates are.
+    """
+
+    def __init__(self, worlds: int, device: str | torch.device = "cpu", *, yaw0: float = 0.0, realign: float = 0.0):
         """All worlds at the beginning of an episode.
 
         Args:
             worlds: Number of worlds.
             device: Torch device of the chunks.
             yaw0: Yaw at the beginning of an episode, in its own frame [rad].
+            realign: Fraction of the gap to the measured yaw that is closed each tick; 0: none, and yaws are exact.
         """
-        self._start = yaw0
+        self._start, self._realign = yaw0, realign
         self._turned = torch.zeros(worlds, dtype=torch.int64, device=device)
         """Yaw since the beginning [RATE_STEP ticks]."""
+        self._gap = torch.zeros(worlds, dtype=torch.float64, device=device)
+        """Measured minus commanded yaw at the last measurement [rad]."""
+        self._age = torch.zeros(worlds, dtype=torch.int64, device=device)
+        """Ticks since then."""
 
     def reset(self, mask: np.ndarray | torch.Tensor | None = None) -> None:
         """Begin new episodes in the worlds of `mask`, bool, shape [worlds]; in all without one."""
-        self._turned[self._mask(mask)] = 0
+        chosen = self._mask(mask)
+        self._turned[chosen] = 0
+        self._gap[chosen], self._age[chosen] = 0.0, 0
+
+    def measure(self, yaw: torch.Tensor, mask: np.ndarray | torch.Tensor | None = None) -> None:
+        """Take the measured heading at the tick at which the next chunk begins.
+
+        Args:
+            yaw: Of the robot in the episode's frame [rad], shape [worlds]; one that is not finite measures no gap.
+            mask: Worlds that are measured, bool, shape [worlds]; all without one.
+        """
+        if not self._realign:
+            return
+        chosen = self._mask(mask)
+        gap = yaw.double() - (self._start + self._turned.double() * (RATE_STEP * robot.TICK))
+        gap = torch.nan_to_num(gap, nan=0.0, posinf=0.0, neginf=0.0)
+        gap = torch.remainder(gap + np.pi, 2.0 * np.pi) - np.pi
+        self._gap = torch.where(chosen, gap, self._gap)
+        self._age = torch.where(chosen, 0, self._age)
 
     def decode(self, chunk: torch.Tensor, mask: np.ndarray | torch.Tensor | None = None) -> torch.Tensor:
         """Actions of v3.1 of a chunk that will be executed to its end.
@@ -225,7 +252,14 @@ class V4Decoder:
         rate = exact[..., V4["yaw_rate"].start]
         steps = torch.nan_to_num(rate, nan=0.0).clamp(-MAX_RATE, MAX_RATE).div(RATE_STEP).round().to(torch.int64)
         turned = self._turned[:, None] + steps.cumsum(dim=1)
-        self._turned = torch.where(self._mask(mask), turned[:, -1], self._turned)
+        chosen = self._mask(mask)
+        if self._realign:
+            ages = self._age[:, None] + torch.arange(chunk.shape[1] + 1, device=chunk.device)
+            closed = self._gap[:, None] * (1.0 - torch.pow(1.0 - self._realign, ages.double()))
+            closed = closed.div(RATE_STEP * robot.TICK).round().to(torch.int64)
+            turned = turned + closed[:, 1:] - closed[:, :1]
+            self._age = torch.where(chosen, ages[:, -1], self._age)
+        self._turned = torch.where(chosen, turned[:, -1], self._turned)
         yaw = self._start + turned.double() * (RATE_STEP * robot.TICK) + 0.0 * rate  # keeps NaN and infinity
         roll, pitch = exact[..., V4["roll_pitch"]].unbind(-1)
         matrix = matrix_from_quat(quat_from_euler(torch.stack([yaw, pitch, roll], dim=-1)))

@@ -144,5 +144,6 @@ TASK = TaskSpec(
     judge=DoubleDeskJudge,
     predicates=PREDICATES,
     expert="arena_newton.policies.experts.double_desk:DoubleDeskExpert",
+    disturbance=0.5,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
 )

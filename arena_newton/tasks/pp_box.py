@@ -193,4 +193,5 @@ TASK = TaskSpec(
     predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
     expert="arena_newton.policies.experts.pp_box:PPBoxExpert",
+    disturbance=0.5,
 )

@@ -9,21 +9,23 @@ from arena_newton.errors import InputError
 __all__ = ["LOCAL", "bind"]
 
 LOCAL = "127.0.0.1"
-"""The only address that is served."""
+"""The address that is served where no other is asked for: this machine's own."""
 
 
-def bind(port: int, flag: str) -> socket.socket:
+def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
     """A listening socket of this machine.
 
     Args:
         port: TCP port; 0 takes a free one.
         flag: What the message names.
+        host: Address of this machine.
 
     Raises:
         InputError: The port is taken or not allowed.
     """
     try:
-        return socket.create_server((LOCAL, port))
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no such port"
-        raise InputError(f"{flag} {port}: cannot be served at {LOCAL} ({reason}); name another port") from None
+        raise InputError(f"{flag} {port}: cannot be served at {host} ({reason}); name another port") from None

@@ -355,3 +355,70 @@ def test_predicates_carry_their_first_ticks(monkeypatch):
     results = Rollout(env, Sway(), _episodes(2), max_steps=8).run()
     assert [r.predicates for r in results] == [{"a": 3, "b": None}, {"a": 6, "b": 2}]
     assert [r.progress for r in results] == [0.5, 1.0]
+
+
+class Dated(Policy):
+    """Chunks of six actions whose forward step names the tick of the look: look t gives t/1000 + action/100000 m."""
+
+    name = "dated"
+    length = 6
+
+    def __init__(self):
+        self.looks = []
+
+    def attach(self, env):
+        self.env = env
+
+    def act(self, observation):
+        worlds = len(observation.state)
+        self.looks.append((self.env.tick.copy(), observation.mask.copy()))
+        actions = torch.from_numpy(STAND_ACTION).repeat(worlds, self.length, 1)
+        actions[:, :, 0] = torch.from_numpy(self.env.tick)[:, None] / 1e3 + torch.arange(self.length) / 1e5
+        return Chunk(actions, phases=[f"look {tick}" for tick in self.env.tick])
+
+
+class Executed(Recorder):
+    """Keeps the forward steps that each world executed."""
+
+    def start(self, env, world, episode):
+        self.steps = getattr(self, "steps", {}) | {world: []}
+
+    def before_physics(self, env, observation, action):
+        for world in np.flatnonzero(env.active & (env.tick >= 0)):
+            self.steps[world].append(round(float(action[world, 0]) * 1e5))
+
+
+@pytest.mark.parametrize("latency", [0, 1, 4, 5])
+def test_a_chunk_begins_so_many_ticks_after_its_look(env, latency):
+    """The robot stands first; then chunk follows chunk, whole, each looked at `latency` ticks before it begins."""
+    policy, seen = Dated(), Executed()
+    results = Rollout(env, policy, _episodes(2), recorder=seen, max_steps=20, latency=latency).run()
+    chunks = [100 * look + action for look in (0, 6, 12, 18) for action in range(6)]
+    assert [r.steps for r in results] == [20, 20]
+    assert seen.steps[0] == seen.steps[1] == ([0] * latency + chunks)[:20]
+    assert [ticks[0] for ticks, _ in policy.looks] == [0, 6, 12, 18]
+    begun = [(f"look {look}", look + latency) for look in (0, 6, 12, 18) if look + latency < 20]
+    assert list(results[0].phases) == begun
+
+
+def test_latency_does_not_mix_worlds():
+    """Episodes that begin at other ticks of the batch execute the same delayed chunks as alone, bit for bit."""
+
+    class Late(Sway):
+        name = "late"
+
+    def run(worlds, episodes):
+        env = ArenaEnv(
+            "football", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", device="cpu", fast_physics=True
+        )
+        return {
+            r.episode.index: (r.steps, r.margin) for r in Rollout(env, Late(), episodes, max_steps=17, latency=3).run()
+        }
+
+    assert run(1, _episodes(3)) == run(2, _episodes(3)[::-1])
+
+
+def test_a_chunk_no_longer_than_the_latency_is_refused(env):
+    """A chunk that would be over before it begins is one error that names flag, policy and length."""
+    with pytest.raises(InputError, match="--latency-ticks 6: policy dated gives chunks of 6 actions"):
+        Rollout(env, Dated(), _episodes(1), max_steps=8, latency=6).run()

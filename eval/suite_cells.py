@@ -1,0 +1,265 @@
+"""Episodes of suites and of plain results folders as cells of tables: a policy, tracker, task and its conditions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.records import Json, shown
+from arena_newton.eval.results import RunRecord, load_run
+from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
+from arena_newton.text import counted, plain_text
+
+__all__ = ["CellSet", "EvaluatedCell", "read_cells"]
+
+ALIKE = ("max_steps", "variant")
+"""Conditions under which all runs must agree: one table must not mix budgets or scenes."""
+NAMED = ("engine", "device", "drive", "fast_physics")
+"""Conditions that may differ; every value is named."""
+UNTRAINED = ("expert", "stand", "replay")
+"""Policies without training: no tracker is the one of theirs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatedCell:
+    """Episodes of one policy through one tracker on one task under one set of conditions."""
+
+    policy: str
+    """Name of its row in tables."""
+    family: str
+    """`act`, `diffusion`, `flow`, `pi05`, or another; empty where nothing is known."""
+    trained_on: tuple[str, ...]
+    """Trackers through which the demonstrations of its training were recorded; none for a policy without training."""
+    trained_tasks: tuple[str, ...]
+    """Tasks of its training."""
+    tracker: str
+    """The tracker that executed its actions."""
+    task: str
+    mode: str
+    labels: str
+    latency: int
+    """Ticks by which each chunk started late."""
+    replan: int | None
+    """Actions of a chunk that were executed before the next look; None: all."""
+    ensemble: bool
+    records: tuple[EpisodeRecord, ...]
+    """Its episodes in plan order."""
+    folder: Path
+
+    @property
+    def merged(self) -> bool:
+        """Whether the policy was trained on several tasks or through several trackers at once."""
+        return len(self.trained_tasks) > 1 or len(self.trained_on) > 1
+
+    @property
+    def matched(self) -> bool:
+        """Whether it was executed by the tracker of its training, or needs none."""
+        return self.trained_on in ((), (self.tracker,))
+
+    def held(self, outcome: str = "success") -> dict[Hashable, bool]:
+        """Whether each episode ended so, by group seed and repeat; a task and these two decide an episode's start."""
+        return {(record.group_seed, record.repeat): record.outcome == outcome for record in self.records}
+
+
+@dataclass(frozen=True)
+class CellSet:
+    """Everything that tables are made of."""
+
+    cells: tuple[EvaluatedCell, ...]
+    rules: str
+    notes: tuple[str, ...]
+    """What a reader of the tables must know besides them."""
+
+
+def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
+    """Read suites (folders with `suite.json`) and results folders.
+
+    Args:
+        folders: Each of them.
+        rules: Rule set whose episodes count; others are left out and counted in a note.
+
+    Raises:
+        InputError: A folder holds neither or is damaged, two hold the same cell, none holds an episode under the
+            rules, or they differ in step budgets, scene variant or a tracker's weights.
+    """
+    found: list[tuple[str, EvaluatedCell, RunRecord]] = []
+    notes: list[str] = []
+    for folder in folders:
+        if (folder / SUITE_FILE).is_file():
+            found += _of_suite(folder, notes)
+        else:
+            run = load_run(folder)
+            found += [(run.config["rules"], cell, run) for cell in _of_run(run)]
+            if len(run.records) < run.document["planned"] and run.config.get("keep") is None:
+                notes.append(f"{folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
+    others = sorted({plain_text(other, 60) for other, _, _ in found if other != rules})
+    if others:
+        number = sum(len(cell.records) for other, cell, _ in found if other != rules)
+        notes.append(f"{counted(number, 'episode')} under the rules {' '.join(others)} left out.")
+    kept = [(cell, run) for other, cell, run in found if other == rules]
+    if not kept:
+        where = " ".join(str(folder) for folder in folders)
+        raise InputError(f"{where}: no episode under the rules {rules}" + (f", only {' '.join(others)}" * bool(others)))
+    _check_alike([run for _, run in kept])
+    notes += _conditions(kept)
+    return CellSet(_named_rows([cell for cell, _ in kept]), rules, tuple(dict.fromkeys(notes)))
+
+
+def _of_suite(folder: Path, notes: list[str]) -> list[tuple[str, EvaluatedCell, RunRecord]]:
+    suite = read_suite(folder)
+    found = []
+    waiting = [cell for cell in suite.cells if not (folder / cell.folder).is_dir()]
+    if waiting:
+        notes.append(f"{folder}: {counted(len(waiting), 'cell')} of {len(suite.cells)} not played yet.")
+    for cell in suite.cells:
+        if cell in waiting:
+            continue
+        run = load_cell(suite, cell)
+        if cell.status == "failed":
+            notes.append(f"{run.folder}: failed ({plain_text(cell.error or 'no reason', 200)}).")
+        if len(run.records) < run.document["planned"]:
+            notes.append(f"{run.folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
+        if run.records:
+            found.append((cell.rules, _suite_cell(cell, run), run))
+    return found
+
+
+def _suite_cell(cell: SuiteCell, run: RunRecord) -> EvaluatedCell:
+    return EvaluatedCell(
+        policy=cell.policy,
+        family=cell.family,
+        trained_on=tuple(sorted(cell.trained_on, key=_tracker_order)),
+        trained_tasks=cell.trained_tasks,
+        tracker=cell.tracker,
+        task=cell.task,
+        mode=cell.mode,
+        labels=cell.labels,
+        latency=cell.latency,
+        replan=cell.replan,
+        ensemble=cell.ensemble,
+        records=tuple(run.records),
+        folder=run.folder,
+    )
+
+
+def _tracker_order(name: str) -> tuple[bool, str]:
+    """The paper's trackers in its order: TWIST2 comes first."""
+    return name != "twist2", name
+
+
+def _of_run(run: RunRecord) -> list[EvaluatedCell]:
+    """Cells of a plain results folder, with what the policy said of itself."""
+    config: Mapping[str, Json] = run.config
+    facts = _facts(config.get("policy_facts"))
+    groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
+    for record in run.records:
+        groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
+    found = []
+    for (task, tracker, policy, mode), records in groups.items():
+        family = _text(facts.get("family"))
+        scheme = policy.partition(":")[0]
+        recipe = _text(facts.get("recipe"))
+        replan = config.get("replan")
+        found.append(
+            EvaluatedCell(
+                policy=" ".join(filter(None, (family, recipe))) or policy,
+                family=family or (scheme if scheme in UNTRAINED else ""),
+                trained_on=tuple(sorted(_texts(facts.get("trackers")), key=_tracker_order)),
+                trained_tasks=_texts(facts.get("tasks")),
+                tracker=tracker,
+                task=task,
+                mode=mode,
+                labels=_text(facts.get("labels")) or _text(config.get("labels")) or "v3.1",
+                latency=_number(config.get("latency_ticks")),
+                replan=replan if type(replan) is int else None,
+                ensemble=config.get("ensemble") is True,
+                records=tuple(records),
+                folder=run.folder,
+            )
+        )
+    return found
+
+
+def _facts(given: Json) -> Mapping[str, Json]:
+    """What a checkpoint says of itself, in what its policy said: on top of it, or as its `facts`."""
+    if not isinstance(given, dict):
+        return {}
+    inner = given.get("facts")
+    return given | inner if isinstance(inner, dict) else given
+
+
+def _text(value: Json) -> str:
+    return plain_text(value, 80) if isinstance(value, str) else ""
+
+
+def _texts(value: Json) -> tuple[str, ...]:
+    return tuple(_text(one) for one in value if isinstance(one, str)) if isinstance(value, list) else ()
+
+
+def _number(value: Json) -> int:
+    return value if type(value) is int and value >= 0 else 0
+
+
+def _check_alike(runs: Sequence[RunRecord]) -> None:
+    """Refuse runs that one table must not mix."""
+    first, weights = runs[0], dict[str, tuple[str, Path]]()
+    for run in runs:
+        for name in ALIKE:
+            was, now = first.config.get(name), run.config.get(name)
+            if was != now:
+                raise InputError(f"{run.folder}: {name} is {shown(now)}, in {first.folder} {shown(was)}")
+        for record in run.records:
+            now = record.hashes.get("checkpoint")
+            if now is None:
+                continue
+            was, where = weights.setdefault(record.tracker, (now, run.folder))
+            if was != now:
+                name = f"weights of {plain_text(record.tracker, 60)}"
+                raise InputError(f"{run.folder}: {name} are {plain_text(now, 60)}, in {where} {plain_text(was, 60)}")
+
+
+def _conditions(kept: Iterable[tuple[EvaluatedCell, RunRecord]]) -> list[str]:
+    """What ran, and what went wrong, in sentences."""
+    pairs = list(kept)
+    runs = list({id(run): run for _, run in pairs}.values())
+    found = []
+    for name in NAMED:
+        values = sorted({shown(run.config.get(name)) for run in runs if name in run.config})
+        if len(values) > 1:
+            found.append(f"{name.replace('_', ' ').capitalize()}: {' and '.join(values)}.")
+    codes = {run.config.get("code") for run in runs}
+    found += [f"The runs were made with {len(codes)} versions of the code."] if len(codes) > 1 else []
+    errors = sum(record.outcome == "error" for cell, _ in pairs for record in cell.records)
+    episodes = sum(len(cell.records) for cell, _ in pairs)
+    if errors:
+        found.append(f"{counted(errors, 'episode')} of {episodes} ended with an error; they count as no success.")
+    return [*found, f"{counted(episodes, 'episode')} in {counted(len(pairs), 'cell')}."]
+
+
+def _named_rows(cells: Sequence[EvaluatedCell]) -> tuple[EvaluatedCell, ...]:
+    """Cells whose `policy` names one row: label protocols and chunk executions that differ are told apart."""
+    parts: dict[str, tuple[set[str], set[object], set[bool]]] = {}
+    for cell in cells:
+        labels, replans, ensembles = parts.setdefault(cell.policy, (set(), set(), set()))
+        labels.add(cell.labels)
+        replans.add(cell.replan)
+        ensembles.add(cell.ensemble)
+    named = []
+    for cell in cells:
+        labels, replans, ensembles = parts[cell.policy]
+        words = [cell.labels] if len(labels) > 1 else []
+        words += [f"replan {cell.replan}"] if len(replans) > 1 and cell.replan is not None else []
+        words += ["ensemble"] if len(ensembles) > 1 and cell.ensemble else []
+        named.append(dataclasses.replace(cell, policy=" ".join([cell.policy, *words])))
+    seen: dict[tuple[object, ...], EvaluatedCell] = {}
+    for cell in named:
+        key = (cell.policy, cell.trained_on, cell.merged, cell.tracker, cell.task, cell.mode, cell.latency)
+        other = seen.setdefault(key, cell)
+        if other is not cell:
+            name = " ".join(plain_text(word, 60) for word in (cell.policy, cell.tracker, cell.task, cell.mode))
+            raise InputError(f"{cell.folder}: cell {name} is in {other.folder} too; leave one of them out")
+    return tuple(named)

@@ -1,0 +1,66 @@
+"""`python -m arena_newton.eval tables`: the paper's tables from suites and results folders, written as files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from arena_newton import rule_sets
+from arena_newton.errors import InputError
+from arena_newton.eval import paper_claims, table_text
+from arena_newton.eval.journal import StorageError, write_atomic
+from arena_newton.eval.paper_numbers import paper_numbers
+from arena_newton.eval.suite_cells import read_cells
+from arena_newton.eval.suite_tables import suite_tables
+from arena_newton.eval.table_options import FORMATS, TablesOptions
+from arena_newton.extras import require
+
+__all__ = ["run"]
+
+
+def run(folders: Sequence[Path], options: TablesOptions) -> int:
+    """Write the tables of all folders, and print where they are and what must be known besides them.
+
+    Raises:
+        InputError: A folder is unfit, or a flag.
+        StorageError: A file cannot be written.
+    """
+    unknown = [name for name in options.format if name not in FORMATS]
+    if unknown or not options.format:
+        raise InputError(f"--format {' '.join(unknown)}: known are {' '.join(FORMATS)}")
+    rule_sets.get(options.rules)
+    if "png" in options.format:
+        require("plots", "eval tables --format png", ("matplotlib",))
+    cells = read_cells(folders, options.rules)
+    paper = paper_numbers()
+    tables = suite_tables(cells.cells, paper)
+    if not tables:
+        raise InputError(f"{folders[0]}: holds no cell of any table (policies executed by another tracker only)")
+    out = Path(options.out).expanduser()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
+    written = []
+    for form, name, text in (
+        ("md", "tables.md", table_text.as_markdown(tables, cells.notes)),
+        ("tex", "tables.tex", table_text.as_latex(tables, cells.notes)),
+        ("csv", "cells.csv", table_text.as_csv(tables)),
+    ):
+        if form in options.format:
+            write_atomic(out / name, text)
+            written.append(name)
+    if "png" in options.format:
+        from arena_newton.eval import suite_figures
+
+        written += suite_figures.write(out, tables)
+    for note in cells.notes:
+        print(note)
+    if options.findings:
+        text = paper_claims.findings_text(paper_claims.findings(cells.cells, paper))
+        write_atomic(out / "findings.md", text)
+        written.append("findings.md")
+        print(text, end="")
+    print(f"tables: {', '.join(table.name for table in tables)}")
+    print(f"written: {', '.join(str(out / name) for name in written)}")
+    return 0

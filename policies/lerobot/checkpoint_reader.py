@@ -1,0 +1,283 @@
+"""A checkpoint of LeRobot as it is on disk: read and checked before its network is built.
+
+Only JSON and safetensors are read: nothing of a checkpoint is code, and pickles in it are left alone. Its processors
+are steps of LeRobot by their registered names, of those that a policy of our families can have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import logging
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+
+from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.errors import InputError
+from arena_newton.extras import require
+from arena_newton.foreign import check_size, read_bytes
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts, checkpoint_folder
+from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
+
+__all__ = [
+    "FAMILY_TYPES",
+    "FRONT",
+    "STATE",
+    "TASK_VECTOR",
+    "WEIGHTS",
+    "Checkpoint",
+    "lerobot_silent",
+    "read_checkpoint",
+]
+
+FRONT = "observation.images.front"
+"""Key of the head camera's picture."""
+STATE = "observation.state"
+"""Key of the canonical state."""
+TASK_VECTOR = "observation.environment_state"
+"""Key of the one-hot vector of the task."""
+WEIGHTS = "model.safetensors"
+"""File of a checkpoint's weights."""
+MOST_WEIGHTS = 64 * 2**30
+"""Largest file of weights that is read [bytes]; pi0.5 in float32 has 15 GB."""
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+"""Files of what comes before and after the network."""
+FAMILY_TYPES: Mapping[str, str] = {"act": "act", "diffusion": "diffusion", "multi_task_dit": "flow", "pi05": "pi05"}
+"""LeRobot's type of policy → our name of the family; those that can be run."""
+EXTRA_MODULES: Mapping[str, tuple[str, ...]] = {
+    "diffusion": ("diffusers",),
+    "multi_task_dit": ("diffusers", "transformers"),
+    "pi05": ("transformers",),
+}
+"""LeRobot's type of policy → modules of the extra `policies` that it needs."""
+STEPS = frozenset(
+    {
+        "absolute_actions_processor",
+        "device_processor",
+        "normalizer_processor",
+        "pi05_prepare_state_tokenizer_processor_step",
+        "relative_actions_processor",
+        "rename_observations_processor",
+        "to_batch_processor",
+        "tokenizer_processor",
+        "unnormalizer_processor",
+    }
+)
+"""Processor steps that a checkpoint may name; all are LeRobot's own and run no code of the checkpoint."""
+NATIVE = (640, 480)
+"""Width and height of the head camera's picture in the original [px]."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint says, checked."""
+
+    folder: Path
+    """With `config.json`."""
+    config: PreTrainedConfig
+    """LeRobot's configuration of the policy; nothing in it makes LeRobot download or compile."""
+    facts: CheckpointFacts
+    """What it says of itself; of a foreign one actions of v3.1."""
+    camera: CameraConfig | None
+    """The picture that is rendered; None for a policy without pictures."""
+    preparation: PicturePreparation | None
+    """What happens to the picture before LeRobot's processors, in checkpoints of the original."""
+    digest: str
+    """First 12 hex digits of the SHA-256 of the weights."""
+    ignored: tuple[str, ...] = ()
+    """Fields of its `config.json` that this LeRobot does not have."""
+
+    @property
+    def type(self) -> str:
+        """LeRobot's type of policy."""
+        return str(self.config.type)
+
+    @property
+    def observations(self) -> int:
+        """Ticks that the policy looks at: this one and those before it."""
+        return int(self.config.n_obs_steps)
+
+    @property
+    def predicted(self) -> int:
+        """Actions of an answer of the network, from this tick on."""
+        chunk = getattr(self.config, "chunk_size", None)
+        return int(self.config.n_action_steps if chunk is None else chunk)
+
+    @property
+    def executed(self) -> int:
+        """Actions of an answer that are executed before the next look."""
+        return int(self.config.n_action_steps)
+
+
+@contextmanager
+def lerobot_silent() -> Iterator[None]:
+    """Keeps LeRobot from warning about a device that only its training had."""
+    root = logging.getLogger()
+    disabled = root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(disabled)
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint, or the last one of a training's folder, without its weights.
+
+    Raises:
+        InputError: There is none, a file is damaged, or it was trained for other observations or actions; the message
+            names file and field.
+    """
+    folder = checkpoint_folder(path)
+    if not (folder / WEIGHTS).is_file():
+        raise InputError(f"{folder}: holds no {WEIGHTS}; weights in other files, such as pickles, are not read")
+    check_size(folder / WEIGHTS, MOST_WEIGHTS)
+    content = _json(folder / CONFIG_FILE)
+    kind = content.pop("type", None)
+    known = PreTrainedConfig.get_known_choices()
+    if not isinstance(kind, str) or kind not in known:
+        names = ", ".join(sorted(FAMILY_TYPES))
+        raise InputError(f"{folder / CONFIG_FILE}: type is {kind!r:.60}, which LeRobot does not have; run are {names}")
+    if kind not in FAMILY_TYPES:
+        names = ", ".join(sorted(FAMILY_TYPES))
+        raise InputError(f"{folder / CONFIG_FILE}: type {kind} is not run here, expected one of {names}")
+    if content.get("use_peft"):
+        raise InputError(f"{folder / CONFIG_FILE}: use_peft is set; merge the adapter into the weights first")
+    if kind in EXTRA_MODULES:
+        require("policies", f"--policy lerobot:{path}", EXTRA_MODULES[kind])
+    config, ignored = _configuration(folder / CONFIG_FILE, kind, content)
+    own = CheckpointFacts.read(folder)
+    facts = own or CheckpointFacts(family=FAMILY_TYPES[kind])
+    renamed = _processors(folder)
+    picture = _features(folder, config, facts, own is not None, renamed)
+    camera, preparation = None, None
+    if picture is not None:
+        preparation = PicturePreparation.read(folder) if own is None else None
+        camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
+    with (folder / WEIGHTS).open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    return Checkpoint(folder, config, facts, camera, preparation, digest, ignored)
+
+
+def _json(path: Path) -> dict[str, object]:
+    try:
+        content = json.loads(read_bytes(path, MOST_JSON))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
+    return content
+
+
+def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tuple[PreTrainedConfig, tuple[str, ...]]:
+    """LeRobot's configuration, and the fields that it does not know: those of the original's fork, or of later ones."""
+    chosen = PreTrainedConfig.get_choice_class(kind)
+    known = {field.name for field in dataclasses.fields(chosen)}
+    # A training's device, pretrained weights and compilation mean nothing here; the first two would be looked for.
+    fixed = {"device": "cpu", "pretrained_backbone_weights": None, "pretrained_path": None, "compile_model": False}
+    fixed |= {"gradient_checkpointing": False, "push_to_hub": False, "use_amp": False}
+    kept = {name: value for name, value in content.items() if name in known and name not in fixed}
+    kept |= {name: value for name, value in fixed.items() if name in known}
+    with tempfile.TemporaryDirectory() as folder, lerobot_silent(), draccus.config_type("json"):
+        copy = Path(folder) / CONFIG_FILE
+        copy.write_text(json.dumps(kept))
+        try:
+            config = draccus.parse(chosen, str(copy), args=[])
+            config.validate_features()
+        except (Exception, SystemExit) as error:  # draccus has errors of many kinds
+            raise InputError(f"{path}: {' '.join(str(error).split())[:300]}") from None
+    for name, most in (("n_obs_steps", 16), ("n_action_steps", 4096), ("chunk_size", 4096)):
+        value = getattr(config, name, 1)
+        if not isinstance(value, int) or not 1 <= value <= most:
+            raise InputError(f"{path}: {name} is {value!r:.40}, expected 1 to {most}")
+    return config, tuple(sorted(set(content) - known))
+
+
+def _processors(folder: Path) -> dict[str, str]:
+    """Check the processors' files; returns how observations are renamed, from our name to the network's."""
+    renamed: dict[str, str] = {}
+    for name in PROCESSORS:
+        path = folder / name
+        if not path.is_file():
+            raise InputError(
+                f"{folder}: holds no {name}; LeRobot's migrate_policy_normalization.py makes one for old checkpoints"
+            )
+        steps = _json(path).get("steps")
+        if not isinstance(steps, list):
+            raise InputError(f"{path}: steps is {type(steps).__name__}, expected a list")
+        for index, step in enumerate(steps):
+            where = f"{path}: steps[{index}]"
+            registered = step.get("registry_name") if isinstance(step, dict) else None
+            if registered not in STEPS or "class" in step:
+                raise InputError(f"{where} is {registered!r:.60}, expected one of {', '.join(sorted(STEPS))}")
+            options = step.get("config") or {}
+            if not isinstance(options, dict) or options.get("trust_remote_code"):
+                raise InputError(f"{where}.config is not an object of plain options")
+            state = step.get("state_file")
+            if state is not None:
+                if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):
+                    raise InputError(f"{where}.state_file is {state!r:.60}, expected a name of a safetensors file")
+                check_size(folder / state, MOST_JSON)
+            names = options.get("rename_map") or {} if registered == "rename_observations_processor" else {}
+            if not isinstance(names, dict) or not all(isinstance(value, str) for value in names.values()):
+                raise InputError(f"{where}.config.rename_map is not an object of names")
+            renamed |= names
+    return renamed
+
+
+def _features(
+    folder: Path, config: PreTrainedConfig, facts: CheckpointFacts, own: bool, renamed: Mapping[str, str]
+) -> tuple[int, int] | None:
+    """Check observations and actions; returns height and width of the picture, None for a policy without one."""
+    path = folder / CONFIG_FILE
+    outputs, inputs = dict(config.output_features or {}), dict(config.input_features or {})
+    action = outputs.get("action")
+    if action is None or tuple(action.shape) != (ACTION_WIDTH,):
+        raise InputError(f"{path}: output action is {_shape(action)}, expected [{ACTION_WIDTH}]")
+    ours = {renamed.get(name, name): name for name in (STATE, FRONT, TASK_VECTOR)}
+    picture = None
+    for name, feature in inputs.items():
+        given, shape = ours.get(name), tuple(feature.shape)
+        if given == STATE and shape == (STATE_WIDTH,):
+            continue
+        if given == FRONT and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
+            picture = (int(shape[1]), int(shape[2]))
+            continue
+        if given == TASK_VECTOR and facts.task_vector and shape == (len(facts.task_vector),):
+            continue
+        if name.startswith("observation.images.empty_camera_") and config.type == "pi05":
+            continue  # the network fills it with an empty picture itself
+        if given == TASK_VECTOR:
+            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks for it"
+            raise InputError(f"{path}: input {name} is {_shape(feature)}, but {said}")
+        known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
+        raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")
+    for name in (STATE, *((TASK_VECTOR,) if facts.task_vector else ())):
+        if renamed.get(name, name) not in inputs:
+            raise InputError(f"{path}: has no input {renamed.get(name, name)}, which every policy here is given")
+    if own and picture is not None and picture != (facts.height, facts.width):
+        said = f"{FACTS_FILE} says {facts.width}x{facts.height}"
+        raise InputError(f"{path}: pictures are {picture[1]}x{picture[0]}, but {said}")
+    return picture
+
+
+def _shape(feature: PolicyFeature | None) -> str:
+    return "absent" if feature is None else str(list(feature.shape))
+
+
+def _foreign_camera(picture: tuple[int, int], preparation: PicturePreparation | None) -> CameraConfig:
+    """What somebody else's policy is shown: what the original's server is sent, or the size that it was trained on."""
+    if preparation is not None:
+        return CameraConfig(width=NATIVE[0], height=NATIVE[1], fit="native")
+    height, width = picture
+    if not all(16 <= n <= 4096 for n in picture):
+        raise InputError(f"pictures of {width}x{height} pixels, expected 16 to 4096 each")
+    return CameraConfig(width=width, height=height, fit="native" if 3 * width == 4 * height else "pad")

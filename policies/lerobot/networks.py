@@ -1,0 +1,121 @@
+"""A checkpoint's network with its processors: observations of some rows in, chunks of actions out.
+
+Rows are independent: each has its own noise, and its answer does not depend on what the other rows show.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+
+import torch
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.processor import AbsoluteActionsProcessorStep
+from safetensors.torch import load_model
+
+from arena_newton.errors import InputError
+from arena_newton.policies.lerobot.checkpoint_reader import WEIGHTS, Checkpoint, lerobot_silent
+from arena_newton.policies.lerobot.network_noise import Draw, generators, normal
+
+__all__ = ["PolicyNetwork"]
+
+IMAGES = "observation.images"
+"""Key under which LeRobot stacks the pictures of all cameras."""
+
+
+class PolicyNetwork:
+    """The network of a checkpoint on a device."""
+
+    def __init__(self, checkpoint: Checkpoint, device: torch.device):
+        """Build it and load its weights.
+
+        Raises:
+            InputError: The weights do not fit, a file of the processors is damaged, or a tokenizer is not there.
+        """
+        self.checkpoint, self.device = checkpoint, device
+        self.policy = _loaded(checkpoint).to(device)
+        try:
+            with lerobot_silent():
+                self.before, self.after = make_pre_post_processors(
+                    checkpoint.config,
+                    pretrained_path=str(checkpoint.folder),
+                    preprocessor_overrides={"device_processor": {"device": str(device)}},
+                    postprocessor_overrides={"device_processor": {"device": str(device)}},
+                )
+        except Exception as error:  # LeRobot has errors of many kinds, transformers too
+            raise InputError(f"{checkpoint.folder}: its processors do not load: {_first(error)}") from None
+        # Only these read the state of a look, whose shape they expect in every action.
+        self._per_tick = any(isinstance(one, AbsoluteActionsProcessorStep) and one.enabled for one in self.after.steps)
+
+    def predict(self, seen: Mapping[str, torch.Tensor], instruction: str, draws: Sequence[Draw]) -> torch.Tensor:
+        """Actions of a look.
+
+        Args:
+            seen: Observations by their names in datasets, float32 on the device, shape [rows, ...], or for policies
+                that look at several ticks [rows, ticks, ...]; pictures from 0 to 1, channels first.
+            instruction: What the policy is told to do.
+            draws: Whose noise each row has.
+
+        Returns:
+            In the units of the labels, float32, shape [rows, n, 40].
+        """
+        with torch.inference_mode():
+            rows = len(draws)
+            batch = self.before({**seen, "task": [instruction] * rows})
+            batch = {name: value for name, value in batch.items() if value is not None and name != "action"}
+            chunk = self._chunk(batch, draws).float()
+            if self._per_tick:
+                done = torch.stack([self.after(action) for action in chunk.unbind(1)], dim=1)
+            else:
+                done = self.after(chunk.reshape(-1, chunk.shape[-1])).reshape(chunk.shape)
+        return done.to(self.device, torch.float32).clone()  # outside of inference mode it may be written to
+
+    def _chunk(self, batch: dict[str, torch.Tensor], draws: Sequence[Draw]) -> torch.Tensor:
+        """What the network answers to a normalised batch, normalised."""
+        policy, config = self.policy, self.checkpoint.config
+        match self.checkpoint.type:
+            case "act":
+                return policy.predict_action_chunk(batch)
+            case "diffusion":
+                drawn = generators(draws)
+                noise = normal(drawn, (config.horizon, config.action_feature.shape[0]), self.device)
+                model = policy.diffusion
+                # LeRobot passes the noise on, but not the generator from which DDPM draws at every step.
+                model.conditional_sample = functools.partial(type(model).conditional_sample, model, generator=drawn)
+                return policy.predict_action_chunk(batch, noise=noise)
+            case "multi_task_dit":
+                policy.objective.drawn = generators(draws)
+                pictures = torch.stack([batch[key] for key in config.image_features], dim=-4)
+                batch = {**batch, IMAGES: pictures}
+                return self.policy._generate_actions(batch)  # its public one reads queues, which need all rows at once
+            case "pi05":
+                shape = (config.chunk_size, config.max_action_dim)
+                return policy.predict_action_chunk(batch, noise=normal(generators(draws), shape, self.device))
+        raise AssertionError(self.checkpoint.type)
+
+
+def _loaded(checkpoint: Checkpoint) -> PreTrainedPolicy:
+    """The network with its weights on the CPU; every weight is the checkpoint's."""
+    path = checkpoint.folder / WEIGHTS
+    try:
+        with lerobot_silent():
+            if checkpoint.type == "multi_task_dit":
+                from arena_newton.policies.lerobot.seeded_dit import build  # imports transformers
+
+                policy = build(checkpoint.config)
+            else:
+                policy = get_policy_class(checkpoint.type)(checkpoint.config)
+    except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{checkpoint.folder}: its network cannot be built: {_first(error)}") from None
+    try:
+        # Not LeRobot's own loading, which goes on with random weights where names are missing.
+        load_model(policy, str(path), strict=True, device="cpu")
+    except Exception as error:  # safetensors has an error of its own
+        raise InputError(f"{path}: does not hold the weights of this network: {_first(error)}") from None
+    return policy.eval().requires_grad_(False)
+
+
+def _first(error: BaseException) -> str:
+    """An error's message in one line of bounded length."""
+    return " ".join(str(error).split())[:300] or type(error).__name__

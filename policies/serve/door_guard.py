@@ -1,0 +1,83 @@
+"""Who may come in, for all protocols: the token, no browsers, and how many connections there may be."""
+
+from __future__ import annotations
+
+import hmac
+import os
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from arena_newton.errors import InputError
+
+__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "DoorGuard"]
+
+ACCESS_TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
+"""Environment variable with the token that clients must send; the same of which clients take theirs."""
+HEALTH_PATHS = ("/healthz", "/health")
+"""Routes that answer without a token: whether the server is there, and nothing else."""
+_SCHEMES = ("bearer", "api-key")
+"""Words in front of a token; the second is that of openpi's client."""
+
+
+class DoorGuard:
+    """Decides about connections and requests."""
+
+    def __init__(self, connections: int, token: str | None = None):
+        """Take the number of connections at once and the token.
+
+        Args:
+            connections: Most at once.
+            token: What clients must send as `Authorization: Bearer`; empty for none, the environment's by default.
+
+        Raises:
+            InputError: A token that no HTTP header can carry; it is not printed.
+        """
+        self._token = os.environ.get(ACCESS_TOKEN_VARIABLE, "") if token is None else token
+        if not re.fullmatch(r"[!-~]*", self._token):
+            raise InputError(
+                f"{ACCESS_TOKEN_VARIABLE}: holds a space, a line end or another character that no token has"
+            )
+        self.connections = connections
+        self._inside = 0
+        self._lock = threading.Lock()
+
+    @property
+    def wants_token(self) -> bool:
+        """Whether clients must send one."""
+        return bool(self._token)
+
+    def refusal(self, path: str, authorization: str | None, origin: str | None) -> tuple[int, str] | None:
+        """Status and sentence for a request that is not let in; None for one that is.
+
+        Args:
+            path: Its route.
+            authorization: Its header of that name.
+            origin: Its header of that name, which browsers send: no page of a web site may ask a policy.
+        """
+        if origin is not None:
+            return 403, "requests of browsers are not answered"
+        if not self._token or path in HEALTH_PATHS:
+            return None
+        scheme, _, given = (authorization or "").partition(" ")
+        if scheme.lower() in _SCHEMES and hmac.compare_digest(given.strip().encode(), self._token.encode()):
+            return None
+        return 401, "the token is missing or wrong (Authorization: Bearer)"
+
+    @property
+    def full(self) -> bool:
+        """Whether there are as many connections as there may be."""
+        return self._inside >= self.connections
+
+    @contextmanager
+    def inside(self) -> Iterator[bool]:
+        """Count a connection while it lasts; yields whether there is room for it."""
+        with self._lock:
+            room = self._inside < self.connections
+            self._inside += room
+        try:
+            yield room
+        finally:
+            with self._lock:
+                self._inside -= room

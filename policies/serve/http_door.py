@@ -1,0 +1,241 @@
+"""The door of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
+
+A robot is known by its client's address, the number of its world and its episode's seed, not by its connection: clients
+may open a new one at any time. The original's client names no world, so there is one robot at its address.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import replace
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+
+from arena_newton.errors import ArenaError
+from arena_newton.policies.serve.arena_codec import (
+    pack_begun,
+    pack_chunk,
+    pack_config,
+    pack_failure,
+    unpack_begin,
+    unpack_look,
+)
+from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
+from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.serve.policy_server import PolicyServer, Refused
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
+from arena_newton.text import plain_text
+
+__all__ = ["HttpDoor"]
+
+IDLE_CONNECTION = 600.0
+"""Time without a request after which a connection is closed [s]."""
+BODY_SECONDS = 60.0
+"""Time that a client has to send the body of a request [s]."""
+POLL = 0.05
+"""Time after which a door notices that it is closed [s]."""
+MOST_WORLDS = 4096
+"""Most worlds whose episode is remembered."""
+_STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500}
+"""Reason of a refusal → HTTP status; clients ask again after 503."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
+    server_version, sys_version = "arena-newton", ""
+    timeout = IDLE_CONNECTION
+    wbufsize = 1 << 16  # head and body of a reply leave together
+    server: _Listener
+
+    def handle(self) -> None:
+        """Serve until the client leaves; one connection too many is told so."""
+        self.begun: dict[str, str] = {}
+        with self.server.guard.inside() as self.room:
+            super().handle()
+
+    def do_GET(self) -> None:  # noqa: N802 (the name that http.server calls)
+        """Routes that change nothing."""
+        path = self.path.partition("?")[0]
+        if self._refused(path):
+            return
+        if path == "/healthz":
+            self._send(200, b"OK\n", "text/plain")
+        elif path in HEALTH_PATHS:
+            self._send(200, b'{"status": "ok"}\n')
+        elif path == "/config":
+            self._send(200, pack_config(self.server.policy.facts, {"protocol": "arena"}))
+        else:
+            self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
+
+    def do_POST(self) -> None:  # noqa: N802 (the name that http.server calls)
+        """Begin an episode, or answer a look."""
+        path = self.path.partition("?")[0]
+        if self._refused(path):
+            return
+        body = self._body()
+        if body is None:
+            return
+        policy, address = self.server.policy, self.client_address[0]
+        try:
+            if path == "/reset":
+                begin = unpack_begin(body)
+                self.server.begin(address, begin, self.begun)
+                self._send(200, pack_begun(policy.facts))
+            elif path == "/infer":
+                look, chunk = unpack_look(body)
+                self._send(200, pack_chunk(self.server.look(address, look), chunk=chunk))
+            else:
+                self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
+        except Refused as error:
+            self._send(_STATUS[error.reason], pack_failure(plain_text(error, 300)))
+        except ArenaError as error:
+            self._send(400, pack_failure(plain_text(error, 300)))
+
+    def _refused(self, path: str) -> bool:
+        headers = self.headers
+        refusal = self.server.guard.refusal(path, headers.get("Authorization"), headers.get("Origin"))
+        if refusal is None and not self.room and path not in HEALTH_PATHS:
+            refusal = 503, f"there are {self.server.guard.connections} connections already"
+        if refusal is not None:
+            self.close_connection = True
+            self._send(refusal[0], pack_failure(refusal[1]))
+        return refusal is not None
+
+    def _body(self) -> bytes | None:
+        """The body of a request; None where it cannot be read and the client was told so."""
+        lengths = self.headers.get_all("Content-Length") or []
+        if self.headers.get("Transfer-Encoding") or len(lengths) != 1 or not lengths[0].isascii():
+            self._hang_up(411, "a body needs one Content-Length")
+            return None
+        if not lengths[0].isdecimal() or len(lengths[0]) > 12:
+            self._hang_up(400, "Content-Length is not a number")
+            return None
+        left = int(lengths[0])
+        if left > MAX_FRAME:
+            self._hang_up(413, f"a body of {left} bytes, expected at most {MAX_FRAME}")
+            return None
+        end, pieces = time.monotonic() + BODY_SECONDS, []
+        while left:
+            self.connection.settimeout(max(end - time.monotonic(), 0.01))
+            piece = self.rfile.read1(min(left, 1 << 16))
+            if not piece:
+                self.close_connection = True
+                return None
+            pieces.append(piece)
+            left -= len(piece)
+        self.connection.settimeout(IDLE_CONNECTION)
+        return b"".join(pieces)
+
+    def _hang_up(self, status: int, sentence: str) -> None:
+        self.close_connection = True
+        self._send(status, pack_failure(sentence))
+
+    def _send(self, status: int, body: bytes, kind: str = "application/json") -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(body)
+        self.wfile.flush()
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """What http.server itself refuses, as JSON."""
+        self.close_connection = True
+        if not hasattr(self, "request_version") or self.request_version == "HTTP/0.9":
+            self.request_version = "HTTP/1.1"
+        self._send(code, pack_failure(plain_text(message or HTTPStatus(code).phrase, 200)))
+
+    def log_message(self, format: str, *args: object) -> None:
+        """What strangers send is no news."""
+
+
+class _Listener(ThreadingHTTPServer):
+    """A thread for each connection; the queue holds the connections of all worlds, which come at once."""
+
+    request_queue_size, daemon_threads, allow_reuse_address = 128, True, True
+
+    def __init__(
+        self, listening: socket.socket, policy: PolicyServer, guard: DoorGuard, tls: ssl.SSLContext | None
+    ) -> None:
+        super().__init__(listening.getsockname()[:2], _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+        self.policy, self.guard, self.tls = policy, guard, tls
+        self._worlds: OrderedDict[tuple[str, str], str] = OrderedDict()
+        """Client's address and world → session that was begun there last."""
+        self._lock = threading.Lock()
+
+    def get_request(self) -> tuple[socket.socket, tuple[str, int]]:
+        """Take a connection; TLS shakes hands at its first read, in its own thread."""
+        connection, address = self.socket.accept()
+        if self.tls is not None:
+            connection = self.tls.wrap_socket(connection, server_side=True, do_handshake_on_connect=False)
+        return connection, address
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A connection broke off, which is no news."""
+
+    def begin(self, address: str, begin: Begin, begun: dict[str, str]) -> None:
+        """Begin the episode of a world, and end the one that this connection began there before."""
+        owner, session = f"http {address}", _session(begin.session, begin.seed)
+        before = begun.get(begin.session)
+        if before is not None and before != session:
+            self.policy.end(owner, before)
+        self.policy.begin(owner, replace(begin, session=session), held=False)
+        begun[begin.session] = session
+        with self._lock:
+            self._worlds[address, begin.session] = session
+            self._worlds.move_to_end((address, begin.session))
+            while len(self._worlds) > MOST_WORLDS:
+                self._worlds.popitem(last=False)
+
+    def look(self, address: str, look: Look) -> np.ndarray:
+        """The chunk of a world; a look without a seed is of the episode that was begun there last."""
+        session = _session(look.session, look.seed)
+        if look.seed is None:
+            with self._lock:
+                session = self._worlds.get((address, look.session), session)
+        return self.policy.look(f"http {address}", replace(look, session=session), held=False).actions
+
+
+def _session(world: str, seed: int | None) -> str:
+    return f"{world}/{seed}" if world and seed is not None else world
+
+
+class HttpDoor:
+    """Listens, and translates between JSON and the policy server."""
+
+    def __init__(
+        self, server: PolicyServer, listening: socket.socket, guard: DoorGuard, tls: ssl.SSLContext | None = None
+    ):
+        """Begin to listen.
+
+        Args:
+            server: Answers; it has started.
+            listening: The port, which belongs to the door from now on.
+            guard: Who may come in.
+            tls: Certificate and key, for `https`.
+        """
+        self.port = int(listening.getsockname()[1])
+        listening.listen(_Listener.request_queue_size)
+        self._listener = _Listener(listening, server, guard, tls)
+        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="door", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the door; connections end with the program."""
+        self._listener.shutdown()
+        self._listener.server_close()
+        self._thread.join(timeout=2.0)

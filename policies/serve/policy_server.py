@@ -1,0 +1,502 @@
+"""One policy for many robots: every session is a row of the policy's batch, and looks that come close together are one.
+
+A policy's memory belongs to the row, so to the session: `begin` clears it with the episode's seed, and a session that
+leaves frees its row. What a session is answered does not depend on which others asked with it, as far as the policy
+keeps its promises (docs/policies.md). One thread has the policy; every connection has its own and waits for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import threading
+import time
+import traceback
+import zlib
+from collections import Counter, deque
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+
+from arena_newton import tasks
+from arena_newton.canonical import ACTION_WIDTH, IDENTITY_ROT6D, STATE_WIDTH
+from arena_newton.data.label_protocols import action_names, protocol
+from arena_newton.data.layouts import state_names
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.interfaces import Observation
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.policies.base import Policy, PolicyUnavailable
+from arena_newton.policies.serve.handshake import RATE, ServedFacts, ServedPicture
+from arena_newton.policies.serve.picture_fit import fitted_picture
+from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.serve.wire_error import WireError
+from arena_newton.text import plain_text
+
+__all__ = ["Answer", "PolicyServer", "Refused", "ServerCounts"]
+
+LONGEST_ACT = 600.0
+"""Time after which a waiting connection gives up on the policy [s]."""
+IDLE = 30.0
+"""Time without a request after which a session that no connection holds may lose its row to another [s]."""
+WARM_UP_SEED = 0
+"""Seed of the look before the first one, which nobody is answered."""
+
+type Reason = Literal["unfit", "unknown_episode", "full", "policy"]
+"""Why a request is refused: what it says, an episode that is not known, no free row, or the policy failed."""
+
+
+class Refused(ArenaError):
+    """A request that gets no answer; one line says why."""
+
+    def __init__(self, reason: Reason, message: str):
+        """Say why."""
+        super().__init__(plain_text(message, 300))
+        self.reason: Reason = reason
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a session is answered."""
+
+    actions: np.ndarray
+    """The chunk, float32, shape [n, 40]."""
+    infer_ms: float
+    """From the request to its answer, waiting for a batch included [ms]."""
+
+
+@dataclass
+class ServerCounts:
+    """What a server has done so far."""
+
+    episodes: int = 0
+    looks: int = 0
+    """Looks that were answered by the policy."""
+    repeated: int = 0
+    """Looks that were answered from memory, because they came twice."""
+    refused: int = 0
+    act_seconds: float = 0.0
+    """Time in the policy [s]."""
+    batches: Counter[int] = field(default_factory=Counter)
+    """Looks in one call of the policy → number of calls."""
+    started: float = field(default_factory=time.monotonic)
+    first_look: float | None = None
+    last_look: float = 0.0
+
+    def summary(self) -> list[str]:
+        """Lines for the console."""
+        calls = sum(self.batches.values())
+        busy = self.last_look - (self.first_look or 0.0)
+        rate = f", {self.looks / busy:.1f} looks/s while asked" if self.looks > 1 and busy > 0 else ""
+        lines = [
+            f"{self.episodes} episodes, {self.looks} looks answered, {self.repeated} repeated, "
+            f"{self.refused} refused{rate}"
+        ]
+        if calls:
+            sizes = ", ".join(f"{size}: {count}" for size, count in sorted(self.batches.items()))
+            each = 1000 * self.act_seconds / calls
+            lines.append(f"{calls} calls of the policy, {each:.1f} ms each; batch sizes {sizes}")
+        return lines
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What the policy is told of a session's task."""
+
+    name: str
+    gym_id: str
+    instruction: str
+
+
+@dataclass
+class _Session:
+    row: int
+    seed: int
+    task: _Task
+    held: bool
+    """Whether a connection holds it, so that it leaves with the connection."""
+    used: float
+    last: tuple[int | None, int] | None = None
+    """Step and content of the last look."""
+    answer: np.ndarray | None = None
+    """To the last look."""
+
+
+@dataclass
+class _Job:
+    kind: Literal["begin", "look", "end", "leave"]
+    owner: str
+    session: str
+    message: Begin | Look | None
+    done: Future[Answer]
+    held: bool = True
+    came: float = field(default_factory=time.monotonic)
+
+
+class PolicyServer:
+    """Answers the looks of many sessions by one policy, those of `max_wait` seconds in one call."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        *,
+        max_batch_size: int = 16,
+        max_wait: float = 0.02,
+        max_sessions: int = 64,
+        device: str | torch.device = "cpu",
+    ):
+        """Take the policy; `start` begins to serve.
+
+        Args:
+            policy: Answers by one label protocol, which `facts` declares.
+            max_batch_size: Most looks in one call of the policy.
+            max_wait: How long the first look of a batch waits for others [s].
+            max_sessions: Rows of the policy, so most episodes at once.
+            device: Torch device of what the policy sees.
+        """
+        self.policy, self.device = policy, torch.device(device)
+        self.max_batch_size, self.max_wait, self.max_sessions = max_batch_size, max_wait, max_sessions
+        self.counts = ServerCounts()
+        self.protocol = protocol(policy.labels or "v3.1")
+        self._facts: ServedFacts | None = None
+        self._camera = policy.camera or CameraConfig()
+        state = torch.zeros(max_sessions, STATE_WIDTH)
+        state[:, : len(IDENTITY_ROT6D)] = torch.tensor(IDENTITY_ROT6D)
+        self._state = state.to(self.device)
+        self._image: torch.Tensor | None = None
+        if policy.needs_image:
+            size = (max_sessions, self._camera.height, self._camera.width, 3)
+            self._image = torch.zeros(size, dtype=torch.uint8, device=self.device)
+        self._seeds, self._tasks = [0] * max_sessions, [""] * max_sessions
+        self._free = list(range(max_sessions))[::-1]
+        self._sessions: dict[tuple[str, str], _Session] = {}
+        self._unseeded = 0
+        self._jobs: deque[_Job] = deque()
+        self._news = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
+        self._known = {}
+        for name in tasks.names():
+            spec = tasks.get(name)
+            known = _Task(name, spec.gym_id, spec.instruction)
+            self._known |= {name: known, spec.gym_id: known}
+
+    @property
+    def facts(self) -> ServedFacts:
+        """What the server declares; complete after `start`."""
+        if self._facts is None:
+            raise RuntimeError("the server has not begun")
+        return self._facts
+
+    def start(self, task: str = "boxing") -> None:
+        """Validate the policy, let it look once so that everything is loaded and compiled, and begin to serve.
+
+        Args:
+            task: Of the look that nobody sees.
+
+        Raises:
+            InputError: The policy cannot work, or only in the process of the world.
+        """
+        self.policy.check()
+        known = self._known.get(task, _Task(task, task, ""))
+        everyone = np.ones(self.max_sessions, dtype=bool)
+        self.policy.reset([WARM_UP_SEED] * self.max_sessions, [known.gym_id] * self.max_sessions, everyone)
+        chunk = self.policy.act(self._observation(known, [0]))
+        if 0 in chunk.errors:
+            raise InputError(f"--policy {self.policy.name}: {chunk.errors[0]}")
+        self._check_shape(chunk.actions)
+        labels, picture = self.protocol.name, ServedPicture(self._camera.width, self._camera.height, self._camera.fit)
+        about = json.loads(json.dumps(self.policy.describe(), default=str))
+        digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
+        self._facts = ServedFacts(
+            policy=f"{self.policy.name} {digest}",
+            labels=labels,
+            realign=float(getattr(self.policy, "realign", 0.0)) if labels == "v4" else None,
+            action_names=tuple(action_names(labels)),
+            state_names=tuple(state_names()),
+            chunk_length=int(chunk.actions.shape[1]),
+            rate_hz=RATE,
+            needs_picture=self.policy.needs_image,
+            picture=picture if self.policy.needs_image else None,
+            seeded=not self.policy.depends_on_worlds,
+            facts=about,
+        )
+        self._thread.start()
+
+    def begin(self, owner: str, begin: Begin, *, held: bool = True) -> None:
+        """Begin an episode in a session: its memory is cleared.
+
+        Args:
+            owner: Connection, or whoever the session belongs to.
+            begin: What is said of the episode.
+            held: The session lives until its owner leaves; otherwise it may lose its row when it is idle.
+
+        Raises:
+            Refused: No row is free, or the policy cannot do the task.
+        """
+        self._wait_for(_Job("begin", owner, begin.session, begin, Future(), held))
+
+    def look(self, owner: str, look: Look, *, held: bool = True) -> Answer:
+        """The chunk of a session, by one call of the policy for all that ask at this time.
+
+        The same look again (seed, step and content) is given the same answer again. One with `step` 0, or without a
+        step in a session that has no episode, begins an episode.
+
+        Raises:
+            Refused: The look is unfit, its episode is not known, or the policy failed.
+        """
+        return self._wait_for(_Job("look", owner, look.session, look, Future(), held))
+
+    def end(self, owner: str, session: str) -> None:
+        """End a session's episode and free its row."""
+        self._put(_Job("end", owner, session, None, Future()))
+
+    def leave(self, owner: str) -> None:
+        """End all sessions of an owner."""
+        self._put(_Job("leave", owner, "", None, Future()))
+
+    def close(self) -> None:
+        """Stop; who waits for an answer is refused."""
+        with self._news:
+            self._closed = True
+            self._news.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+        self.policy.close()
+
+    def _put(self, job: _Job) -> None:
+        with self._news:
+            if self._closed:
+                job.done.set_exception(Refused("policy", "the server is closing"))
+                return
+            self._jobs.append(job)
+            self._news.notify_all()
+
+    def _wait_for(self, job: _Job) -> Answer:
+        self._put(job)
+        try:
+            return job.done.result(LONGEST_ACT)
+        except TimeoutError:
+            raise Refused("policy", f"the policy gave no answer within {LONGEST_ACT:g} s") from None
+
+    def _work(self) -> None:
+        """Take jobs in their order; looks of different sessions together."""
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._closed or bool(self._jobs))
+                if self._closed:
+                    break
+                job = self._jobs.popleft()
+            if job.kind != "look":
+                self._do(job)
+                continue
+            self._answer(self._batch(job))
+        for job in self._jobs:
+            job.done.set_exception(Refused("policy", "the server is closing"))
+
+    def _batch(self, first: _Job) -> list[_Job]:
+        """Looks that are answered together; what begins or ends meanwhile is done at once, unless it is theirs."""
+        batch, keys = [first], {(first.owner, first.session)}
+        end = first.came + self.max_wait
+        while len(batch) < self.max_batch_size:
+            job = self._next(keys, end)
+            if job is None:
+                break
+            if job.kind == "look":
+                batch.append(job)
+                keys.add((job.owner, job.session))
+            else:
+                self._do(job)
+        return batch
+
+    def _next(self, keys: set[tuple[str, str]], end: float) -> _Job | None:
+        """The next job that does not have to wait for the sessions `keys`; None where there is none until `end`."""
+        with self._news:
+            # Nobody else can ask where every session already does.
+            if not self._jobs and not all(key in keys for key in self._sessions):
+                self._news.wait_for(lambda: self._closed or bool(self._jobs), max(end - time.monotonic(), 0.0))
+            if self._closed or not self._jobs:
+                return None
+            job = self._jobs[0]
+            owners = {owner for owner, _ in keys}
+            if (job.owner, job.session) in keys or (job.kind == "leave" and job.owner in owners):
+                return None
+            return self._jobs.popleft()
+
+    def _do(self, job: _Job) -> None:
+        """Begin or end."""
+        try:
+            if isinstance(job.message, Begin):
+                self._begin((job.owner, job.session), job.message, job.held)
+            elif job.kind == "end":
+                self._drop((job.owner, job.session))
+            else:
+                for key in [key for key in self._sessions if key[0] == job.owner]:
+                    self._drop(key)
+            job.done.set_result(Answer(np.zeros((0, ACTION_WIDTH), np.float32), 0.0))
+        except Exception as error:
+            job.done.set_exception(self._refusal(error))
+
+    def _begin(self, key: tuple[str, str], begin: Begin, held: bool) -> _Session:
+        task = self._task(begin.task, begin.instruction)
+        if task.name:
+            self.policy.check_task(task.name)
+        session = self._sessions.get(key)
+        seed = begin.seed
+        if seed is None:
+            seed, self._unseeded = self._unseeded, self._unseeded + 1
+        row = self._row() if session is None else session.row
+        session = self._sessions[key] = _Session(row, seed, task, held, time.monotonic())
+        self._seeds[row], self._tasks[row] = seed, task.gym_id
+        mask = np.zeros(self.max_sessions, dtype=bool)
+        mask[row] = True
+        try:
+            self.policy.reset(list(self._seeds), list(self._tasks), mask)
+        except BaseException:
+            self._drop(key)
+            raise
+        self.counts.episodes += 1
+        return session
+
+    def _row(self) -> int:
+        if not self._free:
+            idle = [(s.used, key) for key, s in self._sessions.items() if not s.held]
+            used, key = min(idle, default=(time.monotonic(), ("", "")))
+            if time.monotonic() - used < IDLE:
+                raise Refused("full", f"all {self.max_sessions} sessions are in use; --max-sessions of the server")
+            self._drop(key)
+        return self._free.pop()
+
+    def _drop(self, key: tuple[str, str]) -> None:
+        session = self._sessions.pop(key, None)
+        if session is not None:
+            self._free.append(session.row)
+
+    def _task(self, text: str, instruction: str) -> _Task:
+        """The task that a message means, by Gym id, name or instruction; its own words where it is none of ours."""
+        known = self._known.get(text)
+        if known is None and not text:
+            known = next((one for one in self._known.values() if one.instruction == instruction), None)
+        if known is None:
+            return _Task(text, text, instruction)
+        return _Task(known.name, known.gym_id, instruction or known.instruction)
+
+    def _session(self, job: _Job, look: Look, content: int) -> _Session:
+        """The session of a look; a look that begins an episode makes it."""
+        key = (job.owner, job.session)
+        session = self._sessions.get(key)
+        if session is not None:
+            other = look.seed is not None and look.seed != session.seed
+            again = session.last is not None and session.last != (0, content)
+            if look.step == 0 and (other or again):
+                session = None
+            elif other:
+                raise Refused("unfit", f"the look is of seed {look.seed}, the session's episode of seed {session.seed}")
+        elif look.step:
+            raise Refused(
+                "unknown_episode",
+                f"the look is {look.step} actions into an episode that the server does not know (it was started again, "
+                "or the session was idle and lost its row); begin the episode again",
+            )
+        if session is None:
+            session = self._begin(key, Begin(look.session, look.seed, look.task, look.instruction), job.held)
+        session.used = time.monotonic()
+        task = self._task(look.task, look.instruction) if look.task or look.instruction else session.task
+        if task != session.task:
+            if task.name != session.task.name:
+                self.policy.check_task(task.name)
+            session.task = task
+        return session
+
+    def _answer(self, batch: Sequence[_Job]) -> None:
+        """Put the looks of a batch into the policy's rows, and answer them task by task."""
+        groups: dict[_Task, list[tuple[_Job, _Session]]] = {}
+        now = time.monotonic()
+        self.counts.first_look = self.counts.first_look or now
+        for job in batch:
+            look = job.message
+            try:
+                if not isinstance(look, Look):
+                    raise TypeError("no look")
+                content = zlib.crc32(look.state.tobytes())
+                if look.image is not None:
+                    content = zlib.crc32(look.image.tobytes(), content)
+                session = self._session(job, look, content)
+                if look.step is not None and session.last == (look.step, content) and session.answer is not None:
+                    self.counts.repeated += 1
+                    job.done.set_result(Answer(session.answer, 1000 * (time.monotonic() - job.came)))
+                    continue
+                self._see(session.row, look)
+                session.last, session.answer = (look.step, content), None
+                groups.setdefault(session.task, []).append((job, session))
+            except Exception as error:
+                job.done.set_exception(self._refusal(error))
+        for task, asking in groups.items():
+            self._act(task, asking)
+        self.counts.last_look = time.monotonic()
+
+    def _see(self, row: int, look: Look) -> None:
+        """Put what a session sees into its row."""
+        if look.robot_type and look.robot_type != self.protocol.robot_type:
+            kinds = f"{plain_text(look.robot_type, 60)!r}, the policy's actions are for {self.protocol.robot_type!r}"
+            raise Refused("unfit", f"robot_type is {kinds} (label protocol {self.protocol.name})")
+        if self._image is not None:
+            if look.image is None:
+                raise Refused("unfit", f"policy {self.policy.name} looks at pictures, the message holds none")
+            picture = fitted_picture(look.image, self._camera)
+            self._image[row] = torch.from_numpy(np.ascontiguousarray(picture)).to(self.device)
+        self._state[row] = torch.from_numpy(look.state).to(self.device)
+
+    def _observation(self, task: _Task, rows: Sequence[int]) -> Observation:
+        mask = np.zeros(self.max_sessions, dtype=bool)
+        mask[list(rows)] = True
+        return Observation(self._state, self._image, mask, task.name, task.gym_id, task.instruction)
+
+    def _act(self, task: _Task, asking: Sequence[tuple[_Job, _Session]]) -> None:
+        """One call of the policy."""
+        rows = [session.row for _, session in asking]
+        began = time.monotonic()
+        try:
+            chunk = self.policy.act(self._observation(task, rows))
+            self._check_shape(chunk.actions)
+            chosen = torch.as_tensor(chunk.actions)[rows].detach().cpu().numpy()
+        except Exception as error:
+            refusal = self._refusal(error, "policy")
+            for job, _ in asking:  # what the policy remembers of them is not known
+                self._drop((job.owner, job.session))
+                job.done.set_exception(refusal)
+            return
+        self.counts.act_seconds += time.monotonic() - began
+        self.counts.batches[len(rows)] += 1
+        self.counts.looks += len(rows)
+        for (job, session), made in zip(asking, chosen, strict=True):
+            try:
+                if session.row in chunk.errors:
+                    raise Refused("policy", chunk.errors[session.row])
+                session.answer = self.protocol.validate(made, f"policy {self.policy.name}").copy()
+                job.done.set_result(Answer(session.answer, 1000 * (time.monotonic() - job.came)))
+            except Exception as error:
+                job.done.set_exception(self._refusal(error, "policy"))
+
+    def _check_shape(self, actions: torch.Tensor | np.ndarray) -> None:
+        shape = tuple(actions.shape)
+        if len(shape) != 3 or shape[::2] != (self.max_sessions, ACTION_WIDTH) or not shape[1]:
+            wanted = f"[{self.max_sessions}, n, {ACTION_WIDTH}]"
+            raise InputError(f"policy {self.policy.name}: a chunk of shape {list(shape)}, expected {wanted}")
+
+    def _refusal(self, error: Exception, reason: Reason = "unfit") -> Refused:
+        """What the client is told of an error; the console is told all of it where it is not a client's fault."""
+        self.counts.refused += 1
+        match error:
+            case Refused():
+                return error
+            case PolicyUnavailable():
+                return Refused("policy", str(error))
+            case WireError() | InputError():
+                return Refused(reason, str(error))
+        print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
+        return Refused("policy", f"the policy failed ({type(error).__name__}); the server's console says more")

@@ -1,0 +1,160 @@
+"""The work of ``policies serve``: make the policy, open a door, report at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import ssl
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from arena_newton import tasks
+from arena_newton.errors import InputError, naming
+from arena_newton.policies.base import Policy, get
+from arena_newton.policies.label_reader import read_by
+from arena_newton.policies.serve.door_guard import ACCESS_TOKEN_VARIABLE, DoorGuard
+from arena_newton.policies.serve.http_door import HttpDoor
+from arena_newton.policies.serve.policy_server import PolicyServer
+from arena_newton.policies.serve.serve_options import ServeOptions
+from arena_newton.policies.serve.websocket_doors import WebsocketDoor
+from arena_newton.policies.teleop.ports import bind
+
+__all__ = ["make_policy", "open_door", "serve_policy"]
+
+type Say = Callable[[str], None]
+
+
+def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.Event | None = None) -> int:
+    """Serve until Ctrl-C.
+
+    Args:
+        options: The flags.
+        say: Takes the lines of the console; they are printed by default.
+        stop: Ends the server, too.
+
+    Returns:
+        Exit code 0.
+
+    Raises:
+        InputError: A flag is wrong, or the policy cannot be served.
+    """
+    say = say or (lambda line: print(line, flush=True))
+    guard = DoorGuard(options.max_sessions)
+    tls = _tls(options)
+    tasks.get(options.task)
+    device = _device(options.device)
+    server = PolicyServer(
+        make_policy(options, device),
+        max_batch_size=options.max_batch_size,
+        max_wait=options.max_wait,
+        max_sessions=options.max_sessions,
+        device=device,
+    )
+    try:
+        server.start(options.task)
+        door = open_door(server, options, guard, tls)
+        try:
+            for line in _greeting(server, options, guard, door.port):
+                say(line)
+            with contextlib.suppress(KeyboardInterrupt):
+                (stop or threading.Event()).wait()
+        finally:
+            door.close()
+    finally:
+        server.close()
+    for line in server.counts.summary():
+        say(line)
+    return 0
+
+
+def make_policy(options: ServeOptions, device: torch.device) -> Policy:
+    """The policy that is served, decoded to v3.1 unless its own labels are wanted.
+
+    Raises:
+        InputError: There is no such policy, or it is of other labels than it is said to be.
+    """
+    more: dict[str, object] = {}
+    if options.policy.partition(":")[0] == "lerobot":
+        more = {"replan": options.replan, "ensemble": options.ensemble, "device": str(device)}
+    elif options.replan is not None or options.ensemble:
+        raise InputError("--replan and --ensemble: of a checkpoint only, --policy lerobot:<checkpoint>")
+    policy = get(options.policy, **{name: value for name, value in more.items() if value is not None})
+    labels = options.labels or getattr(policy, "labels", None) or "v3.1"
+    decoded = read_by(policy, labels)
+    if not options.raw_labels:
+        if policy.labels is None and decoded is policy:
+            policy.labels = "v3.1"
+        return decoded
+    policy.labels = labels
+    return policy
+
+
+def open_door(
+    server: PolicyServer, options: ServeOptions, guard: DoorGuard, tls: ssl.SSLContext | None = None
+) -> HttpDoor | WebsocketDoor:
+    """Listen at the port of the flags.
+
+    Raises:
+        InputError: The port is taken.
+    """
+    listening = bind(options.port, "--port", options.host)
+    match options.protocol:
+        case "arena":
+            return HttpDoor(server, listening, guard, tls)
+        case "openpi" | "roboarena" | "vla-eval" as protocol:
+            return WebsocketDoor(server, listening, protocol, guard, tls)
+    raise InputError(f"--protocol {options.protocol}: unknown")
+
+
+def _device(name: str | None) -> torch.device:
+    with naming(f"--device {name}:"):
+        try:
+            device = torch.device(name or ("cuda" if torch.cuda.is_available() else "cpu"))
+        except RuntimeError:
+            raise InputError("no such device, expected cpu, cuda or cuda:<number>") from None
+        if device.type not in ("cpu", "cuda"):
+            raise InputError("expected cpu, cuda or cuda:<number>")
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise InputError(f"there are {torch.cuda.device_count()} CUDA devices")
+    return device
+
+
+def _tls(options: ServeOptions) -> ssl.SSLContext | None:
+    if options.tls_cert is None or options.tls_key is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(Path(options.tls_cert).expanduser(), Path(options.tls_key).expanduser())
+    except (OSError, ssl.SSLError) as error:
+        reason = getattr(error, "strerror", None) or "not a certificate with its key"
+        raise InputError(f"--tls-cert {options.tls_cert}, --tls-key {options.tls_key}: {reason}") from None
+    return context
+
+
+def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, port: int) -> list[str]:
+    """What is served where, for whom reads the console."""
+    facts = server.facts
+    kind = "http" if options.protocol == "arena" else "ws"
+    scheme = kind + ("s" if options.tls_cert else "")
+    picture = "no picture"
+    if facts.picture is not None:
+        picture = f"pictures of {facts.picture.width}x{facts.picture.height} ({facts.picture.fit})"
+    lines = [
+        f"policy {facts.policy}: chunks of {facts.chunk_length} actions of {facts.labels} at {facts.rate_hz:g} Hz, "
+        f"{picture}",
+        f"{options.protocol} at {scheme}://{options.host}:{port}, up to {options.max_sessions} episodes at once on "
+        f"{server.device}; Ctrl-C ends",
+    ]
+    if not guard.wants_token and not _local(options.host):
+        lines.append(f"warning: whoever reaches {options.host}:{port} can ask; set {ACCESS_TOKEN_VARIABLE} to a token")
+    return lines
+
+
+def _local(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

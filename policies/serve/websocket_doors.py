@@ -1,0 +1,209 @@
+"""The doors of openpi, RoboArena and vla-eval: websockets, a thread for each connection, which is a robot or several.
+
+Next to the socket every door answers `GET /healthz`, `/health` and `/config`. A frame that is no message gets one line
+back and never a traceback.
+"""
+
+from __future__ import annotations
+
+import http
+import logging
+import socket
+import ssl
+import threading
+import time
+from collections import deque
+from typing import Literal
+
+import numpy as np
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request as HttpRequest
+from websockets.http11 import Response
+from websockets.sync.server import ServerConnection, serve
+
+from arena_newton.errors import ArenaError
+from arena_newton.policies.serve import openpi_codec, vla_eval_codec
+from arena_newton.policies.serve.arena_codec import pack_config, pack_failure
+from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
+from arena_newton.policies.serve.policy_messages import Begin, End, Look
+from arena_newton.policies.serve.policy_server import PolicyServer
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
+from arena_newton.text import plain_text
+
+__all__ = ["WebsocketDoor", "WebsocketProtocol"]
+
+type WebsocketProtocol = Literal["openpi", "roboarena", "vla-eval"]
+"""What is spoken; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
+
+HANDSHAKE_SECONDS = 10.0
+"""Time that a client has to become a websocket [s]."""
+PING_SECONDS, PONG_SECONDS = 20.0, 300.0
+"""Time between two pings, and time that a client has to answer one: compiling kernels holds up a robot [s]."""
+INTERNAL_ERROR, FULL = 1011, 1013
+"""Codes with which a socket is closed: a request failed, as openpi's server does it; too many connections."""
+
+
+class WebsocketDoor:
+    """Listens, and translates between frames and the policy server."""
+
+    def __init__(
+        self,
+        server: PolicyServer,
+        listening: socket.socket,
+        protocol: WebsocketProtocol,
+        guard: DoorGuard,
+        tls: ssl.SSLContext | None = None,
+    ):
+        """Begin to listen.
+
+        Args:
+            server: Answers; it has started.
+            listening: The port, which belongs to the door from now on.
+            protocol: What is spoken.
+            guard: Who may come in.
+            tls: Certificate and key, for `wss`.
+        """
+        self.port = int(listening.getsockname()[1])
+        self._policy, self._protocol, self._guard = server, protocol, guard
+        self._number, self._lock = 0, threading.Lock()
+        logger = logging.getLogger("arena_newton.serve")
+        logger.setLevel(logging.CRITICAL)  # what strangers send is no news
+        self._server = serve(
+            self._connected,
+            sock=listening,
+            ssl=tls,
+            origins=[None],
+            process_request=self._answer_http,
+            compression=None,
+            max_size=MAX_FRAME,
+            open_timeout=HANDSHAKE_SECONDS,
+            ping_interval=PING_SECONDS,
+            ping_timeout=PONG_SECONDS,
+            server_header=None,
+            logger=logger,
+        )
+        self._open: set[ServerConnection] = set()
+        self._thread = threading.Thread(target=self._server.serve_forever, name="door", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the door and its connections."""
+        self._server.shutdown()
+        with self._lock:
+            connections = list(self._open)
+        for connection in connections:
+            try:
+                connection.close(1001, "the server is closing")
+            except (OSError, ConnectionClosed):
+                pass  # it was closed meanwhile
+        self._thread.join(timeout=2.0)
+
+    def _answer_http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
+        """A route; None lets the handshake of a socket go on."""
+        path = request.path.partition("?")[0]
+        headers = request.headers
+        origin, authorization = (" ".join(headers.get_all(name)) or None for name in ("Origin", "Authorization"))
+        refused = self._guard.refusal(path, authorization, origin)
+        if refused is not None:
+            return _response(refused[0], pack_failure(refused[1]))
+        if path == "/healthz":
+            return _response(200, b"OK\n", "text/plain")
+        if path in HEALTH_PATHS:
+            return _response(200, b'{"status": "ok"}\n')
+        if path == "/config":
+            return _response(200, pack_config(self._policy.facts, {"protocol": self._protocol}))
+        if self._guard.full:
+            return _response(503, pack_failure(f"there are {self._guard.connections} connections already"))
+        return None
+
+    def _connected(self, connection: ServerConnection) -> None:
+        """Serve a connection until it ends."""
+        with self._lock:
+            self._number += 1
+            owner = f"socket {self._number}"
+            self._open.add(connection)
+        try:
+            with self._guard.inside() as room:
+                if not room:
+                    connection.close(FULL, "too many connections")
+                elif self._protocol == "vla-eval":
+                    self._serve_vla_eval(connection, owner)
+                else:
+                    self._serve_openpi(connection, owner)
+        except (ConnectionClosed, OSError):
+            pass  # the robot has left
+        finally:
+            self._policy.leave(owner)
+            with self._lock:
+                self._open.discard(connection)
+
+    def _serve_openpi(self, connection: ServerConnection, owner: str) -> None:
+        connection.send(openpi_codec.pack_metadata(self._policy.facts, roboarena=self._protocol == "roboarena"))
+        total: float | None = None
+        for data in connection:
+            began = time.monotonic()
+            try:
+                request, roboarena = openpi_codec.unpack_request(data)
+                if isinstance(request, Begin):
+                    self._policy.begin(owner, request)
+                    connection.send(openpi_codec.RESET_ANSWER)
+                    continue
+                answer = self._policy.look(owner, request)
+                frame = openpi_codec.pack_answer(answer.actions, answer.infer_ms, total, roboarena=roboarena)
+            except ArenaError as error:  # openpi's server says so in a text frame, too, and closes
+                connection.send(plain_text(error, 300))
+                connection.close(INTERNAL_ERROR, "the request failed, as the last frame says")
+                return
+            connection.send(frame)
+            total = 1000 * (time.monotonic() - began)
+
+    def _serve_vla_eval(self, connection: ServerConnection, owner: str) -> None:
+        whole = False
+        kept: dict[str, deque[np.ndarray]] = {}
+        """Actions of a robot that takes one at a time, by session."""
+        for data in connection:
+            seq = 0
+            try:
+                message = vla_eval_codec.unpack_message(data)
+                seq = message.seq
+                if message.type == "hello":
+                    _, whole = vla_eval_codec.unpack_hello(message, "hello")
+                    connection.send(vla_eval_codec.pack_hello(self._policy.facts, seq, time.time()))
+                    continue
+                if message.type in ("error", "record"):
+                    continue
+                request = vla_eval_codec.unpack_request(message)
+                kept.setdefault(request.session, deque())
+                if isinstance(request, Look):
+                    actions = self._actions(owner, request, kept[request.session], whole=whole)
+                    connection.send(vla_eval_codec.pack_action(actions, seq, time.time()))
+                    continue
+                del kept[request.session]
+                if isinstance(request, End):
+                    self._policy.end(owner, request.session)
+                else:
+                    self._policy.begin(owner, request)  # answered only where it fails
+            except ArenaError as error:
+                connection.send(vla_eval_codec.pack_error(plain_text(error, 300), seq, time.time()))
+
+    def _actions(self, owner: str, look: Look, kept: deque[np.ndarray], *, whole: bool) -> np.ndarray:
+        """A chunk, or the next action of one, as a robot takes them."""
+        if whole:
+            return self._policy.look(owner, look).actions
+        if not kept:
+            kept.extend(self._policy.look(owner, look).actions)
+        return kept.popleft()
+
+
+def _response(status: int, body: bytes, kind: str = "application/json") -> Response:
+    headers = Headers(
+        {
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Connection": "close",
+        }
+    )
+    return Response(status, http.HTTPStatus(status).phrase, headers, body)

@@ -1,0 +1,57 @@
+"""Command line: ``python -m arena_newton.policies.train [flags]``, and ``bench``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from arena_newton.command_line import exit_code
+from arena_newton.extras import require
+from arena_newton.flags import parse_flags
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions, check_numbers
+
+__all__ = ["main"]
+
+PROG = "python -m arena_newton.policies.train"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments; those of the process by default.
+
+    Returns:
+        Exit code: 0 done, 1 training failed, 2 bad input, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    return exit_code(lambda: _bench(arguments[1:]) if arguments[:1] == ["bench"] else _train(arguments))
+
+
+def _train(arguments: list[str]) -> None:
+    options = parse_flags(PolicyTrainOptions, arguments, PROG)
+    check_numbers(options)  # before the libraries are loaded
+    _require(options.policy)
+    from arena_newton.policies.train.training import train
+
+    train(options)
+
+
+def _bench(arguments: list[str]) -> None:
+    options = parse_flags(TrainingBenchOptions, arguments, f"{PROG} bench")
+    check_numbers(options)
+    _require(options.policy)
+    from arena_newton.policies.train.training_bench import bench
+
+    bench(options)
+
+
+def _require(family: str) -> None:
+    """Check the libraries that a family's training needs."""
+    require("data", "policies train", ("pyarrow",))
+    if family != "act":
+        require("policies", f"policies train --policy {family}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

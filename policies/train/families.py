@@ -1,0 +1,49 @@
+"""Policies of LeRobot as a trainer needs them: from a recipe, with a loss for CUDA graphs, saved for a stock LeRobot.
+
+A batch is a dict of normalised tensors on the device: `observation.images.front` [B, 3, H, W], `observation.state`
+[B, 64], for recipes with a task vector `observation.environment_state` [B, tasks], `action` [B, n, 40] at the offsets
+`samples` of the model from the observation's tick, `action_is_pad` bool [B, n]; for families that read the instruction
+either `task`, a list of strings, or its tokens (`tokens` of the model).
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import torch
+
+from arena_newton.errors import InputError
+from arena_newton.policies.recipes.training_recipe import FAMILIES, TrainingRecipe
+from arena_newton.policies.train.feature_scaling import Stats
+from arena_newton.policies.train.policy_model import TrainableModel
+
+__all__ = ["Model", "build"]
+
+Model = TrainableModel
+"""What `build` returns."""
+
+_MODULES = {family: f"arena_newton.policies.train.{family}_family" for family in FAMILIES}
+
+
+def build(
+    recipe: TrainingRecipe, stats: Stats, device: str | torch.device, weights: str | Path | None = None
+) -> TrainableModel:
+    """A policy with new or pretrained weights, in training mode, and its processors.
+
+    Args:
+        recipe: Sizes and options.
+        stats: Statistics of the training's data, of its features before normalisation. Those of
+            `observation.environment_state` say the width of the task vector.
+        device: Torch device of the policy.
+        weights: Name on the Hugging Face hub or a local folder (of ResNet also the file) with pretrained weights: of
+            the vision encoder, of pi0.5 the whole network. None: as the recipe says.
+
+    Raises:
+        InputError: Weights are not there or do not fit, or statistics are missing.
+    """
+    if recipe.family not in FAMILIES:
+        raise InputError(f"--policy {recipe.family}: unknown, choose from {', '.join(FAMILIES)}")
+    found = importlib.import_module(_MODULES[recipe.family]).build(recipe, stats, torch.device(device), weights)
+    assert isinstance(found, TrainableModel)
+    return found

@@ -1,0 +1,302 @@
+"""All pictures, states and actions of datasets on one device: decoded once, read by index.
+
+Pictures are uint8. Rows that are black in every picture, above and below a padded 4:3 picture, are cut off and put back
+when a batch is made: a quarter of the memory.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.data.frame_reader import Frames
+from arena_newton.errors import InputError
+from arena_newton.policies.train.demonstration_rows import DatasetRows, EpisodeRows
+
+__all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "needed_memory"]
+
+BLACK = 12
+"""Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
+NETWORK_BYTES = 6 * 2**30
+"""Memory of a GPU that is left to the network, its optimizer and its activations (ACT, batch 64, bf16: 2.6 GB)."""
+HOST_BYTES = 2**30
+"""The same of the host, for tests and small networks."""
+
+
+@dataclass(frozen=True)
+class FrameStore:
+    """Rows of all episodes, one after the other, on one device."""
+
+    pictures: torch.Tensor
+    """uint8, shape [rows, height - top - bottom, width, 3]."""
+    states: torch.Tensor
+    """float32, shape [rows, 64]."""
+    actions: torch.Tensor
+    """float32, shape [rows, 40]."""
+    first: torch.Tensor
+    """First row of each row's episode, int64, shape [rows]."""
+    last: torch.Tensor
+    """Last row of each row's episode, int64, shape [rows]."""
+    instruction: torch.Tensor
+    """Number of each row's instruction, int64, shape [rows]."""
+    task: torch.Tensor
+    """Number of each row's task, int64, shape [rows]."""
+    instructions: tuple[str, ...]
+    tasks: tuple[str, ...]
+    """Names of tasks, sorted."""
+    lengths: tuple[int, ...]
+    """Rows of each episode."""
+    held: tuple[bool, ...]
+    """Whether an episode is held out."""
+    top: int
+    """Black rows above [px]."""
+    bottom: int
+    """Black rows below [px]."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the rows are."""
+        return self.pictures.device
+
+    @property
+    def rows(self) -> int:
+        """Rows of all episodes."""
+        return len(self.states)
+
+    @property
+    def height(self) -> int:
+        """Height of a whole picture [px]."""
+        return int(self.pictures.shape[1]) + self.top + self.bottom
+
+    @property
+    def width(self) -> int:
+        """Width of a picture [px]."""
+        return int(self.pictures.shape[2])
+
+    def samples(self, *, held: bool = False, drop_last: int = 0) -> np.ndarray:
+        """Rows at which a sample may begin.
+
+        Args:
+            held: Those of held-out episodes instead of the others.
+            drop_last: Rows at the end of each episode at which none begins.
+
+        Returns:
+            int64, ascending.
+        """
+        starts = np.cumsum([0, *self.lengths])
+        parts = [
+            np.arange(start, start + length - drop_last)
+            for start, length, out in zip(starts, self.lengths, self.held, strict=False)
+            if out == held and length > drop_last
+        ]
+        return np.concatenate(parts) if parts else np.zeros(0, np.int64)
+
+
+def needed_memory(frames: int, height: int, width: int) -> int:
+    """Bytes of so many rows."""
+    return frames * (height * width * 3 + 4 * (STATE_WIDTH + ACTION_WIDTH) + 4 * 8)
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes of a device that rows may take, those of the network left out."""
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        return int(free) - NETWORK_BYTES
+    for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else ():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024 - HOST_BYTES
+    return 2**62
+
+
+def check_memory(frames: int, height: int, width: int, device: torch.device) -> None:
+    """Refuse what does not fit.
+
+    Raises:
+        InputError: The device has too little free memory; the message says how much is missing.
+    """
+    needed, free = needed_memory(frames, height, width), free_memory(device)
+    if needed > free:
+        raise InputError(
+            f"--dataset: {frames} pictures of {width}x{height} need {needed / 1e9:.1f} GB of memory on {device}, "
+            f"{max(0, free) / 1e9:.1f} GB are free beside the network: name fewer datasets, record smaller pictures, "
+            "or use a device with more memory"
+        )
+
+
+def load_frames(
+    datasets: Sequence[DatasetRows],
+    device: torch.device,
+    *,
+    hold_out: int = 0,
+    jobs: int = 0,
+    on_frames: Callable[[int], None] = lambda count: None,
+) -> FrameStore:
+    """Decode all pictures onto a device.
+
+    Args:
+        datasets: Read with `read_rows`; their pictures must have one size.
+        device: Where the rows are wanted.
+        hold_out: Last episodes of each dataset that are held out.
+        jobs: Threads that decode, an episode each; 0: one per core that the process may use.
+        on_frames: Is told after each episode how many pictures were decoded.
+
+    Raises:
+        InputError: The pictures differ in size, do not fit, or cannot be decoded; or no episode is left to train on.
+    """
+    height, width = datasets[0].height, datasets[0].width
+    for dataset in datasets[1:]:
+        if (dataset.height, dataset.width) != (height, width):
+            raise InputError(
+                f"--dataset {dataset.root}: pictures of {dataset.width}x{dataset.height} pixels, "
+                f"{datasets[0].root} has {width}x{height}"
+            )
+    for dataset in datasets:
+        if hold_out >= len(dataset.episodes):
+            raise InputError(
+                f"--hold-out {hold_out}: {dataset.root} has {len(dataset.episodes)} episodes, none would be left"
+            )
+    frames = sum(dataset.frames for dataset in datasets)
+    workers = jobs or len(os.sched_getaffinity(0))
+    top, bottom = black_rows(datasets, workers)
+    check_memory(frames, height - top - bottom, width, device)
+    pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
+    if not _decode(datasets, pictures, (top, bottom), workers, on_frames):
+        # Some picture is not black where the first ones of all episodes are.
+        del pictures
+        top = bottom = 0
+        check_memory(frames, height, width, device)
+        pictures = torch.empty((frames, height, width, 3), dtype=torch.uint8, device=device)
+        _decode(datasets, pictures, (0, 0), workers, on_frames)
+    episodes = [episode for dataset in datasets for episode in dataset.episodes]
+    held = [number >= len(d.episodes) - hold_out for d in datasets for number in range(len(d.episodes))]
+    return assembled(episodes, pictures, held, top, bottom)
+
+
+def black_rows(datasets: Sequence[DatasetRows], workers: int) -> tuple[int, int]:
+    """Rows above and below that are black in the first picture of every episode; none where a whole picture is."""
+
+    def brightest(dataset: DatasetRows) -> np.ndarray:
+        frames, row, most = Frames(dataset.root, dataset.camera), 0, np.zeros(dataset.height, np.uint8)
+        for episode in dataset.episodes:
+            most = np.maximum(most, frames[row].max(axis=(1, 2)))
+            row += episode.length
+        frames.close()
+        return most
+
+    with ThreadPoolExecutor(workers) as pool:
+        most = np.max(list(pool.map(brightest, datasets)), axis=0)
+    bright = np.flatnonzero(most > BLACK)
+    return (int(bright[0]), int(len(most) - 1 - bright[-1])) if len(bright) else (0, 0)
+
+
+def _decode(
+    datasets: Sequence[DatasetRows],
+    pictures: torch.Tensor,
+    bands: tuple[int, int],
+    workers: int,
+    on_frames: Callable[[int], None],
+) -> bool:
+    """Decode every episode into its rows; False where a picture is not black in the bands that are cut off."""
+    top, bottom = bands
+    end = datasets[0].height - bottom
+    work: list[tuple[DatasetRows, Frames, int, int]] = []
+    row = 0
+    for dataset in datasets:
+        reader = Frames(dataset.root, dataset.camera, open_files=1)
+        for number, episode in enumerate(dataset.episodes):
+            work.append((dataset, reader, number, row))
+            row += episode.length
+
+    def one(item: tuple[DatasetRows, Frames, int, int]) -> int:
+        dataset, reader, number, row = item
+        length = dataset.episodes[number].length
+        frames = copy.copy(reader)  # with open files of its own: a decoder gives one frame after the other
+        found = np.empty((length, *pictures.shape[1:]), np.uint8)
+        clean = True
+        for place, picture in enumerate(frames.episode(number)):
+            if picture.shape[:2] != (dataset.height, dataset.width):
+                raise InputError(f"{dataset.root}: episode {number}: a picture has shape {list(picture.shape)}")
+            found[place] = picture[top:end]
+            clean = clean and int(picture[:top].max(initial=0)) <= BLACK and int(picture[end:].max(initial=0)) <= BLACK
+        frames.close()
+        pictures[row : row + length].copy_(torch.from_numpy(found))
+        return length if clean else -1
+
+    with ThreadPoolExecutor(workers) as pool:
+        running = pool.map(one, work)
+        try:
+            for length in running:
+                if length < 0:
+                    return False
+                on_frames(length)
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return True
+
+
+def assembled(
+    episodes: Sequence[EpisodeRows], pictures: torch.Tensor, held: Sequence[bool], top: int, bottom: int
+) -> FrameStore:
+    """Rows of episodes next to their pictures."""
+    device = pictures.device
+    lengths = np.array([episode.length for episode in episodes])
+    ends = np.cumsum(lengths)
+    instructions = tuple(sorted({episode.instruction for episode in episodes}))
+    tasks = tuple(sorted({episode.task for episode in episodes}))
+
+    def per_row(values: Iterator[int] | np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.repeat(np.fromiter(values, np.int64, len(episodes)), lengths)).to(device)
+
+    return FrameStore(
+        pictures=pictures,
+        states=torch.from_numpy(np.concatenate([e.states for e in episodes])).to(device),
+        actions=torch.from_numpy(np.concatenate([e.actions for e in episodes])).to(device),
+        first=per_row(ends - lengths),
+        last=per_row(ends - 1),
+        instruction=per_row(instructions.index(e.instruction) for e in episodes),
+        task=per_row(tasks.index(e.task) for e in episodes),
+        instructions=instructions,
+        tasks=tasks,
+        lengths=tuple(lengths.tolist()),
+        held=tuple(held),
+        top=top,
+        bottom=bottom,
+    )
+
+
+def made_frames(frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500) -> FrameStore:
+    """Rows of noise, for measurements without a dataset.
+
+    Args:
+        frames: Number of rows.
+        size: Height and width of a picture [px]; an eighth of the rows above and below is black, as in a padded one.
+        device: Where they are wanted.
+        seed: Of the noise.
+        length: Rows of an episode.
+
+    Raises:
+        InputError: They do not fit.
+    """
+    band = size // 8
+    check_memory(frames, size - 2 * band, size, device)
+    generator = torch.Generator(device).manual_seed(seed)
+    pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
+    for start in range(0, frames, length):
+        part = pictures[start : start + length]
+        part.copy_(torch.randint(0, 256, part.shape, generator=generator, dtype=torch.uint8, device=device))
+    rng = np.random.default_rng(seed)
+    episodes = []
+    for start in range(0, frames, length):
+        rows = min(length, frames - start)
+        states = rng.normal(size=(rows, STATE_WIDTH)).astype(np.float32)
+        actions = rng.normal(size=(rows, ACTION_WIDTH)).astype(np.float32)
+        episodes.append(EpisodeRows(states, actions, "Walk to the sign.", "vis_navi"))
+    return assembled(episodes, pictures, [False] * len(episodes), band, band)

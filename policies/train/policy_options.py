@@ -1,0 +1,142 @@
+"""Flags of the training of policies, and the bounds of their numbers; nothing heavy is loaded here."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
+
+__all__ = ["PolicyTrainOptions", "TrainingBenchOptions", "check_numbers"]
+
+MOST_TRAININGS = 16
+"""Most trainings that are measured side by side."""
+
+
+def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]:
+    """Metadata of a flag whose number is within these bounds."""
+    return {"range": (low, high)}
+
+
+@dataclass(frozen=True)
+class PolicyTrainOptions:
+    """Train a policy on datasets of demonstrations."""
+
+    policy: str = "act"
+    """Family: act, diffusion, flow or pi05."""
+    dataset: tuple[Path, ...] = ()
+    """Folders of LeRobot v3.0 datasets; several are trained on together."""
+    recipe: str = "fast"
+    """Settings: paper (the paper's table), fast (better per GPU minute), compact (ACT in 32 MB), small (for tests)."""
+    out: Path | None = None
+    """Folder of the training; runs/<policy>_<recipe>_<dataset> by default."""
+    steps: int = field(default=0, metadata=bounds(0, 10_000_000))
+    """Optimizer steps; 0: the recipe's, or what --minutes gives."""
+    minutes: float = field(default=0.0, metadata=bounds(0.0, 100_000.0))
+    """Time of the optimization [min], from its first step: the speed is measured, then the number of steps is fixed so
+    that the schedule ends when the time is up; 0: no limit."""
+    resume: Path | None = None
+    """Folder of a training to go on with, with its own options; only --device, --minutes, --save-every and the like
+    may differ."""
+    labels: str = ""
+    """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted
+    in memory."""
+    task_vector: bool = False
+    """Give the policy a one-hot vector of its tasks; recipes that need one have it without this flag."""
+    batch_size: int = field(default=0, metadata=bounds(0, 65536))
+    """Samples of a step, of each process; 0: the recipe's."""
+    lr: float = field(default=0.0, metadata=bounds(0.0, 1.0))
+    """Learning rate after the warm-up; 0: the recipe's."""
+    seed: int | None = field(default=None, metadata=bounds(0, 2**31))
+    """Of weights, order, augmentation and noise; the recipe's by default."""
+    device: str = "auto"
+    """cpu, cuda, cuda:N or auto; with torchrun each process takes a GPU of its own."""
+    weights: str = ""
+    """Pretrained weights by their name on the hub or a local folder, where the family takes some."""
+    save_every: int = field(default=5000, metadata=bounds(0))
+    """Steps between checkpoints; 0: only the last one."""
+    keep: int = field(default=2, metadata=bounds(0))
+    """Number of latest checkpoints that are kept; 0: all."""
+    hold_out: int = field(default=0, metadata=bounds(0, 100_000))
+    """Episodes of each dataset, its last ones, that are not trained on; their loss is measured at intervals."""
+    hold_out_every: int = field(default=1000, metadata=bounds(1))
+    """Steps between measurements of the held-out loss."""
+    log_every: int = field(default=50, metadata=bounds(1))
+    """Steps between rows of the log."""
+    graph: bool = True
+    """On CUDA: capture batch and step in one CUDA graph."""
+    jobs: int = field(default=0, metadata=bounds(0, 1024))
+    """Threads that decode pictures; 0: one per core that the process may use."""
+    quiet: bool = False
+    """Show no progress bar."""
+
+
+@dataclass(frozen=True)
+class TrainingBenchOptions:
+    """Measure steps/s of trainings: alone, and several at once on one device."""
+
+    policy: str = "act"
+    """Family: act, diffusion, flow or pi05."""
+    recipe: str = "fast"
+    """Settings, as of a training."""
+    dataset: tuple[Path, ...] = ()
+    """Datasets; without them pictures are made up."""
+    frames: int = field(default=20_000, metadata=bounds(100, 10_000_000))
+    """Pictures that are made up."""
+    trainings: tuple[int, ...] = (1, 2, 4)
+    """Numbers of trainings at once."""
+    seconds: float = field(default=20.0, metadata=bounds(0.1, 3600.0))
+    """Time of each measurement [s], after the warm-up."""
+    batch_size: int = field(default=0, metadata=bounds(0, 65536))
+    """Samples of a step; 0: the recipe's."""
+    device: str = "auto"
+    """cpu, cuda, cuda:N or auto."""
+    weights: str = ""
+    """Pretrained weights, as of a training."""
+    graph: bool = True
+    """On CUDA: capture batch and step in one CUDA graph."""
+    against_lerobot: bool = False
+    """Measure LeRobot's own loop too, its data loader on the dataset; needs --dataset."""
+    workers: int = field(default=4, metadata=bounds(0, 256))
+    """Processes of LeRobot's data loader."""
+
+
+def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
+    """Refuse flags that no training can use, before anything is loaded.
+
+    Raises:
+        InputError: A flag's value is unfit.
+    """
+    for one in dataclasses.fields(options):
+        if "range" in one.metadata:
+            low, high = one.metadata["range"]
+            value = getattr(options, one.name)
+            if value is not None and not (low <= value <= high and math.isfinite(value)):
+                flag = "--" + one.name.replace("_", "-")
+                until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
+                raise InputError(f"{flag} {value}: expected a number {until}")
+    for flag, value, known in (("--policy", options.policy, FAMILIES), ("--recipe", options.recipe, RECIPES)):
+        if value not in known:
+            raise InputError(f"{flag} {value}: unknown, choose from {', '.join(known)}")
+    for folder in options.dataset:
+        if not folder.is_dir():
+            raise InputError(f"--dataset {folder}: no such folder")
+    resolved = [folder.resolve() for folder in options.dataset]
+    for number, folder in enumerate(resolved):
+        if folder in resolved[:number]:
+            raise InputError(f"--dataset {options.dataset[number]}: is named twice")
+    if isinstance(options, TrainingBenchOptions):
+        if not options.trainings or not all(1 <= n <= MOST_TRAININGS for n in options.trainings):
+            raise InputError(f"--trainings: expected numbers from 1 to {MOST_TRAININGS}")
+        if options.against_lerobot and not options.dataset:
+            raise InputError("--against-lerobot: LeRobot's loop reads a dataset; name one with --dataset")
+        return
+    if options.labels not in ("", "v3.1", "v4"):
+        raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
+    if options.resume is None and not options.dataset:
+        raise InputError("--dataset: name at least one folder of a dataset")
+    if options.resume is not None and not options.resume.is_dir():
+        raise InputError(f"--resume {options.resume}: no such folder")

@@ -1,0 +1,280 @@
+"""Steps of a training: batch, loss, gradient and update, on CUDA as one graph.
+
+Everything random within a step comes from the device's default generator, which is seeded from seed, step and process
+before it: a resumed training takes the same steps as one that was never interrupted, and a graph, whose generator is
+read when it is replayed, the same as plain execution.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+import torch
+
+from arena_newton.errors import ArenaError
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
+from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.policy_model import TrainableModel
+
+__all__ = ["PolicyTrainer"]
+
+WARM_STEPS = 3
+"""Steps on a side stream before a graph is captured: libraries choose their kernels, the optimizer makes its moments.
+Torch's documentation of CUDA graphs asks for three; they are undone afterwards."""
+SHORTEST_WARMUP = 10
+"""A training with fewer steps than its recipe warms up for one of so many."""
+HELD_BATCHES = 16
+"""Most batches of held-out rows whose loss is measured."""
+
+
+class PolicyTrainer:
+    """A network, its optimizer and the next step."""
+
+    def __init__(
+        self,
+        model: TrainableModel,
+        batches: BatchMaker,
+        recipe: TrainingRecipe,
+        *,
+        graph: bool = True,
+        rank: int = 0,
+        ranks: int = 1,
+    ):
+        """Make optimizer and order of rows; nothing is trained yet.
+
+        Args:
+            model: The family's network; its policy is put into training mode.
+            batches: Where batches come from.
+            recipe: Settings; `steps` is the end of the schedule.
+            graph: On CUDA: capture a step in a graph, where the model can be captured.
+            rank: Number of this process.
+            ranks: Number of processes.
+        """
+        self.model, self.batches, self.recipe = model, batches, recipe
+        self.rank, self.ranks = rank, ranks
+        self.device = batches.store.device
+        self.step = 0
+        """Steps that are done."""
+        self.graphed = graph and self.device.type == "cuda" and model.capturable
+        """Whether steps are graphs."""
+        drop, store = model.drop_last, batches.store
+        self.samples = store.samples(drop_last=drop)
+        """Rows at which a sample may begin."""
+        self.held = store.samples(held=True, drop_last=drop)
+        """Those of held-out episodes."""
+        if not len(self.samples):
+            raise ArenaError(f"no episode is longer than the {drop} rows at its end at which no sample begins")
+        self._order = RowOrder(self.samples, recipe.seed, self.device)
+        self._rows = torch.zeros(recipe.batch_size, dtype=torch.int64, device=self.device)
+        self._loss = torch.zeros((), device=self.device)
+        self._norm = torch.zeros((), device=self.device)
+        self.optimizer, self._lrs = _optimizer(model, recipe, self.device)
+        self._parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        self._flat: torch.Tensor | None = None
+        self._graphs: list[torch.cuda.CUDAGraph] = []
+        model.policy.train()
+        if ranks > 1:
+            for tensor in model.policy.state_dict().values():
+                torch.distributed.broadcast(tensor, 0)
+
+    @property
+    def loss(self) -> torch.Tensor:
+        """Loss of the last step, of this process; reading it waits for the device."""
+        return self._loss
+
+    @property
+    def gradient_norm(self) -> torch.Tensor:
+        """Norm of the last step's gradient before it was clipped."""
+        return self._norm
+
+    def fix_steps(self, steps: int) -> None:
+        """Let the schedule end after so many steps, of which the warm-up takes a tenth at most."""
+        warmup = min(self.recipe.warmup_steps, steps // SHORTEST_WARMUP)
+        self.recipe = dataclasses.replace(self.recipe, steps=max(1, steps), warmup_steps=warmup)
+
+    def learning_rate(self) -> float:
+        """Learning rate of the next step, of all but the vision encoder."""
+        return self.recipe.lr * self.recipe.lr_factor(self.step)
+
+    def advance(self) -> None:
+        """Take one step; on CUDA it is launched, not awaited."""
+        if self.graphed and not self._graphs:
+            self._capture()
+        self._prepare(self.step)
+        if self._graphs:
+            self._graphs[0].replay()
+            if self.ranks > 1:
+                self._average()
+                self._graphs[1].replay()
+        else:
+            self._descend()
+            if self.ranks > 1:
+                self._average()
+            self._update()
+        self.step += 1
+
+    def _prepare(self, step: int) -> None:
+        """Rows, learning rates and seed of a step."""
+        rows = self._order.rows(step, self.recipe.batch_size, rank=self.rank, ranks=self.ranks)
+        self._rows.copy_(rows, non_blocking=True)
+        factor = self.recipe.lr_factor(step)
+        for group, lr in zip(self.optimizer.param_groups, self._lrs, strict=True):
+            if isinstance(group["lr"], torch.Tensor):
+                group["lr"].fill_(lr * factor)
+            else:
+                group["lr"] = lr * factor
+        torch.manual_seed(step_seed(self.recipe.seed, step, self.rank))
+
+    def _precision(self) -> contextlib.AbstractContextManager[object]:
+        if self.recipe.precision == "bfloat16":
+            # Weights that were cast outside of a graph would be stale within it.
+            return torch.autocast(self.device.type, torch.bfloat16, cache_enabled=False)
+        return contextlib.nullcontext()
+
+    def _descend(self) -> None:
+        """Batch, loss and gradient."""
+        batch = self.batches(self._rows, shift=self.recipe.shift_px, colour=self.recipe.colour)
+        with self._precision():
+            loss = self.model.loss(batch, self.model.noise(len(self._rows)))
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._loss.copy_(loss.detach())
+        if self.ranks > 1:
+            gradients = [_gradient(p).reshape(-1) for p in self._parameters]
+            if self._flat is None:
+                self._flat = torch.cat(gradients)
+            else:
+                torch.cat(gradients, out=self._flat)
+
+    def _whole(self) -> None:
+        """A step of a single process."""
+        self._descend()
+        self._update()
+
+    def _average(self) -> None:
+        """Mean of the gradients of all processes."""
+        assert self._flat is not None
+        torch.distributed.all_reduce(self._flat)
+        self._flat /= self.ranks
+
+    def _update(self) -> None:
+        """Clip the gradient and change the weights."""
+        if self._flat is not None:
+            parts = self._flat.split([p.numel() for p in self._parameters])
+            for parameter, part in zip(self._parameters, parts, strict=True):
+                parameter.grad = part.view_as(parameter).to(parameter.dtype)
+        norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.recipe.grad_clip)
+        self._norm.copy_(norm.detach())
+        self.optimizer.step()
+
+    def _capture(self) -> None:
+        """Capture a step: one graph, or two with the exchange of gradients between them.
+
+        Raises:
+            ArenaError: The family's loss cannot be captured.
+        """
+        before = _copied(self.model.policy.state_dict())
+        moments = _copied_moments(self.optimizer)
+        side = torch.cuda.Stream(self.device)
+        side.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.cuda.stream(side):
+            for _ in range(WARM_STEPS):
+                self._prepare(self.step)
+                self._descend()
+                if self.ranks > 1:
+                    self._average()
+                self._update()
+        torch.cuda.current_stream(self.device).wait_stream(side)
+        # Undone in the same tensors, whose addresses the graph keeps.
+        with torch.no_grad():
+            for name, tensor in self.model.policy.state_dict().items():
+                tensor.copy_(before[name])
+        _restore_moments(self.optimizer, moments)
+        self.optimizer.zero_grad(set_to_none=True)
+        parts: list[Callable[[], None]] = [self._descend, self._update] if self.ranks > 1 else [self._whole]
+        pool = torch.cuda.graph_pool_handle()
+        for part in parts:
+            graph = torch.cuda.CUDAGraph()
+            try:
+                # Other threads (a process group's watchdog) may use the device meanwhile.
+                with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+                    part()
+            except RuntimeError as error:
+                reason = " ".join(str(error).split())[:200]
+                raise ArenaError(f"no CUDA graph could be captured; --no-graph trains without it ({reason})") from error
+            self._graphs.append(graph)
+
+    @torch.no_grad()
+    def held_out_loss(self) -> float:
+        """Mean loss of held-out rows spread over their episodes, without augmentation; NaN where none are held out.
+
+        The same rows and noise each time, so that values of different steps differ by the network alone.
+        """
+        if not len(self.held):
+            return float("nan")
+        size = min(self.recipe.batch_size, len(self.held))
+        count = min(HELD_BATCHES, len(self.held) // size)
+        chosen = self.held[np.linspace(0, len(self.held) - 1, count * size).round().astype(np.int64)]
+        rows = torch.from_numpy(chosen).to(self.device)
+        total = torch.zeros((), device=self.device)
+        with _evaluating(self.model):
+            torch.manual_seed(step_seed(self.recipe.seed, -1))
+            for part in rows.split(size):
+                with self._precision():
+                    total += self.model.loss(self.batches(part), self.model.noise(size)).float()
+        return float(total / count)
+
+
+@contextlib.contextmanager
+def _evaluating(model: TrainableModel) -> Iterator[None]:
+    """The policy in evaluation mode."""
+    model.policy.eval()
+    try:
+        yield
+    finally:
+        model.policy.train()
+
+
+def _gradient(parameter: torch.Tensor) -> torch.Tensor:
+    """Gradient of a parameter in float32; zeros where the loss does not depend on it."""
+    return torch.zeros_like(parameter, dtype=torch.float32) if parameter.grad is None else parameter.grad.float()
+
+
+def _optimizer(
+    model: TrainableModel, recipe: TrainingRecipe, device: torch.device
+) -> tuple[torch.optim.Optimizer, list[float]]:
+    """The optimizer, and the highest learning rate of each of its groups."""
+    made = model.groups()
+    lrs = [float(group["lr"]) for group in made]  # type: ignore[arg-type]  # a number
+    on_cuda = device.type == "cuda"
+    for group, lr in zip(made, lrs, strict=True):
+        # In a graph a number would be the one of its capture.
+        group["lr"] = torch.tensor(lr, device=device) if on_cuda else lr
+    kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[recipe.optimizer]
+    settings: Mapping[str, object] = {"fused": True, "capturable": True} if on_cuda else {}
+    optimizer = kind(made, betas=recipe.betas, eps=recipe.eps, weight_decay=recipe.weight_decay, **settings)
+    return optimizer, lrs
+
+
+def _copied(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
+
+
+def _copied_moments(optimizer: torch.optim.Optimizer) -> dict[torch.Tensor, dict[str, torch.Tensor]]:
+    return {parameter: _copied(state) for parameter, state in optimizer.state.items()}
+
+
+def _restore_moments(
+    optimizer: torch.optim.Optimizer, moments: Mapping[torch.Tensor, Mapping[str, torch.Tensor]]
+) -> None:
+    """Put moments back into the tensors that exist now; those that were none are 0."""
+    with torch.no_grad():
+        for parameter, state in optimizer.state.items():
+            for name, tensor in state.items():
+                if parameter in moments:
+                    tensor.copy_(moments[parameter][name])
+                else:
+                    tensor.zero_()

@@ -1,0 +1,78 @@
+"""Flags of a training in its checkpoints, and those with which it goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
+
+__all__ = ["plain", "plain_options", "read_options", "resumed"]
+
+FREE_ON_RESUME = frozenset(
+    ("resume", "out", "dataset", "steps", "minutes", "device", "save_every", "keep", "hold_out_every", "log_every")
+    + ("graph", "jobs", "quiet")
+)
+"""Flags that may differ when a training goes on; datasets must have the content that they had."""
+
+
+def resumed(options: PolicyTrainOptions, content: Mapping[str, object], where: Path) -> PolicyTrainOptions:
+    """Flags of a training that goes on.
+
+    Raises:
+        InputError: A flag contradicts the training, or its stored flags are damaged.
+    """
+    stored = read_options(content, where)
+    empty = PolicyTrainOptions()
+    changes: dict[str, object] = {"resume": options.resume, "out": options.resume}
+    for one in dataclasses.fields(PolicyTrainOptions):
+        given = getattr(options, one.name)
+        if one.name in changes or given == getattr(empty, one.name):
+            continue
+        if one.name not in FREE_ON_RESUME and given != getattr(stored, one.name):
+            flag = "--" + one.name.replace("_", "-")
+            raise InputError(f"{flag} {given}: the training in {options.resume} has {getattr(stored, one.name)}")
+        changes[one.name] = given
+    return dataclasses.replace(stored, **changes)  # type: ignore[arg-type]  # fields of the class
+
+
+def plain_options(options: PolicyTrainOptions) -> dict[str, object]:
+    """Flags as JSON; datasets by their whole path."""
+    found = plain(dataclasses.asdict(options))
+    assert isinstance(found, dict)
+    return found | {"dataset": [str(folder.resolve()) for folder in options.dataset]}
+
+
+def read_options(content: Mapping[str, object], where: Path) -> PolicyTrainOptions:
+    """Flags that a checkpoint stores.
+
+    Raises:
+        InputError: They are damaged.
+    """
+    values: dict[str, object] = {}
+    for one in dataclasses.fields(PolicyTrainOptions):
+        if one.name not in content:
+            continue
+        value, default = content[one.name], one.default
+        if one.name == "dataset" and isinstance(value, list) and all(isinstance(name, str) for name in value):
+            values[one.name] = tuple(Path(name) for name in value)
+        elif one.name in ("out", "resume"):
+            continue
+        elif type(value) is type(default) or (isinstance(default, float) and type(value) is int):
+            values[one.name] = value
+        elif one.name == "seed" and (value is None or type(value) is int):
+            values[one.name] = value
+        else:
+            raise InputError(f"{where}: options: {one.name} is {str(value)[:60]!r}, which it cannot be")
+    return PolicyTrainOptions(**values)  # type: ignore[arg-type]  # each is of its default's kind
+
+
+def plain(value: object) -> object:
+    """A value as JSON."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return value if isinstance(value, str | int | float | bool | None) else str(value)

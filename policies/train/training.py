@@ -1,0 +1,265 @@
+"""One training of a policy, from datasets to a checkpoint: `train`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from tqdm import tqdm
+
+from arena_newton.errors import InputError
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
+from arena_newton.policies.train import families
+from arena_newton.policies.train.batching import BatchMaker
+from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
+from arena_newton.policies.train.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.policy_model import TrainableModel
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
+from arena_newton.policies.train.policy_trainer import PolicyTrainer
+from arena_newton.policies.train.stored_flags import plain, plain_options, resumed
+from arena_newton.policies.train.training_loop import Processes, TrainingLoop
+from arena_newton.policies.train.training_state import TrainingProgress, last_checkpoint, restore
+from arena_newton.text import counted
+
+__all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
+
+TOKEN_ROWS = 4096
+"""Rows whose prompts are made at once."""
+
+
+def train(options: PolicyTrainOptions) -> Path:
+    """Train to the end of the steps or of the time.
+
+    Args:
+        options: Flags. With `resume` those of the interrupted training hold; of those that may differ, what is not
+            at its default is taken.
+
+    Returns:
+        Folder of the last checkpoint, which `--policy lerobot:` and LeRobot load.
+
+    Raises:
+        InputError: A flag or a dataset is unfit.
+        ArenaError: The training failed: a loss that is not finite, a full disk.
+        KeyboardInterrupt: Ctrl-C or SIGTERM; the state was saved.
+    """
+    check_numbers(options)
+    progress: TrainingProgress | None = None
+    checkpoint: Path | None = None
+    if options.resume is not None:
+        checkpoint = last_checkpoint(options.resume)
+        progress = TrainingProgress.read(checkpoint)
+        options = resumed(options, progress.options, checkpoint)
+        check_numbers(options)
+        if 0 < (options.steps or progress.steps) <= progress.step:  # it came to its end
+            return checkpoint / PRETRAINED_MODEL_DIR
+    settings = chosen_recipe(options)
+    out = options.out or default_folder(options)
+    if options.resume is None and any(one.name.isdigit() for one in out.glob("checkpoints/*")):
+        raise InputError(f"--out {out}: holds a training already; --resume {out} goes on with it")
+    device, processes = chosen_device(options.device)
+    with _group(device, processes), fast_kernels(device):
+        return _train(options, settings, out, device, processes, progress, checkpoint)
+
+
+def _train(
+    options: PolicyTrainOptions,
+    settings: TrainingRecipe,
+    out: Path,
+    device: torch.device,
+    processes: Processes,
+    progress: TrainingProgress | None,
+    checkpoint: Path | None,
+) -> Path:
+    speaks = processes.first and not options.quiet
+    datasets = [read_rows(root, settings.labels) for root in options.dataset]
+    if progress is not None:
+        _check_same_data(datasets, progress)
+    check_pictures(datasets, settings)
+    began = time.monotonic()
+    total = sum(dataset.frames for dataset in datasets)
+    with tqdm(total=total, unit="picture", desc="decoding", disable=None if speaks else True, leave=False) as bar:
+        jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+        store = load_frames(datasets, device, hold_out=options.hold_out, jobs=jobs, on_frames=bar.update)
+    if speaks:
+        size = store.pictures.numel() / 1e9
+        print(
+            f"{counted(len(store.lengths), 'episode')} ({sum(store.held)} held out), {store.rows} pictures, "
+            f"{size:.2f} GB on {device} in {time.monotonic() - began:.1f} s",
+            flush=True,
+        )
+    trained = [e for d in datasets for e in d.episodes[: len(d.episodes) - options.hold_out]]
+    stats = {
+        key: {name: torch.from_numpy(np.array(value)) for name, value in of.items()}
+        for key, of in statistics(datasets, trained, settings.labels).items()
+    }
+    vector = task_vector(store, settings)
+    if vector:
+        ones, zeros = torch.ones(len(vector)), torch.zeros(len(vector))
+        stats[VECTOR_KEY] = {"mean": zeros, "std": ones, "min": zeros, "max": ones, "q01": zeros, "q99": ones}
+    torch.manual_seed(settings.seed)
+    model = families.build(settings, stats, device, options.weights or None)
+    batches = make_batches(model, store, vector)
+    trainer = PolicyTrainer(model, batches, settings, graph=options.graph, rank=processes.rank, ranks=processes.count)
+    if options.steps:
+        trainer.fix_steps(options.steps)
+    elif progress is not None and progress.steps:
+        trainer.fix_steps(progress.steps)
+    if progress is not None and checkpoint is not None:
+        restore(trainer, checkpoint)
+    fit = "pad" if store.top or store.bottom else "native"
+    facts = CheckpointFacts(
+        labels=settings.labels,
+        realign=settings.realign,
+        width=store.width,
+        height=store.height,
+        fit=fit,
+        task_vector=vector,
+        family=settings.family,
+        recipe=settings.name,
+        tasks=tuple(task for task in store.tasks if task),
+        trackers=tuple(sorted({tracker for dataset in datasets for tracker in dataset.trackers})),
+        seed=settings.seed,
+        device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        datasets=tuple(dataset.described for dataset in datasets),
+        options={"flags": plain_options(options), "recipe": plain(dataclasses.asdict(settings))},
+    )
+    run = TrainingLoop(options, out, trainer, facts, processes, progress)
+    return run.work() / PRETRAINED_MODEL_DIR
+
+
+def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
+    """The recipe with what the flags change.
+
+    Raises:
+        InputError: The family has no such recipe.
+    """
+    changes: dict[str, object] = {}
+    if options.labels:
+        changes["labels"] = options.labels
+        if options.labels != "v4":
+            changes["realign"] = 0.0
+    if options.task_vector:
+        changes["use_task_vector"] = True
+    if options.batch_size:
+        changes["batch_size"] = options.batch_size
+    if options.lr:
+        changes |= {"lr": options.lr, "lr_backbone": options.lr}
+    if options.seed is not None:
+        changes["seed"] = options.seed
+    return recipe(options.policy, options.recipe, **changes)
+
+
+def make_batches(model: TrainableModel, store: FrameStore, vector: tuple[str, ...] = ()) -> BatchMaker:
+    """Batches of a store as a model takes them; prompts are turned into tokens once."""
+    tokens: dict[str, torch.Tensor] = {}
+    per_row = model.reads_task and model.recipe.family == "pi05"  # its prompt holds the state
+    if per_row:
+        parts = []
+        for start in range(0, store.rows, TOKEN_ROWS):
+            rows = slice(start, start + TOKEN_ROWS)
+            words = [store.instructions[number] for number in store.instruction[rows].tolist()]
+            parts.append(model.tokens(words, model.normalise("observation.state", store.states[rows])))
+        tokens = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+    elif model.reads_task:
+        tokens = model.tokens(store.instructions)
+    placed = {key: value.to(store.device) for key, value in tokens.items()}
+    return BatchMaker(store, model.normalise, model.samples, vector, placed, per_row)
+
+
+def task_vector(store: FrameStore, settings: TrainingRecipe) -> tuple[str, ...]:
+    """Tasks of the one-hot vector; none where the recipe has none.
+
+    Raises:
+        InputError: The datasets do not say what an episode's task is.
+    """
+    if not settings.use_task_vector:
+        return ()
+    if "" in store.tasks:
+        raise InputError("--task-vector: an episode's dataset does not say which task it is of")
+    return store.tasks
+
+
+def check_pictures(datasets: list[DatasetRows], settings: TrainingRecipe) -> None:
+    """Refuse pictures of another size than the recipe's network sees.
+
+    Raises:
+        InputError: They have another size.
+    """
+    for dataset in datasets:
+        if (dataset.width, dataset.height) != (settings.picture, settings.picture):
+            raise InputError(
+                f"--dataset {dataset.root}: pictures of {dataset.width}x{dataset.height} pixels, recipe "
+                f"{settings.family}/{settings.name} takes {settings.picture}x{settings.picture}"
+            )
+
+
+def chosen_device(name: str) -> tuple[torch.device, Processes]:
+    """Device of this process, and its number among those of `torchrun`.
+
+    Raises:
+        InputError: There is no such device.
+    """
+    processes = Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    cuda = torch.cuda.is_available()
+    wanted = ("cuda" if cuda else "cpu") if name == "auto" else name
+    if wanted == "cpu":
+        return torch.device("cpu"), processes
+    number = wanted.removeprefix("cuda").removeprefix(":")
+    if not wanted.startswith("cuda") or (number and not number.isdigit()):
+        raise InputError(f"--device {name}: unknown, choose cpu, cuda, cuda:N or auto")
+    index = int(os.environ.get("LOCAL_RANK", "0")) if processes.count > 1 else int(number or 0)
+    if not cuda or index >= torch.cuda.device_count():
+        raise InputError(f"--device {name}: no such device, this machine has {torch.cuda.device_count()} for CUDA")
+    return torch.device("cuda", index), processes
+
+
+def default_folder(options: PolicyTrainOptions) -> Path:
+    """Folder of a training that names none."""
+    names = options.dataset[0].resolve().name if len(options.dataset) == 1 else f"{len(options.dataset)}_datasets"
+    return Path("runs") / f"{options.policy}_{options.recipe}_{names}"
+
+
+def _check_same_data(datasets: list[DatasetRows], progress: TrainingProgress) -> None:
+    now = [dataset.hash for dataset in datasets]
+    before = [one.get("hash") for one in progress.datasets]
+    if now != before:
+        names = ", ".join(str(one.get("name")) for one in progress.datasets)
+        raise InputError(f"--dataset: the content is not that of the datasets which the training began with ({names})")
+
+
+@contextlib.contextmanager
+def fast_kernels(device: torch.device) -> Iterator[None]:
+    """Settings of LeRobot's trainer: TF32, and convolutions that are chosen by trying; what was set before returns."""
+    matmul, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = matmul.allow_tf32, cudnn.allow_tf32, cudnn.benchmark
+    matmul.allow_tf32 = cudnn.allow_tf32 = cudnn.benchmark = True
+    try:
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            yield
+    finally:
+        matmul.allow_tf32, cudnn.allow_tf32, cudnn.benchmark = before
+        if device.type == "cuda":
+            torch.cuda.empty_cache()
+
+
+@contextlib.contextmanager
+def _group(device: torch.device, processes: Processes) -> Iterator[None]:
+    """The processes of `torchrun`, connected."""
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    if processes.count == 1:
+        yield
+        return
+    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    try:
+        yield
+    finally:
+        torch.distributed.destroy_process_group()

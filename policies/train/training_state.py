@@ -1,0 +1,269 @@
+"""Checkpoints of a training: LeRobot's folders, whole or not there at all, and what a resumed training needs.
+
+`<out>/checkpoints/<step>/pretrained_model` is the policy, `training_state` next to it LeRobot's files of optimizer,
+random numbers and step, and one of ours; `<out>/checkpoints/last` is a relative link. A folder grows under a temporary
+name and is renamed when all of it is on the disk: whatever kills a training leaves the last whole checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    OPTIMIZER_PARAM_GROUPS,
+    OPTIMIZER_STATE,
+    PRETRAINED_MODEL_DIR,
+    TRAINING_STATE_DIR,
+    TRAINING_STEP,
+)
+from lerobot.utils.random_utils import save_rng_state
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.files import PARTIAL, replace_atomically
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.policies.train.policy_trainer import PolicyTrainer
+
+__all__ = [
+    "PROGRESS_FILE",
+    "TrainingProgress",
+    "checkpoint_name",
+    "last_checkpoint",
+    "remove_older",
+    "restore",
+    "write_checkpoint",
+]
+
+PROGRESS_FILE = "arena_training.json"
+"""File of a training state that holds its `TrainingProgress`."""
+WEIGHTS = "model.safetensors"
+"""LeRobot's file of a policy's weights."""
+FORMAT = 1
+"""Version of the file."""
+FEWEST_DIGITS = 6
+"""Digits of a step in a folder's name, as LeRobot writes them."""
+BATCH_COUNTER = "num_batches_tracked"
+"""Buffer of a batch normalization that checkpoints leave out; with a fixed momentum nothing reads it."""
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Where a training is, and what it is of."""
+
+    step: int
+    """Steps that are done."""
+    steps: int
+    """Steps at which the schedule ends; 0 while --minutes has not fixed them."""
+    minutes: float
+    """Time of the optimization so far [min]."""
+    processes: int
+    """Processes that trained."""
+    batch_size: int
+    """Samples of a step, of each process."""
+    options: Mapping[str, object] = field(default_factory=dict)
+    """Flags by the names of `PolicyTrainOptions`."""
+    datasets: tuple[Mapping[str, object], ...] = ()
+    """As in `CheckpointFacts`."""
+
+    @classmethod
+    def read(cls, folder: Path) -> TrainingProgress:
+        """Progress of a checkpoint.
+
+        Raises:
+            InputError: The file is absent or damaged.
+        """
+        path = folder / TRAINING_STATE_DIR / PROGRESS_FILE
+        try:
+            content = json.loads(path.read_bytes())
+        except FileNotFoundError:
+            raise InputError(f"{path}: is missing; the checkpoint is of no training that can go on") from None
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{path}: not readable as JSON ({type(error).__name__})") from None
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise InputError(f"{path}: expected an object with format {FORMAT}")
+        for name, least in (("step", 0), ("steps", 0), ("processes", 1), ("batch_size", 1)):
+            value = content.get(name)
+            if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**40:
+                raise InputError(f"{path}: {name} is {str(value)[:60]!r}, expected an integer of at least {least}")
+        minutes, options, datasets = (content.get(name) for name in ("minutes", "options", "datasets"))
+        if not isinstance(minutes, int | float) or isinstance(minutes, bool) or not 0.0 <= minutes < 1e9:
+            raise InputError(f"{path}: minutes is {str(minutes)[:60]!r}, expected a time")
+        if not isinstance(options, dict):
+            raise InputError(f"{path}: options is no object")
+        if not isinstance(datasets, list) or not all(isinstance(one, dict) for one in datasets):
+            raise InputError(f"{path}: datasets is no list of objects")
+        numbers = [int(content[name]) for name in ("step", "steps", "processes", "batch_size")]
+        return cls(numbers[0], numbers[1], float(minutes), numbers[2], numbers[3], options, tuple(datasets))
+
+    def write(self, folder: Path) -> None:
+        """Write the file of a checkpoint."""
+        text = json.dumps({"format": FORMAT} | dataclasses.asdict(self), indent=2, sort_keys=True, default=str) + "\n"
+        with replace_atomically(folder / TRAINING_STATE_DIR / PROGRESS_FILE) as file:
+            file.write(text.encode())
+
+
+def checkpoint_name(step: int) -> str:
+    """Name of the folder of a step."""
+    return f"{step:0{FEWEST_DIGITS}d}"
+
+
+def last_checkpoint(out: Path, flag: str = "--resume") -> Path:
+    """The last whole checkpoint of a training.
+
+    Raises:
+        InputError: There is none.
+    """
+    named = [one for one in (out / CHECKPOINTS_DIR).glob("*") if one.name.isdecimal()]
+    for folder in sorted(named, key=lambda one: int(one.name), reverse=True):
+        if (folder / TRAINING_STATE_DIR).is_dir() and (folder / PRETRAINED_MODEL_DIR).is_dir():
+            return folder
+    raise InputError(
+        f"{flag} {out}: holds no checkpoint of a training (no {CHECKPOINTS_DIR}/<step>/{TRAINING_STATE_DIR})"
+    )
+
+
+def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, progress: TrainingProgress) -> Path:
+    """Write a checkpoint of the current step, and let `last` lead to it.
+
+    Returns:
+        Its folder, `<out>/checkpoints/<step>`.
+
+    Raises:
+        ArenaError: It cannot be written.
+    """
+    parent = out / CHECKPOINTS_DIR
+    final = parent / checkpoint_name(progress.step)
+    growing = parent / f"{final.name}{PARTIAL}"
+    try:
+        shutil.rmtree(growing, ignore_errors=True)
+        state = growing / TRAINING_STATE_DIR
+        state.mkdir(parents=True)
+        trainer.model.save(growing / PRETRAINED_MODEL_DIR, facts)
+        _write_optimizer(trainer.optimizer, state)
+        save_rng_state(state)
+        step = {"step": progress.step, "num_processes": progress.processes, "batch_size": progress.batch_size}
+        (state / TRAINING_STEP).write_text(json.dumps(step, indent=4))
+        progress.write(growing)
+        for file in [one for one in growing.rglob("*") if one.is_file()]:
+            _synced(file)
+        if final.is_dir():  # the same step, written just before an interruption: it is whole
+            shutil.rmtree(growing)
+        else:
+            growing.rename(final)
+        _synced(parent)
+        link = parent / f"{LAST_CHECKPOINT_LINK}{PARTIAL}"
+        link.unlink(missing_ok=True)
+        link.symlink_to(final.name)
+        os.replace(link, parent / LAST_CHECKPOINT_LINK)
+    except OSError as error:
+        raise ArenaError(f"{final}: the checkpoint cannot be written ({error.strerror or error})") from error
+    return final
+
+
+def remove_older(out: Path, keep: int) -> None:
+    """Remove all but the latest checkpoints, and what killed trainings left; 0 keeps all of them."""
+    folder = out / CHECKPOINTS_DIR
+    for left in folder.glob(f"*{PARTIAL}"):
+        shutil.rmtree(left, ignore_errors=True)
+    if keep:
+        whole = sorted((one for one in folder.glob("*") if one.name.isdecimal()), key=lambda one: int(one.name))
+        for old in whole[:-keep]:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def restore(trainer: PolicyTrainer, checkpoint: Path) -> None:
+    """Put weights, moments and step of a checkpoint into a trainer.
+
+    Raises:
+        InputError: A file is absent, damaged or of another network.
+    """
+    weights = _tensors(checkpoint / PRETRAINED_MODEL_DIR / WEIGHTS)
+    own = trainer.model.policy.state_dict()
+    tied = {tensor.data_ptr() for name, tensor in own.items() if name in weights}
+    missing = [
+        name
+        for name, tensor in own.items()
+        if name not in weights and not name.endswith(BATCH_COUNTER) and tensor.data_ptr() not in tied
+    ]
+    unknown = sorted(set(weights) - set(own))
+    unlike = [name for name in own if name in weights and own[name].shape != weights[name].shape]
+    for names, words in ((missing, "lacks"), (unknown, "has unknown"), (unlike, "has another shape of")):
+        if names:
+            raise InputError(f"{checkpoint / PRETRAINED_MODEL_DIR / WEIGHTS}: {words} {names[0]}")
+    with torch.no_grad():
+        for name, tensor in weights.items():
+            own[name].copy_(tensor)
+    _read_optimizer(trainer.optimizer, checkpoint / TRAINING_STATE_DIR)
+    trainer.step = TrainingProgress.read(checkpoint).step
+
+
+def _write_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
+    """Moments and settings in LeRobot's files."""
+    content = optimizer.state_dict()
+    flat = {
+        f"state/{number}/{name}": tensor.detach().cpu().contiguous()
+        for number, state in content["state"].items()
+        for name, tensor in state.items()
+    }
+    save_file(flat, folder / OPTIMIZER_STATE)
+    groups = [{name: _plain(value) for name, value in group.items()} for group in content["param_groups"]]
+    (folder / OPTIMIZER_PARAM_GROUPS).write_text(json.dumps(groups, indent=4))
+
+
+def _plain(value: object) -> object:
+    """A setting of the optimizer as JSON."""
+    return float(value) if isinstance(value, torch.Tensor) else value
+
+
+def _read_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
+    path = folder / OPTIMIZER_STATE
+    own = optimizer.state_dict()
+    parameters = {
+        number: parameter
+        for group, stored in zip(optimizer.param_groups, own["param_groups"], strict=True)
+        for number, parameter in zip(stored["params"], group["params"], strict=True)
+    }
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, tensor in _tensors(path).items():
+        parts = name.split("/")
+        if len(parts) != 3 or parts[0] != "state" or not parts[1].isdigit() or int(parts[1]) not in parameters:
+            raise InputError(f"{path}: {name[:80]} is no moment of this network's optimizer")
+        number = int(parts[1])
+        if tensor.dim() and tensor.shape != parameters[number].shape:
+            raise InputError(f"{path}: {name[:80]} has shape {list(tensor.shape)}, another network's")
+        state.setdefault(number, {})[parts[2]] = tensor
+    # Settings are the recipe's: learning rates follow from the step.
+    optimizer.load_state_dict({"state": state, "param_groups": own["param_groups"]})
+
+
+def _tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Tensors of a file.
+
+    Raises:
+        InputError: It is absent or damaged.
+    """
+    try:
+        return load_file(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: is missing") from None
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: not a readable safetensors file ({' '.join(str(error).split())[:120]})") from None
+
+
+def _synced(path: Path) -> None:
+    """Wait until a file or a folder's entries are on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

@@ -1,0 +1,20 @@
+"""A tiny checkpoint of each family, once per process."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from made_checkpoints import facts, made_clip, save
+
+
+@pytest.fixture(scope="session")
+def checkpoints(tmp_path_factory):
+    """Family → folder of a checkpoint; `two` is a Diffusion Policy that looks at two ticks."""
+    root = tmp_path_factory.mktemp("checkpoints")
+    clip = made_clip(root / "clip")
+    found = {name: save(root / name, name, facts=facts(family=name)) for name in ("act", "diffusion")}
+    found["flow"] = save(root / "flow", "flow", clip=clip, facts=facts(family="flow"))
+    found["two"] = save(root / "two", "diffusion", facts=facts(family="diffusion"), n_obs_steps=2)
+    return found

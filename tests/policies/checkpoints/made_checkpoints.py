@@ -1,0 +1,162 @@
+"""Tiny checkpoints with random weights, as LeRobot saves them, and observations to ask them with."""
+
+import json
+
+import numpy as np
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
+from tokenizers import Tokenizer, models, pre_tokenizers
+from transformers import CLIPConfig, CLIPModel, PreTrainedTokenizerFast
+
+from arena_newton.canonical import STAND_ACTION
+from arena_newton.data.label_protocols import encode_v4
+from arena_newton.policies import Observation
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+
+SIDE = 64
+"""Width and height of pictures [px]."""
+CHUNK = 6
+"""Actions that are executed of a chunk."""
+FRONT, STATE, TASK = "observation.images.front", "observation.state", "observation.environment_state"
+
+
+def made_clip(folder):
+    """A CLIP of a few thousand weights, with a tokenizer of words."""
+    common = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    text = common | {"vocab_size": 64, "max_position_embeddings": 16, "bos_token_id": 1, "eos_token_id": 2}
+    vision = common | {"image_size": SIDE, "patch_size": 32}
+    CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=16)).save_pretrained(folder)
+    words = ["[PAD]", "[UNK]", "[END]", *"strike the green markers on punching bag avoid obstacles and move to".split()]
+    tokenizer = Tokenizer(models.WordLevel({word: i for i, word in enumerate(words)}, unk_token="[UNK]"))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    fast = PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="[PAD]", unk_token="[UNK]", eos_token="[END]")
+    fast.save_pretrained(folder)
+    return folder
+
+
+def configuration(family, features, clip=None, **changes):
+    """LeRobot's configuration of a tiny policy."""
+    modes = {kind: NormalizationMode.MEAN_STD for kind in ("VISUAL", "STATE", "ACTION", "ENV")}
+    common = {
+        "input_features": features,
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (40,))},
+        "normalization_mapping": modes,
+        "n_action_steps": CHUNK,
+        "device": "cpu",
+    }
+    if family == "act":
+        sizes = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1, "use_vae": False}
+        own = sizes | {"chunk_size": 10, "pretrained_backbone_weights": None}
+        return ACTConfig(**common | own | changes)
+    if family == "diffusion":
+        sizes = {
+            "down_dims": (16, 32),
+            "diffusion_step_embed_dim": 16,
+            "spatial_softmax_num_keypoints": 4,
+            "n_groups": 4,
+        }
+        own = sizes | {"n_obs_steps": 1, "horizon": 8, "num_train_timesteps": 4, "pretrained_backbone_weights": None}
+        return DiffusionConfig(**common | own | {"crop_shape": None, "drop_n_last_frames": 2} | changes)
+    own = {"n_obs_steps": 1, "horizon": 8, "hidden_dim": 16, "num_layers": 1, "num_heads": 2, "timestep_embed_dim": 16}
+    own |= {
+        "objective": "flow_matching",
+        "num_integration_steps": 4,
+        "image_crop_shape": None,
+        "tokenizer_max_length": 16,
+    }
+    return MultiTaskDiTConfig(
+        **common | own | {"vision_encoder_name": str(clip), "text_encoder_name": str(clip)} | changes
+    )
+
+
+def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.02, **changes):
+    """A checkpoint that sways about standing; `facts` None: somebody else's."""
+    torch.manual_seed(7)
+    features = {
+        STATE: PolicyFeature(FeatureType.STATE, (64,)),
+        FRONT: PolicyFeature(FeatureType.VISUAL, (3, *side)),
+    }
+    stand = torch.from_numpy(STAND_ACTION)
+    if facts is not None and facts.labels == "v4":
+        stand = torch.from_numpy(encode_v4(STAND_ACTION[None])[0])
+    stats = {
+        STATE: {"mean": torch.zeros(64), "std": torch.ones(64)},
+        FRONT: {"mean": torch.full((3, 1, 1), 0.5), "std": torch.full((3, 1, 1), 0.25)},
+        "action": {"mean": stand, "std": torch.full((40,), spread)},
+    }
+    if facts is not None and facts.task_vector:
+        features[TASK] = PolicyFeature(FeatureType.ENV, (len(facts.task_vector),))
+        stats[TASK] = {"mean": torch.zeros(len(facts.task_vector)), "std": torch.ones(len(facts.task_vector))}
+    config = configuration(family, features, clip, **changes)
+    policy = get_policy_class(config.type)(config)
+    for parameter in policy.parameters():  # some begin at 0, which would hide what they are multiplied with
+        if parameter.requires_grad and parameter.std() == 0 and parameter.ndim > 1:
+            torch.nn.init.normal_(parameter, std=0.05)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    if facts is not None:
+        facts.write(folder)
+    return folder
+
+
+def facts(**changes):
+    """What a checkpoint of ours says, with tiny pictures."""
+    return CheckpointFacts(**{"width": SIDE, "height": SIDE} | changes)
+
+
+def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing"):
+    """What worlds show: it follows from each world's seed and tick alone."""
+    state, pictures = [], []
+    for key in zip(seeds, ticks, strict=True):
+        rng = np.random.default_rng(key)
+        state.append(0.3 * rng.standard_normal(64).astype(np.float32))
+        pictures.append(rng.integers(0, 256, (*side, 3), np.uint8))
+    return Observation(
+        state=torch.from_numpy(np.stack(state)),
+        image=torch.from_numpy(np.stack(pictures)),
+        mask=np.ones(len(seeds), bool) if mask is None else np.asarray(mask, bool),
+        task=task,
+        gym_id=task,
+        instruction="Strike the green markers on the punching bag.",
+    )
+
+
+def follow(policy, seeds, looks, *, asks=None, side=(SIDE, SIDE)):
+    """Actions of each world by seed, tick by tick, over `looks` answers of full length.
+
+    Args:
+        policy: Is reset.
+        seeds: Episode seeds of the worlds.
+        looks: Ticks that are played are `looks` times the policy's chunk.
+        asks: World → tick at which its episode begins, so that worlds ask at different ticks.
+        side: Height and width of pictures.
+    """
+    worlds = len(seeds)
+    begins = [0] * worlds if asks is None else list(asks)
+    policy.reset(seeds, ["boxing"] * worlds)
+    ticks, left = [0] * worlds, [[] for _ in range(worlds)]
+    played = [[] for _ in range(worlds)]
+    total = looks * policy.chunk_size
+    for now in range(total + max(begins)):
+        acting = [now >= begin and ticks[w] < total for w, begin in enumerate(begins)]
+        mask = [acting[w] and not left[w] for w in range(worlds)]
+        if any(mask):
+            answer = policy.act(seen(seeds, ticks, mask, side=side))
+            assert not answer.errors
+            for world in np.flatnonzero(mask):
+                left[world] = list(torch.as_tensor(answer.actions)[world].clone())
+        for world in np.flatnonzero(acting):
+            played[world].append(left[world].pop(0))
+            ticks[world] += 1
+    return {seed: torch.stack(rows) for seed, rows in zip(seeds, played, strict=True)}
+
+
+def edit(path, **changes):
+    """Change fields of a JSON file."""
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | changes))

@@ -1,0 +1,215 @@
+"""Files of a checkpoint: the original's are read as its server does, foreign and damaged ones are one clear error."""
+
+import json
+import random
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_checkpoints import FRONT, SIDE, STATE, edit, facts, follow, save, seen
+
+from arena_newton import policies
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from arena_newton.policies.lerobot.picture_preparation import PicturePreparation, PictureStep
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
+from mutants import damaged
+
+TRANSFORMS = {
+    "enable": True,
+    "max_num_transforms": 3,
+    "random_order": False,
+    "tfs": {
+        "resize": {"weight": 1.0, "type": "Resize", "kwargs": {"size": [48, 64], "interpolation": "bilinear"}},
+        "colour": {"weight": 1.0, "type": "ColorJitter", "kwargs": {"brightness": [0.8, 1.2]}},
+        "pad": {"weight": 1.0, "type": "Pad", "kwargs": {"padding": [0, 8, 0, 8], "fill": 0}},
+    },
+}
+"""What the original's training does to 640x480 pictures, at a size for tests."""
+
+
+@pytest.fixture
+def folder(checkpoints, tmp_path):
+    """A copy of the ACT checkpoint that may be damaged."""
+    return Path(shutil.copytree(checkpoints["act"], tmp_path / "act"))
+
+
+def test_the_originals_checkpoints_load_unchanged(tmp_path):
+    """640x480 pictures are asked for, resized and padded as the original's server does, and actions are v3.1."""
+    made = save(tmp_path / "out" / "checkpoints" / "000100" / "pretrained_model", "act", side=(480, 640))
+    (made / "train_config.json").write_text(json.dumps({"dataset": {"image_transforms": TRANSFORMS}}))
+    edit(made / "config.json", a_field_of_the_fork=1)
+    (tmp_path / "out" / "checkpoints" / "last").symlink_to("000100")
+    policy = policies.get(f"lerobot:{tmp_path / 'out'}")
+    assert (policy.camera.width, policy.camera.height, policy.camera.fit) == (640, 480, "native")
+    assert (policy.labels, policy.describe()["prepared"], policy.describe()["ignored"]) == (
+        "v3.1",
+        True,
+        ["a_field_of_the_fork"],
+    )
+    policy.reset([11], ["boxing"])
+    shown = seen([11], [0], side=(480, 640))
+    # Step by step as torchvision does it, and rounded to whole values in between.
+    from torchvision.transforms import v2
+
+    small = v2.Resize([48, 64], antialias=True)(shown.image.permute(0, 3, 1, 2).float() / 255.0)
+    padded = (v2.Pad([0, 8, 0, 8])(small) * 255.0).round().to(torch.uint8)
+    network = policy._on(torch.device("cpu"))
+    batch = network.before({STATE: shown.state, FRONT: padded.float() / 255.0})
+    wanted = network.after(network.policy.predict_action_chunk(batch)[0])[: policy.chunk_size]
+    assert torch.allclose(policy.act(shown).actions[0], wanted, atol=1e-6)
+
+
+def test_a_picture_is_prepared_as_torchvision_does():
+    """A constant picture keeps its value, padding is black, a shrunk edge is filtered, and values are rounded."""
+    picture = torch.zeros((1, 480, 640, 3), dtype=torch.uint8)
+    picture[:, :, 320:] = 200
+    steps = (PictureStep(size=(48, 64)), PictureStep(padding=(0, 8, 0, 8)))
+    done = PicturePreparation(steps)(picture)
+    assert done.shape == (1, 64, 64, 3)
+    assert done.dtype == torch.uint8
+    assert not done[:, :8].any()
+    assert not done[:, -8:].any()
+    assert (done[0, 8:-8, :30] == 0).all()
+    assert (done[0, 8:-8, 34:] == 200).all()
+    assert 0 < done[0, 30, 31, 0] < 100 < done[0, 30, 32, 0] < 200
+
+
+def test_somebody_elses_checkpoint_sees_what_it_was_trained_on(tmp_path):
+    """Without facts and transforms the picture has the size of its input; the fit follows from the shape."""
+    square = LeRobotPolicy(save(tmp_path / "square", "act"))
+    assert (square.camera.width, square.camera.fit) == (SIDE, "pad")
+    wide = LeRobotPolicy(save(tmp_path / "wide", "act", side=(48, 64)))
+    assert (wide.camera.width, wide.camera.height, wide.camera.fit) == (64, 48, "native")
+
+
+def rename(path, old, new):
+    """Rename a feature of a configuration."""
+    content = json.loads(path.read_text())
+    content["input_features"][new] = content["input_features"].pop(old)
+    path.write_text(json.dumps(content))
+
+
+def shape(path, kind, name, numbers):
+    """Change the shape of a feature."""
+    content = json.loads(path.read_text())
+    content[kind][name]["shape"] = numbers
+    path.write_text(json.dumps(content))
+
+
+def step(path, **changes):
+    """Change the first step of a processor."""
+    content = json.loads(path.read_text())
+    content["steps"][0] |= changes
+    path.write_text(json.dumps(content))
+
+
+WRONG = {
+    "no network of LeRobot": (
+        lambda f: edit(f / "config.json", type="magic"),
+        "config.json: type is 'magic'",
+    ),
+    "another network": (lambda f: edit(f / "config.json", type="vqbet"), "type vqbet is not run here"),
+    "an adapter": (lambda f: edit(f / "config.json", use_peft=True), "use_peft is set"),
+    "a wrong number": (lambda f: edit(f / "config.json", dim_model="many"), "config.json: .*many"),
+    "no actions": (lambda f: edit(f / "config.json", chunk_size=0), "config.json: "),
+    "a camera": (lambda f: rename(f / "config.json", FRONT, "observation.images.top"), "input observation.images.top"),
+    "a state": (lambda f: shape(f / "config.json", "input_features", STATE, [14]), r"input observation.state \[14\]"),
+    "an action": (lambda f: shape(f / "config.json", "output_features", "action", [14]), r"output action is \[14\]"),
+    "a picture": (
+        lambda f: edit(f / "arena_policy.json", width=96),
+        "64x64, but arena_policy.json says 96x64",
+    ),
+    "code": (lambda f: step(f / "policy_preprocessor.json", **{"class": "os.system"}), r"steps\[0\] is"),
+    "a step": (
+        lambda f: step(f / "policy_postprocessor.json", registry_name="libero_processor"),
+        r"\[0\] is 'libero",
+    ),
+    "remote code": (
+        lambda f: step(f / "policy_preprocessor.json", config={"trust_remote_code": True}),
+        r"steps\[0\].config is not",
+    ),
+    "a path": (
+        lambda f: step(f / "policy_preprocessor.json", state_file="../x.safetensors"),
+        "state_file is '../x",
+    ),
+    "no processor": (lambda f: (f / "policy_preprocessor.json").unlink(), "holds no policy_preprocessor.json"),
+    "no weights": (lambda f: (f / "model.safetensors").rename(f / "pytorch_model.bin"), "holds no model.safetensors"),
+    "other weights": (lambda f: edit(f / "config.json", dim_model=64), "does not hold the weights of this network"),
+    "cut weights": (
+        lambda f: (f / "model.safetensors").write_bytes((f / "model.safetensors").read_bytes()[:-9]),
+        "model.safetensors: does not hold",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_what_cannot_be_run_is_one_clear_error(folder, kind):
+    """Before the first episode, naming the file and what is wrong in it."""
+    damage, message = WRONG[kind]
+    damage(folder)
+    with pytest.raises(InputError, match=message):
+        LeRobotPolicy(folder).check()
+
+
+def test_transforms_at_random_are_refused(tmp_path):
+    """As the original's server refuses them; a size or a colour that cannot be is named."""
+    for changes, message in (
+        ({"random_order": True}, "random_order false"),
+        ({"max_num_transforms": 1}, "max_num_transforms of at least"),
+        ({"tfs": {"r": {"type": "Resize", "kwargs": {"size": 224}}}}, "tfs.r.kwargs.size is 224, expected height and"),
+        ({"tfs": {"p": {"type": "Pad", "kwargs": {"padding": "all"}}}}, "tfs.p.kwargs.padding is 'all'"),
+    ):
+        config = {"dataset": {"image_transforms": TRANSFORMS | changes}}
+        (tmp_path / "train_config.json").write_text(json.dumps(config))
+        with pytest.raises(InputError, match=message):
+            PicturePreparation.read(tmp_path)
+
+
+def test_damaged_files_raise_nothing_else(folder):
+    """Hundreds of damaged JSON files of a checkpoint are read, or are an input error."""
+    draw, refused = random.Random(3), 0
+    (folder / "train_config.json").write_text(json.dumps({"dataset": {"image_transforms": TRANSFORMS}}))
+    sound = {path: path.read_bytes() for path in sorted(folder.glob("*.json"))}
+    for _ in range(240):
+        path = draw.choice(list(sound))
+        path.write_bytes(damaged(sound[path], draw, text=True))
+        try:
+            LeRobotPolicy(folder)
+        except InputError:
+            refused += 1
+        path.write_bytes(sound[path])
+    assert refused > 60
+
+
+def test_a_name_of_the_hub_that_is_not_here(tmp_path, monkeypatch, capsys):
+    """Offline: one clear line, exit code 2, no waiting; a path that is not there is named as a path."""
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    out = str(tmp_path / "out")
+    assert main(["run", "--task", "boxing", "--policy", "lerobot:nobody/nothing", "--out", out]) == 2
+    assert "lerobot:nobody/nothing: is no folder here, and the Hugging Face hub" in capsys.readouterr().err
+    assert main(["run", "--task", "boxing", "--policy", "lerobot:no/such/folder", "--out", out]) == 2
+    assert "--policy no/such/folder: no such file" in capsys.readouterr().err
+    assert not Path(out).exists()
+
+
+def test_a_picture_of_another_size_is_refused(checkpoints):
+    """Given by a server's client, say: the message names both sizes."""
+    policy = LeRobotPolicy(checkpoints["act"])
+    policy.reset([11], ["boxing"])
+    with pytest.raises(InputError, match=r"expected pictures of \[64, 64, 3\], was given \[32, 32, 3\]"):
+        policy.act(seen([11], [0], side=(32, 32)))
+
+
+def test_it_works_without_a_reset_or_an_environment(checkpoints):
+    """As a policy server's first request: memory is made for the worlds that are shown."""
+    policy = LeRobotPolicy(checkpoints["act"])
+    assert policy.act(seen([1, 2, 3], [0, 0, 0])).actions.shape == (3, policy.chunk_size, 40)
+    assert set(follow(policy, [1, 2], 1)) == {1, 2}
+    assert facts().camera.width == SIDE
+    assert np.isfinite(policy.act(seen([1, 2], [0, 0])).actions.numpy()).all()

@@ -1,0 +1,6 @@
+"""Lets the tests of clients import their servers."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))

@@ -1,0 +1,385 @@
+"""Servers that fail: only the world concerned ends as an error, nothing waits forever, a run stops where it must."""
+
+import json
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from foreign_servers import Gr00tServer, HttpServer, SocketServer, facts, observation
+
+from arena_newton import policies
+from arena_newton.errors import InputError
+from arena_newton.policies import PolicyUnavailable
+from arena_newton.policies.remote_address import TOKEN_VARIABLE
+from arena_newton.policies.remote_client import MAX_FAILURES
+
+pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+
+SOCKETS = ("openpi", "roboarena", "vla-eval")
+
+
+def started(protocol, **options):
+    """A server that declares itself."""
+    if protocol == "gr00t":
+        return Gr00tServer(declared=facts(), **options)
+    return SocketServer(protocol, facts(), config=facts(), **options)
+
+
+def client(server, **options):
+    """Its client, checked and with episodes begun in three worlds."""
+    policy = policies.get(f"remote:{server.url}", **({"timeout": 3.0, "retries": 2, "backoff": 0.01} | options))
+    policy.check()
+    policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
+    while server.url.startswith("vla-eval") and sum(kind == "reset" for kind, _ in server.seen) < 3:
+        time.sleep(0.005)  # it answers no beginning
+    return policy
+
+
+@pytest.fixture
+def running(request):
+    server = started(request.param)
+    yield server
+    server.close()
+
+
+@pytest.mark.parametrize("running", SOCKETS, indirect=True)
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("39", "[4, 39]"),
+        ("nan", "(index 20) is nan, expected a finite number"),
+        ("none", "[0, 40]"),
+        ("long", "[4400, 40]"),
+        ("words", "[1, 3], expected [n, 40]"),
+        ("flat", "[1, 160], expected [n, 40]"),
+        ("text", "the server says RuntimeError: CUDA out of memory"),
+        ("garbage", "not MessagePack"),
+        ("oversize", "longer than 4 MiB"),
+    ],
+)
+def test_bad_answer_ends_one_world(running, kind, text):
+    """A bad answer is one line that names the address, the others are served, and the next episode is a new one."""
+    policy = client(running)
+    running.behave = {1.0: kind}
+    chunk = policy.act(observation(3))
+    assert set(chunk.errors) == {1}
+    assert text in chunk.errors[1] and running.url in chunk.errors[1] and "\n" not in chunk.errors[1]
+    assert "Traceback" not in chunk.errors[1] and "line 7" not in chunk.errors[1]
+    assert np.isfinite(chunk.actions).all()
+    running.behave = {}
+    policy.reset([7, 18, 9], ["Isaac-Football"] * 3, np.array([False, True, False]))
+    assert policy.act(observation(3)).errors == {}
+    policy.close()
+
+
+@pytest.mark.parametrize("running", ["vla-eval"], indirect=True)
+@pytest.mark.parametrize(("kind", "text"), [("late", "the answer to look"), ("hello", "type hello, expected action")])
+def test_answers_to_something_else(running, kind, text):
+    """An answer to another look than the last one is refused."""
+    policy = client(running)
+    running.behave = {1.0: kind}
+    chunk = policy.act(observation(3))
+    assert set(chunk.errors) == {1} and text in chunk.errors[1]
+    policy.close()
+
+
+@pytest.mark.parametrize("running", SOCKETS, indirect=True)
+def test_frames_that_nobody_asked_for(running):
+    """A second frame for one look is never taken for the answer to the next one."""
+    policy = client(running)
+    running.behave = {1.0: "twice"}
+    first = policy.act(observation(3))
+    running.behave = {}
+    time.sleep(0.1)
+    if running.protocol == "openpi":  # it keeps no episode with the connection
+        second = policy.act(observation(3))
+        assert first.errors == second.errors == {} and (np.asarray(second.actions)[1] != 7).any()
+    else:
+        with pytest.raises(PolicyUnavailable, match="what the server knew of the running episode"):
+            policy.act(observation(3))
+    policy.close()
+
+
+@pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
+def test_deadline(running):
+    """A server that hangs costs one deadline; where it serves others meanwhile, one world."""
+    policy = client(running, timeout=0.5)
+    running.behave = {1.0: "slow"}
+    start = time.monotonic()
+    if running.url.startswith("gr00t"):  # one request for all, and one server for all requests
+        with pytest.raises(PolicyUnavailable, match=r"the server is gone: .*no reply within 0.5 s"):
+            policy.act(observation(3))
+    else:
+        chunk = policy.act(observation(3))
+        assert set(chunk.errors) == {1} and "no reply within 0.5 s" in chunk.errors[1]
+    assert time.monotonic() - start < 3.0
+    policy.close()
+
+
+@pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
+def test_failed_reset_ends_its_world(running):
+    """An episode whose beginning fails is an error at its first look, and the next one is not."""
+    policy = client(running)
+    running.behave = {"reset": True}
+    policy.reset([1, 2, 3], ["Isaac-Football"] * 3, np.array([False, True, False]))
+    running.behave = {}
+    chunk = policy.act(observation(3))
+    if running.url.startswith("openpi"):  # it has no beginning
+        assert chunk.errors == {}
+    else:
+        assert set(chunk.errors) == {1} and "the server says" in chunk.errors[1]
+    policy.reset([1, 2, 3], ["Isaac-Football"] * 3)
+    assert policy.act(observation(3)).errors == {}
+    policy.close()
+
+
+@pytest.mark.parametrize("protocol", [*SOCKETS, "gr00t"])
+@pytest.mark.parametrize("how", ["in a batch", "between two"])
+def test_killed_server_stops_the_run(protocol, how):
+    """When the server dies no world is called an error: the run stops, and its episodes stay unplayed."""
+    server = started(protocol)
+    policy = client(server, timeout=5.0, retries=1)
+    assert policy.act(observation(3)).errors == {}
+    if how == "in a batch":
+        server.behave = {1.0: "dies"}
+    else:
+        server.kill()
+    start = time.monotonic()
+    with pytest.raises(PolicyUnavailable, match="the server is gone"):
+        policy.act(observation(3))
+    assert time.monotonic() - start < 4.0
+    with pytest.raises(PolicyUnavailable, match="the server is gone"):
+        policy.reset([1, 2, 3], ["Isaac-Football"] * 3) if protocol != "openpi" else policy.act(observation(3))
+    policy.close()
+    server.close()
+
+
+@pytest.mark.parametrize("protocol", [*SOCKETS, "gr00t"])
+def test_restarted_server(protocol):
+    """After a restart a server that keeps nothing goes on; one that lost a running episode stops the run."""
+    server = started(protocol)
+    policy = client(server, retries=4, backoff=0.05)
+    first = np.asarray(policy.act(observation(3)).actions)
+    server.close()
+    server = started(protocol, port=server.port)
+    if protocol in ("openpi", "gr00t"):
+        second = policy.act(observation(3))
+        assert second.errors == {} and (np.asarray(second.actions) != first).any()
+    else:
+        with pytest.raises(PolicyUnavailable, match=r"what the server knew of the running episode; .* stay unplayed"):
+            policy.act(observation(3))
+    policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
+    again = policy.act(observation(3))
+    assert again.errors == {} and np.asarray(again.actions).tobytes() == first.tobytes()
+    policy.close()
+    server.close()
+
+
+@pytest.mark.parametrize("protocol", SOCKETS)
+def test_restart_before_the_first_look(protocol):
+    """An episode that has not received an action yet begins again on the new connection."""
+    server = started(protocol)
+    policy = client(server, retries=4, backoff=0.05)
+    server.close()
+    server = started(protocol, port=server.port)
+    assert policy.act(observation(3)).errors == {}
+    assert protocol == "openpi" or sorted(s.seed for kind, s in server.seen if kind == "reset") == [7, 8, 9]
+    policy.close()
+    server.close()
+
+
+def test_another_policy_after_a_restart():
+    """A server that declares something else than at the beginning is not asked any more."""
+    server = started("openpi")
+    policy = client(server, retries=4, backoff=0.05)
+    server.close()
+    server = SocketServer("openpi", facts(policy="another"), port=server.port)
+    with pytest.raises(PolicyUnavailable, match="declares something else"):
+        policy.act(observation(3))
+    policy.close()
+    server.close()
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "http"])
+def test_episode_that_the_server_does_not_know(protocol):
+    """A server that says that it does not know the running episode stops the run."""
+    server = HttpServer(facts()) if protocol == "http" else started(protocol)
+    policy = client(server)
+    assert policy.act(observation(3)).errors == {}
+    server.behave = {"any": "unknown"}
+    with pytest.raises(PolicyUnavailable, match="unknown episode"):
+        policy.act(observation(3))
+    policy.close()
+    server.close()
+
+
+@pytest.mark.parametrize("running", ["openpi", "vla-eval", "gr00t"], indirect=True)
+def test_server_without_a_usable_answer_stops_the_run(running):
+    """A server that serves nobody stops the run after at most `MAX_FAILURES` worlds with an error."""
+    policy = client(running)
+    running.behave = {"any": "text"}
+    errors = 0
+    with pytest.raises(PolicyUnavailable, match="requests in a row brought no usable answer"):
+        for _ in range(100):
+            errors += len(policy.act(observation(3)).errors)
+            policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
+    assert errors < MAX_FAILURES
+    policy.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("39", "joint_pos has shape [3, 4, 28], expected [3, n, 29]"),
+        ("missing", "hands has shape NoneType"),
+        ("text", "the server says CUDA out of memory"),
+        ("ERROR", "the server says ERROR"),
+        ("garbage", "not MessagePack"),
+        ("oversize", "longer than 4 MiB"),
+        ("objects", "an array of type '|O'"),
+    ],
+)
+def test_bad_answer_of_gr00t(kind, text):
+    """One answer for all worlds that is bad is the error of all, in one line; the next one is served."""
+    server = started("gr00t")
+    policy = client(server)
+    server.behave = {1.0: kind}
+    chunk = policy.act(observation(3))
+    assert set(chunk.errors) == {0, 1, 2} and len(set(chunk.errors.values())) == 1
+    assert text in chunk.errors[0] and server.url in chunk.errors[0] and "\n" not in chunk.errors[0]
+    server.behave = {}
+    assert policy.act(observation(3)).errors == {}
+    policy.close()
+    server.close()
+
+
+def test_bad_row_of_gr00t():
+    """One row that is bad is the error of its world alone."""
+    server = started("gr00t")
+    policy = client(server)
+    server.behave = {1.0: "nan"}
+    chunk = policy.act(observation(3))
+    assert set(chunk.errors) == {1} and "(index 20) is nan" in chunk.errors[1]
+    policy.close()
+    server.close()
+
+
+def raw_server(reply):
+    """A server that sends fixed bytes when it is asked."""
+    listening = socket.create_server(("127.0.0.1", 0), backlog=64)
+
+    def answer(connection):
+        with connection:
+            connection.settimeout(2.0)
+            try:
+                if connection.recv(65536):
+                    connection.sendall(reply)
+            except OSError:
+                pass
+
+    def run():
+        while True:
+            try:
+                connection, _ = listening.accept()
+            except OSError:
+                return
+            threading.Thread(target=answer, args=(connection,), daemon=True).start()
+
+    threading.Thread(target=run, daemon=True).start()
+    return listening
+
+
+@pytest.mark.parametrize("protocol", ["ws", "roboarena", "vla-eval", "gr00t"])
+@pytest.mark.parametrize(
+    ("reply", "text"),
+    [
+        (b"HTTP/1.1 302 Found\r\nLocation: ws://127.0.0.1:1/\r\nContent-Length: 0\r\n\r\n", "a redirect, which is not"),
+        (b"HTTP/1.1 401 No\r\nContent-Length: 0\r\n\r\n", f"status 401.* variable {TOKEN_VARIABLE}"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", "status 200, expected a websocket"),
+        (b"HTTP/1.1 503 Busy\r\nContent-Length: 0\r\n\r\n", "status 503"),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", "no websocket"),
+    ],
+)
+def test_check_refuses_what_is_no_policy_server(protocol, reply, text):
+    """Something else at the address, a redirect too, is one line before the first episode."""
+    listening = raw_server(reply)
+    address = f"{protocol}://127.0.0.1:{listening.getsockname()[1]}"
+    policy = policies.get(f"remote:{address}", timeout=1.0, retries=1, backoff=0.01)
+    with pytest.raises(InputError, match="gr00t" if protocol == "gr00t" else text) as caught:
+        policy.check()
+    assert "\n" not in str(caught.value) and address in str(caught.value)
+    policy.close()
+    listening.close()
+
+
+@pytest.mark.parametrize("protocol", ["ws", "vla-eval", "gr00t"])
+def test_nobody_there(protocol):
+    """An address where nobody listens is one line, soon."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+    policy = policies.get(f"remote:{protocol}://127.0.0.1:{port}", timeout=5.0, retries=1, backoff=0.01)
+    with pytest.raises(InputError, match="no server answers there"):
+        policy.check()
+    policy.close()
+
+
+@pytest.mark.parametrize("protocol", ["ws", "vla-eval", "gr00t"])
+def test_silent_server(protocol):
+    """A server that takes connections and never speaks is refused after one deadline."""
+    with socket.create_server(("127.0.0.1", 0), backlog=64) as listening:
+        policy = policies.get(f"remote:{protocol}://127.0.0.1:{listening.getsockname()[1]}", timeout=0.4, retries=3)
+        start = time.monotonic()
+        with pytest.raises(InputError, match="within 0.4 s"):
+            policy.check()
+        assert time.monotonic() - start < 3.0
+        policy.close()
+
+
+@pytest.mark.parametrize("running", ["openpi", "vla-eval"], indirect=True)
+def test_token_is_sent_and_never_told(running, monkeypatch):
+    """The token of the environment goes with every connection, and into no message or description."""
+    monkeypatch.setenv(TOKEN_VARIABLE, "s3kret-token")
+    policy = client(running)
+    running.behave = {1.0: "escapes"}
+    chunk = policy.act(observation(3))
+    assert set(running.tokens) == {"Bearer s3kret-token"}
+    assert "s3kret" not in str(chunk.errors) + str(policy.describe()) and "\x1b" not in str(chunk.errors)
+    assert set(chunk.errors) == {1}
+    policy.close()
+
+
+def test_token_of_gr00t(monkeypatch):
+    """GR00T's servers read the token in the message; without it the refusal is one line."""
+    server = Gr00tServer(token="s3kret")
+    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
+    with pytest.raises(InputError, match="Invalid API token"):
+        policy.check()
+    policy.close()
+    monkeypatch.setenv(TOKEN_VARIABLE, "s3kret")
+    policy = client(server)
+    assert policy.act(observation(3)).errors == {} and "s3kret" not in json.dumps(policy.describe())
+    policy.close()
+    server.close()
+
+
+@pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
+def test_close_breaks_off_what_waits(running):
+    """Closing does not wait for the deadline of requests that are under way."""
+    policy = client(running, timeout=15.0)
+    running.behave = {0.0: "slow"}
+
+    def ask():
+        try:
+            policy.act(observation(1))
+        except PolicyUnavailable:
+            pass
+
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
+    while not any(kind in ("look", "get_action") for kind, _ in running.seen[-1:]):
+        time.sleep(0.01)
+    policy.close()
+    asking.join(5.0)
+    assert not asking.is_alive()

@@ -1,0 +1,405 @@
+"""The doors: each protocol as its clients speak it, who is let in, and what hostile or slow clients can do."""
+
+import http.client
+import json
+import socket
+import threading
+import time
+
+import msgpack
+import numpy as np
+import pytest
+from served_policies import Fails, Remembers, look, state, together
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from arena_newton.policies.serve import arena_codec, openpi_codec, vla_eval_codec
+from arena_newton.policies.serve.policy_messages import Begin, End
+
+pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+
+VALUES = [0.1, 0.2, 0.3]
+
+
+def expected(served, seed):
+    """The chunks of an episode as the server object gives them."""
+    served.server.begin("direct", Begin("", seed, "boxing"))
+    chunks = [served.server.look("direct", look(v, seed=seed, step=4 * i)).actions for i, v in enumerate(VALUES)]
+    served.server.leave("direct")
+    return chunks
+
+
+def ask(socket, request, **more):
+    """The answer of openpi's server, or RoboArena's."""
+    socket.send(openpi_codec.pack_request(request, **more))
+    return openpi_codec.unpack_answer(socket.recv(timeout=10), "server")
+
+
+def say(socket, request, seq=1):
+    """Send a message of vla-eval."""
+    socket.send(vla_eval_codec.pack_request(request, seq, 0.0))
+
+
+def heard(socket):
+    """The next message of vla-eval."""
+    return vla_eval_codec.unpack_message(socket.recv(timeout=10))
+
+
+def test_openpi(served):
+    """Openpi's client is sent the metadata, and each look its chunk; seed and step 0 begin an episode."""
+    one = served(Remembers())
+    with one.socket() as client:
+        facts, frame = openpi_codec.unpack_metadata(client.recv(timeout=10), "server")
+        assert facts == one.server.facts and facts.chunk_length == 4 and frame["action_space"] == "arena_v3.1"
+        for seed in (3, 4, 3):
+            chunks = [ask(client, look(v, seed=seed, step=4 * i)) for i, v in enumerate(VALUES)]
+            assert np.array_equal(chunks, expected(one, seed))
+
+
+def test_openpi_client_that_knows_only_openpi(served):
+    """A client without seeds and steps is one episode from its connection to its end."""
+    one = served(Remembers())
+    for number in range(2):
+        with one.socket() as client:
+            client.recv(timeout=10)
+            chunks = []
+            for value in VALUES:
+                frame = {"observation/state": state(value), "prompt": "Box."}
+                client.send(openpi_codec.pack(frame, openpi_codec.OPENPI_KEYS))
+                answer = openpi_codec.unpack(client.recv(timeout=10), openpi_codec.OPENPI_KEYS, "server")
+                chunks.append(answer["actions"])
+            assert set(answer["server_timing"]) == {"infer_ms", "prev_total_ms"}
+        assert np.array_equal(chunks, expected(one, number))  # the server numbers the seeds that nobody names
+
+
+def test_roboarena(served):
+    """RoboArena's reset is answered by its text; sessions of one connection are robots of their own."""
+    one = served(Remembers(), "roboarena")
+    with one.socket() as client:
+        facts, frame = openpi_codec.unpack_metadata(client.recv(timeout=10), "server")
+        assert facts.action_names is None and len(frame) == 6
+        assert arena_codec.read_facts(one.http("GET", "/config")[1], "server") == one.server.facts
+        chunks = {"a": [], "b": []}
+        for session, seed in (("a", 3), ("b", 4)):
+            client.send(openpi_codec.pack_request(Begin(session, seed, "boxing"), roboarena=True))
+            assert client.recv(timeout=10) == "reset successful"
+        for i, value in enumerate(VALUES):
+            for session, seed in (("a", 3), ("b", 4)):
+                seen = look(value, seed=seed, step=4 * i, session=session)
+                chunks[session].append(ask(client, seen, roboarena=True, image_key="observation/exterior_image_1_left"))
+    assert np.array_equal(chunks["a"], expected(one, 3)) and np.array_equal(chunks["b"], expected(one, 4))
+
+
+def test_vla_eval(served):
+    """A robot that says it knows chunks is given whole ones; an error answers its look and the connection goes on."""
+    one = served(Remembers(), "vla-eval")
+    with one.socket() as client:
+        client.send(vla_eval_codec.pack_hello(None, 1, 0.0))
+        facts, chunks = vla_eval_codec.unpack_hello(heard(client), "server")
+        assert facts == one.server.facts and chunks
+        for seed in (3, 4):
+            say(client, Begin("", seed, "boxing"))
+            got = []
+            for i, value in enumerate(VALUES):
+                say(client, look(value, seed=seed, step=4 * i), seq=10 + i)
+                got.append(vla_eval_codec.unpack_action(heard(client), 10 + i, "server"))
+            assert np.array_equal(got, expected(one, seed))
+            say(client, End())
+        say(client, look(seed=3, step=8), seq=77)
+        error = heard(client)
+        assert error.type == "error" and error.seq == 77 and "does not know" in error.payload["error"]
+        client.send(b"\xff\xff")
+        assert heard(client).type == "error"
+        say(client, look(seed=3, step=0), seq=78)
+        assert heard(client).type == "action"
+
+
+def test_vla_eval_harness_takes_one_action_a_look(served):
+    """A robot that does not know chunks is given one action of 40 numbers a look, and a new chunk after the last."""
+    one = served(Remembers(), "vla-eval")
+    with one.socket() as client:
+        say(client, Begin("", 3, "boxing"))
+        actions = []
+        for i in range(8):
+            say(client, look(VALUES[i // 4]), seq=i)
+            actions.append(heard(client).payload["actions"])
+        assert actions[0].shape == (40,)
+        assert np.array_equal(np.reshape(actions, (2, 4, 40)), expected(one, 3)[:2])
+        say(client, look(VALUES[2]), seq=9)
+        heard(client)
+        say(client, Begin("", 4, "boxing"))  # what is left of the chunk is not the new episode's
+        say(client, look(VALUES[0]), seq=1)
+        assert np.array_equal(heard(client).payload["actions"], expected(one, 4)[0][0])
+
+
+def post(served, route, body):
+    return served.http("POST", route, body, {"Content-Type": "application/json"})
+
+
+def test_arena(served):
+    """The original's protocol: worlds are robots of their own, over any connection; `/config` says what is served."""
+    one = served(Remembers(), "arena")
+    chunks = {0: [], 1: []}
+    for world, seed in ((0, 3), (1, 4)):
+        status, reply = post(one, "/reset", arena_codec.pack_begin(Begin(str(world), seed, "boxing")))
+        assert status == 200 and reply == {"ok": True, "seeded": True, "policy": one.server.facts.policy}
+    for i, value in enumerate(VALUES):
+        for world, seed in ((0, 3), (1, 4)):
+            body = arena_codec.pack_look(look(value, seed=seed, step=4 * i, session=str(world)))
+            status, reply = post(one, "/infer", body)
+            assert status == 200 and reply["chunk_size"] == 4
+            chunks[world].append(np.float32(reply["action_chunk"]))
+    assert np.array_equal(chunks[0], expected(one, 3)) and np.array_equal(chunks[1], expected(one, 4))
+    assert arena_codec.read_facts(one.http("GET", "/config")[1], "server") == one.server.facts
+    status, reply = post(one, "/infer", arena_codec.pack_look(look(seed=9, step=4, session="0")))
+    assert status == 409 and "does not know" in reply["error"]
+
+
+def test_arena_as_the_original_asks(served):
+    """A client that names no world, seed or step is one robot; one action is given where no chunk is wanted."""
+    one = served(Remembers(), "arena")
+    assert post(one, "/reset", b'{"seed": 3}')[0] == 200
+    got = []
+    for value in VALUES:
+        seen = {"observation": {"state": [float(v) for v in state(value)]}, "return_chunk": True, "task": "boxing"}
+        got.append(np.float32(post(one, "/infer", json.dumps(seen).encode())[1]["action_chunk"]))
+    assert np.array_equal(got, expected(one, 3))
+    assert list(post(one, "/infer", json.dumps({**seen, "return_chunk": False}).encode())[1]) == ["action"]
+
+
+def test_two_evaluations_at_one_address(served):
+    """Worlds of one number and two seeds, from two clients of one machine, do not disturb each other."""
+    one = served(Remembers(), "arena")
+    for seed in (3, 4):
+        post(one, "/reset", arena_codec.pack_begin(Begin("0", seed, "boxing")))
+    got = {3: [], 4: []}
+    for i, value in enumerate(VALUES):
+        for seed in (3, 4):
+            reply = post(one, "/infer", arena_codec.pack_look(look(value, seed=seed, step=4 * i, session="0")))[1]
+            got[seed].append(np.float32(reply["action_chunk"]))
+    assert np.array_equal(got[3], expected(one, 3)) and np.array_equal(got[4], expected(one, 4))
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "arena"])
+def test_routes(served, protocol):
+    """Every door answers /healthz, /health and /config; a browser and another route get nothing."""
+    one = served(Remembers(), protocol)
+    assert one.http("GET", "/healthz") == (200, b"OK\n")
+    assert one.http("GET", "/health") == (200, {"status": "ok"})
+    status, config = one.http("GET", "/config?max_batch_size=1")
+    assert status == 200 and config["protocol"] == protocol and config["rate_hz"] == 50
+    assert one.server.max_batch_size == 16, "a question changed the server"
+    assert one.http("GET", "/config", headers={"Origin": "http://evil.example"})[0] == 403
+    if protocol == "arena":
+        assert one.http("GET", "/secret")[0] == 404 and one.http("POST", "/secret", b"{}")[0] == 404
+        assert one.http("PUT", "/reset", b"{}")[0] == 501
+        assert post(one, "/reset", b"{}")[0] == 200
+        assert one.http("POST", "/reset", b"{}", {"Origin": "null"})[0] == 403
+    else:
+        with pytest.raises(InvalidStatus, match="403"):
+            one.socket(origin="http://127.0.0.1")
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_token(served, protocol):
+    """With a token only who sends it is let in; whether the server is there is told to everybody."""
+    one = served(Remembers(), protocol, token="s3cret")
+    right, wrong = {"Authorization": "Bearer s3cret"}, {"Authorization": "Bearer s3cre"}
+    assert one.http("GET", "/healthz")[0] == 200
+    for headers in ({}, wrong, {"Authorization": "s3cret"}, {"Authorization": "Basic s3cret"}):
+        status, reply = one.http("GET", "/config", headers=headers)
+        assert status == 401 and "s3cret" not in str(reply)
+    assert one.http("GET", "/config", headers=right)[0] == 200
+    assert one.http("GET", "/config", headers={"Authorization": "Api-Key s3cret"})[0] == 200
+    if protocol == "openpi":
+        with pytest.raises(InvalidStatus, match="401"):
+            one.socket(additional_headers=wrong)
+        with one.socket(additional_headers=right) as client:
+            client.recv(timeout=10)
+    else:
+        assert one.http("POST", "/reset", b"{}", wrong)[0] == 401 and one.http("POST", "/reset", b"{}", right)[0] == 200
+
+
+def test_one_connection_too_many(served):
+    """Connections beyond the limit are refused, and let in when another has left."""
+    one = served(Remembers(), connections=2)
+    first, second = one.socket(), one.socket()
+    with pytest.raises(InvalidStatus, match="503"):
+        one.socket()
+    assert one.http("GET", "/healthz")[0] == 200
+    second.close()
+    for _ in range(100):
+        try:
+            one.socket().close()
+            break
+        except InvalidStatus:
+            time.sleep(0.05)
+    else:
+        pytest.fail("no room after one has left")
+    first.close()
+    two = served(Remembers(), "arena", connections=1)
+    kept = http.client.HTTPConnection("127.0.0.1", two.port, timeout=10)
+    kept.request("GET", "/config")
+    assert kept.getresponse().read()
+    assert two.http("POST", "/reset", b"{}")[0] == 503
+    kept.close()
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "arena"])
+def test_errors_are_one_line(served, protocol):
+    """A failing policy, an unfit action and an unfit message are told in one line without paths; the server goes on."""
+    one = served(Fails(), protocol)
+
+    def told(kind, **more):
+        seen = look(kind=kind, step=0, **more)
+        if protocol == "arena":
+            status, reply = post(one, "/infer", arena_codec.pack_look(seen))
+            assert status == (500 if kind else 400)
+            return reply["error"]
+        with one.socket() as client:
+            if protocol == "vla-eval":
+                say(client, seen)
+                return heard(client).payload["error"]
+            client.recv(timeout=10)
+            client.send(openpi_codec.pack_request(seen))
+            text = client.recv(timeout=10)
+            with pytest.raises(ConnectionClosed) as closed:
+                client.recv(timeout=10)
+            assert closed.value.rcvd.code == 1011
+            return text
+
+    assert told(1) == "the policy failed (RuntimeError); the server's console says more"
+    assert "is nan, expected a finite number" in told(2)
+    assert told(3) == "no plan for this world"
+    assert told(0, task="sit_sofa") == "policy fails: does not know sit_sofa"
+
+
+def test_a_session_that_closes_frees_its_row(served):
+    """As many robots as wanted may come one after the other, also those whose connection is cut off."""
+    one = served(Remembers(), max_sessions=2, connections=8)
+    for number in range(6):
+        client = one.socket()
+        client.recv(timeout=10)
+        ask(client, look(seed=1, step=0))
+        if number % 2:
+            client.close()
+        else:
+            client.socket.shutdown(socket.SHUT_RDWR)
+        for _ in range(200):
+            if len(one.server._sessions) == 0:
+                break
+            time.sleep(0.01)
+        else:
+            pytest.fail("the row is kept")
+
+
+def test_a_slow_client_holds_up_nobody(served):
+    """Clients that send a request by drips, never read, or stop in the middle do not delay another one's answers."""
+    one = served(Remembers(), "arena", connections=16)
+    body = arena_codec.pack_look(look(seed=1, step=0, image=np.zeros((480, 640, 3), np.uint8)))
+    head = b"POST /infer HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body)
+    slow = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(6)]
+    for n, connection in enumerate(slow):
+        connection.sendall((head + body)[: 10 + 40 * n])
+    began = time.monotonic()
+    for i in range(5):
+        assert post(one, "/infer", arena_codec.pack_look(look(seed=1, step=0, session=str(i))))[0] == 200
+    assert time.monotonic() - began < 5.0
+    for connection in slow:
+        connection.close()
+    two = served(Remembers(), connections=16)
+    silent = [socket.create_connection(("127.0.0.1", two.port)) for _ in range(4)]
+    deaf = two.socket(max_queue=1)
+    with two.socket() as client:
+        for _ in range(300):
+            deaf.send(openpi_codec.pack_request(look(seed=1, step=0)))  # and never reads
+        client.recv(timeout=10)
+        assert ask(client, look(seed=2, step=0)).shape == (4, 40)
+    for connection in silent:
+        connection.close()
+    deaf.socket.close()
+
+
+@pytest.mark.parametrize(
+    ("head", "status"),
+    [
+        ("POST /infer HTTP/1.1\r\n\r\n", 411),
+        ("POST /infer HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n", 411),
+        ("POST /infer HTTP/1.1\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n", 411),
+        ("POST /infer HTTP/1.1\r\nContent-Length: -5\r\n\r\n", 400),
+        ("POST /infer HTTP/1.1\r\nContent-Length: 99999999999\r\n\r\n", 413),
+        ("POST /infer HTTP/1.1\r\nContent-Length: 2\r\n\r\n[]", 400),
+        ("GET / HTTP/9.9\r\n\r\n", 505),
+        ("nonsense\r\n\r\n", 400),
+        ("GET /" + "a" * 70000 + " HTTP/1.1\r\n\r\n", 414),
+        ("GET / HTTP/1.1\r\n" + "a: b\r\n" * 200 + "\r\n", 431),
+    ],
+)
+def test_unfit_http(served, head, status):
+    """What is not a request of the protocol is refused as JSON, without pages or tracebacks, and the server goes on."""
+    one = served(Remembers(), "arena")
+    with socket.create_connection(("127.0.0.1", one.port), timeout=10) as connection:
+        connection.sendall(head.encode())
+        connection.shutdown(socket.SHUT_WR)
+        reply = b""
+        while piece := connection.recv(65536):
+            reply += piece
+    assert reply.startswith(b"HTTP/1.1 %d " % status), reply[:200]
+    assert b"Traceback" not in reply and b"<html" not in reply.lower() and b'{"error": "' in reply
+    assert one.http("GET", "/health")[0] == 200
+
+
+def test_many_robots_at_once(served):
+    """Eight robots over all of two protocols' connections are answered together, each as if it were alone."""
+    one = served(Remembers(), "openpi", max_wait=0.1)
+
+    def play(seed):
+        with one.socket() as client:
+            client.recv(timeout=10)
+            return [ask(client, look(v, seed=seed, step=4 * i)) for i, v in enumerate(VALUES)]
+
+    results = together(*[lambda seed=seed: play(seed) for seed in range(8)])
+    assert max(one.server.counts.batches) >= 4, one.server.counts.batches
+    for seed, chunks in enumerate(results):
+        assert np.array_equal(chunks, expected(one, seed))
+
+
+def test_too_large_a_frame(served):
+    """A frame beyond the limit closes its connection, and no other."""
+    one = served(Remembers())
+    with one.socket() as other:
+        other.recv(timeout=10)
+        with one.socket() as client:
+            client.recv(timeout=10)
+            with pytest.raises(ConnectionClosed) as closed:
+                client.send(bytes(17 * 2**20))
+                client.recv(timeout=10)
+            assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
+        assert ask(other, look(seed=2, step=0)).shape == (4, 40)
+
+
+def test_closing_ends_the_connections(served):
+    """A server that closes says goodbye to who is connected, soon."""
+    one = served(Remembers())
+    client = one.socket()
+    client.recv(timeout=10)
+    began = time.monotonic()
+    one.close()
+    with pytest.raises(ConnectionClosed):
+        client.recv(timeout=10)
+    assert time.monotonic() - began < 5.0
+    assert not [t for t in threading.enumerate() if t.name == "policy" and t.is_alive()]
+
+
+def test_a_text_frame_and_a_wrong_type(served):
+    """A text frame is told apart in openpi and vla-eval; a message of the server's own types is refused."""
+    one = served(Remembers())
+    with one.socket() as client:
+        client.recv(timeout=10)
+        client.send("hello")
+        assert "a text frame, expected MessagePack" in client.recv(timeout=10)
+    two = served(Remembers(), "vla-eval")
+    with two.socket() as client:
+        frame = {"type": "action", "payload": {}, "seq": 5, "timestamp": 0.0}
+        client.send(msgpack.packb(frame))
+        message = heard(client)
+        assert message.seq == 5 and message.payload["error"].startswith("message: type action, expected episode_start")

@@ -1,0 +1,230 @@
+"""Rows of datasets on a device: pictures, actions of both protocols, statistics, batches."""
+
+import dataclasses
+import itertools
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+from arena_newton.data import Frames
+from arena_newton.data.label_protocols import encode_v4
+from arena_newton.data.lerobot_reader import DatasetActions
+from arena_newton.errors import InputError
+from arena_newton.policies.train import frame_store
+from arena_newton.policies.train.augmentation import gathered_pictures
+from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.demonstration_rows import read_rows, statistics
+from arena_newton.policies.train.frame_store import load_frames, made_frames
+from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def rows(dataset):
+    """The dataset without its pictures, in v4."""
+    return read_rows(dataset, "v4")
+
+
+@pytest.fixture(scope="module")
+def store(rows):
+    """It on the CPU, its last episode held out."""
+    return load_frames([rows], CPU, hold_out=1, jobs=2)
+
+
+def unchanged(key, value):
+    """No normalization."""
+    return value
+
+
+def test_pictures_are_the_datasets(dataset, store):
+    """Every picture is the dataset's in the rows that are kept, and the black rows are given back."""
+    frames = Frames(dataset)
+    assert (store.top, store.bottom, store.rows) == (BAND, BAND, sum(LENGTHS))
+    found = gathered_pictures(store, torch.arange(store.rows))
+    for row in range(store.rows):
+        wanted = frames[row].copy()
+        assert max(wanted[:BAND].max(), wanted[-BAND:].max()) <= frame_store.BLACK
+        wanted[:BAND] = wanted[-BAND:] = 0
+        assert np.array_equal((found[row] * 255).round().byte().permute(1, 2, 0).numpy(), wanted), row
+
+
+def test_a_late_picture_keeps_its_rows(tmp_path):
+    """Rows that are black at the beginning of all episodes and not later are not cut off."""
+
+    def brightening(rows, size, seed):
+        pictures = np.full((rows, size, size, 3), 90, np.uint8)
+        pictures[:10, :BAND] = 0
+        return pictures
+
+    dataset = make_dataset(tmp_path, lengths=(20, 20), pictures=brightening)
+    store = load_frames([read_rows(dataset, "v3.1")], CPU)
+    assert (store.top, store.bottom) == (0, 0) and store.pictures.shape[1] == SIZE
+    assert store.pictures[15, 0].min() > 60 and store.pictures[0, 0].max() <= frame_store.BLACK
+
+
+def test_actions_are_of_the_wanted_protocol(dataset, rows, tmp_path):
+    """A v3.1 dataset gives v4 as `encode_v4` makes it, a v4 dataset the same bits and v3.1 back, each its own as it is."""
+    about = DatasetActions(dataset)
+    own = read_rows(dataset, "v3.1")
+    built = make_dataset(tmp_path, labels="v4")
+    from_v4, back = read_rows(built, "v4"), read_rows(built, "v3.1")
+    for number in range(len(LENGTHS)):
+        given = about.actions(number)
+        assert np.array_equal(own.episodes[number].actions, given)
+        assert np.array_equal(rows.episodes[number].actions, encode_v4(given))
+        assert np.array_equal(from_v4.episodes[number].actions, encode_v4(given))
+        assert np.allclose(back.episodes[number].actions[1:], given[1:], atol=1e-5)
+    assert (rows.episodes[0].task, rows.trackers) == ("boxing", ("twist2",))
+
+
+def test_statistics_are_the_datasets(dataset):
+    """Of all episodes together they are those of the dataset's own `stats.json`; a floor holds constant numbers up."""
+    whole = read_rows(dataset, "v3.1")
+    found = statistics([whole], whole.episodes, "v3.1")
+    stats = LeRobotDatasetMetadata("local/x", root=dataset).stats
+    for key in ("observation.state", "action", "observation.images.front"):
+        for name, values in found[key].items():
+            assert np.allclose(values, stats[key][name], atol=1e-6), (key, name)
+    floored = statistics([whole], whole.episodes, "v3.1", state_floor=1e-3, action_floor=0.5)
+    assert floored["action"]["std"].min() == 0.5 and floored["observation.state"]["std"].min() >= 1e-3
+
+
+def test_a_batch_ends_where_its_episode_ends(store):
+    """Actions beyond an episode are its last row and marked; those of other episodes never appear."""
+    batches = BatchMaker(store, unchanged, range(-1, 8))
+    last = sum(LENGTHS[:2]) - 1  # the second episode's
+    batch = batches(torch.tensor([0, 3, last - 2, last]))
+    assert batch["action"].shape == (4, 9, 40) and batch["observation.images.front"].shape == (4, 3, SIZE, SIZE)
+    assert batch["action_is_pad"].int().tolist() == [
+        [1, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0] * 9,
+        [0, 0, 0, 0, 1, 1, 1, 1, 1],
+        [0, 0, 1, 1, 1, 1, 1, 1, 1],
+    ]
+    assert torch.equal(batch["action"][0, :2], store.actions[[0, 0]])
+    assert torch.equal(batch["action"][1], store.actions[2:11])
+    assert torch.equal(batch["action"][3, 1:], store.actions[last].expand(8, 40))
+    assert torch.equal(batch["observation.state"], store.states[[0, 3, last - 2, last]])
+
+
+def test_several_datasets_are_one_set(dataset, rows, tmp_path):
+    """Two datasets' episodes follow each other, each row with its own task and instruction."""
+    other = read_rows(make_dataset(tmp_path, lengths=(22,), task="football"), "v4")
+    store = load_frames([rows, other], CPU)
+    assert store.rows == sum(LENGTHS) + 22 and store.tasks == ("boxing", "football")
+    batches = BatchMaker(store, unchanged, range(3), task_vector=("football", "boxing"))
+    batch = batches(torch.tensor([0, store.rows - 1]))
+    assert batch["observation.environment_state"].tolist() == [[0.0, 1.0], [1.0, 0.0]]
+    words = [store.instructions[n] for n in store.instruction[[0, store.rows - 1]].tolist()]
+    assert words == [rows.episodes[0].instruction, other.episodes[0].instruction] and words[0] != words[1]
+    assert store.first[-1] == sum(LENGTHS) and torch.equal(store.actions[-22:], torch.tensor(other.episodes[0].actions))
+
+
+def test_held_out_rows_are_not_sampled(store):
+    """Rows to train on and held-out rows are the episodes' rows, without those at their ends that are left out."""
+    begin, end = sum(LENGTHS[:2]), sum(LENGTHS)
+    assert store.samples().tolist() == list(range(begin))
+    assert store.samples(held=True, drop_last=3).tolist() == list(range(begin, end - 3))
+    assert store.samples(drop_last=32).tolist() == list(range(LENGTHS[0], LENGTHS[0] + LENGTHS[1] - 32))
+
+
+def test_an_epoch_has_every_row_once():
+    """Whatever the batch and the number of processes, rows come once per epoch, in one order, from any step on."""
+    samples = np.arange(100, 137)
+    for batch, ranks in ((5, 1), (64, 1), (3, 2)):
+        order = RowOrder(samples, 7, CPU)
+        steps = 300 // (batch * ranks) + 2
+        parts = [order.rows(s, batch, rank=r, ranks=ranks) for s in range(steps) for r in range(ranks)]
+        taken = torch.cat(parts)
+        for epoch in range(3):
+            assert sorted(taken[epoch * 37 : epoch * 37 + 37].tolist()) == samples.tolist()
+        again = RowOrder(samples, 7, CPU).rows(steps - 1, batch, rank=ranks - 1, ranks=ranks)
+        assert torch.equal(again, parts[-1])
+    first = [RowOrder(samples, seed, CPU).rows(0, 20).tolist() for seed in (1, 2)]
+    assert first[0] != first[1]
+
+
+def test_seeds_of_steps_differ():
+    """Every seed, step and process draws its own numbers."""
+    seeds = {step_seed(a, b, c) for a, b, c in itertools.product(range(20), range(-1, 200), range(4))}
+    assert len(seeds) == 20 * 201 * 4 and all(0 <= seed < 2**63 for seed in seeds)
+
+
+def test_pictures_are_shifted_and_tinted_each_by_itself(store):
+    """A shifted picture is the same content moved by at most the limit; colours stay within theirs; black rows stay."""
+    row = torch.full((64,), 5)
+    plain = gathered_pictures(store, row[:1])[0]
+    torch.manual_seed(3)
+    shifted = gathered_pictures(store, row, shift=2)
+    seen = set()
+    inner = plain[:, BAND + 2 : -BAND - 2, 2:-2]
+    for picture in shifted:
+        moves = [
+            (y, x)
+            for y, x in itertools.product(range(-2, 3), repeat=2)
+            if torch.equal(picture[:, BAND + 2 - y : SIZE - BAND - 2 - y, 2 - x : SIZE - 2 - x], inner)
+        ]
+        assert moves
+        seen.add(moves[0])
+        assert picture[:, :BAND].max() == 0 and picture[:, -BAND:].max() == 0
+    assert len(seen) > 10
+    torch.manual_seed(4)
+    tinted = gathered_pictures(store, row, colour=0.1)
+    ratio = tinted[:, :, BAND:-BAND] / plain[:, BAND:-BAND]
+    low, high = ratio.amin((2, 3)), ratio.amax((2, 3))
+    assert low.min() >= 0.81 - 1e-5 and high.max() <= 1.21 + 1e-5 and (high - low).max() < 1e-4
+    assert low.std() > 0.02 and (low - low.mean(1, keepdim=True)).abs().max() > 0.02
+    torch.manual_seed(4)
+    assert torch.equal(gathered_pictures(store, row, colour=0.1), tinted)
+
+
+def test_what_does_not_fit_is_refused(rows, monkeypatch):
+    """A device with too little memory gives one error that says how much is needed and free."""
+    monkeypatch.setattr(frame_store, "free_memory", lambda device: 500_000)
+    with pytest.raises(InputError, match=r"92 pictures of 64x48 need 0.0 GB of memory on cpu, 0.0 GB are free"):
+        load_frames([rows], CPU)
+    with pytest.raises(InputError, match="--hold-out 3: .* has 3 episodes, none would be left"):
+        load_frames([rows], CPU, hold_out=3)
+    with pytest.raises(InputError, match="pictures of 32x64 pixels, .* has 64x64"):
+        load_frames([rows, dataclasses.replace(rows, width=32)], CPU)
+
+
+def test_made_frames_have_the_form_of_a_dataset():
+    """Frames of a measurement give batches like those of a dataset."""
+    store = made_frames(120, 64, CPU, length=50)
+    batch = BatchMaker(store, unchanged, range(5))(torch.tensor([0, 49, 119]))
+    assert batch["action_is_pad"].sum(1).tolist() == [0, 4, 4] and store.lengths == (50, 50, 20)
+    assert batch["observation.images.front"].shape == (3, 3, 64, 64)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: (d / "meta" / "stats.json").write_text("{}"), "says nothing of observation.images.front"),
+        (lambda d: (d / "meta" / "stats.json").unlink(), "stats.json"),
+        (lambda d: edit(d, lambda i: i["features"]["observation.state"].update(shape=[63])), "expected .64."),
+        (lambda d: edit(d, lambda i: i["features"].pop("observation.images.front")), "has no pictures"),
+        (lambda d: edit(d, lambda i: i["features"]["observation.images.front"].update(shape=[64, 64])), "has shape"),
+        (lambda d: edit(d, lambda i: i.update(robot_type="other")), "robot_type is 'other'"),
+    ],
+)
+def test_a_damaged_dataset_is_named(dataset, tmp_path, change, words):
+    """Each damage gives one error that names the file."""
+    copy = shutil.copytree(dataset, tmp_path / "copy")
+    change(copy)
+    with pytest.raises(InputError, match=words) as error:
+        read_rows(copy, "v4")
+    assert str(copy) in str(error.value)
+
+
+def edit(dataset, change):
+    """Change `info.json`."""
+    path = dataset / "meta" / "info.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))

@@ -1,0 +1,415 @@
+"""Trainings of a narrow ACT on the CPU: result, resume, signals, several processes, errors."""
+
+import csv
+import dataclasses
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from safetensors.torch import load_file
+
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
+from arena_newton.policies.recipes.training_recipe import recipe
+from arena_newton.policies.train import families, training, training_loop, training_state
+from arena_newton.policies.train.__main__ import main
+from arena_newton.policies.train.batching import BatchMaker
+from arena_newton.policies.train.frame_store import made_frames
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
+from arena_newton.policies.train.policy_trainer import PolicyTrainer
+from arena_newton.policies.train.training import train
+from tests.fuzz.mutants import damaged
+from tests.policies.train import narrow_network
+from tests.policies.train.made_stats import made_stats
+from tests.policies.train.small_dataset import info, make_dataset
+
+STEPS = 8
+
+
+@pytest.fixture(autouse=True)
+def narrow(monkeypatch):
+    """A vision encoder that trains in milliseconds."""
+    narrow_network.install(monkeypatch.setattr)
+
+
+def options(data, out, **changes):
+    """Flags of a small training without a bar."""
+    given = {"recipe": "small", "dataset": (data,), "out": out, "device": "cpu", "steps": STEPS, "quiet": True}
+    return PolicyTrainOptions(**(given | changes))
+
+
+def weights(folder):
+    """Tensors of a checkpoint: policy and optimizer."""
+    checkpoint = checkpoint_folder(folder).parent
+    found = load_file(checkpoint / "pretrained_model" / "model.safetensors")
+    return found | load_file(checkpoint / "training_state" / "optimizer_state.safetensors")
+
+
+def same(one, two):
+    """Whether two sets of tensors are equal to the last bit."""
+    return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def whole(dataset, tmp_path_factory):
+    """A training without an interruption."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        narrow_network.install(patch.setattr)
+        train(options(dataset, out, save_every=3, hold_out=1, hold_out_every=4, log_every=2))
+    return out
+
+
+def rows(out):
+    """Rows of a training's log."""
+    with (out / "progress.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def interrupt(monkeypatch, step, act):
+    """Let something happen as soon as a step is done."""
+    advance = PolicyTrainer.advance
+
+    def interrupted(self):
+        advance(self)
+        if self.step == step:
+            act()
+
+    monkeypatch.setattr(PolicyTrainer, "advance", interrupted)
+
+
+def test_a_training_leaves_a_checkpoint_that_says_everything(dataset, whole):
+    """LeRobot's layout, the last checkpoints only, `last` a relative link, and facts with data, steps, time, device."""
+    folder = whole / "checkpoints"
+    assert sorted(one.name for one in folder.iterdir()) == ["000006", "000008", "last"]
+    assert os.readlink(folder / "last") == "000008" and not list(whole.rglob("*.part"))
+    facts = CheckpointFacts.read(checkpoint_folder(whole))
+    assert (facts.family, facts.recipe, facts.labels, facts.realign) == ("act", "small", "v4", 0.002)
+    assert (facts.width, facts.height, facts.fit, facts.task_vector) == (64, 64, "pad", ())
+    assert (facts.tasks, facts.trackers, facts.steps, facts.seed) == (("boxing",), ("twist2",), STEPS, 42)
+    assert facts.device == "cpu" and 0.0 < facts.minutes < 5.0
+    (data,) = facts.datasets
+    assert (data["name"], data["episodes"], data["frames"]) == (dataset.name, 3, info(dataset)["total_frames"])
+    assert facts.options["flags"]["hold_out"] == 1 and facts.options["recipe"]["batch_size"] == 2
+    step = json.loads((folder / "last" / "training_state" / "training_step.json").read_text())
+    assert step == {"step": STEPS, "num_processes": 1, "batch_size": 2}
+
+
+def test_a_stock_lerobot_loads_it(whole):
+    """LeRobot's own calls give a policy with processors that acts on a raw observation."""
+    folder = checkpoint_folder(whole)
+    config = PreTrainedConfig.from_pretrained(folder)
+    policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+    pre, post = make_pre_post_processors(config, pretrained_path=str(folder))
+    batch = pre({"observation.state": torch.zeros(1, 64), "observation.images.front": torch.rand(1, 3, 64, 64)})
+    chunk = post(policy.predict_action_chunk(batch))
+    assert chunk.shape == (1, 20, 40) and torch.isfinite(chunk).all()
+
+
+def test_the_log_has_its_rows(whole):
+    """Steps, losses, learning rates along warm-up and cosine, held-out losses where they are due; curves next to it."""
+    table = rows(whole)
+    assert [int(row["step"]) for row in table] == [2, 4, 6, 8]
+    assert [bool(row["held_out_loss"]) for row in table] == [False, True, False, True]
+    settings = dataclasses.replace(recipe("act", "small"), steps=STEPS, warmup_steps=0)
+    for row in table:
+        wanted = settings.lr * settings.lr_factor(int(row["step"]) - 1)
+        assert float(row["learning_rate"]) == pytest.approx(wanted) and float(row["gradient_norm"]) > 0
+    assert list((whole / "tensorboard").glob("events.*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_training_goes_on_to_the_same_bits(dataset, whole, tmp_path, monkeypatch, capsys, number):
+    """Ctrl-C or SIGTERM saves, says how to go on and gives 130; resumed, weights and moments are those of the whole."""
+    out = tmp_path / "run"
+    flags = ["--recipe", "small", "--dataset", str(dataset), "--out", str(out), "--device", "cpu", "--quiet"]
+    flags += ["--steps", str(STEPS), "--hold-out", "1", "--hold-out-every", "4", "--log-every", "2"]
+    with monkeypatch.context() as patch:
+        interrupt(patch, 5, lambda: os.kill(os.getpid(), number))
+        assert main(flags) == 130
+    assert f"stopped after 5 steps; go on with: python -m arena_newton.policies.train --resume {out}" in (
+        capsys.readouterr().out
+    )
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    torch.manual_seed(999)
+    assert main(["--resume", str(out)]) == 0
+    assert same(weights(out), weights(whole))
+    assert [row["step"] for row in rows(out)] == ["2", "4", "6", "8"]
+    assert [row["loss"] for row in rows(out)] == [row["loss"] for row in rows(whole)]
+
+
+def test_a_finished_training_is_not_repeated(whole, monkeypatch):
+    """Resumed, it gives its checkpoint at once, without reading the data; with more steps it goes on."""
+    monkeypatch.setattr(training, "read_rows", lambda *_: pytest.fail("reads the data"))
+    assert train(PolicyTrainOptions(resume=whole)) == whole / "checkpoints" / "000008" / "pretrained_model"
+
+
+def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_path, monkeypatch):
+    """Whichever part of a checkpoint cannot be written, the one before is whole, and the training goes on from it."""
+    real = {name: getattr(training_state, name) for name in ("_write_optimizer", "_synced", "save_rng_state")}
+    for number, name in enumerate(real):
+        out = tmp_path / str(number)
+
+        def failing(*arguments, name=name):
+            if any("000006" in str(one) for one in arguments):
+                raise OSError(28, "No space left on device")
+            return real[name](*arguments)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(training_state, name, failing)
+            with pytest.raises(ArenaError, match="000006: the checkpoint cannot be written .No space left on device"):
+                train(options(dataset, out, save_every=3, hold_out=1))
+        assert os.readlink(out / "checkpoints" / "last") == "000003"
+        assert CheckpointFacts.read(checkpoint_folder(out)).steps == 3
+    train(PolicyTrainOptions(resume=out, quiet=True))
+    assert same(weights(out), weights(whole)) and not list(out.rglob("*.part"))
+
+
+CHILD = """
+import sys, types
+tests = types.ModuleType("tests"); tests.__path__ = [sys.argv.pop(1)]; sys.modules["tests"] = tests
+from tests.policies.train import narrow_network
+narrow_network.install()
+from arena_newton.policies.train.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""Another process that trains the narrow network; its first argument is the folder of the tests."""
+TESTS = str(Path(__file__).resolve().parents[2])
+
+
+def test_a_killed_training_goes_on(dataset, tmp_path):
+    """After kill -9 at any moment `last` is a whole checkpoint, and the resumed training ends as an uninterrupted one."""
+    out = tmp_path / "run"
+    flags = ["--recipe", "small", "--dataset", str(dataset), "--out", str(out), "--device", "cpu", "--save-every", "1"]
+    process = subprocess.Popen([sys.executable, "-c", CHILD, TESTS, *flags, "--steps", "100000", "--quiet"])
+    try:
+        until = time.monotonic() + 120
+        while not (out / "checkpoints" / "last").exists() and time.monotonic() < until:
+            assert process.poll() is None
+            time.sleep(0.05)
+        time.sleep(random.Random().uniform(0.0, 0.3))
+    finally:
+        process.kill()
+        process.wait()
+    done = CheckpointFacts.read(checkpoint_folder(out)).steps
+    assert done >= 1
+    train(PolicyTrainOptions(resume=out, steps=done + 2, quiet=True))
+    assert CheckpointFacts.read(checkpoint_folder(out)).steps == done + 2
+    assert not list(out.rglob("*.part"))
+
+
+def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
+    """As under torchrun on the CPU: the first process writes, and what it goes on with is both processes' network."""
+    out = tmp_path / "run"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+    flags = ["--recipe", "small", "--dataset", str(dataset), "--out", str(out), "--device", "cpu", "--quiet"]
+    command = [sys.executable, "-c", CHILD, TESTS, *flags, "--steps", "3", "--keep", "0", "--save-every", "1"]
+    second = subprocess.Popen(command, env=os.environ | group | {"RANK": "1", "LOCAL_RANK": "1"})
+    for name, value in (group | {"RANK": "0", "LOCAL_RANK": "0"}).items():
+        monkeypatch.setenv(name, value)
+    try:
+        train(options(dataset, out, steps=3, save_every=1, keep=0))
+        assert second.wait(120) == 0
+    finally:
+        second.kill()
+    progress = training_state.TrainingProgress.read(out / "checkpoints" / "last")
+    assert (progress.step, progress.processes, progress.batch_size) == (3, 2, 2)
+    assert not torch.distributed.is_initialized()
+
+
+def plain_trainer(monkeypatch, batch, rank=0, ranks=1, **more):
+    """A trainer whose loss is a mean over the batch and draws nothing: no dropout, latent, augmentation or padding."""
+    network = {"dropout": 0.0, "use_vae": False, "chunk_size": 1, "n_action_steps": 1}
+    settings = recipe("act", "small", network=network, chunk=1, horizon=1, batch_norm=False)
+    settings = dataclasses.replace(settings, batch_size=batch, shift_px=0, colour=0.0, steps=6, warmup_steps=0, **more)
+    torch.manual_seed(0)
+    zeros, ones = torch.zeros(64), torch.ones(64)
+    stats = {"observation.state": {"mean": zeros, "std": ones}, "action": {"mean": zeros[:40], "std": ones[:40]}}
+    model = families.build(settings, stats, "cpu")
+    batches = BatchMaker(made_frames(40, 64, torch.device("cpu")), model.normalise, model.samples)
+    return PolicyTrainer(model, batches, settings, rank=rank, ranks=ranks)
+
+
+def test_two_processes_take_the_step_of_one_with_twice_the_batch(monkeypatch):
+    """The mean of two processes' gradients is that of both batches together, and both end with the same weights."""
+    one = plain_trainer(monkeypatch, 4)
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, source: None)
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor: None)
+    pair = [plain_trainer(monkeypatch, 2, rank, 2) for rank in range(2)]
+    for _ in range(3):
+        one.advance()
+        for trainer in pair:  # what `advance` does, with the exchange in the middle
+            trainer._prepare(trainer.step)
+            trainer._descend()
+        total = pair[0]._flat + pair[1]._flat
+        for trainer in pair:
+            trainer._flat.copy_(total)
+            trainer._average()
+            trainer._update()
+            trainer.step += 1
+    single, first, second = (t.model.policy.state_dict() for t in (one, *pair))
+    for name in single:
+        assert torch.equal(first[name], second[name]), name
+        assert torch.allclose(single[name], first[name], atol=2e-5), name
+
+
+def test_training_lowers_the_loss(monkeypatch):
+    """Forty steps on forty rows: the loss of rows that are trained on falls by a fifth at least."""
+    trainer = plain_trainer(monkeypatch, 20, lr=5e-3, lr_backbone=5e-3)
+    trainer.fix_steps(40)
+    losses = []
+    for _ in range(40):
+        trainer.advance()
+        losses.append(float(trainer.loss))
+    assert sum(losses[-4:]) < 0.8 * sum(losses[:4]), losses
+
+
+def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
+    """--minutes fixes the number of steps by the measured speed, and the cosine reaches its end with the last of them."""
+    clock = [1000.0]
+    monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    advance = PolicyTrainer.advance
+
+    def slow(self):
+        advance(self)
+        clock[0] += 1.0
+
+    monkeypatch.setattr(PolicyTrainer, "advance", slow)
+    folder = train(options(dataset, tmp_path / "run", steps=0, minutes=1.0, log_every=1, save_every=0))
+    facts = CheckpointFacts.read(folder)
+    assert 57 <= facts.steps <= 60 and 0.95 <= facts.minutes <= 1.0
+    rates = [float(row["learning_rate"]) for row in rows(tmp_path / "run")]
+    low = recipe("act", "small").final_lr_fraction * max(rates)
+    assert rates[-1] == pytest.approx(low, rel=0.3) and rates[30] == pytest.approx(max(rates) / 2, rel=0.15)
+
+
+def test_two_datasets_and_a_task_vector(dataset, tmp_path):
+    """Merged training: the vector has a number per task, and LeRobot's network takes it as a token."""
+    other = make_dataset(tmp_path, lengths=(22,), task="football", labels="v4")
+    folder = train(options(dataset, tmp_path / "run", dataset=(dataset, other), task_vector=True, steps=2))
+    facts = CheckpointFacts.read(folder)
+    assert facts.task_vector == facts.tasks == ("boxing", "football") and len(facts.datasets) == 2
+    features = PreTrainedConfig.from_pretrained(folder).input_features
+    assert features["observation.environment_state"].shape == (2,)
+
+
+def test_a_loss_that_is_not_finite_ends_the_training(dataset, tmp_path, monkeypatch):
+    """It is an error that names the step and keeps the last checkpoint."""
+
+    def broken(self):
+        self.step += 1
+        self._loss.fill_(1.0 if self.step < 4 else float("nan"))
+
+    monkeypatch.setattr(PolicyTrainer, "advance", broken)
+    with pytest.raises(ArenaError, match=r"the loss is nan at step 4; the last checkpoint is .*000002"):
+        train(options(dataset, tmp_path / "run", save_every=2, log_every=1))
+
+
+BAD = [
+    (["--policy", "cat"], "--policy cat: unknown, choose from act, diffusion, flow, pi05"),
+    (["--recipe", "slow"], "--recipe slow: unknown"),
+    (["--policy", "diffusion", "--recipe", "compact"], "--recipe compact: unknown for --policy diffusion"),
+    (["--dataset", "nowhere"], "--dataset nowhere: no such folder"),
+    (["--steps", "-1"], "--steps -1: expected a number from 0"),
+    (["--minutes", "nan"], "--minutes nan: expected a number"),
+    (["--labels", "v5"], "--labels v5: unknown"),
+    (["--device", "tpu"], "--device tpu: unknown"),
+    (["--hold-out", "9"], "--hold-out 9: "),
+    (["--recipe", "fast"], "pictures of 64x64 pixels, recipe act/fast takes 224x224"),
+    (["--resume", "nowhere"], "--resume nowhere: no such folder"),
+    (["--steps", "many"], "--steps: cannot read many"),
+    (["--speed", "1"], "--speed: unknown argument"),
+]
+
+
+@pytest.mark.parametrize(("flags", "words"), BAD)
+def test_a_bad_flag_is_one_error(dataset, tmp_path, monkeypatch, capsys, flags, words):
+    """It names flag or file, the code is 2, and nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    given = ["--dataset", str(dataset), "--recipe", "small", "--device", "cpu", "--steps", "1", *flags]
+    assert main(given) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_not_overwritten_nor_mixed(dataset, whole, tmp_path, capsys):
+    """A folder with a training is refused without --resume; a resumed one refuses other settings and other data."""
+    before = weights(whole)
+    given = ["--dataset", str(dataset), "--recipe", "small", "--device", "cpu", "--steps", "1", "--out", str(whole)]
+    for flags, words in (
+        (given, f"--out {whole}: holds a training already; --resume {whole} goes on with it"),
+        (["--resume", str(whole), "--seed", "3"], f"--seed 3: the training in {whole} has None"),
+        (["--resume", str(whole), "--policy", "flow"], f"--policy flow: the training in {whole} has act"),
+        (["--resume", str(tmp_path)], f"--resume {tmp_path}: holds no checkpoint of a training"),
+    ):
+        assert main(flags) == 2
+        assert words in capsys.readouterr().err
+    other = make_dataset(tmp_path, lengths=(22, 23))
+    assert main(["--resume", str(whole), "--dataset", str(other)]) == 2
+    assert "the content is not that of the datasets which the training began with" in capsys.readouterr().err
+    assert same(weights(whole), before)
+
+
+def test_damaged_states_are_refused_by_name(whole, tmp_path, monkeypatch):
+    """Hundreds of damaged progress files, optimizer states and weights: accepted, or one error with the file's name."""
+    checkpoint = shutil.copytree(whole / "checkpoints" / "000008", tmp_path / "c")
+    trainer = plain_trainer(monkeypatch, 2)
+    trainer.model.save(checkpoint / "pretrained_model", CheckpointFacts())
+    trainer.advance()
+    training_state._write_optimizer(trainer.optimizer, checkpoint / "training_state")
+    rng, refused = random.Random(1), 0
+    for file in (
+        checkpoint / "training_state" / "arena_training.json",
+        checkpoint / "training_state" / "optimizer_state.safetensors",
+        checkpoint / "pretrained_model" / "model.safetensors",
+    ):
+        sound = file.read_bytes()
+        # Of large files the header is what is read; the numbers are numbers.
+        head = len(sound) if file.suffix == ".json" else 8 + int.from_bytes(sound[:8], "little")
+        for _ in range(70):
+            file.write_bytes(damaged(sound[:head], rng, text=file.suffix == ".json") + sound[head:])
+            try:
+                training_state.restore(trainer, checkpoint)
+                training.resumed(
+                    PolicyTrainOptions(), training_state.TrainingProgress.read(checkpoint).options, checkpoint
+                )
+            except InputError as error:
+                refused += 1
+                assert str(checkpoint) in str(error)
+        file.write_bytes(sound)
+        training_state.restore(trainer, checkpoint)
+    assert refused > 100
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_graph_takes_the_steps_of_plain_execution(precision):
+    """On CUDA: the losses of captured steps are those of steps that are not, with dropout, latent and augmentation."""
+    losses = {}
+    for graph in (False, True):
+        settings = recipe("act", "small", precision=precision, batch_size=8, steps=20)
+        torch.manual_seed(0)
+        model = families.build(settings, made_stats(), "cuda:0")
+        batches = BatchMaker(made_frames(400, 64, torch.device("cuda:0")), model.normalise, model.samples)
+        trainer = PolicyTrainer(model, batches, settings, graph=graph)
+        losses[graph] = []
+        for _ in range(10):
+            trainer.advance()
+            losses[graph].append(float(trainer.loss))
+        assert trainer.graphed == graph
+    assert losses[True] == pytest.approx(losses[False], rel=2e-2)
