@@ -36,7 +36,7 @@ CHECKED_POLICIES = ("expert", "stand", "replay")
 """Policies that are made before the first cell to be checked; others take seconds and memory, or a server."""
 OF_CODE = ("version", "code", "scenes")
 """Parts of a run's identity that another version of the product changes."""
-OF_PARTS = ("tracker_facts", "policy_facts", "worlds")
+OF_PARTS = ("tracker_facts", "policy_facts", "worlds", "labels")
 """Parts that are known only when tracker and policy were made."""
 
 
