@@ -1,343 +1,265 @@
-"""The cells of a suite file: expanded, chosen, dealt to shards, shown. Nothing is built and nothing runs.
-
-Cells of one task, tracker, mode and rule set follow each other, so that they can use one environment.
-"""
+"""Episodes of suites and of plain results folders as cells of tables: a policy, tracker, task and its conditions."""
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import itertools
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from arena_newton import policies, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval import plan
-from arena_newton.eval.options import RunOptions
-from arena_newton.eval.progress import simulated
-from arena_newton.eval.records import MAX_NAME, JsonObject
-from arena_newton.eval.suite_file import SELECTORS, PolicyEntry, Selector, SuiteFile
-from arena_newton.eval.suite_records import SuiteCell
-from arena_newton.eval.wording import markdown_table
-from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
+from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.records import Json, shown
+from arena_newton.eval.results import RunRecord, load_run
+from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
-__all__ = [
-    "MAX_CELLS",
-    "check_policies",
-    "dealt",
-    "expand_cells",
-    "matrix_table",
-    "parse_only",
-    "run_options",
-    "selected",
-]
+__all__ = ["CellSet", "EvaluatedCell", "read_cells"]
 
-MAX_CELLS = 20_000
-"""Cells of one suite; the paper's largest table has a few hundred."""
-LATER_FLAGS = {"latency": "latency_ticks", "replan": "replan", "ensemble": "ensemble"}
-"""Field of a cell → flag of `eval run`."""
-CHECKPOINTS = "lerobot"
-"""Policies whose spec names a checkpoint."""
+ALIKE = ("max_steps", "variant")
+"""Conditions under which all runs must agree: one table must not mix budgets or scenes."""
+NAMED = ("engine", "device", "drive", "fast_physics")
+"""Conditions that may differ; every value is named."""
+UNTRAINED = ("expert", "stand", "replay")
+"""Policies without training: no tracker is the one of theirs."""
 
 
-def expand_cells(suite: SuiteFile) -> list[SuiteCell]:
-    """Every cell of a suite file, in the order in which they are played.
+@dataclass(frozen=True, kw_only=True)
+class EvaluatedCell:
+    """Episodes of one policy through one tracker on one task under one set of conditions."""
 
-    Raises:
-        InputError: A condition is out of range, a rule fits no cell, two cells are alike, or none is left.
-    """
-    axes = suite.axes
-    size = len(axes.tasks) * len(axes.trackers) * len(axes.modes) * len(axes.rules) * len(axes.latency)
-    size *= sum(max(len(entry.trained_on), 1) for entry in suite.policies)
-    if size > MAX_CELLS:
-        raise InputError(f"{suite.path}: makes {size:,} cells, at most {MAX_CELLS:,} are planned at once")
-    cells: list[SuiteCell] = []
-    for task, tracker, mode, rules in itertools.product(axes.tasks, axes.trackers, axes.modes, axes.rules):
-        size_of = _size(suite, task, tracker, mode, rules)
-        for entry in suite.policies:
-            chosen = {"tasks": task, "trackers": tracker, "modes": mode, "rules": rules}
-            if any(getattr(entry, key) and value not in getattr(entry, key) for key, value in chosen.items()):
-                continue
-            for latency in entry.latency or axes.latency:
-                for trained_on in _trainings(entry):
-                    cells.append(_cell(suite, entry, trained_on, size_of, (task, tracker, mode, rules, latency)))
-    return _ruled(suite, cells)
+    policy: str
+    """Name of its row in tables."""
+    family: str
+    """`act`, `diffusion`, `flow`, `pi05`, or another; empty where nothing is known."""
+    trained_on: tuple[str, ...]
+    """Trackers through which the demonstrations of its training were recorded; none for a policy without training."""
+    trained_tasks: tuple[str, ...]
+    """Tasks of its training."""
+    tracker: str
+    """The tracker that executed its actions."""
+    task: str
+    mode: str
+    labels: str
+    latency: int
+    """Ticks by which each chunk started late."""
+    replan: int | None
+    """Actions of a chunk that were executed before the next look; None: all."""
+    ensemble: bool
+    records: tuple[EpisodeRecord, ...]
+    """Its episodes in plan order."""
+    folder: Path
 
+    @property
+    def merged(self) -> bool:
+        """Whether the policy was trained on several tasks or through several trackers at once."""
+        return len(self.trained_tasks) > 1 or len(self.trained_on) > 1
 
-def _trainings(entry: PolicyEntry) -> list[tuple[str, ...]]:
-    """The trackers of each checkpoint that an entry names."""
-    return [(tracker,) for tracker in entry.trained_on] if "{tracker}" in entry.spec else [entry.trained_on]
+    @property
+    def matched(self) -> bool:
+        """Whether it was executed by the tracker of its training, or needs none."""
+        return self.trained_on in ((), (self.tracker,))
 
-
-def _size(suite: SuiteFile, task: str, tracker: str, mode: str, rules: str) -> tuple[int, int]:
-    """Episodes of a cell and the sum of their budgets [ticks]."""
-    given = {key: suite.defaults[key] for key in ("seeds", "repeats", "max_steps") if key in suite.defaults}
-    try:
-        episodes = plan.expand([task], trackers=[tracker], policy="", modes=[mode], rules=rules, **given)
-    except InputError as error:
-        raise InputError(f"{suite.path}: [defaults]: {error}") from None
-    return len(episodes), sum(episode.max_steps for episode in episodes)
-
-
-def _cell(
-    suite: SuiteFile,
-    entry: PolicyEntry,
-    trained_on: tuple[str, ...],
-    size: tuple[int, int],
-    conditions: tuple[str, str, str, str, int],
-) -> SuiteCell:
-    """The cell of a checkpoint under task, tracker, mode, rules and latency."""
-    task, tracker, mode, rules, latency = conditions
-    spec = entry.spec.replace("{task}", task).replace("{tracker}", "".join(trained_on[:1]))
-    if len(spec) > MAX_NAME:
-        raise InputError(f"{suite.path}: [[policies]] {entry.name}: spec has more than {MAX_NAME} characters")
-    scheme = spec.partition(":")[0]
-    if "{task}" in entry.spec:
-        learned: tuple[str, ...] = (task,)
-    else:
-        learned = (entry.trained_tasks or entry.tasks or suite.axes.tasks) if trained_on else ()
-    if trained_on and task not in learned:
-        raise InputError(
-            f"{suite.path}: [[policies]] {entry.name}: is played on {task}, which is not in trained_tasks "
-            f"({' '.join(learned)})"
-        )
-    trained = f".{'+'.join(trained_on)}" if trained_on else ""
-    ending = ("" if rules == "paper" else f".{rules}") + (f".latency{latency}" if latency else "")
-    name = f"{entry.name}{trained}/{tracker}/{task}/{mode}{ending}"
-    return SuiteCell(
-        id=name,
-        policy=entry.name,
-        family=entry.family or ("" if scheme in (CHECKPOINTS, "remote") else scheme),
-        spec=spec,
-        trained_on=trained_on,
-        trained_tasks=learned,
-        tracker=tracker,
-        task=task,
-        mode=mode,
-        rules=rules,
-        labels=entry.labels or "v3.1",
-        latency=latency,
-        replan=entry.replan,
-        ensemble=entry.ensemble,
-        folder=name,
-        episodes=size[0],
-        ticks=size[1],
-    )
+    def held(self, outcome: str = "success") -> dict[Hashable, bool]:
+        """Whether each episode ended so, by group seed and repeat; a task and these two decide an episode's start."""
+        return {(record.group_seed, record.repeat): record.outcome == outcome for record in self.records}
 
 
-def _ruled(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCell]:
-    """The cells that the rules of [[cells]] leave: of several rules that fit a cell the last decides."""
-    if not cells:
-        raise InputError(f"{suite.path}: [matrix] and [[policies]] have no cell in common")
-    kept = dict.fromkeys((cell.id for cell in cells), True)
-    for rule in suite.rules:
-        _check_selector(rule.where, rule.selector, cells)
-        fitting = [cell.id for cell in cells if _fits(cell, rule.selector)]
-        if not fitting:
-            raise InputError(f"{rule.where}: fits no cell")
-        kept |= dict.fromkeys(fitting, rule.include)
-    left = [cell for cell in cells if kept[cell.id]]
-    if not left:
-        raise InputError(f"{suite.path}: [[cells]] leave no cell")
-    return left
+@dataclass(frozen=True)
+class CellSet:
+    """Everything that tables are made of."""
+
+    cells: tuple[EvaluatedCell, ...]
+    rules: str
+    notes: tuple[str, ...]
+    """What a reader of the tables must know besides them."""
 
 
-def _fields(cell: SuiteCell) -> dict[str, tuple[str, ...]]:
-    """What a selector compares, by its key."""
-    matched = "none" if cell.matched is None else str(cell.matched).lower()
-    plain = {key: (str(getattr(cell, key)),) for key in SELECTORS if key not in ("trained_on", "matched")}
-    return plain | {"trained_on": cell.trained_on or ("none",), "matched": (matched,)}
+def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
+    """Read suites (folders with `suite.json`) and results folders.
 
-
-def _fits(cell: SuiteCell, selector: Selector) -> bool:
-    fields = _fields(cell)
-    return all(set(fields[key]) & set(values) for key, values in selector.items())
-
-
-def _check_selector(where: str, selector: Selector, cells: Sequence[SuiteCell]) -> None:
-    """Refuse a value that no cell has: it is mistyped."""
-    for key, values in selector.items():
-        known = list(dict.fromkeys(value for cell in cells for value in _fields(cell)[key]))
-        for value in values:
-            if value not in known:
-                raise InputError(f"{where}: {key} {plain_text(value, 60)}: no cell has it, known are {' '.join(known)}")
-
-
-def parse_only(text: str | None) -> dict[str, tuple[str, ...]]:
-    """The selector of --only: `key=value` or `key=value,value`, with spaces between.
+    Args:
+        folders: Each of them.
+        rules: Rule set whose episodes count; others are left out and counted in a note.
 
     Raises:
-        InputError: It is something else.
+        InputError: A folder holds neither or is damaged, two hold the same cell, none holds an episode under the
+            rules, or they differ in step budgets, scene variant or a tracker's weights.
     """
-    found: dict[str, tuple[str, ...]] = {}
-    for part in (text or "").split():
-        key, equals, values = part.partition("=")
-        parts = tuple(value for value in values.split(",") if value)
-        if not equals or not parts:
-            raise InputError(f"--only {plain_text(part, 60)}: expected key=value, such as 'policy=act task=boxing'")
-        if key not in SELECTORS:
-            raise InputError(f"--only {plain_text(key, 60)}: is unknown, known are {' '.join(SELECTORS)}")
-        if key in found:
-            raise InputError(f"--only {key}: given twice; several values have a comma between")
-        found[key] = parts
-    if text is not None and not found:
-        raise InputError("--only: is empty, name cells such as 'policy=act task=boxing'")
-    return found
+    found: list[tuple[str, EvaluatedCell, RunRecord]] = []
+    notes: list[str] = []
+    for folder in folders:
+        if (folder / SUITE_FILE).is_file():
+            found += _of_suite(folder, notes)
+        else:
+            run = load_run(folder)
+            found += [(run.config["rules"], cell, run) for cell in _of_run(run)]
+            if len(run.records) < run.document["planned"] and run.config.get("keep") is None:
+                notes.append(f"{folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
+    others = sorted({plain_text(other, 60) for other, _, _ in found if other != rules})
+    if others:
+        number = sum(len(cell.records) for other, cell, _ in found if other != rules)
+        notes.append(f"{counted(number, 'episode')} under the rules {' '.join(others)} left out.")
+    kept = [(cell, run) for other, cell, run in found if other == rules]
+    if not kept:
+        where = " ".join(str(folder) for folder in folders)
+        raise InputError(f"{where}: no episode under the rules {rules}" + (f", only {' '.join(others)}" * bool(others)))
+    _check_alike([run for _, run in kept])
+    notes += _conditions(kept)
+    return CellSet(_named_rows([cell for cell, _ in kept]), rules, tuple(dict.fromkeys(notes)))
 
 
-def selected(cells: Sequence[SuiteCell], only: Selector) -> list[SuiteCell]:
-    """The cells that --only names.
-
-    Raises:
-        InputError: None is.
-    """
-    _check_selector("--only", only, cells)
-    found = [cell for cell in cells if _fits(cell, only)]
-    if not found:
-        raise InputError("--only: no cell has all of these")
-    return found
-
-
-def dealt(cells: Sequence[SuiteCell], shard: int, shards: int) -> list[SuiteCell]:
-    """Cells of one shard, counted from 1: of each task every so many-th by the hash of their names.
-
-    The deal goes on from task to task, so that shards differ by one cell at most.
-    """
-    kept: set[str] = set()
-    number = 0
-    for task in sorted({cell.task for cell in cells}):
-        names = [cell.id for cell in cells if cell.task == task]
-        for name in sorted(names, key=lambda text: hashlib.sha256(text.encode()).digest()):
-            if number % shards == shard - 1:
-                kept.add(name)
-            number += 1
-    return [cell for cell in cells if cell.id in kept]
-
-
-def check_policies(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCell]:
-    """Hold cells to what can be known of their policies without making them.
-
-    Returns:
-        The cells with family, labels and trained tasks as their checkpoints say them.
-
-    Raises:
-        InputError: An unknown policy, an absent checkpoint, or one that was trained on something else.
-    """
-    entries = {entry.name: entry for entry in suite.policies}
-    problems: dict[str, str] = {}
-    facts: dict[str, CheckpointFacts | None] = {}
-    for cell in cells:
-        if cell.spec not in facts:
-            facts[cell.spec] = None
-            try:
-                facts[cell.spec] = _facts(cell.spec, entries[cell.policy])
-            except InputError as error:
-                problems[cell.spec] = f"{suite.path}: [[policies]] {cell.policy}: {error}"
-    if problems:
-        more = f" (the same or another fault in {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise InputError(f"{next(iter(problems.values()))}{more}")
+def _of_suite(folder: Path, notes: list[str]) -> list[tuple[str, EvaluatedCell, RunRecord]]:
+    suite = read_suite(folder)
     found = []
-    for cell in cells:
-        where, known = f"{suite.path}: [[policies]] {cell.policy}", facts[cell.spec]
-        if cell.spec.partition(":")[0] == "expert" and tasks.get(cell.task).expert is None:
-            raise InputError(f"{where}: task {cell.task} has no expert; leave it out with tasks, or in [[cells]]")
-        found.append(cell if known is None else _with_facts(where, cell, entries[cell.policy], known))
+    waiting = [cell for cell in suite.cells if not (folder / cell.folder).is_dir()]
+    if waiting:
+        notes.append(f"{folder}: {counted(len(waiting), 'cell')} of {len(suite.cells)} not played yet.")
+    for cell in suite.cells:
+        if cell in waiting:
+            continue
+        run = load_cell(suite, cell)
+        if cell.status == "failed":
+            notes.append(f"{run.folder}: failed ({plain_text(cell.error or 'no reason', 200)}).")
+        if len(run.records) < run.document["planned"]:
+            notes.append(f"{run.folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
+        if run.records:
+            found.append((cell.rules, _suite_cell(cell, run), run))
     return found
 
 
-def _facts(spec: str, entry: PolicyEntry) -> CheckpointFacts | None:
-    """What the checkpoint of a spec says of itself, if it is one of ours."""
-    policies.check_spec(spec)
-    scheme, _, argument = spec.partition(":")
-    return CheckpointFacts.read(_checkpoint(argument)) if scheme == CHECKPOINTS and not entry.hub else None
-
-
-def _checkpoint(argument: str) -> Path:
-    """Folder of a checkpoint that has weights."""
-    if not argument:
-        raise InputError("spec lerobot: names no checkpoint, expected lerobot:<folder>")
-    folder = checkpoint_folder(Path(argument).expanduser(), "spec lerobot")
-    if not any(folder.glob("*.safetensors")):
-        raise InputError(f"spec lerobot:{argument}: {folder} holds no weights (no .safetensors)")
-    return folder
-
-
-def _with_facts(where: str, cell: SuiteCell, entry: PolicyEntry, facts: CheckpointFacts) -> SuiteCell:
-    """A cell held to what its checkpoint says of its training."""
-    names = {tasks.get(name).gym_id: name for name in tasks.names()}
-    learned, path = tuple(names.get(task, task) for task in facts.tasks), cell.spec.partition(":")[2]
-    claims = (
-        ("labels", (entry.labels,) if entry.labels else (), (facts.labels,)),
-        ("family", (entry.family,) if entry.family else (), (facts.family,) if facts.family else ()),
-        ("trained_on", cell.trained_on, facts.trackers),
-        ("trained_tasks", entry.trained_tasks, learned),
+def _suite_cell(cell: SuiteCell, run: RunRecord) -> EvaluatedCell:
+    return EvaluatedCell(
+        policy=cell.policy,
+        family=cell.family,
+        trained_on=tuple(sorted(cell.trained_on, key=_tracker_order)),
+        trained_tasks=cell.trained_tasks,
+        tracker=cell.tracker,
+        task=cell.task,
+        mode=cell.mode,
+        labels=cell.labels,
+        latency=cell.latency,
+        replan=cell.replan,
+        ensemble=cell.ensemble,
+        records=tuple(run.records),
+        folder=run.folder,
     )
-    for key, said, true in claims:
-        if said and true and set(said) != set(true):
-            raise InputError(f"{where}: {key} is {' '.join(said)}, but checkpoint {path} says {' '.join(true)}")
-    if learned and cell.task not in learned:
-        raise InputError(
-            f"{where}: checkpoint {path} was trained on {' '.join(learned)}, cell {cell.id} plays {cell.task}"
+
+
+def _tracker_order(name: str) -> tuple[bool, str]:
+    """The paper's trackers in its order: TWIST2 comes first."""
+    return name != "twist2", name
+
+
+def _of_run(run: RunRecord) -> list[EvaluatedCell]:
+    """Cells of a plain results folder, with what the policy said of itself."""
+    config: Mapping[str, Json] = run.config
+    facts = _facts(config.get("policy_facts"))
+    groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
+    for record in run.records:
+        groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
+    found = []
+    for (task, tracker, policy, mode), records in groups.items():
+        family = _text(facts.get("family"))
+        scheme = policy.partition(":")[0]
+        recipe = _text(facts.get("recipe"))
+        replan = config.get("replan")
+        found.append(
+            EvaluatedCell(
+                policy=" ".join(filter(None, (family, recipe))) or policy,
+                family=family or (scheme if scheme in UNTRAINED else ""),
+                trained_on=tuple(sorted(_texts(facts.get("trackers")), key=_tracker_order)),
+                trained_tasks=_texts(facts.get("tasks")),
+                tracker=tracker,
+                task=task,
+                mode=mode,
+                labels=_text(facts.get("labels")) or _text(config.get("labels")) or "v3.1",
+                latency=_number(config.get("latency_ticks")),
+                replan=replan if type(replan) is int else None,
+                ensemble=config.get("ensemble") is True,
+                records=tuple(records),
+                folder=run.folder,
+            )
         )
-    return dataclasses.replace(
-        cell,
-        family=cell.family or facts.family,
-        labels=facts.labels,
-        trained_on=cell.trained_on or facts.trackers,
-        trained_tasks=learned or cell.trained_tasks,
-    )
+    return found
 
 
-def run_options(suite: SuiteFile, cell: SuiteCell, out: Path, device: str | None = None) -> RunOptions:
-    """The flags of `eval run` for a cell."""
-    entry = next(entry for entry in suite.policies if entry.name == cell.policy)
-    scheme = cell.spec.partition(":")[0]
-    flags: JsonObject = {
-        key: v for key, v in suite.defaults.items() if scheme == "remote" or not key.startswith("remote_")
-    }
-    flags |= {
-        "task": (cell.task,),
-        "tracker": (cell.tracker,),
-        "mode": (cell.mode,),
-        "rules": cell.rules,
-        "policy": cell.spec,
-        "checkpoint": suite.checkpoints.get(cell.tracker),
-        "out": str(out / cell.folder),
-    }
-    if scheme != CHECKPOINTS and entry.labels:  # a checkpoint says its protocol itself
-        flags["labels"] = entry.labels
-    if entry.worlds is not None:
-        flags["worlds"] = entry.worlds
-    if device is not None:
-        flags["device"] = device
-    flags |= {flag: getattr(cell, key) for key, flag in LATER_FLAGS.items() if getattr(cell, key)}
-    return RunOptions(**flags)
+def _facts(given: Json) -> Mapping[str, Json]:
+    """What a checkpoint says of itself, in what its policy said: on top of it, or as its `facts`."""
+    if not isinstance(given, dict):
+        return {}
+    inner = given.get("facts")
+    return given | inner if isinstance(inner, dict) else given
 
 
-def matrix_table(cells: Sequence[SuiteCell], *, each: bool = False) -> str:
-    """The matrix as Markdown: a row per policy, training and tracker, a column per task with finished and all cells.
+def _text(value: Json) -> str:
+    return plain_text(value, 80) if isinstance(value, str) else ""
 
-    `each` lists every cell below it.
-    """
-    shown = [name for name in tasks.names() if any(cell.task == name for cell in cells)]
-    shown += [cell.task for cell in cells if cell.task not in shown]
-    rows: dict[tuple[str, str, str], dict[str, list[SuiteCell]]] = {}
+
+def _texts(value: Json) -> tuple[str, ...]:
+    return tuple(_text(one) for one in value if isinstance(one, str)) if isinstance(value, list) else ()
+
+
+def _number(value: Json) -> int:
+    return value if type(value) is int and value >= 0 else 0
+
+
+def _check_alike(runs: Sequence[RunRecord]) -> None:
+    """Refuse runs that one table must not mix."""
+    first, weights = runs[0], dict[str, tuple[str, Path]]()
+    for run in runs:
+        for name in ALIKE:
+            was, now = first.config.get(name), run.config.get(name)
+            if was != now:
+                raise InputError(f"{run.folder}: {name} is {shown(now)}, in {first.folder} {shown(was)}")
+        for record in run.records:
+            now = record.hashes.get("checkpoint")
+            if now is None:
+                continue
+            was, where = weights.setdefault(record.tracker, (now, run.folder))
+            if was != now:
+                name = f"weights of {plain_text(record.tracker, 60)}"
+                raise InputError(f"{run.folder}: {name} are {plain_text(now, 60)}, in {where} {plain_text(was, 60)}")
+
+
+def _conditions(kept: Iterable[tuple[EvaluatedCell, RunRecord]]) -> list[str]:
+    """What ran, and what went wrong, in sentences."""
+    pairs = list(kept)
+    runs = list({id(run): run for _, run in pairs}.values())
+    found = []
+    for name in NAMED:
+        values = sorted({shown(run.config.get(name)) for run in runs if name in run.config})
+        if len(values) > 1:
+            found.append(f"{name.replace('_', ' ').capitalize()}: {' and '.join(values)}.")
+    codes = {run.config.get("code") for run in runs}
+    found += [f"The runs were made with {len(codes)} versions of the code."] if len(codes) > 1 else []
+    errors = sum(record.outcome == "error" for cell, _ in pairs for record in cell.records)
+    episodes = sum(len(cell.records) for cell, _ in pairs)
+    if errors:
+        found.append(f"{counted(errors, 'episode')} of {episodes} ended with an error; they count as no success.")
+    return [*found, f"{counted(episodes, 'episode')} in {counted(len(pairs), 'cell')}."]
+
+
+def _named_rows(cells: Sequence[EvaluatedCell]) -> tuple[EvaluatedCell, ...]:
+    """Cells whose `policy` names one row: label protocols and chunk executions that differ are told apart."""
+    parts: dict[str, tuple[set[str], set[object], set[bool]]] = {}
     for cell in cells:
-        key = (cell.policy, "+".join(cell.trained_on) or "–", cell.tracker)
-        rows.setdefault(key, {}).setdefault(cell.task, []).append(cell)
-    order = list(dict.fromkeys(cell.policy for cell in cells))
-    lines = []
-    for key in sorted(rows, key=lambda row: (order.index(row[0]), row[1:])):
-        states = [rows[key].get(task, []) for task in shown]
-        lines.append([*key, *("–" if not s else f"{sum(c.status == 'done' for c in s)}/{len(s)}" for s in states)])
-    text = markdown_table(["policy", "trained on", "tracker", *shown], lines, 3)
-    if each:
-        text += "\n" + "\n".join(
-            f"{cell.status:<8} {cell.id}  {counted(cell.episodes, 'episode')}  {cell.spec}" for cell in cells
-        )
-    waiting = [cell for cell in cells if cell.status != "done"]
-    left = f", {len(waiting)} to play: {simulated(sum(cell.ticks for cell in waiting))}" if waiting else ", all done"
-    episodes = counted(sum(cell.episodes for cell in cells), "episode")
-    return f"{text}\n{counted(len(cells), 'cell')} with {episodes}{left}"
+        labels, replans, ensembles = parts.setdefault(cell.policy, (set(), set(), set()))
+        labels.add(cell.labels)
+        replans.add(cell.replan)
+        ensembles.add(cell.ensemble)
+    named = []
+    for cell in cells:
+        labels, replans, ensembles = parts[cell.policy]
+        words = [cell.labels] if len(labels) > 1 else []
+        words += [f"replan {cell.replan}"] if len(replans) > 1 and cell.replan is not None else []
+        words += ["ensemble"] if len(ensembles) > 1 and cell.ensemble else []
+        named.append(dataclasses.replace(cell, policy=" ".join([cell.policy, *words])))
+    seen: dict[tuple[object, ...], EvaluatedCell] = {}
+    for cell in named:
+        key = (cell.policy, cell.trained_on, cell.merged, cell.tracker, cell.task, cell.mode, cell.latency)
+        other = seen.setdefault(key, cell)
+        if other is not cell:
+            name = " ".join(plain_text(word, 60) for word in (cell.policy, cell.tracker, cell.task, cell.mode))
+            raise InputError(f"{cell.folder}: cell {name} is in {other.folder} too; leave one of them out")
+    return tuple(named)
