@@ -42,12 +42,13 @@ __all__ = ["Answer", "PolicyServer", "Refused", "ServerCounts"]
 LONGEST_ACT = 600.0
 """Time after which a waiting connection gives up on the policy [s]."""
 IDLE = 30.0
-"""Time without a request after which a session that no connection holds may lose its row to another [s]."""
+"""Time without a request after which no batch waits for a session any more, and after which one that no connection
+holds may lose its row to another [s]."""
 WARM_UP_SEED = 0
 """Seed of the look before the first one, which nobody is answered."""
 
-type Reason = Literal["unfit", "unknown_episode", "full", "policy"]
-"""Why a request is refused: what it says, an episode that is not known, no free row, or the policy failed."""
+type Reason = Literal["unfit", "unknown_episode", "full", "policy", "closing"]
+"""Why a request is refused: what it says, an unknown episode, no free row, the policy failed, or the server ends."""
 
 
 class Refused(ArenaError):
@@ -271,7 +272,7 @@ class PolicyServer:
     def _put(self, job: _Job) -> None:
         with self._news:
             if self._closed:
-                job.done.set_exception(Refused("policy", "the server is closing"))
+                job.done.set_exception(Refused("closing", "the server is closing"))
                 return
             self._jobs.append(job)
             self._news.notify_all()
@@ -296,7 +297,7 @@ class PolicyServer:
                 continue
             self._answer(self._batch(job))
         for job in self._jobs:
-            job.done.set_exception(Refused("policy", "the server is closing"))
+            job.done.set_exception(Refused("closing", "the server is closing"))
 
     def _batch(self, first: _Job) -> list[_Job]:
         """Looks that are answered together; what begins or ends meanwhile is done at once, unless it is theirs."""
@@ -316,8 +317,10 @@ class PolicyServer:
     def _next(self, keys: set[tuple[str, str]], end: float) -> _Job | None:
         """The next job that does not have to wait for the sessions `keys`; None where there is none until `end`."""
         with self._news:
-            # Nobody else can ask where every session already does.
-            if not self._jobs and not all(key in keys for key in self._sessions):
+            # Nobody else can ask where every session already does; those that were left behind count no more.
+            now = time.monotonic()
+            others = [s for key, s in self._sessions.items() if key not in keys and now - s.used < IDLE]
+            if not self._jobs and others:
                 self._news.wait_for(lambda: self._closed or bool(self._jobs), max(end - time.monotonic(), 0.0))
             if self._closed or not self._jobs:
                 return None
