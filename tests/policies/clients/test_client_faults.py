@@ -127,8 +127,8 @@ def test_failed_reset_ends_its_world(running):
     policy = client(running)
     running.behave = {"reset": True}
     policy.reset([1, 2, 3], ["Isaac-Football"] * 3, np.array([False, True, False]))
-    running.behave = {}
     chunk = policy.act(observation(3))
+    running.behave = {}  # not before: vla-eval's server answers no beginning, and may read it late
     if running.url.startswith("openpi"):  # it has no beginning
         assert chunk.errors == {}
     else:
