@@ -26,7 +26,9 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.bench_figure import BenchFigure
+from arena_newton.eval.bench_policy import policy_figures
 from arena_newton.eval.bench_recording import recording_figures
+from arena_newton.eval.bench_start import start_figures
 from arena_newton.eval.options import BenchOptions
 from arena_newton.interfaces import Physics
 from arena_newton.pictures.recorder import EpisodeRecorder
@@ -328,4 +330,6 @@ _ITEMS: dict[str, Callable[[BenchOptions], Iterator[BenchFigure]]] = {
     "pictures": _pictures,
     "recording": recording_figures,
     "episodes": _episodes,
+    "policy": policy_figures,
+    "start": start_figures,
 }

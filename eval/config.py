@@ -340,10 +340,6 @@ def _check_chunks(options: RunOptions) -> None:
         raise InputError(f"--replan {replan}: expected at least 1")
     if late < 0:
         raise InputError(f"--latency-ticks {late}: expected at least 0")
-    if options.ensemble and replan is not None:
-        raise InputError("--ensemble: looks at every tick; drop it or --replan")
-    if late and options.ensemble:
-        raise InputError(f"--latency-ticks {late}: a chunk must be longer; --ensemble executes one action of each")
     if replan is not None and 0 < replan <= late:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
 

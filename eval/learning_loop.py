@@ -24,7 +24,7 @@ from arena_newton.devices import resolve_engine
 from arena_newton.doctor import versions
 from arena_newton.errors import InputError
 from arena_newton.eval import loop_report
-from arena_newton.eval.config import recording_run, resolve
+from arena_newton.eval.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.folder import ResultsFolder
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING, LoopRecord, StageRecord
@@ -35,10 +35,11 @@ from arena_newton.eval.results import load_run
 from arena_newton.eval.run import Factories, execute
 from arena_newton.files import file_label
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE as CHECKPOINT_CONFIG
+from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.text import counted
 
-__all__ = ["LOOP_FILE", "LoopParts", "resolved", "run"]
+__all__ = ["LOOP_FILE", "LoopParts", "held", "resolved", "run"]
 
 LOOP_FILE = "loop.json"
 """What was asked, and which stages are finished."""
@@ -84,7 +85,7 @@ def run(options: LoopOptions, factories: Factories | None = None, parts: LoopPar
     """
     options = resolved(options)
     out = Path(str(options.out)).expanduser()
-    with _held(out):
+    with held(out):
         return _Loop(options, out, factories, parts or LoopParts()).play()
 
 
@@ -114,6 +115,10 @@ def resolved(options: LoopOptions) -> LoopOptions:
     if options.minutes is not None and not options.minutes > 0:
         raise InputError(f"--minutes {options.minutes:g}: expected more than 0")
     check_numbers(dataclasses.replace(_training(options, Path()), dataset=(Path(),)))  # its dataset is not there yet
+    picture, flag = recipe(options.policy, str(options.recipe)).picture, f"--size {options.size}"
+    cameras = recorded_cameras(RunOptions(record=True, record_size=str(options.size)), "--")
+    if any((camera.width, camera.height) != (picture, picture) for camera in cameras.values()):
+        raise InputError(f"{flag}: recipe {options.policy}/{options.recipe} takes {picture}x{picture}")
     if options.out is None:
         words = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
         options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(words))))
@@ -171,7 +176,7 @@ def _evaluation(options: LoopOptions, out: Path) -> RunOptions:
 
 
 @contextlib.contextmanager
-def _held(out: Path) -> Iterator[None]:
+def held(out: Path) -> Iterator[None]:
     """Make the folder and hold it, so that no two processes work in it.
 
     Raises:

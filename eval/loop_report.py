@@ -90,7 +90,7 @@ def read(path: Path, version: int) -> LoopRecord:
     try:
         content = json.loads(path.read_bytes()[: MAX_BYTES + 1])
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({plain(error)[:200]})") from None
+        raise InputError(f"{path}: not readable as JSON ({plain(str(error))[:200]})") from None
     if not isinstance(content, dict) or content.get("format") != version:
         raise InputError(f"{path}: expected an object with format {version}")
     options, stages = content.get("options"), content.get("stages")

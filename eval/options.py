@@ -55,7 +55,8 @@ class RunOptions:
     replan: int | None = None
     """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
     ensemble: bool = False
-    """For --policy lerobot: look at every tick and execute the mean of all chunks that cover it."""
+    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; looks every 2 ticks, or as
+    --replan says."""
     latency_ticks: int = 0
     """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
     mode: tuple[str, ...] = ()
@@ -279,7 +280,7 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: help tick generator throughput camera pictures recording episodes tests, or `all`
+    """What to measure: help tick generator throughput camera pictures recording episodes policy start tests, or `all`
     (all but tests)."""
     checkpoint: str | None = None
     """Weights of TWIST2; those that come with the package when none are named."""
@@ -299,6 +300,14 @@ class BenchOptions:
     """Size of the recorded pictures [px]."""
     recording_task: str = "vis_navi"
     """Task that is recorded."""
+    policy_checkpoint: str | None = None
+    """Checkpoint of `policy`; an ACT of full size with random weights when none is named."""
+    policy_tasks: tuple[str, ...] = ("vis_navi", "boxing")
+    """Tasks of `policy`."""
+    policy_episodes: int = 0
+    """Episodes of `policy`, all at once; 0: 60 on CUDA, for which the figures to reach are, and 2 on the CPU."""
+    policy_steps: int = 0
+    """Ticks of an episode of `policy` at most; 0: what the rules or the length of usual successes say."""
     json: bool = False
     """Print one JSON array instead of the table."""
 

@@ -120,7 +120,7 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     if replan:
         found.append(f"The policy looks again after {counted(replan, 'action')} of each chunk.")
     if results["config"].get("ensemble"):
-        found.append("The policy looks at every tick; the mean of all chunks that cover it is executed.")
+        found.append("At each tick the mean of all chunks that cover it is executed.")
     cap = results["config"]["max_steps"]
     if cap is not None:
         found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")

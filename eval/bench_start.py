@@ -1,0 +1,95 @@
+"""Seconds from the start of a process to its first tick: with no kernel in the cache, and with all of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+
+import warp as wp
+
+from arena_newton.errors import ArenaError
+from arena_newton.eval.bench_figure import BenchFigure
+from arena_newton.eval.options import BenchOptions
+
+__all__ = ["first_tick", "start_figures"]
+
+COLD, WARM = 40.0, 8.0
+"""Seconds to the first tick on a GPU machine, without and with kernels in the cache."""
+TIMEOUT = 900.0
+"""Longest start that is waited for [s]."""
+
+
+def first_tick(task: str, worlds: int, threads: int) -> None:
+    """Build an environment with a camera, look once, play a tick, and print the seconds of each part as JSON.
+
+    Args:
+        task: Task.
+        worlds: Worlds.
+        threads: Threads that load kernels; 1: one module after the other, when its first kernel is launched. 0: as
+            many as usual.
+    """
+    began = time.perf_counter()
+    import torch
+
+    from arena_newton import kernel_loading, trackers
+    from arena_newton.canonical import STAND_ACTION
+    from arena_newton.env import ArenaEnv
+    from arena_newton.pictures.settings import CameraConfig
+    from arena_newton.quiet import quiet_warp
+
+    quiet_warp()
+    if threads:
+        kernel_loading.MOST_THREADS = threads
+    parts = {"libraries": time.perf_counter() - began}
+    cuda = bool(wp.is_cuda_available())
+    engine, device = ("warp", "cuda:0") if cuda else ("mujoco", "cpu")
+    env = ArenaEnv(
+        task, tracker=trackers.get("twist2"), worlds=worlds, engine=engine, device=device, camera=CameraConfig()
+    )
+    parts["environment"] = time.perf_counter() - began - sum(parts.values())
+    env.reset(list(range(worlds)))
+    env.observe(image=True)
+    env.step(torch.tensor(STAND_ACTION, device=env.torch_device).repeat(worlds, 1))
+    wp.synchronize_device(env.device)
+    parts["first tick"] = time.perf_counter() - began - sum(parts.values())
+    print(json.dumps(parts))
+
+
+def start_figures(options: BenchOptions) -> Iterator[BenchFigure]:
+    """A start with an empty cache, the next one with the full cache, and one that compiles module by module."""
+    cuda = bool(wp.is_cuda_available())
+    where, worlds = ("CUDA", 60) if cuda else ("CPU", 2)
+    with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
+        cold, parts = _start(one, worlds, 0)
+        warm, again = _start(one, worlds, 0)
+        serial, _ = _start(other, worlds, 1)
+    name = f"first tick, boxing, {worlds} worlds, camera, {where}, kernels"
+    ratio = f"one module after the other {serial:.1f} s = {serial / cold:.2f} x"
+    for kind, bar, seconds, said, more in (
+        ("compiled", COLD, cold, parts, f"; {ratio}"),
+        ("cached", WARM, warm, again, ""),
+    ):
+        note = ", ".join(f"{part} {value:.1f} s" for part, value in said.items()) + more
+        if not cuda:
+            note = f"{seconds:.1f} s, judged on CUDA only: {note}"
+        yield BenchFigure(f"{name} {kind}", bar, "s", True, seconds if cuda else None, note)
+
+
+def _start(cache: str, worlds: int, threads: int) -> tuple[float, dict[str, float]]:
+    """Seconds of a process from its start to its first tick, and those of its parts."""
+    code = f"from arena_newton.eval.bench_start import first_tick; first_tick('boxing', {worlds}, {threads})"
+    environment = os.environ | {"WARP_CACHE_PATH": cache, "CUDA_CACHE_PATH": f"{cache}/cuda"}
+    began = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=TIMEOUT
+    )
+    seconds = time.perf_counter() - began
+    if done.returncode:
+        raise ArenaError(f"the first tick was not reached: {' '.join(done.stderr.split())[-300:]}")
+    parts: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return seconds, {"interpreter": max(0.0, seconds - sum(parts.values()))} | parts

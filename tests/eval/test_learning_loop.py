@@ -1,0 +1,215 @@
+"""The whole loop: every stage resumes, none is repeated, other folders are refused, the report says what happened."""
+
+import dataclasses
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from arena_newton.errors import InputError
+from arena_newton.eval import learning_loop, loop_report
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.learning_loop import LOOP_FILE, LoopParts, resolved
+from arena_newton.eval.loop_report import StageRecord
+from arena_newton.eval.options import LoopOptions
+from arena_newton.eval.results import load_run
+from tests.fuzz.mutants import damaged
+
+FLAGS = ["--small", "--task", "boxing", "--tracker", "pd", "--engine", "mujoco", "--device", "cpu", "--episodes", "2"]
+FLAGS += ["--steps", "6", "--max-steps", "12", "--worlds", "2", "--seed", "3"]
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from arena_newton.eval import learning_loop
+from arena_newton.eval.__main__ import main
+from arena_newton.policies.train import policy_trainer
+at = sys.argv.pop(1)
+
+def kill():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+if at == "record":
+    from arena_newton.eval.journal import Journal
+    append = Journal.append
+    Journal.append = lambda self, record: (append(self, record), kill())
+if at == "build":
+    from arena_newton.data import lerobot_dataset
+    lerobot_dataset.build = lambda folders, options: kill()
+if at == "train":
+    advance = policy_trainer.PolicyTrainer.advance
+    policy_trainer.PolicyTrainer.advance = lambda self: (advance(self), kill() if self.step == 3 else None)[0]
+sys.exit(main(["loop", *sys.argv[1:]]))
+"""
+
+
+def killed(stage, out, *flags):
+    """Run the command in a process that kills itself in a stage."""
+    environment = os.environ | {"HF_HUB_OFFLINE": "1"}
+    command = [sys.executable, "-c", KILLED, stage, *FLAGS, "--out", str(out), *flags]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
+
+
+def content(out):
+    """Stages of loop.json."""
+    return json.loads((out / LOOP_FILE).read_text())["stages"]
+
+
+@pytest.fixture(scope="module")
+def looped(tmp_path_factory):
+    """A small loop that was killed in recording and in training, then finished by the same command."""
+    out = tmp_path_factory.mktemp("loop") / "out"
+    killed("record", out)
+    first = [record.index for record in load_run(out / "demonstrations").records]
+    killed("train", out)
+    made = {path: path.stat().st_mtime_ns for path in sorted((out / "dataset").rglob("*")) if path.is_file()}
+    code = main(["loop", *FLAGS, "--out", str(out)])
+    return out, code, first, made
+
+
+def test_kills_cost_no_finished_stage(looped):
+    """After kill -9 in recording and in training the same command finishes; what was finished is not made again."""
+    out, code, first, made = looped
+    assert code == 0 and len(first) == 1
+    stages = content(out)
+    assert list(stages) == ["record", "build", "train", "evaluate"]
+    assert all(stage["finished"] for stage in stages.values())
+    assert [stage["attempts"] for stage in stages.values()] == [2, 1, 2, 1]
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    assert len((out / "demonstrations" / "episodes.jsonl").read_text().splitlines()) == 2
+    checkpoint = out / stages["train"]["checkpoint"]
+    assert (checkpoint / "model.safetensors").is_file() and checkpoint.parent.name == "000006"
+
+
+def test_the_trained_policy_sees_and_is_evaluated(looped):
+    """The evaluation plays 3 group seeds with the checkpoint of this loop and with a camera of the recorded size."""
+    out, *_ = looped
+    run = load_run(out / "evaluation")
+    assert len(run.records) == 3 and {record.outcome for record in run.records} <= {"success", "fall", "timeout"}
+    assert run.config["policy"].startswith("lerobot:") and run.config["policy_facts"]
+    assert all(record.media for record in run.records)
+
+
+def test_the_report_has_times_rate_curve_and_strips(looped):
+    """Markdown and page name stages, the rate with its interval, the training and a strip that exists."""
+    out, *_ = looped
+    text, page = (out / "loop.md").read_text(), (out / "loop.html").read_text()
+    for words in ("record demonstrations", "95 % Wilson", "recipe small, 6 steps", "in 2 attempts", "0/3"):
+        assert words in text and words in page, words
+    assert "<polyline" in page and "script-src" not in page and "<script" not in page
+    strips = [line.split("](")[1].rstrip(")") for line in text.splitlines() if line.startswith("![")]
+    assert strips and all((out / path).is_file() and path in page for path in strips)
+
+
+def test_a_finished_loop_only_writes_its_report(looped, capsys):
+    """The same command again trains and plays nothing; the seconds stay."""
+    out, *_ = looped
+    before = content(out)
+
+    def never(options):
+        raise AssertionError("trained again")
+
+    (out / "loop.html").unlink()
+    options = LoopOptions(**_options(out))
+    assert learning_loop.run(options, parts=LoopParts(train=never)) == 0
+    assert content(out) == before and (out / "loop.html").is_file()
+    assert capsys.readouterr().out.count("finished before") == 4
+
+
+def _options(out):
+    stored = json.loads((out / LOOP_FILE).read_text())["options"]
+    return stored | {"task": tuple(stored["task"]), "out": str(out)}
+
+
+def test_another_loop_is_refused(looped, capsys):
+    """A folder that was begun with other flags, and one that holds something else, is one line and code 2."""
+    out, *_ = looped
+    flags = [*FLAGS[:-1], "4"]
+    assert main(["loop", *flags, "--out", str(out)]) == 2
+    assert "was begun with --seed 3, now 4" in capsys.readouterr().err
+    assert main(["loop", *FLAGS, "--out", str(out / "dataset")]) == 2
+    assert "is not empty and holds no loop" in capsys.readouterr().err
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
+    """An interruption in training is code 130 and the command to continue; the next call resumes the training."""
+
+    class Stop(learning_loop._Loop):
+        def _record(self):
+            (self.out / "demonstrations" / "episodes").mkdir(parents=True)
+            (self.out / "demonstrations" / "episodes" / "one.npz").touch()
+            return 0
+
+        def _build(self):
+            return 0
+
+    given = []
+
+    def stop(options):
+        given.append(options)
+        (tmp_path / "training" / "checkpoints" / "last").mkdir(parents=True, exist_ok=True)
+        raise KeyboardInterrupt
+
+    options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
+    for _ in range(2):
+        assert Stop(options, tmp_path, None, LoopParts(train=stop)).play() == 130
+    assert "continue with: python -m arena_newton.eval loop --task boxing" in capsys.readouterr().out
+    assert given[0].resume is None and given[1].resume == tmp_path / "training"
+    assert content(tmp_path)["train"]["attempts"] == 2 and content(tmp_path)["record"]["attempts"] == 1
+
+
+def _small():
+    return LoopOptions(task=("boxing",), tracker="pd", engine="mujoco", device="cpu", small=True)
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--minutes", "0"], "--minutes 0: expected more than 0"),
+        (["--minutes", "2", "--steps", "5"], "--steps: is given by --minutes too"),
+        (["--episodes", "0"], "--episodes 0: expected at least 1"),
+        (["--policy", "ppo"], "--policy ppo: unknown"),
+        (["--recipe", "mine"], "--recipe mine: unknown"),
+        (["--task", "chess"], "chess"),
+        (["--tracker", "nobody"], "--tracker nobody"),
+        (["--size", "63x63"], "--size 63x63"),
+        (["--size", "128x128"], "--size 128x128: recipe act/fast takes 224x224"),
+        (["--recipe", "compact", "--policy", "flow"], "compact"),
+    ],
+)
+def test_unfit_flags_are_refused_first(tmp_path, capsys, flags, says):
+    """One line that names the flag, exit code 2, and no folder."""
+    out = tmp_path / "out"
+    assert main(["loop", "--engine", "mujoco", "--device", "cpu", *flags, "--out", str(out)]) == 2
+    assert says in capsys.readouterr().err and not out.exists()
+
+
+def test_two_processes_do_not_share_a_folder(tmp_path, capsys):
+    """A folder in which another process works is refused."""
+    with learning_loop.held(tmp_path / "out"):
+        assert main(["loop", *FLAGS, "--out", str(tmp_path / "out")]) == 2
+    assert "another process works in it" in capsys.readouterr().err
+
+
+def test_a_damaged_file_is_one_error(tmp_path):
+    """Whatever is wrong with loop.json, the reader names the file and nothing is overwritten."""
+    good = json.dumps(
+        {
+            "format": 1,
+            "options": {"task": ["boxing"]},
+            "stages": {"train": dataclasses.asdict(StageRecord(True, 2.5, 1, 0, "training/x"))},
+        }
+    ).encode()
+    path, refused, rng = tmp_path / LOOP_FILE, 0, random.Random(0)
+    for _ in range(300):
+        path.write_bytes(damaged(good, rng, text=True))
+        try:
+            loop_report.read(path, 1)
+        except InputError as error:
+            assert str(path) in str(error)
+            refused += 1
+    assert refused > 50
