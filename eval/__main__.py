@@ -38,6 +38,7 @@ OVERVIEW = f"""commands:
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
+  {PROG} tsne [flags]            map what one policy answers to the observations of two datasets
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
@@ -254,6 +255,19 @@ def _tables(arguments: list[str], factories: Factories | None) -> int:
     return tables_command.run(folders, options)
 
 
+def _tsne(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.table_options import TsneOptions
+
+    options = parse_flags(TsneOptions, arguments, f"{PROG} tsne")
+    from arena_newton.extras import require
+
+    require("plots", "eval tsne")
+    require("data", "eval tsne", ("pyarrow",))
+    from arena_newton.eval import tsne_command
+
+    return tsne_command.run(options)
+
+
 _COMMANDS = {
     "run": _run,
     "record": _record,
@@ -262,6 +276,7 @@ _COMMANDS = {
     "film": _film,
     "loop": _loop,
     "tables": _tables,
+    "tsne": _tsne,
     "matrix": _matrix,
     "bench": _bench,
     "engines": _engines,

@@ -49,6 +49,14 @@ class EvaluatedCell:
     records: tuple[EpisodeRecord, ...]
     """Its episodes in plan order."""
     folder: Path
+    wall_s: float | None = None
+    """Time that its evaluation took [s], where a suite measured it."""
+    device: str = ""
+    """Where it was played, such as `NVIDIA H200`."""
+    weights: str = ""
+    """Hash of the policy's weights, where it says one."""
+    training_minutes: float | None = None
+    """Time that the training of these weights took [min], where the policy says it."""
 
     @property
     def merged(self) -> bool:
@@ -129,6 +137,7 @@ def _of_suite(folder: Path, notes: list[str]) -> list[tuple[str, EvaluatedCell, 
 
 
 def _suite_cell(cell: SuiteCell, run: RunRecord) -> EvaluatedCell:
+    facts = _facts(run.config.get("policy_facts"))
     return EvaluatedCell(
         policy=cell.policy,
         family=cell.family,
@@ -143,6 +152,10 @@ def _suite_cell(cell: SuiteCell, run: RunRecord) -> EvaluatedCell:
         ensemble=cell.ensemble,
         records=tuple(run.records),
         folder=run.folder,
+        wall_s=cell.wall_s,
+        device=cell.device,
+        weights=_text(facts.get("weights")),
+        training_minutes=_minutes(facts.get("minutes")),
     )
 
 
@@ -179,6 +192,8 @@ def _of_run(run: RunRecord) -> list[EvaluatedCell]:
                 ensemble=config.get("ensemble") is True,
                 records=tuple(records),
                 folder=run.folder,
+                weights=_text(facts.get("weights")),
+                training_minutes=_minutes(facts.get("minutes")),
             )
         )
     return found
@@ -202,6 +217,11 @@ def _texts(value: Json) -> tuple[str, ...]:
 
 def _number(value: Json) -> int:
     return value if type(value) is int and value >= 0 else 0
+
+
+def _minutes(value: Json) -> float | None:
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e7
+    return float(value) if usable else None
 
 
 def _check_alike(runs: Sequence[RunRecord]) -> None:

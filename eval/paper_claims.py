@@ -11,13 +11,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers
 from arena_newton.eval.stats import Contrast, Outcomes, contrast, holm, paired_rates, suites
-from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.table_entries import points, probability
 from arena_newton.eval.wording import escaped
 
-__all__ = ["NEGLIGIBLE", "Finding", "findings", "findings_text"]
+__all__ = ["NEGLIGIBLE", "ClaimResult", "findings", "findings_text"]
 
 type Verdict = Literal["reproduces", "does not", "undecided", "not measured"]
 
@@ -31,7 +31,7 @@ HALVES = ("HOI_AVG", "HSI_AVG")
 
 
 @dataclass(frozen=True)
-class Finding:
+class ClaimResult:
     """A claim of the paper and what our episodes say of it."""
 
     name: str
@@ -109,7 +109,7 @@ class _Cells:
         return [(cell.task, sign / len(names), cell.held(outcome)) for cell in cells]
 
 
-def findings(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[Finding]:
+def findings(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[ClaimResult]:
     """Every claim, in the paper's order; one that our episodes cannot test is `not measured`."""
     found = _Cells(cells)
     return [
@@ -123,7 +123,7 @@ def findings(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[Findin
     ]
 
 
-def _same_family(cells: _Cells) -> Finding:
+def _same_family(cells: _Cells) -> ClaimResult:
     pairs = []
     for (mode, tracker, policy, task), cell in sorted(cells.matched.items()):
         other = cells.matched.get((mode, "sonic", policy, task))
@@ -142,7 +142,7 @@ def _same_family(cells: _Cells) -> Finding:
             said += f"; most: {name} {points(c.value)} points, p {probability(p)}"
         close = all(-WIDE < c.low and c.high < WIDE for _, _, c in tested)
         verdict = "reproduces" if apart else "does not" if close else "undecided"
-    return Finding(
+    return ClaimResult(
         "tracker-conditioned: same family",
         "The same policy family succeeds differently when it is trained and executed with another tracker.",
         "for instance FM on SitSofa: 68.3 % with TWIST2, 15.0 % with SONIC",
@@ -170,7 +170,7 @@ def _common(cells: _Cells, trackers: Sequence[str]) -> tuple[list[str], list[str
     return kept, sorted(set.intersection(*(known[p] for p in kept))) if kept else []
 
 
-def _best_family(cells: _Cells, paper: PaperNumbers) -> Finding:
+def _best_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
     policies, tasks = _common(cells, ("twist2", "sonic"))
     verdict: Verdict = "not measured"
     said = "fewer than two policies were evaluated matched through both trackers on common tasks"
@@ -192,7 +192,7 @@ def _best_family(cells: _Cells, paper: PaperNumbers) -> Finding:
             verdict = "reproduces" if clear else "undecided"
             said = f"{a} is best with twist2, {b} with sonic over {len(tasks)} tasks"
         said += f"; leads {_said(leads[0], 'twist2')} and {_said(leads[1], 'sonic')}"
-    return Finding(
+    return ClaimResult(
         "tracker-conditioned: best family",
         "The best policy under one tracker is not the best under the other.",
         "FM is best with TWIST2 (HOI 36.1, HSI 58.8 %), DP with SONIC (HOI 52.2, HSI 65.8 %)",
@@ -201,7 +201,7 @@ def _best_family(cells: _Cells, paper: PaperNumbers) -> Finding:
     )
 
 
-def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
+def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     found = []
     for suite in HALVES:
         policies, common = _common(cells, ("twist2", "sonic"))
@@ -215,7 +215,7 @@ def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
         theirs = {t: max(paper.in_gmt[t, "base", f, suite].sr for f in FAMILIES.values()) for t in ("twist2", "sonic")}
         name = suite.removesuffix("_AVG")
         found.append(
-            Finding(
+            ClaimResult(
                 f"tracker-conditioned: SONIC ahead on {name}",
                 f"The best average over {name} is higher with SONIC than with TWIST2.",
                 f"{points(theirs['sonic'] - theirs['twist2'])} points",
@@ -238,7 +238,7 @@ def _drop(pairs: Sequence[tuple[EvaluatedCell, EvaluatedCell]], sign: float = 1.
     return [term for a, b in pairs for term in ((a.task, weight, a.held()), (b.task, -weight, b.held()))]
 
 
-def _swapped(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
+def _swapped(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     directions = (("twist2", "sonic"), ("sonic", "twist2"))
     pairs = {d: _transfer(cells, *d) for d in directions}
     found = []
@@ -252,7 +252,7 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
         lost = sum(c.retention == 0 for c in theirs)
         said = f"{_said(result, f'{len(mine)} cells')}; nothing left in {gone} of {len(mine)}" if mine else _NO_SWAP
         found.append(
-            Finding(
+            ClaimResult(
                 f"cross-GMT: {a} → {b}",
                 "Replacing the tracker costs success.",
                 f"{points(means[a][0])} points on average; nothing left in {lost} of {len(theirs)} cells",
@@ -265,7 +265,7 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
     alike = {d: [(a, b) for a, b in pairs[d] if (a.policy, a.task) in both] for d in directions}
     result = _contrast(_drop(alike[directions[0]]) + _drop(alike[directions[1]], -1.0)) if both else None
     found.append(
-        Finding(
+        ClaimResult(
             "cross-GMT: asymmetric drop",
             "The two directions differ in the drop of success.",
             f"{points(means['twist2'][0] - means['sonic'][0])} points more from TWIST2 to SONIC",
@@ -280,7 +280,7 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
             terms += [(b.task, sign / len(alike[d]), b.held("fall")) for _, b in alike[d]]
         falls = _contrast(terms)
     found.append(
-        Finding(
+        ClaimResult(
             "cross-GMT: asymmetric falls",
             "Swapped policies fall more often from SONIC to TWIST2 than in the other direction.",
             f"{points(means['sonic'][1] - means['twist2'][1])} points",
@@ -294,7 +294,7 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
 _NO_SWAP = "no policy was evaluated matched and swapped"
 
 
-def _visual(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
+def _visual(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     """Drops from base by mode, over (tracker, policy, task) cells that have the modes compared."""
     groups: dict[tuple[str, str, str], dict[str, EvaluatedCell]] = {}
     for (mode, *rest), cell in cells.matched.items():
@@ -321,7 +321,9 @@ def _visual(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
         result, number = ours(weights, every)
         said = _said(result, f"{number} cells") if number else f"no cell was evaluated in modes {' and '.join(weights)}"
         found.append(
-            Finding(f"perturbation: {name}", claim, f"{points(theirs(weights, every))} points", said, _greater(result))
+            ClaimResult(
+                f"perturbation: {name}", claim, f"{points(theirs(weights, every))} points", said, _greater(result)
+            )
         )
     drop = compared[0][2]
     halves = [ours(drop, suites()[suite]) for suite in HALVES]
@@ -335,7 +337,7 @@ def _visual(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
         result = _contrast(terms)
     first, second = (theirs(drop, suites()[suite]) for suite in HALVES)
     found.append(
-        Finding(
+        ClaimResult(
             "perturbation: visual on HOI",
             "Visual perturbations cost more on human-object than on human-scene tasks.",
             f"{points(first - second)} points",
@@ -346,7 +348,7 @@ def _visual(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
     return found
 
 
-def _stability(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
+def _stability(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     found = []
     for tracker in ("twist2", "sonic"):
         rates = {f: [paper.in_gmt[tracker, "base", f, task] for task in suites()["ALL_AVG"]] for f in FAMILIES.values()}
@@ -385,7 +387,7 @@ def _stability(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
                 said += f"; success {_said(more, 'difference')}, falls {_said(fewer, 'difference')}"
                 verdict = "reproduces" if more and fewer and more.low > 0 and fewer.low > 0 else "undecided"
         found.append(
-            Finding(
+            ClaimResult(
                 f"SR and AFR disagree: {tracker}",
                 "The policy that falls least is not the one that succeeds most.",
                 theirs,
@@ -396,7 +398,7 @@ def _stability(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
     return found
 
 
-def _merged(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
+def _merged(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     """Merged minus single-task training of the same family, per training set and suite."""
     found = []
     for name, trackers in TRAINING_SETS.items():
@@ -429,7 +431,7 @@ def _merged(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
             said = "; ".join(f"{family}: {_said(c, 'merged minus single')}" for family, c in results)
             half = suite.removesuffix("_AVG")
             found.append(
-                Finding(
+                ClaimResult(
                     f"merged training: {name} {half}",
                     "Merged demonstrations change the success rate, for better or worse.",
                     f"{', '.join(theirs)} points",
@@ -440,7 +442,7 @@ def _merged(cells: _Cells, paper: PaperNumbers) -> list[Finding]:
     return found
 
 
-def findings_text(found: Sequence[Finding]) -> str:
+def findings_text(found: Sequence[ClaimResult]) -> str:
     """The findings as Markdown."""
     parts = ["# The paper's findings on these episodes\n"]
     parts.append(

@@ -9,9 +9,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+from arena_newton.eval.cost_table import cost_table
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate
 from arena_newton.eval.stats import contrast, holm, paired_rates, suites
-from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.table_entries import (
     UNDEFINED,
     SuiteTable,
@@ -55,6 +56,7 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[Su
         _merge_all(prompt, paper),
         _latency(cells),
         _labels(prompt),
+        cost_table(cells),
     ]
     return [_with_rules(table) for table in found if table is not None]
 
@@ -94,9 +96,14 @@ def _title(task: str) -> str:
     return {"pp_box": "P&PBox"}.get(task, "".join(word.capitalize() for word in task.split("_")))
 
 
-def _rate_columns(extra: Sequence[str] = ()) -> tuple[str, ...]:
-    """Tasks and averages in the order of the paper's columns, then tasks outside the suites."""
-    return (*suites()["HOI_AVG"], "HOI_AVG", *suites()["HSI_AVG"], "HSI_AVG", *extra)
+def _rate_columns(cells: Sequence[EvaluatedCell]) -> tuple[str, ...]:
+    """Tasks that were played and averages of which all are, as the paper orders them, then tasks outside its suites."""
+    played = {cell.task for cell in cells}
+    columns: list[str] = []
+    for half in HALVES:
+        columns += [task for task in suites()[half] if task in played]
+        columns += [half] if played >= set(suites()[half]) else []
+    return (*columns, *sorted(played - set(suites()["ALL_AVG"])))
 
 
 def _rate_row(table: str, cells: Sequence[EvaluatedCell], columns: Sequence[str]) -> tuple[list[str], list[TableEntry]]:
@@ -138,7 +145,7 @@ def _in_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers, mode: str) -> S
     if not mine:
         return None
     name = "in_gmt" if mode == "base" else f"in_gmt_{mode}"
-    columns = _rate_columns([task for task in _tasks(mine) if task not in suites()["ALL_AVG"]])
+    columns = _rate_columns(mine)
     rows: list[tuple[str, ...]] = []
     entries: list[TableEntry] = []
     groups = []
@@ -456,7 +463,7 @@ def _merge_all(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
     if not merged:
         return None
     names = {trackers: name for name, trackers in TRAINING_SETS.items()}
-    columns = _rate_columns()
+    columns = _rate_columns(merged)
     rows: list[tuple[str, ...]] = []
     entries: list[TableEntry] = []
     groups = []

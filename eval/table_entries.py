@@ -7,9 +7,9 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.paper_numbers import PaperRate
 from arena_newton.eval.stats import Contrast, contrast, population_std, seed_rates, wilson
-from arena_newton.eval.evaluated_cells import EvaluatedCell
 
 __all__ = [
     "UNDEFINED",

@@ -42,7 +42,5 @@ class TsneOptions:
     """Of the embedding and of the policy's noise."""
     perplexity: float = 30.0
     """Of the embedding."""
-    labels: str = "v3.1"
-    """Protocol of the policy's actions, as in eval run."""
     batch: int = 50
     """Observations that the policy is given at once."""

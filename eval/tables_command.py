@@ -8,9 +8,9 @@ from pathlib import Path
 from arena_newton import rule_sets
 from arena_newton.errors import InputError
 from arena_newton.eval import paper_claims, table_text
+from arena_newton.eval.evaluated_cells import read_cells
 from arena_newton.eval.journal import StorageError, write_atomic
 from arena_newton.eval.paper_numbers import paper_numbers
-from arena_newton.eval.evaluated_cells import read_cells
 from arena_newton.eval.suite_tables import suite_tables
 from arena_newton.eval.table_options import FORMATS, TablesOptions
 from arena_newton.extras import require

@@ -27,16 +27,15 @@ from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json, Observation
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, read_address
 from arena_newton.policies.remote_client import MAX_CHUNK, MAX_FAILURES, MAX_REPLY, RemoteClient
-from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink
+from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink, episode_lost
 from arena_newton.policies.serve.handshake import ServedFacts, read_facts
-from arena_newton.policies.serve.packed_arrays import WireError
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = ["MAX_CHUNK", "MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
 
 ROBOT_TYPE = LABELS["v3.1"].robot_type
 """Robot type that the original's server checks: actions of v3.1; those of other protocols have their own."""
 _RETRY_STATUS = (502, 503, 504)
-_UNKNOWN_EPISODE = 409
 _OTHERS = {
     "openpi": ("remote_openpi", "serve", ("websockets", "msgpack")),
     "roboarena": ("remote_openpi", "serve", ("websockets", "msgpack")),
@@ -245,8 +244,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
             said = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
-            # Our server refuses so an episode that began before it was started again.
-            raise RemoteError(f"{where}: status {status}{said}", silent=silent, lost=status == _UNKNOWN_EPISODE)
+            raise RemoteError(f"{where}: status {status}{said}", silent=silent, lost=episode_lost(said))
         if not isinstance(content, dict):
             raise RemoteError(f"{where}: the reply is not a JSON object")
         return content

@@ -27,7 +27,7 @@ from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, P
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
 from arena_newton.policies.remote_link import RemoteError, ServerLink
 from arena_newton.policies.serve.handshake import RATE, ServedFacts, compare_facts, expected_facts
-from arena_newton.policies.serve.packed_arrays import WireError
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = [
     "MAX_CHUNK",
@@ -216,6 +216,7 @@ class RemoteClient[Q, R](Policy):
             fit: Literal["native", "pad"] = "native" if facts.picture.fit == "native" else "pad"
             self.camera = CameraConfig(width=facts.picture.width, height=facts.picture.height, fit=fit)
         self.chunk_size = facts.chunk_length or self.chunk_size
+        self.realign = facts.realign or 0.0
         self.batched, self._seeded = facts.batched, facts.seeded
         self._served = self.one_line(facts.policy)
 
@@ -364,7 +365,7 @@ class RemoteClient[Q, R](Policy):
             "worlds_matter": self.depends_on_worlds,
         }
         declared = self.told.to_json() if self.told != ServedFacts() else {}
-        shown = ("labels", "chunk_length", "rate_hz", "picture", "batched", "facts")
+        shown = ("labels", "realign", "chunk_length", "rate_hz", "picture", "batched", "facts")
         more = {"declared": {name: declared[name] for name in shown if name in declared}, "assumed": self._assumed}
         return facts | {name: value for name, value in more.items() if value}
 
@@ -447,8 +448,8 @@ class RemoteClient[Q, R](Policy):
 
     def _alive(self) -> bool:
         """Whether the server answers at all, asked over a new connection."""
-        if self._closing:
-            return False
+        if self._closing:  # nobody waits for the answer any more
+            return True
         connection = self._connect()
         answer = self._threads().submit(connection.alive, self.timeout)
         try:

@@ -24,9 +24,11 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json, Mask, Observation, world_mask
 from arena_newton.policies.remote_client import MAX_REPLY, RemoteClient, host
-from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink
+from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink, episode_lost
 from arena_newton.policies.serve.handshake import ServedFacts, read_facts
-from arena_newton.policies.serve.packed_arrays import MAX_FRAME, TEXT_KEYS, WireError, checked_array, pack, unpack
+from arena_newton.policies.serve.packed_arrays import TEXT_KEYS, pack, unpack
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME, checked_array
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = ["Gr00tPolicy", "ModalityNames", "make", "pack_gr00t", "read_modalities", "unpack_gr00t"]
 
@@ -58,7 +60,7 @@ def pack_gr00t(content: object) -> bytes:
 
     def npy(array: np.ndarray) -> Mapping[str, object]:
         file = io.BytesIO()
-        np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+        np.save(file, array, allow_pickle=False)
         return {ARRAY_KEY: True, "as_npy": file.getvalue()}
 
     return pack(content, TEXT_KEYS, npy)
@@ -395,7 +397,8 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
             raise RemoteError(f"{where}: the server says ERROR")
         content = unpack_gr00t(reply, where)
         if isinstance(content, dict) and "error" in content:
-            raise RemoteError(f"{where}: the server says {self.one_line(content['error'])}")
+            said = self.one_line(content["error"])
+            raise RemoteError(f"{where}: the server says {said}", lost=episode_lost(said))
         return content
 
     def _rows(self, content: object) -> np.ndarray:

@@ -9,7 +9,10 @@ from typing import ClassVar
 from arena_newton.errors import ArenaError
 from arena_newton.policies.remote_address import cause
 
-__all__ = ["AskAgain", "RemoteError", "ServerLink"]
+__all__ = ["AskAgain", "RemoteError", "ServerLink", "episode_lost"]
+
+NOT_KNOWN = ("episode that the server does not know", "unknown episode", "the server is closing")
+"""What our servers say where they cannot go on with a running episode, which is no fault of the episode."""
 
 
 class RemoteError(ArenaError):
@@ -110,3 +113,8 @@ class ServerLink[Q, R]:
     def close(self) -> None:
         """Close the connection; the next exchange opens a new one."""
         raise TypeError(f"{type(self).__name__} defines no close()")
+
+
+def episode_lost(said: str) -> bool:
+    """Whether a server says that it no longer knows the episode that is running, or is about to forget it."""
+    return any(text in said for text in NOT_KNOWN)

@@ -13,9 +13,8 @@ import numpy as np
 from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json, Observation
-from arena_newton.policies.remote_link import RemoteError
+from arena_newton.policies.remote_link import RemoteError, episode_lost
 from arena_newton.policies.remote_websocket import (
-    UNKNOWN_EPISODE,
     SocketClient,
     SocketLink,
     SocketRequest,
@@ -23,8 +22,9 @@ from arena_newton.policies.remote_websocket import (
 )
 from arena_newton.policies.serve import arena_codec, openpi_codec
 from arena_newton.policies.serve.handshake import ServedFacts
-from arena_newton.policies.serve.packed_arrays import OPENPI_KEYS, WireError, pack, unpack
+from arena_newton.policies.serve.packed_arrays import OPENPI_KEYS, pack, unpack
 from arena_newton.policies.serve.policy_messages import PICTURE_SIDES, Begin
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = ["ROBOARENA_IMAGE_KEY", "OpenpiPolicy", "make"]
 
@@ -126,7 +126,7 @@ class OpenpiPolicy(SocketClient):
         if isinstance(answer, str):
             lines = [line for line in answer[-LONGEST_SAID:].splitlines() if line.strip()]
             said = self.one_line(lines[-1]) if lines else "nothing"
-            raise RemoteError(f"{where}: the server says {said}", lost=UNKNOWN_EPISODE in said)
+            raise RemoteError(f"{where}: the server says {said}", lost=episode_lost(said))
         raise RemoteError(f"{where}: a binary frame, expected the text {openpi_codec.RESET_ANSWER!r}")
 
     def _cameras(self) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json
-from arena_newton.policies.remote_link import RemoteError
-from arena_newton.policies.remote_websocket import UNKNOWN_EPISODE, SocketClient, SocketLink, SocketRequest
+from arena_newton.policies.remote_link import RemoteError, episode_lost
+from arena_newton.policies.remote_websocket import SocketClient, SocketLink, SocketRequest
 from arena_newton.policies.serve import vla_eval_codec
 from arena_newton.policies.serve.handshake import ServedFacts
 from arena_newton.policies.serve.policy_messages import Begin, End
@@ -106,7 +106,7 @@ class VlaEvalPolicy(SocketClient):
         message, seq = reply
         if isinstance(message, VlaEvalMessage) and message.type == "error":
             said = self.one_line(message.payload.get("error", "nothing"))
-            raise RemoteError(f"{self.url}{kind}: the server says {said}", lost=UNKNOWN_EPISODE in said)
+            raise RemoteError(f"{self.url}{kind}: the server says {said}", lost=episode_lost(said))
         return message, seq
 
     def _rows(self, content: object) -> np.ndarray:

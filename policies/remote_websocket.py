@@ -23,15 +23,13 @@ from arena_newton.policies.remote_address import cause
 from arena_newton.policies.remote_client import MAX_REPLY, RemoteClient
 from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink
 from arena_newton.policies.serve.handshake import ServedFacts
-from arena_newton.policies.serve.packed_arrays import WireError
 from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.serve.wire_error import WireError
 
-__all__ = ["GATEWAY_STATUS", "UNKNOWN_EPISODE", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
+__all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
 
 GATEWAY_STATUS = (502, 503, 504)
 """Status of a gateway whose server is not there."""
-UNKNOWN_EPISODE = "unknown episode"
-"""What our servers say of a running episode that began elsewhere, or before they were started again."""
 CLOSING = 0.5
 """How long the closing handshake may take [s]."""
 MOST_PAGE = 2**20

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
@@ -15,12 +15,12 @@ from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from gymnasium.vector import VectorEnv
 
 __all__ = ["CAMERAS", "ArenaNewtonEnv", "DropRepeated"]
 
+LABELS = ("v3.1", "v4")
+"""Label protocols, `data.label_protocols.LABELS`."""
 FPS = 50
 """Ticks per second."""
 CAMERAS = {"front": "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
@@ -75,12 +75,19 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """Height of pictures [px]."""
     episode_length: int | None = None
     """Cap on the step budget of the rule set [ticks]."""
+    labels: str = "v3.1"
+    """Protocol of the policy's actions: v3.1, or v4, which is decoded per world."""
+    realign: float = 0.0
+    """Of v4: fraction of the gap between commanded and measured heading that is closed each tick."""
+    look_ticks: int = 20
+    """Of v4: ticks between two looks of the policy, at which `realign` measures the heading: its n_action_steps."""
 
     def __post_init__(self) -> None:
         """Name the features.
 
         Raises:
-            InputError: An unknown task or camera, or another number of ticks per second than the world has.
+            InputError: An unknown task, camera or protocol, a number that is out of range, or another number of ticks
+                per second than the world has.
         """
         if self.fps != FPS:
             raise InputError(f"--env.fps {self.fps}: the world has {FPS} ticks per second")
@@ -88,6 +95,12 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError(
                 f"--env.max_parallel_tasks {self.max_parallel_tasks}: tasks run one after the other, use 1"
             )
+        if self.labels not in LABELS:
+            raise InputError(f"--env.labels {self.labels}: unknown, choose from {', '.join(LABELS)}")
+        if not 0.0 <= self.realign <= 1.0:
+            raise InputError(f"--env.realign {self.realign}: expected 0 to 1")
+        if self.look_ticks < 1:
+            raise InputError(f"--env.look_ticks {self.look_ticks}: expected at least 1")
         for task in self.tasks:
             task_registry.get(task)
         shape = (self.image_height, self.image_width, 3)
@@ -147,10 +160,10 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             n_envs: Worlds in a batch, LeRobot's `--eval.batch_size`.
             use_async_envs: Ignored: the worlds of a batch are simulated at once, in this process.
         """
-        from arena_newton.eval.gym import ArenaVectorEnv
+        from arena_newton.eval.lerobot_env.labelled_worlds import make_worlds
 
-        options = cast("dict[str, Any]", self.gym_kwargs)
-        return {task: {0: ArenaVectorEnv(task, n_envs, **options)} for task in self.tasks}
+        options, of = self.gym_kwargs, (self.labels, self.realign, self.look_ticks)
+        return {task: {0: make_worlds(task, n_envs, *of, options)} for task in self.tasks}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """What changes observations before the policy's own processors, and actions after them."""

@@ -11,18 +11,18 @@ import torch
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, hub_name, world_mask
+from arena_newton.policies.lerobot.checkpoint_network import PolicyNetwork
 from arena_newton.policies.lerobot.checkpoint_reader import (
     FAMILY_TYPES,
     FRONT,
     STATE,
     TASK_VECTOR,
-    Checkpoint,
+    PolicyCheckpoint,
     read_checkpoint,
 )
 from arena_newton.policies.lerobot.chunk_memory import ChunkMemory
 from arena_newton.policies.lerobot.hub_folder import fetched
 from arena_newton.policies.lerobot.network_noise import NOISE_RULE, Draw
-from arena_newton.policies.lerobot.networks import PolicyNetwork
 
 __all__ = ["ENSEMBLE_TICKS", "LeRobotPolicy", "from_spec"]
 
@@ -66,7 +66,7 @@ class LeRobotPolicy(Policy):
             InputError: There is no checkpoint, one of its files is damaged, it was trained for something else than our
                 observations and actions, or it does not predict as many actions as `replan` says.
         """
-        self.checkpoint: Checkpoint = read_checkpoint(Path(folder))
+        self.checkpoint: PolicyCheckpoint = read_checkpoint(Path(folder))
         facts, predicted = self.checkpoint.facts, self.checkpoint.predicted
         if replan is None:
             replan = ENSEMBLE_TICKS if ensemble else self.checkpoint.executed

@@ -33,7 +33,7 @@ __all__ = [
     "STATE",
     "TASK_VECTOR",
     "WEIGHTS",
-    "Checkpoint",
+    "PolicyCheckpoint",
     "lerobot_silent",
     "read_checkpoint",
 ]
@@ -77,7 +77,7 @@ NATIVE = (640, 480)
 
 
 @dataclass(frozen=True)
-class Checkpoint:
+class PolicyCheckpoint:
     """What a checkpoint says, checked."""
 
     folder: Path
@@ -129,7 +129,7 @@ def lerobot_silent() -> Iterator[None]:
         logging.disable(disabled)
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
+def read_checkpoint(path: Path) -> PolicyCheckpoint:
     """Read a checkpoint, or the last one of a training's folder, without its weights.
 
     Raises:
@@ -164,7 +164,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
     with (folder / WEIGHTS).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
-    return Checkpoint(folder, config, facts, camera, preparation, digest, ignored)
+    return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
 
 
 def _json(path: Path) -> dict[str, object]:

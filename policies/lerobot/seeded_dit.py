@@ -81,13 +81,10 @@ class _Untrained:
 @contextmanager
 def _empty_encoders() -> Iterator[None]:
     """Lets LeRobot build CLIP without fetching weights: those of the checkpoint are loaded over them all."""
-    stand_ins = {
-        "CLIPVisionModel": _Untrained(CLIPVisionModel, CLIPVisionConfig),
-        "CLIPTextModel": _Untrained(CLIPTextModel, CLIPTextConfig),
-    }
-    kept = {name: getattr(modeling_multi_task_dit, name) for name in stand_ins}
-    for name, stand_in in stand_ins.items():
-        setattr(modeling_multi_task_dit, name, stand_in)
+    kept = {name: getattr(modeling_multi_task_dit, name) for name in ("CLIPVisionModel", "CLIPTextModel")}
+    for model, config in ((CLIPVisionModel, CLIPVisionConfig), (CLIPTextModel, CLIPTextConfig)):
+        if kept[model.__name__] is model:  # else a checkpoint's own architecture stands for it already
+            setattr(modeling_multi_task_dit, model.__name__, _Untrained(model, config))
     try:
         yield
     finally:

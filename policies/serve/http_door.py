@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import socket
 import ssl
+import sys
 import threading
 import time
+import traceback
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -42,7 +46,7 @@ POLL = 0.05
 """Time after which a door notices that it is closed [s]."""
 MOST_WORLDS = 4096
 """Most worlds whose episode is remembered."""
-_STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500}
+_STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "closing": 503}
 """Reason of a refusal → HTTP status; clients ask again after 503."""
 
 
@@ -58,7 +62,7 @@ class _Handler(BaseHTTPRequestHandler):
     def handle(self) -> None:
         """Serve until the client leaves; one connection too many is told so."""
         self.begun: dict[str, str] = {}
-        with self.server.guard.inside() as self.room:
+        with self.server.guard.inside() as self.room, self.server.listed(self.connection):
             super().handle()
 
     def do_GET(self) -> None:  # noqa: N802 (the name that http.server calls)
@@ -175,6 +179,7 @@ class _Listener(ThreadingHTTPServer):
         self.policy, self.guard, self.tls = policy, guard, tls
         self._worlds: OrderedDict[tuple[str, str], str] = OrderedDict()
         """Client's address and world → session that was begun there last."""
+        self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
 
     def get_request(self) -> tuple[socket.socket, tuple[str, int]]:
@@ -185,7 +190,28 @@ class _Listener(ThreadingHTTPServer):
         return connection, address
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A connection broke off, which is no news."""
+        """A connection broke off, which is no news; anything else is."""
+        error = sys.exception()
+        if not isinstance(error, OSError):
+            print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
+
+    @contextmanager
+    def listed(self, connection: socket.socket) -> Iterator[None]:
+        """Remember a connection while it lasts."""
+        with self._lock:
+            self._open.add(connection)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._open.discard(connection)
+
+    def hang_up(self) -> None:
+        """Close all connections: clients that keep one would go on asking."""
+        with self._lock:
+            for connection in self._open:
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def begin(self, address: str, begin: Begin, begun: dict[str, str]) -> None:
         """Begin the episode of a world, and end the one that this connection began there before."""
@@ -235,7 +261,8 @@ class HttpDoor:
         self._thread.start()
 
     def close(self) -> None:
-        """End the door; connections end with the program."""
+        """End the door and its connections."""
         self._listener.shutdown()
+        self._listener.hang_up()
         self._listener.server_close()
         self._thread.join(timeout=2.0)

@@ -46,8 +46,8 @@ IDLE = 30.0
 WARM_UP_SEED = 0
 """Seed of the look before the first one, which nobody is answered."""
 
-type Reason = Literal["unfit", "unknown_episode", "full", "policy"]
-"""Why a request is refused: what it says, an episode that is not known, no free row, or the policy failed."""
+type Reason = Literal["unfit", "unknown_episode", "full", "policy", "closing"]
+"""Why a request is refused: what it says, an unknown episode, no free row, the policy failed, or the server ends."""
 
 
 class Refused(ArenaError):
@@ -271,7 +271,7 @@ class PolicyServer:
     def _put(self, job: _Job) -> None:
         with self._news:
             if self._closed:
-                job.done.set_exception(Refused("policy", "the server is closing"))
+                job.done.set_exception(Refused("closing", "the server is closing"))
                 return
             self._jobs.append(job)
             self._news.notify_all()
@@ -296,7 +296,7 @@ class PolicyServer:
                 continue
             self._answer(self._batch(job))
         for job in self._jobs:
-            job.done.set_exception(Refused("policy", "the server is closing"))
+            job.done.set_exception(Refused("closing", "the server is closing"))
 
     def _batch(self, first: _Job) -> list[_Job]:
         """Looks that are answered together; what begins or ends meanwhile is done at once, unless it is theirs."""

@@ -10,8 +10,10 @@ import http
 import logging
 import socket
 import ssl
+import sys
 import threading
 import time
+import traceback
 from collections import deque
 from typing import Literal
 
@@ -133,6 +135,9 @@ class WebsocketDoor:
                     self._serve_openpi(connection, owner)
         except (ConnectionClosed, OSError):
             pass  # the robot has left
+        except Exception:
+            print(traceback.format_exc(), file=sys.stderr, flush=True)
+            connection.close(INTERNAL_ERROR, "the server failed; its console says more")
         finally:
             self._policy.leave(owner)
             with self._lock:

@@ -76,7 +76,9 @@ def write_suite(folder, cells, name="made"):
         if results is not None:
             write_cell(folder / cell.folder, cell, results)
             at = f"2026-01-01T00:{number // 60:02d}:{number % 60:02d}+00:00"
-            lines += event_line(CellEvent(cell=cell.id, event="done", at=at, finished=len(results), device="cpu"))
+            lines += event_line(
+                CellEvent(cell=cell.id, event="done", at=at, finished=len(results), device="cpu", wall_s=90.0)
+            )
     (folder / journal_file(1, 1)).write_bytes(lines)
     plan = SuitePlan(folder, name, "made.toml", "0123456789ab", tuple(cell for cell, _ in cells))
     (folder / SUITE_FILE).write_text(json.dumps(suite_json(plan)))

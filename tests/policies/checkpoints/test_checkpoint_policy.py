@@ -79,7 +79,7 @@ def test_an_answer_is_what_lerobot_computes(made, checkpoints):
 @pytest.mark.parametrize("family", ["diffusion", "flow"])
 def test_sampling_is_lerobots_but_for_the_noise(made, family, monkeypatch):
     """Where the global generator is set as an episode's, LeRobot's own sampling gives the same actions."""
-    from arena_newton.policies.lerobot import networks
+    from arena_newton.policies.lerobot import checkpoint_network
     from arena_newton.policies.lerobot.network_noise import Draw, generators
 
     policy, shown = made[family], seen([11], [0])
@@ -93,7 +93,7 @@ def test_sampling_is_lerobots_but_for_the_noise(made, family, monkeypatch):
             "task": [shown.instruction],
         }
     )
-    fresh = networks.get_policy_class(policy.checkpoint.type).from_pretrained(policy.checkpoint.folder)
+    fresh = checkpoint_network.get_policy_class(policy.checkpoint.type).from_pretrained(policy.checkpoint.folder)
     state = torch.get_rng_state()
     torch.set_rng_state(generators([Draw(11, 0)])[0].get_state())
     pictures = {"observation.images": batch[FRONT].unsqueeze(2)}

@@ -4,14 +4,44 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from foreign_servers import SIZE, NoisePolicy, declared_servers, observation
 
 from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
+from arena_newton.policies import PolicyUnavailable
+from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.serve.policy_server import PolicyServer
+from arena_newton.policies.serve.serve_command import open_door
+from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.rollout import Rollout
 
 DOORS = declared_servers()
 STEPS = 9
+
+
+OWN = {"arena": "http", "openpi": "openpi", "roboarena": "roboarena", "vla-eval": "vla-eval"}
+"""Protocols of this package's own server, and what stands in front of its address."""
+
+
+class OwnServer:
+    """This package's server with the same policy."""
+
+    def __init__(self, protocol, port=0):
+        self.server = PolicyServer(
+            NoisePolicy(), max_batch_size=8, max_wait=0.01, max_sessions=16, device=torch.device("cpu")
+        )
+        self.server.start("football")
+        options = ServeOptions(policy="stand", protocol=protocol, port=port)
+        self.door = open_door(self.server, options, DoorGuard(16))
+        self.url = f"{OWN[protocol]}://127.0.0.1:{self.door.port}"
+
+    def close(self):
+        self.door.close()
+        self.server.close()
+
+
+DOORS |= {f"own {protocol}": lambda protocol=protocol: OwnServer(protocol) for protocol in OWN}
 
 
 def ask(policy, seeds):
@@ -34,7 +64,8 @@ def test_actions_are_the_same_through_every_door(door):
     server = DOORS[door]()
     policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=1, backoff=0.01)
     policy.check()
-    assert not policy.depends_on_worlds and policy.describe()["server"].startswith("noise")
+    if not door.startswith("own"):
+        assert not policy.depends_on_worlds and policy.describe()["server"].startswith("noise")
     assert (policy.camera.width, policy.camera.height) == (SIZE, SIZE)
     for got, wanted in zip(ask(policy, [5, 6, 7, 8]), ask(NoisePolicy(), [5, 6, 7, 8]), strict=True):
         assert got.tobytes() == wanted.tobytes()
@@ -65,3 +96,27 @@ def test_outcomes_are_the_same_through_every_door():
         server.close()
     assert all(error is None for *_, error in ends["direct"].values()) and len(ends["direct"]) == 3
     assert all(found == ends["direct"] for found in ends.values()), ends
+
+
+@pytest.mark.parametrize("protocol", OWN)
+def test_own_server_that_was_restarted(protocol):
+    """A restarted server knows no running episode: the run stops, and the same episodes then give the same actions."""
+    server = OwnServer(protocol)
+    policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=4, backoff=0.05)
+    policy.check()
+    tasks = ["Isaac-Football"] * 2
+    policy.reset([5, 6], tasks)
+    first = policy.act(observation(2)).actions.tobytes()
+    server.close()
+    with pytest.raises(PolicyUnavailable, match="the server is (gone|closing)"):
+        policy.retries = 0
+        policy.act(observation(2))
+    policy.retries = 4
+    server = OwnServer(protocol, port=int(server.url.rpartition(":")[2]))
+    with pytest.raises(PolicyUnavailable, match="episode"):
+        policy.close()  # as the process that resumes the run
+        policy.act(observation(2))
+    policy.reset([5, 6], tasks)
+    assert policy.act(observation(2)).actions.tobytes() == first
+    policy.close()
+    server.close()

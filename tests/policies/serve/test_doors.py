@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from arena_newton.policies.serve import arena_codec, openpi_codec, vla_eval_codec
 from arena_newton.policies.serve.policy_messages import Begin, End
+from arena_newton.policies.serve.policy_server import Refused
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -403,3 +404,59 @@ def test_a_text_frame_and_a_wrong_type(served):
         client.send(msgpack.packb(frame))
         message = heard(client)
         assert message.seq == 5 and message.payload["error"].startswith("message: type action, expected episode_start")
+
+
+def test_a_closing_http_server_hangs_up(served):
+    """A connection that a client keeps is closed with the server, so that the client sees that it is gone."""
+    one = served(Remembers(), "arena")
+    kept = http.client.HTTPConnection("127.0.0.1", one.port, timeout=10)
+    kept.request("GET", "/config")
+    assert kept.getresponse().read()
+    one.close()
+    with pytest.raises((OSError, http.client.HTTPException)):
+        kept.request("GET", "/config")
+        kept.getresponse()
+    with pytest.raises(Refused, match="^the server is closing$") as caught:
+        one.server.look("a", look(step=0))
+    assert caught.value.reason == "closing"
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_strangers_are_no_news(served, protocol, capfd, caplog):
+    """Whoever opens the port and sends nothing, nonsense or half a request leaves no traceback on the console."""
+    one = served(Remembers(), protocol)
+    for data in (
+        b"",
+        b"garbage\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: x\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+    ):
+        with socket.create_connection(("127.0.0.1", one.port)) as connection:
+            connection.sendall(data)
+    assert one.http("GET", "/health")[0] == 200
+    time.sleep(0.2)
+    printed = capfd.readouterr()
+    assert not printed.out + printed.err and not caplog.records
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_an_error_of_our_own_is_on_the_console(served, protocol, capfd, monkeypatch):
+    """A fault of the server itself is printed there, and the client is hung up on without it."""
+    one = served(Remembers(), protocol)
+
+    def broken(*_, **__):
+        raise ZeroDivisionError("inside the server")
+
+    monkeypatch.setattr(one.server, "look", broken)
+    if protocol == "arena":
+        with pytest.raises((OSError, http.client.HTTPException)):
+            one.http("POST", "/infer", arena_codec.pack_look(look(step=0)))
+    else:
+        with one.socket() as client:
+            client.recv(timeout=10)
+            client.send(openpi_codec.pack_request(look(step=0)))
+            with pytest.raises(ConnectionClosed) as closed:
+                client.recv(timeout=10)
+            assert "inside the server" not in str(closed.value)
+    time.sleep(0.1)
+    assert "ZeroDivisionError: inside the server" in capfd.readouterr().err

@@ -68,7 +68,7 @@ def test_a_late_picture_keeps_its_rows(tmp_path):
 
 
 def test_actions_are_of_the_wanted_protocol(dataset, rows, tmp_path):
-    """A v3.1 dataset gives v4 as `encode_v4` makes it, a v4 dataset the same bits and v3.1 back, each its own as it is."""
+    """A v3.1 dataset gives v4 as `encode_v4` makes it, a v4 dataset the same bits, and v3.1 back."""
     about = DatasetActions(dataset)
     own = read_rows(dataset, "v3.1")
     built = make_dataset(tmp_path, labels="v4")

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import io
 import json
 import os
 import random
@@ -23,11 +24,18 @@ from safetensors.torch import load_file
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import families, training, training_loop, training_state
+from arena_newton.policies.train import (
+    families,
+    measured_training,
+    training,
+    training_bench,
+    training_loop,
+    training_state,
+)
 from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.frame_store import made_frames
-from arena_newton.policies.train.policy_options import PolicyTrainOptions
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import train
 from tests.fuzz.mutants import damaged
@@ -190,7 +198,7 @@ TESTS = str(Path(__file__).resolve().parents[2])
 
 
 def test_a_killed_training_goes_on(dataset, tmp_path):
-    """After kill -9 at any moment `last` is a whole checkpoint, and the resumed training ends as an uninterrupted one."""
+    """After kill -9 at any moment `last` is a whole checkpoint, with which the training goes on."""
     out = tmp_path / "run"
     flags = ["--recipe", "small", "--dataset", str(dataset), "--out", str(out), "--device", "cpu", "--save-every", "1"]
     process = subprocess.Popen([sys.executable, "-c", CHILD, TESTS, *flags, "--steps", "100000", "--quiet"])
@@ -279,7 +287,7 @@ def test_training_lowers_the_loss(monkeypatch):
 
 
 def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
-    """--minutes fixes the number of steps by the measured speed, and the cosine reaches its end with the last of them."""
+    """--minutes fixes the number of steps by the measured speed; with the last one the cosine reaches its end."""
     clock = [1000.0]
     monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     advance = PolicyTrainer.advance
@@ -394,6 +402,28 @@ def test_damaged_states_are_refused_by_name(whole, tmp_path, monkeypatch):
         file.write_bytes(sound)
         training_state.restore(trainer, checkpoint)
     assert refused > 100
+
+
+def test_the_bench_measures_trainings_side_by_side(monkeypatch):
+    """Each training is a process that begins when all are ready and answers a figure; a failed one is an error."""
+    program = Path(__file__).with_name("made_measurement.py")
+    monkeypatch.setattr(training_bench, "_command", lambda flags: [sys.executable, str(program), flags])
+    given = TrainingBenchOptions(recipe="small", device="cpu", trainings=(1, 3), seconds=0.1)
+    found = training_bench.bench(given)
+    assert [(count, len(figures)) for count, figures in found] == [(1, 1), (3, 3)]
+    assert all(figure.steps_per_s == 5.0 for _, figures in found for figure in figures)
+    for frames, words in ((666, "2 at once: no memory"), (667, "2 at once: a training ended with code 3")):
+        with pytest.raises(ArenaError, match=words):
+            training_bench.bench(dataclasses.replace(given, frames=frames, trainings=(2,)))
+
+
+def test_a_measured_training_counts_its_steps(monkeypatch, capsys):
+    """It says that it is ready, waits to be told, and answers the speed of real steps."""
+    monkeypatch.setattr(sys, "stdin", io.StringIO("go\n"))
+    flags = dataclasses.asdict(TrainingBenchOptions(recipe="small", device="cpu", frames=100, seconds=0.2))
+    assert measured_training.main(json.dumps(flags)) == 0
+    ready, answer = capsys.readouterr().out.splitlines()
+    assert ready == "ready" and json.loads(answer)["steps_per_s"] > 0 and not json.loads(answer)["graphed"]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

@@ -6,7 +6,8 @@ Rows are independent: each has its own noise, and its answer does not depend on 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import torch
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
@@ -15,7 +16,7 @@ from lerobot.processor import AbsoluteActionsProcessorStep
 from safetensors.torch import load_model
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot.checkpoint_reader import WEIGHTS, Checkpoint, lerobot_silent
+from arena_newton.policies.lerobot.checkpoint_reader import WEIGHTS, PolicyCheckpoint, lerobot_silent
 from arena_newton.policies.lerobot.network_noise import Draw, generators, normal
 
 __all__ = ["PolicyNetwork"]
@@ -27,7 +28,7 @@ IMAGES = "observation.images"
 class PolicyNetwork:
     """The network of a checkpoint on a device."""
 
-    def __init__(self, checkpoint: Checkpoint, device: torch.device):
+    def __init__(self, checkpoint: PolicyCheckpoint, device: torch.device):
         """Build it and load its weights.
 
         Raises:
@@ -36,13 +37,15 @@ class PolicyNetwork:
         self.checkpoint, self.device = checkpoint, device
         self.policy = _loaded(checkpoint).to(device)
         try:
-            with lerobot_silent():
+            with lerobot_silent(), _own_encoders(checkpoint):
                 self.before, self.after = make_pre_post_processors(
                     checkpoint.config,
                     pretrained_path=str(checkpoint.folder),
                     preprocessor_overrides={"device_processor": {"device": str(device)}},
                     postprocessor_overrides={"device_processor": {"device": str(device)}},
                 )
+        except InputError:
+            raise
         except Exception as error:  # LeRobot has errors of many kinds, transformers too
             raise InputError(f"{checkpoint.folder}: its processors do not load: {_first(error)}") from None
         # Only these read the state of a look, whose shape they expect in every action.
@@ -95,11 +98,11 @@ class PolicyNetwork:
         raise AssertionError(self.checkpoint.type)
 
 
-def _loaded(checkpoint: Checkpoint) -> PreTrainedPolicy:
+def _loaded(checkpoint: PolicyCheckpoint) -> PreTrainedPolicy:
     """The network with its weights on the CPU; every weight is the checkpoint's."""
     path = checkpoint.folder / WEIGHTS
     try:
-        with lerobot_silent():
+        with lerobot_silent(), _own_encoders(checkpoint):
             if checkpoint.type == "multi_task_dit":
                 from arena_newton.policies.lerobot.seeded_dit import build  # imports transformers
 
@@ -114,6 +117,18 @@ def _loaded(checkpoint: Checkpoint) -> PreTrainedPolicy:
     except Exception as error:  # safetensors has an error of its own
         raise InputError(f"{path}: does not hold the weights of this network: {_first(error)}") from None
     return policy.eval().requires_grad_(False)
+
+
+@contextmanager
+def _own_encoders(checkpoint: PolicyCheckpoint) -> Iterator[None]:
+    """Lets LeRobot build with the architecture and the tokenizer that a checkpoint of ours brings."""
+    if checkpoint.type not in ("multi_task_dit", "pi05"):
+        yield
+        return
+    from arena_newton.policies.train.encoder_sources import checkpoint_encoders  # imports transformers
+
+    with checkpoint_encoders(checkpoint.folder):
+        yield
 
 
 def _first(error: BaseException) -> str:

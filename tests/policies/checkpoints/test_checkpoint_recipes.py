@@ -1,0 +1,35 @@
+"""Checkpoints as our own trainer saves them, of every family at its smallest: they run without a hub."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from made_checkpoints import follow
+
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from arena_newton.policies.recipes.training_recipe import recipe
+from arena_newton.policies.train.families import build
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "train"))
+from made_stats import made_stats
+
+
+@pytest.mark.parametrize("family", ["act", "diffusion", "flow", "pi05"])
+def test_what_is_trained_is_run(family, tmp_path):
+    """Saved, opened and asked: the recipe's facts, and the same actions for 1, 3 and 20 worlds, bit for bit."""
+    torch.manual_seed(3)
+    model = build(recipe(family, "small"), made_stats(), "cpu")
+    model.save(tmp_path, CheckpointFacts(tasks=("boxing",), steps=1))
+    policy = LeRobotPolicy(tmp_path)
+    about = policy.describe()
+    assert (about["family"], about["recipe"], about["tasks"]) == (family, "small", ["boxing"])
+    side = (policy.camera.height, policy.camera.width)
+    seeds = (11, 12, 13)
+    few = follow(policy, seeds, 2, asks=(0, 3, 5), side=side)
+    many = follow(policy, [*range(100, 117), *seeds], 2, side=side)
+    assert all(torch.equal(few[seed], many[seed]) for seed in seeds)
+    assert torch.equal(follow(policy, [12], 2, side=side)[12], few[12])
+    assert not torch.equal(few[11], few[12])
+    assert torch.isfinite(few[11]).all()
