@@ -30,12 +30,22 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
+<<<<<<< HEAD
 _REPORTING = """__main__ action_map bench bench_figure bench_policy bench_recording bench_start certify config console
     cost_table document engines evaluated_cells folder html_report identity journal learning_loop loop_report options
     original_format paper_claims paper_numbers predicted_actions progress recording records report rerecord results
     rounds stats success_film suite_call suite_cells suite_figures suite_file suite_folder suite_options
     suite_records suite_run suite_tables table_entries table_options table_text tables tables_command
     tsne_command wording"""
+=======
+_REPORTING = """__main__ action_map bench bench_figure bench_policy bench_recording bench_start certify config
+    console cost_table document engines evaluated_cells folder html_report identity journal
+    learning_loop loop_report matrix_cells options original_format paper_claims
+    paper_numbers predicted_actions progress recording records report rerecord results rounds stats
+    success_film suite_call suite_figures suite_file suite_folder suite_options suite_records
+    suite_run suite_tables table_entries table_options table_text tables tables_command tsne_command
+    wording"""
+>>>>>>> 93a79d4971d9117fad964170f9f47ea90bd12dc7
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
@@ -54,6 +64,10 @@ UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
 
 
+LARGE_BYTES = 8 << 20
+"""From this size on a hash is kept [bytes]; nothing that is edited by hand is so large."""
+
+
 def config_hash(value: object) -> str:
     """First 12 hex digits of the SHA-256 of the canonical JSON of a value."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
@@ -61,11 +75,31 @@ def config_hash(value: object) -> str:
 
 
 def hash_path(path: Path) -> str:
-    """First 12 hex digits of the SHA-256 of a file, or of names and contents of all files in a folder."""
+    """First 12 hex digits of the SHA-256 of a file, or of names and contents of all files in a folder.
+
+    Large content, such as a checkpoint's, is read once in a process while size and time of its files stay the same.
+    """
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: is not a regular file")
-    digest = hashlib.sha256()
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    try:
+        about = [file.stat() for file in files]
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None
+    if sum(stat.st_size for stat in about) < LARGE_BYTES:
+        return _digest(path, tuple(files))
+    stamps = tuple((stat.st_size, stat.st_mtime_ns, stat.st_ino) for stat in about)
+    return _kept_digest(path.absolute(), tuple(file.absolute() for file in files), stamps)
+
+
+@functools.lru_cache(maxsize=256)
+def _kept_digest(path: Path, files: tuple[Path, ...], stamps: tuple[tuple[int, ...], ...]) -> str:
+    """The digest of files as long as their stamps are these."""
+    return _digest(path, files)
+
+
+def _digest(path: Path, files: tuple[Path, ...]) -> str:
+    digest = hashlib.sha256()
     for file in files:
         if path.is_dir():
             digest.update(file.relative_to(path).as_posix().encode() + b"\0")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import json
-from typing import Any
 
 from arena_newton.env import ArenaEnv
 from arena_newton.trackers.base import Tracker
@@ -38,7 +37,7 @@ class EnvironmentKeeper:
         self.built = 0
         """Environments built so far."""
 
-    def __call__(self, task: str, *, tracker: Tracker, **options: Any) -> LastingEnv:
+    def __call__(self, task: str, *, tracker: Tracker, **options: object) -> LastingEnv:
         """The environment of a run, whose arguments are those of `ArenaEnv`.
 
         A tracker that says the same of itself as the last one's is taken to be the same.
@@ -47,7 +46,7 @@ class EnvironmentKeeper:
         key = (task, type(tracker), said, tuple(sorted(options.items(), key=lambda item: item[0])))
         if self._env is None or self._key != key:
             self.drop()
-            self._env = LastingEnv(task, tracker=tracker, **options)
+            self._env = LastingEnv(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
             self._key, self.built = key, self.built + 1
         return self._env
 

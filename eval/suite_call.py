@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton.errors import InputError
-from arena_newton.eval.suite_cells import check_policies, dealt, expand_cells, matrix_table, parse_only, selected
+from arena_newton.eval.matrix_cells import check_policies, dealt, expand_cells, matrix_table, parse_only, selected
 from arena_newton.eval.suite_file import SuiteFile, read_suite_file, suite_path
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, read_suite

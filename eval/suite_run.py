@@ -19,10 +19,10 @@ from arena_newton.eval.config import RunConfig, resolve
 from arena_newton.eval.folder import ResultsFolder, iso, setting
 from arena_newton.eval.journal import StorageError
 from arena_newton.eval.lasting_env import EnvironmentKeeper
+from arena_newton.eval.matrix_cells import matrix_table, run_options
 from arena_newton.eval.progress import duration
 from arena_newton.eval.run import Factories, RunStopped, execute
 from arena_newton.eval.suite_call import SuiteCall
-from arena_newton.eval.suite_cells import matrix_table, run_options
 from arena_newton.eval.suite_file import SuiteFile
 from arena_newton.eval.suite_folder import SuiteFolder
 from arena_newton.eval.suite_options import MatrixOptions
@@ -36,7 +36,7 @@ CHECKED_POLICIES = ("expert", "stand", "replay")
 """Policies that are made before the first cell to be checked; others take seconds and memory, or a server."""
 OF_CODE = ("version", "code", "scenes")
 """Parts of a run's identity that another version of the product changes."""
-OF_PARTS = ("tracker_facts", "policy_facts", "worlds")
+OF_PARTS = ("tracker_facts", "policy_facts", "worlds", "labels")
 """Parts that are known only when tracker and policy were made."""
 
 

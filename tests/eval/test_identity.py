@@ -2,7 +2,9 @@
 
 import ast
 import dataclasses
+import hashlib
 import importlib
+import os
 import sys
 from pathlib import Path
 
@@ -196,3 +198,24 @@ def test_video_size_is_two_numbers():
     resolved = resolve(options)
     assert resolved.video_size == (960, 540)
     assert (resolved.flags.video_episodes, resolved.flags.follow) == (3, True)
+
+
+def test_large_files_are_read_once_until_they_change(tmp_path, monkeypatch):
+    """A large file's hash is kept; another time or size of it, or another file in its folder, is seen."""
+    monkeypatch.setattr(identity, "LARGE_BYTES", 4)
+    path = tmp_path / "model.bin"
+    path.write_bytes(b"one two")
+    first, folder = identity.hash_path(path), identity.hash_path(tmp_path)
+    assert first == hashlib.sha256(b"one two").hexdigest()[:12]
+    opened = []
+    monkeypatch.setattr(Path, "open", lambda self, *args: opened.append(self))
+    assert (identity.hash_path(path), identity.hash_path(tmp_path)) == (first, folder) and not opened
+    monkeypatch.undo()
+    monkeypatch.setattr(identity, "LARGE_BYTES", 4)
+    path.write_bytes(b"two one")
+    os.utime(path, ns=(0, 1))
+    assert identity.hash_path(path) == hashlib.sha256(b"two one").hexdigest()[:12]
+    (tmp_path / "config.json").write_bytes(b"{}")
+    assert identity.hash_path(tmp_path) != folder
+    with pytest.raises(InputError, match="cannot be read"):
+        identity.hash_path(tmp_path / "absent")
