@@ -34,20 +34,31 @@ class PolicyNetwork:
         Raises:
             InputError: The weights do not fit, a file of the processors is damaged, or a tokenizer is not there.
         """
-        self.checkpoint, self.device = checkpoint, device
-        self.policy = _loaded(checkpoint).to(device)
+        self.checkpoint = checkpoint
+        self.policy = _loaded(checkpoint)
+        self.move(device)
+
+    def move(self, device: torch.device) -> None:
+        """Bring it to a device; its processors are made again, since they hold tensors and the name of a device.
+
+        Raises:
+            InputError: A file of the processors is damaged, or a tokenizer is not there.
+        """
+        self.device = device
+        self.policy = self.policy.to(device)
+        chosen = {"device_processor": {"device": str(device)}}
         try:
-            with lerobot_silent(), _own_encoders(checkpoint):
+            with lerobot_silent(), _own_encoders(self.checkpoint):
                 self.before, self.after = make_pre_post_processors(
-                    checkpoint.config,
-                    pretrained_path=str(checkpoint.folder),
-                    preprocessor_overrides={"device_processor": {"device": str(device)}},
-                    postprocessor_overrides={"device_processor": {"device": str(device)}},
+                    self.checkpoint.config,
+                    pretrained_path=str(self.checkpoint.folder),
+                    preprocessor_overrides=chosen,
+                    postprocessor_overrides=chosen,
                 )
         except InputError:
             raise
         except Exception as error:  # LeRobot has errors of many kinds, transformers too
-            raise InputError(f"{checkpoint.folder}: its processors do not load: {_first(error)}") from None
+            raise InputError(f"{self.checkpoint.folder}: its processors do not load: {_first(error)}") from None
         # Only these read the state of a look, whose shape they expect in every action.
         self._per_tick = any(isinstance(one, AbsoluteActionsProcessorStep) and one.enabled for one in self.after.steps)
 

@@ -164,6 +164,7 @@ class LeRobotPolicy(Policy):
             "tasks": list(facts.tasks),
             "trackers": list(facts.trackers),
             "steps": facts.steps,
+            "minutes": facts.minutes,
             "seed": facts.seed,
             "datasets": [dict(one) for one in facts.datasets],
             "labels": facts.labels,
@@ -184,10 +185,11 @@ class LeRobotPolicy(Policy):
         self._network = self._memory = None
 
     def _on(self, device: torch.device) -> PolicyNetwork:
-        """The network on a device; it is loaded once, and again where it is first asked on another device."""
-        if self._network is None or self._network.device != device:
-            self._network = None  # the old one is released before the new one is built
+        """The network on a device; its weights are loaded once."""
+        if self._network is None:
             self._network = PolicyNetwork(self.checkpoint, device)
+        elif self._network.device != device:
+            self._network.move(device)
         return self._network
 
     def _remembering(self, worlds: int, device: torch.device) -> ChunkMemory:

@@ -8,6 +8,7 @@ from made_checkpoints import CHUNK, FRONT, STATE, facts, follow, save, seen
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from arena_newton.testing import check_policy
 
 FAMILIES = ("act", "diffusion", "flow", "two")
 SEEDS = (11, 12, 13)
@@ -200,6 +201,13 @@ def test_half_precision_computes_in_float32(tmp_path, checkpoints):
     rows = [follow(LeRobotPolicy(where), [11], 1)[11] for where in (folder, checkpoints["act"])]
     assert rows[0].dtype == torch.float32
     assert 0.0 < (rows[0] - rows[1]).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("family", ["act", "two"])
+def test_it_keeps_every_promise_of_a_policy(checkpoints, family):
+    """Those that `policies check` tries, with chunks averaged too."""
+    for options in ({}, {"replan": 3, "ensemble": True}):
+        check_policy(LeRobotPolicy(checkpoints[family], **options), task="boxing")
 
 
 def test_what_a_result_records(made, checkpoints):
