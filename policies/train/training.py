@@ -31,6 +31,8 @@ from arena_newton.text import counted
 
 __all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
 
+BAND_TOLERANCE = 2
+"""Rows of a pad that a codec may have brightened next to the picture [px]."""
 TOKEN_ROWS = 4096
 """Rows whose prompts are made at once."""
 
@@ -120,13 +122,12 @@ def _train(
         trainer.fix_steps(progress.steps)
     if progress is not None and checkpoint is not None:
         restore(trainer, checkpoint)
-    fit = "pad" if store.top or store.bottom else "native"
     facts = CheckpointFacts(
         labels=settings.labels,
         realign=settings.realign,
         width=store.width,
         height=store.height,
-        fit=fit,
+        fit=camera_fit(store),
         task_vector=vector,
         family=settings.family,
         recipe=settings.name,
@@ -191,6 +192,12 @@ def task_vector(store: FrameStore, settings: TrainingRecipe) -> tuple[str, ...]:
     if "" in store.tasks:
         raise InputError("--task-vector: an episode's dataset does not say which task it is of")
     return store.tasks
+
+
+def camera_fit(store: FrameStore) -> str:
+    """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
+    band = (store.height - store.width * 3 // 4) // 2
+    return "pad" if band > 0 and min(store.top, store.bottom) >= band - BAND_TOLERANCE else "native"
 
 
 def check_pictures(datasets: list[DatasetRows], settings: TrainingRecipe) -> None:

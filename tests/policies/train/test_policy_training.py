@@ -452,12 +452,12 @@ def test_a_measured_training_counts_its_steps(monkeypatch, capsys):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_a_graph_takes_the_steps_of_plain_execution(precision):
+@pytest.mark.parametrize(("precision", "latent"), [("float32", True), ("bfloat16", True), ("bfloat16", False)])
+def test_a_graph_takes_the_steps_of_plain_execution(precision, latent):
     """On CUDA: the losses of captured steps are those of steps that are not, with dropout, latent and augmentation."""
     losses = {}
     for graph in (False, True):
-        settings = recipe("act", "small", precision=precision, batch_size=8, steps=20)
+        settings = recipe("act", "small", precision=precision, batch_size=8, steps=20, network={"use_vae": latent})
         torch.manual_seed(0)
         model = families.build(settings, made_stats(), "cuda:0")
         batches = BatchMaker(made_frames(400, 64, torch.device("cuda:0")), model.normalise, model.samples)
