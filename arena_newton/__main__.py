@@ -38,7 +38,7 @@ COMMANDS = (
     Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
     Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
-    Command("policies serve", "arena_newton.policies.serve.__main__", "answer over the network: openpi, vla-eval, HTTP"),
+    Command("policies serve", "arena_newton.policies.serve.__main__", "serve a policy: openpi, vla-eval, HTTP"),
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
     Command("policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; bench"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),

@@ -11,9 +11,8 @@ import contextlib
 import importlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import warp as wp
 
@@ -97,18 +96,17 @@ def loading(engine: str, device: str, *, camera: bool) -> Iterator[None]:
                 vars(module).pop("load", None)
 
 
-def _load(module: Any, device: str) -> None:
+def _load(module: wp.Module, device: str) -> None:
     with contextlib.suppress(Exception):  # the launch that needs it says what is wrong
         wp.force_load(device, modules=[module], max_workers=0)
 
 
-def _one_at_a_time(module: Any) -> None:
+def _one_at_a_time(module: wp.Module) -> None:
     """Let one thread load a module while others wait, until the attribute is removed again."""
     lock, plain = threading.Lock(), module.load
 
-    def load(*args: Any, **kwargs: Any) -> Any:
+    def load(*args: object, **kwargs: object) -> object:
         with lock:
             return plain(*args, **kwargs)
 
-    guarded: Callable[..., Any] = load
-    module.load = guarded
+    vars(module)["load"] = load

@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 import warp as wp
@@ -129,8 +128,8 @@ def _parts(env: ArenaEnv, policy: Policy, play: Callable[[], object]) -> tuple[d
         if env.device.is_cuda:
             wp.synchronize_device(env.device)
 
-    def timed(name: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
+    def timed(name: str, work: Callable[..., object]) -> Callable[..., object]:
+        def call(*args: object, **kwargs: object) -> object:
             wait()
             began = time.perf_counter()
             try:

@@ -7,6 +7,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton import seeding
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
@@ -92,7 +93,8 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
 
     Raises:
         InputError: A folder holds neither or is damaged, two hold the same cell, none holds an episode under the
-            rules, or they differ in step budgets, scene variant or a tracker's weights.
+            rules, one holds recordings for training, or they differ in step budgets, scene variant or a tracker's
+            weights.
     """
     found: list[tuple[str, EvaluatedCell, RunRecord]] = []
     notes: list[str] = []
@@ -101,6 +103,8 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
             found += _of_suite(folder, notes)
         else:
             run = load_run(folder)
+            if run.config.get("seed_range", seeding.EVALUATION) != seeding.EVALUATION:
+                raise InputError(f"{folder}: holds recordings for training; tables are of evaluations")
             found += [(run.config["rules"], cell, run) for cell in _of_run(run)]
             if len(run.records) < run.document["planned"] and run.config.get("keep") is None:
                 notes.append(f"{folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")

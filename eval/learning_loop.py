@@ -51,7 +51,10 @@ RECORD_WORLDS = {True: 100, False: 20}
 """Episodes simulated at once, with CUDA and without."""
 FULL = {"episodes": 100, "repeats": 20, "recipe": "fast", "size": "224x224"}
 """What is left open in a loop."""
-SMALL = {"episodes": 3, "repeats": 1, "recipe": "small", "size": "64x64", "steps": 20, "max_steps": 60, "worlds": 3}
+SMALL_STEPS = 20
+"""Optimizer steps of a small loop."""
+SMALL = {"episodes": 3, "repeats": 1, "recipe": "small", "size": "64x64", "max_steps": 60, "worlds": 3}
+SMALL |= {"steps": SMALL_STEPS}
 """What is left open in one that only tries the machinery."""
 UNRESOLVED = ("out",)
 """Flags that may differ when a loop goes on."""
@@ -155,6 +158,7 @@ def _training(options: LoopOptions, out: Path) -> PolicyTrainOptions:
         seed=options.seed,
         device=str(options.device),
         weights=options.weights or "",
+        log_every=max(1, (options.steps or SMALL_STEPS) // 10) if options.small else PolicyTrainOptions.log_every,
     )
 
 

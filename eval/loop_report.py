@@ -243,9 +243,17 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
     run = load_run(out / EVALUATION)
     drawn, films, facts = _paths(curve(out / TRAINING)), _films(run), _facts(out, loop)
     rates, stages = _rate_rows(run), _stage_rows(loop)
+    notes = ["A small loop, which tries the machinery: no result."] if loop.options.get("small") is True else []
     text = [f"# The loop of {escaped(' '.join(map(str, _listed(loop.options.get('task')))))}", ""]
     text += [f"`{plain(command).replace('`', '')}`", "", "## Result", "", markdown_table(RATE_HEAD, rates, 3)]
-    text += ["## Time", "", markdown_table(["stage", "seconds", ""], stages, 1), "## What was made", ""]
+    text += [f"> {note}" for note in notes] + [
+        "",
+        "## Time",
+        "",
+        markdown_table(["stage", "seconds", ""], stages, 1),
+        "## What was made",
+        "",
+    ]
     text += [f"- {escaped(name)}: {escaped(value)}" for name, value in facts]
     if drawn is not None:
         ends = drawn["ends"]
@@ -271,6 +279,7 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
         facts=facts,
         curve=drawn,
         films=films,
+        notes=notes,
     )
     write_atomic(out / "loop.html", page)
     return out / "loop.html"

@@ -16,8 +16,8 @@ from matplotlib.colors import LinearSegmentedColormap  # noqa: E402
 
 from arena_newton.eval.journal import StorageError  # noqa: E402
 from arena_newton.eval.stats import suites  # noqa: E402
-from arena_newton.eval.suite_tables import MODE_ORDER, PAPER_NAMES, tracker_order  # noqa: E402
-from arena_newton.eval.table_entries import SuiteTable, TableEntry, percent  # noqa: E402
+from arena_newton.eval.suite_tables import MODE_ORDER, tracker_order  # noqa: E402
+from arena_newton.eval.table_entries import PAPER_NAMES, SuiteTable, TableEntry, percent  # noqa: E402
 from arena_newton.files import replace_atomically  # noqa: E402
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate
 from arena_newton.eval.stats import contrast, holm, paired_rates, suites
 from arena_newton.eval.table_entries import (
+    PAPER_NAMES,
     UNDEFINED,
     SuiteTable,
     TableEntry,
@@ -27,10 +28,8 @@ from arena_newton.eval.table_entries import (
     rate_text,
 )
 
-__all__ = ["MODE_ORDER", "PAPER_NAMES", "suite_tables", "tracker_order"]
+__all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 
-PAPER_NAMES = {"act": "ACT", "diffusion": "DP", "flow": "FM", "pi05": "π0.5"}
-"""Family → how the paper's tables name it."""
 MODE_ORDER = ("base", "visual", "semantic", "execution")
 """Order of the paper's columns."""
 HALVES = ("HOI_AVG", "HSI_AVG")

@@ -12,6 +12,7 @@ from arena_newton.eval.paper_numbers import PaperRate
 from arena_newton.eval.stats import Contrast, contrast, population_std, seed_rates, wilson
 
 __all__ = [
+    "PAPER_NAMES",
     "UNDEFINED",
     "SuiteTable",
     "TableEntry",
@@ -25,6 +26,8 @@ __all__ = [
     "rate_text",
 ]
 
+PAPER_NAMES = {"act": "ACT", "diffusion": "DP", "flow": "FM", "pi05": "π0.5"}
+"""Family → how the paper's tables name it."""
 UNDEFINED = "—"
 """Shown where a number is undefined, such as a retention of nothing."""
 

@@ -164,6 +164,7 @@ class LeRobotPolicy(Policy):
             "tasks": list(facts.tasks),
             "trackers": list(facts.trackers),
             "steps": facts.steps,
+            "minutes": facts.minutes,
             "seed": facts.seed,
             "datasets": [dict(one) for one in facts.datasets],
             "labels": facts.labels,

@@ -42,7 +42,8 @@ __all__ = ["Answer", "PolicyServer", "Refused", "ServerCounts"]
 LONGEST_ACT = 600.0
 """Time after which a waiting connection gives up on the policy [s]."""
 IDLE = 30.0
-"""Time without a request after which a session that no connection holds may lose its row to another [s]."""
+"""Time without a request after which no batch waits for a session any more, and after which one that no connection
+holds may lose its row to another [s]."""
 WARM_UP_SEED = 0
 """Seed of the look before the first one, which nobody is answered."""
 
@@ -316,8 +317,10 @@ class PolicyServer:
     def _next(self, keys: set[tuple[str, str]], end: float) -> _Job | None:
         """The next job that does not have to wait for the sessions `keys`; None where there is none until `end`."""
         with self._news:
-            # Nobody else can ask where every session already does.
-            if not self._jobs and not all(key in keys for key in self._sessions):
+            # Nobody else can ask where every session already does; those that were left behind count no more.
+            now = time.monotonic()
+            others = [s for key, s in self._sessions.items() if key not in keys and now - s.used < IDLE]
+            if not self._jobs and others:
                 self._news.wait_for(lambda: self._closed or bool(self._jobs), max(end - time.monotonic(), 0.0))
             if self._closed or not self._jobs:
                 return None

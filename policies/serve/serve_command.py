@@ -26,6 +26,9 @@ __all__ = ["make_policy", "open_door", "serve_policy"]
 
 type Say = Callable[[str], None]
 
+SPARE_CONNECTIONS = 8
+"""Connections beyond the sessions: for questions, and for those that come before an old one has ended."""
+
 
 def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.Event | None = None) -> int:
     """Serve until Ctrl-C.
@@ -42,7 +45,7 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
         InputError: A flag is wrong, or the policy cannot be served.
     """
     say = say or (lambda line: print(line, flush=True))
-    guard = DoorGuard(options.max_sessions)
+    guard = DoorGuard(options.max_sessions + SPARE_CONNECTIONS)
     tls = _tls(options)
     tasks.get(options.task)
     device = _device(options.device)

@@ -32,7 +32,7 @@ class ServeOptions:
     max_wait: float = 0.02
     """How long the first look of a batch waits for others [s]."""
     max_sessions: int = 64
-    """Most episodes at once: rows of the policy; also the number of connections."""
+    """Most episodes at once: rows of the policy. Eight connections more are taken."""
     device: str | None = None
     """Torch device of the policy: cpu, cuda, cuda:1; the best there is when none is named."""
     task: str = "boxing"

@@ -37,6 +37,7 @@ from arena_newton.policies.train.policy_model import (
     STATE,
     WEIGHTS_FILE,
     TrainableModel,
+    finished,
     new_policy,
     prepared,
 )
@@ -56,6 +57,8 @@ PADDED = {
     "model.action_out_proj.bias": 0,
 }
 """Tensors whose size is that of the action, and in which dimension."""
+BEYOND = 2.0
+"""A normalised number above all bins: the last one, which has the most digits."""
 STATE_BINS = 256
 """Bins of a number of the state in the prompt, from -1 to 1."""
 _EMBEDDING = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
@@ -125,11 +128,14 @@ class Pi05Model(TrainableModel):
         return mean
 
     def tokens(self, tasks: Sequence[str], state: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-        """Tokens of prompts with instruction and state; one that would be cut is refused."""
+        """Tokens of prompts with instruction and state; an instruction whose prompt could be cut is refused."""
         if state is None:
             raise InputError("pi05: the prompt holds the state, which was not given")
-        texts = prompts(tasks, state)
-        ids, mask = tokenized(self.tokenizer, texts, int(self.policy.config.tokenizer_max_length))
+        longest = int(self.policy.config.tokenizer_max_length)
+        known = sorted(set(tasks))
+        # Also the longest prompts that running can have, whose end LeRobot's processors would cut.
+        tokenized(self.tokenizer, prompts(known, torch.full((len(known), state.shape[-1]), BEYOND)), longest)
+        ids, mask = tokenized(self.tokenizer, prompts(tasks, state), longest)
         return {TOKENS: ids.to(self.device), MASK: mask.to(self.device)}
 
     def is_backbone(self, parameter: str) -> bool:
@@ -139,7 +145,7 @@ class Pi05Model(TrainableModel):
     def save(self, folder: Path, facts: CheckpointFacts, precision: str = "float32") -> None:
         """As of every family, with the tokenizer. A policy in bfloat16 is written as it is."""
         if not self.tokenizer_name:
-            set_tokenizer_name(self.preprocess, str((folder / TOKENIZER_FOLDER).resolve()))
+            set_tokenizer_name(self.preprocess, str(finished(folder) / TOKENIZER_FOLDER))
         super().save(folder, facts, precision)
         self.tokenizer.save_pretrained(folder / TOKENIZER_FOLDER)
         sizes = self.recipe.network.get("gemma")

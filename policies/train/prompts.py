@@ -24,14 +24,14 @@ def tokenized(
     Raises:
         InputError: A text has more tokens, so that its end would be cut.
     """
-    counts = [len(row) for row in tokenizer(texts, truncation=False)["input_ids"]]
+    found = tokenizer(texts, max_length=longest, padding="max_length", padding_side=side, truncation=False)
+    counts = [len(row) for row in found["input_ids"]]
     if max(counts) > longest:
         text = texts[counts.index(max(counts))]
         raise InputError(
             f"prompt {text[:60]!r}...: has {max(counts)} tokens, the policy reads {longest} (tokenizer_max_length)"
         )
-    found = tokenizer(texts, max_length=longest, padding="max_length", padding_side=side, return_tensors="pt")
-    return found["input_ids"], found["attention_mask"].bool()
+    return torch.tensor(found["input_ids"]), torch.tensor(found["attention_mask"], dtype=torch.bool)
 
 
 def set_tokenizer_name(pipeline: PolicyProcessorPipeline, name: str) -> None:

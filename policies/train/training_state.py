@@ -149,6 +149,7 @@ def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, 
         state = growing / TRAINING_STATE_DIR
         state.mkdir(parents=True)
         trainer.model.save(growing / PRETRAINED_MODEL_DIR, facts)
+        _say_final_paths(growing, final)
         _write_optimizer(trainer.optimizer, state)
         save_rng_state(state)
         step = {"step": progress.step, "num_processes": progress.processes, "batch_size": progress.batch_size}
@@ -205,6 +206,15 @@ def restore(trainer: PolicyTrainer, checkpoint: Path) -> None:
             own[name].copy_(tensor)
     _read_optimizer(trainer.optimizer, checkpoint / TRAINING_STATE_DIR)
     trainer.step = TrainingProgress.read(checkpoint).step
+
+
+def _say_final_paths(growing: Path, final: Path) -> None:
+    """Let a policy's files name the folder that will be: those of some families say where their encoders lie."""
+    before, after = (json.dumps(str(folder.resolve()))[1:-1] for folder in (growing, final))
+    for file in (growing / PRETRAINED_MODEL_DIR).glob("*.json"):
+        text = file.read_text()
+        if before in text:
+            file.write_text(text.replace(before, after))
 
 
 def _write_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:

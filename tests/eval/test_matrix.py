@@ -175,6 +175,32 @@ def test_interrupt_says_how_to_go_on(suite, tmp_path, capsys):
     assert read_suite(out).cells[0].status == "started"
 
 
+class Killed(BaseException):
+    """Stands for `kill -9`: nothing is written after it."""
+
+
+@pytest.mark.parametrize("moment", [1, 2, 4, 7, 11, 16, 22, 29, 37])
+def test_a_kill_at_any_moment_loses_nothing(suite, played, tmp_path, monkeypatch, moment):
+    """The process dies at its n-th write to the disk: what was journalled is whole, the same command completes it."""
+    out, only = tmp_path / "out", ("--only", "task=boxing policy=still,expert mode=base")
+    writes = 0
+
+    def dying(file):
+        nonlocal writes
+        writes += 1
+        if writes >= moment:
+            raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(os, "fsync", dying)
+        call(suite, out, *only)
+    if (out / "suite.json").exists():
+        done = [cell for cell in read_suite(out).cells if cell.status == "done"]
+        assert all(len(load_cell(read_suite(out), cell).records) == 4 for cell in done)
+    assert call(suite, out, *only) == 0
+    assert journals(out) == {name: journals(played)[name] for name in journals(out)} and len(journals(out)) == 2
+
+
 def test_limit_and_only_play_their_cells(suite, tmp_path, capsys):
     """--limit counts cells that are played in this call; --only narrows them; the rest waits."""
     out = tmp_path / "out"

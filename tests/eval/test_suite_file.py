@@ -129,10 +129,12 @@ def test_conditions_are_in_the_id(tmp_path):
 LEARNED = """[matrix]
 tasks = ["boxing", "vis_navi"]
 trackers = ["twist2", "sonic"]
+latency = [0, 5, 20]
 [[policies]]
 name = "act"
 spec = "lerobot:{at}/act_{{task}}_{{tracker}}"
 trained_on = ["twist2", "sonic"]
+latency = 0
 [[policies]]
 name = "both"
 spec = "lerobot:{at}/both"
@@ -153,7 +155,7 @@ def checkpoints(tmp_path, monkeypatch):
     for name, said in facts.items():
         folder = tmp_path / name / "checkpoints/last/pretrained_model"
         folder.mkdir(parents=True)
-        (folder / "config.json").write_text("{}")
+        (folder / "config.json").write_text('{"n_action_steps": 20, "horizon": 40}')
         (folder / "model.safetensors").write_bytes(b"")
         said.write(folder)
     path = tmp_path / "learned.toml"
@@ -162,7 +164,9 @@ def checkpoints(tmp_path, monkeypatch):
 
 
 def learned(path):
-    """The cells of a suite file, held to their checkpoints."""
+    """The cells of a suite file, held to their checkpoints; without latency where its last entry says none."""
+    if "latency" not in path.read_text().split("[[policies]]")[-1]:
+        path.write_text(path.read_text() + "\nlatency = 0\n")
     suite = read_suite_file(path)
     return check_policies(suite, expand_cells(suite))
 
@@ -194,6 +198,9 @@ def test_one_entry_names_a_checkpoint_per_task_and_tracker(checkpoints):
             "trained_tasks is boxing vis_navi football",
         ),
         (lambda s: s.replace("{task}_", "boxing_"), r"trained on boxing, cell act.twist2/twist2/vis_navi/base plays"),
+        (lambda s: s + "latency = 20", "cell both.*latency20: latency is 20 ticks, 20 actions of each chunk"),
+        (lambda s: s + "replan = 41", "replan is 41, the checkpoint predicts 40 actions"),
+        (lambda s: s + "replan = 5\nlatency = 5", "latency is 5 ticks, 5 actions of each chunk are executed"),
         (
             lambda s: s[: s.rindex("trained_on")] + 'trained_on = "sonic"',
             "trained_on is sonic, but checkpoint .* says twist2 sonic",
@@ -210,6 +217,7 @@ def test_checkpoints_are_looked_at_first(checkpoints, change, said):
 def test_a_dry_run_shows_what_is_absent(checkpoints, tmp_path, capsys):
     """A dry run prints the matrix, then what is absent, with code 2; --only asks for its own cells' alone."""
     (tmp_path / "both").rename(tmp_path / "moved")
+    checkpoints.write_text(checkpoints.read_text() + "latency = 0\n")
     command = ["matrix", str(checkpoints), "--dry-run", "--out", str(tmp_path / "out")]
     assert main(command) == 2
     said = capsys.readouterr()

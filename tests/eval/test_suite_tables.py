@@ -267,6 +267,9 @@ def test_cells_that_one_table_must_not_mix(tmp_path):
         read_cells([tmp_path / "a", tmp_path / "b"])
     with pytest.raises(InputError, match="max_steps is 1300, in"):
         read_cells([tmp_path / "a", tmp_path / "c"])
+    write_cell(tmp_path / "d", cell, [], seed_range="demonstration")
+    with pytest.raises(InputError, match="d: holds recordings for training; tables are of evaluations"):
+        read_cells([tmp_path / "d"])
 
 
 def test_command_writes_the_same_bytes_again(suite, tmp_path, capsys):
@@ -371,6 +374,10 @@ def test_findings_follow_the_data(cells):
     assert found["perturbation: visual against execution"].verdict == "not measured"
     assert found["cross-GMT: twist2 → sonic"].verdict == "reproduces"
     assert found["cross-GMT: twist2 → sonic"].paper == "+39.9 points on average; nothing left in 22 of 28 cells"
+    said = "twist2 HOI: FM 36.1 %; twist2 HSI: FM 58.8 %; sonic HOI: DP 52.2 %; sonic HSI: DP 65.8 %"
+    assert found["tracker-conditioned: best family"].paper == said
+    assert found["tracker-conditioned: same family"].paper == "most: FM sit_sofa, 68.3 % with TWIST2, 15.0 % with SONIC"
+    assert found["SR and AFR disagree: sonic"].paper == "highest success: DP, fewest falls: π0.5 (5.24 %)"
     assert found["tracker-conditioned: SONIC ahead on HSI"].verdict == "not measured"
     assert found["tracker-conditioned: SONIC ahead on HOI"].paper == "+16.1 points"
     assert "## cross-GMT: twist2 → sonic: reproduces" in paper_claims.findings_text(list(found.values()))

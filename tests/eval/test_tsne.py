@@ -240,3 +240,24 @@ def test_datasets_without_a_common_task(made, tmp_path):
     pyarrow.parquet.write_table(table.set_column(0, "observation.state", bad), path)
     with pytest.raises(InputError, match="a state is not finite"):
         DatasetObservations(other).sample("football", 4, 2)
+
+
+def test_a_checkpoint_goes_through_its_own_pipeline(made, tmp_path, capsys):
+    """A Diffusion Policy with random weights answers each observation with the noise of that observation alone."""
+    checkpoints = pytest.importorskip("tests.policies.checkpoints.made_checkpoints")
+    known = checkpoints.facts(family="diffusion")
+    folder = checkpoints.save(tmp_path / "dp", "diffusion", facts=known, num_inference_steps=2)
+    data = DatasetObservations(made[0][0])
+    samples = data.sample("boxing", 4, 1)
+    policy = policies.get(f"lerobot:{folder}")
+    policy.check()
+    found = predict(policy, data, samples, batch=3)
+    assert found.shape == (4, ACTION_WIDTH) and np.isfinite(found).all()
+    assert np.array_equal(found, predict(policy, data, samples, batch=2))
+    assert not np.array_equal(found, predict(policy, data, samples, batch=3, seed=1))
+    flags = ["--policy", f"lerobot:{folder}", "--datasets", *(str(root) for root, _ in made)]
+    assert (
+        main(["tsne", *flags, "--samples", "8", "--frames", "2", "--batch", "8", "--out", str(tmp_path / "out")]) == 0
+    )
+    assert json.loads((tmp_path / "out" / "tsne.json").read_text())["policy"]["family"] == "diffusion"
+    assert "boxing: 8 + 8 observations" in capsys.readouterr().out

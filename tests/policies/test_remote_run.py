@@ -56,7 +56,7 @@ def test_password_in_the_address_is_nowhere(tmp_path, monkeypatch, capsys, comma
 
 
 @pytest.mark.parametrize("command", [[], ["list"]])
-@pytest.mark.parametrize("spec", ["lerobot:someone/policy", "http://user:sekret@localhost", "dance"])
+@pytest.mark.parametrize("spec", ["gizmo:someone/policy", "http://user:sekret@localhost", "dance"])
 def test_unknown_policy(tmp_path, monkeypatch, capsys, command, spec):
     """A policy that nobody offers is called unknown, whatever stands behind the colon."""
     monkeypatch.chdir(tmp_path)

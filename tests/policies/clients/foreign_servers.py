@@ -119,7 +119,7 @@ class Recorder:
 class SocketServer(Recorder):
     """openpi's, RoboArena's or vla-eval's server."""
 
-    def __init__(self, protocol, declared=None, port=0, metadata=None, config=None):
+    def __init__(self, protocol, declared=None, port=0, metadata=None, config=None, ssl=None):
         super().__init__()
         self.protocol, self.declared, self.metadata, self.config = protocol, declared, metadata, config
         talk = {"openpi": self.openpi, "roboarena": self.openpi, "vla-eval": self.vla_eval}[protocol]
@@ -130,6 +130,7 @@ class SocketServer(Recorder):
             compression=None,
             max_size=None,
             process_request=self.page,
+            ssl=ssl,
         )
         self.port = self.server.socket.getsockname()[1]
         self.url = f"{protocol}://127.0.0.1:{self.port}"

@@ -1,7 +1,10 @@
 """Servers that fail: only the world concerned ends as an error, nothing waits forever, a run stops where it must."""
 
 import json
+import shutil
 import socket
+import ssl
+import subprocess
 import threading
 import time
 
@@ -124,8 +127,8 @@ def test_failed_reset_ends_its_world(running):
     policy = client(running)
     running.behave = {"reset": True}
     policy.reset([1, 2, 3], ["Isaac-Football"] * 3, np.array([False, True, False]))
-    running.behave = {}
     chunk = policy.act(observation(3))
+    running.behave = {}  # not before: vla-eval's server answers no beginning, and may read it late
     if running.url.startswith("openpi"):  # it has no beginning
         assert chunk.errors == {}
     else:
@@ -266,6 +269,21 @@ def test_bad_row_of_gr00t():
     server.close()
 
 
+def test_broken_state_is_not_sent_with_others():
+    """A world whose state is not finite is an error by itself and spoils no batch."""
+    server = started("gr00t")
+    policy = client(server)
+    server.seen.clear()
+    seen = observation(3)
+    seen.state[1, 5] = float("nan")
+    chunk = policy.act(seen)
+    assert set(chunk.errors) == {1} and "not finite" in chunk.errors[1]
+    ((_, data),) = server.seen
+    assert len(data["observation"]["state"]["joint_pos"]) == 2
+    policy.close()
+    server.close()
+
+
 def raw_server(reply):
     """A server that sends fixed bytes when it is asked."""
     listening = socket.create_server(("127.0.0.1", 0), backlog=64)
@@ -383,3 +401,29 @@ def test_close_breaks_off_what_waits(running):
     policy.close()
     asking.join(5.0)
     assert not asking.is_alive()
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate (Debian: openssl)")
+@pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
+def test_wss(protocol, tmp_path):
+    """A certificate that nobody vouches for is refused before the first episode, or taken on request."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    make = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=localhost -keyout"
+    subprocess.run([*make.split(), str(key), "-out", str(certificate)], check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    server = SocketServer(protocol, facts(), ssl=context)
+    url = f"{protocol}+wss://127.0.0.1:{server.port}"
+    policy = policies.get(f"remote:{url}", timeout=3.0, retries=0)
+    with pytest.raises(InputError, match="--remote-insecure does without"):
+        policy.check()
+    policy.close()
+    policy = policies.get(f"remote:{url}", timeout=3.0, retries=0, verify_ssl=False)
+    policy.check()
+    policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
+    server.behave = {1.0: "slow"}
+    policy.timeout = 0.5
+    chunk = policy.act(observation(3))
+    assert set(chunk.errors) == {1} and "no reply within 0.5 s" in chunk.errors[1]
+    policy.close()
+    server.close()

@@ -93,6 +93,27 @@ def test_the_same_look_again_is_not_a_new_one(made):
     assert np.array_equal(third, episode(made(Remembers()), "a", 1, [0.1, 0.2, 0.3])[2])
 
 
+def test_another_look_at_the_same_step_is_a_new_one(made):
+    """What was answered is remembered for the same content only."""
+    server = made(Remembers())
+    chunks = episode(server, "a", 1, [0.1, 0.2])
+    assert not np.array_equal(server.look("a", look(0.7, seed=1, step=4)).actions, chunks[1])
+    assert server.counts.repeated == 0 and server.counts.looks == 3
+
+
+def test_a_session_is_in_a_batch_once(made):
+    """Looks of one session that come at the same time are answered one after the other, each from its own content."""
+    server = made(Remembers(), max_wait=0.3)
+    for owner in ("a", "b"):  # while b asks nothing, the batch of a is open
+        server.begin(owner, Begin("", 1, "boxing"))
+    first, second = together(
+        lambda: server.look("a", look(0.1)).actions,
+        lambda: (time.sleep(0.1), server.look("a", look(0.2)).actions)[1],
+    )
+    assert np.array_equal([first, second], episode(made(Remembers()), "a", 1, [0.1, 0.2]))
+    assert server.counts.batches == {1: 2}
+
+
 def test_step_zero_begins_an_episode(made):
     """A look of step 0 begins an episode where none was announced, with its seed, and again after others."""
     server = made(Remembers())

@@ -1,5 +1,6 @@
 """The command: flags, what it says, how it ends, and that a policy behind it is the policy itself."""
 
+import importlib.util
 import json
 import os
 import shutil
@@ -193,3 +194,21 @@ def test_the_http_client_of_the_evaluation(served, sees):
         assert all(np.array_equal(a, b) for a, b in zip(got, expected, strict=True))
     remote.close()
     assert max(one.server.counts.batches) > 1
+
+
+def test_a_missing_extra(capsys, monkeypatch):
+    """Without the extra `serve` the command says so in one line, with the command that installs it."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name == "msgpack" else find(name, *more)
+    )
+    assert main(["--policy", "stand", "--port", "0"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("error: policies serve: needs the extra [serve] (msgpack is not")
+
+
+def test_a_bare_installation_reads_handshakes():
+    """The HTTP client's codec and the handshake import neither msgpack nor websockets."""
+    code = "import sys, arena_newton.policies.serve.arena_codec, arena_newton.policies.serve.handshake; "
+    code += "sys.exit(bool({'msgpack', 'websockets'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

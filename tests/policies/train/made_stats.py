@@ -30,7 +30,7 @@ def made_batch(model: TrainableModel, rows: int = 2, tasks: int = 0, seed: int =
     size, count = model.recipe.picture, len(model.samples)
     pictures = torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8)
     batch: dict[str, object] = {
-        "observation.images.front": model.normalise("observation.images.front", pictures),
+        "observation.images.front": model.normalise("observation.images.front", pictures.to(model.device)),
         "observation.state": torch.randn(rows, STATE, generator=generator).clamp(-1, 1),
         "action": torch.randn(rows, count, ACTION, generator=generator).clamp(-1, 1),
         "action_is_pad": torch.zeros(rows, count, dtype=torch.bool),
@@ -38,6 +38,7 @@ def made_batch(model: TrainableModel, rows: int = 2, tasks: int = 0, seed: int =
     batch["action_is_pad"][-1, -3:] = True
     if tasks:
         batch["observation.environment_state"] = torch.eye(tasks)[torch.arange(rows) % tasks]
+    batch = {name: value.to(model.device) for name, value in batch.items()}
     if model.reads_task:
         words = ["Open the door.", "Sit on the sofa."]
         batch |= model.tokens([words[i % 2] for i in range(rows)], batch["observation.state"])

@@ -46,10 +46,20 @@ from tests.policies.train.small_dataset import info, make_dataset
 STEPS = 8
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Work this small is slower in two threads, on a busy machine by far."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(autouse=True)
 def narrow(monkeypatch):
     """A vision encoder that trains in milliseconds."""
     narrow_network.install(monkeypatch.setattr)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
 def options(data, out, **changes):
@@ -159,7 +169,7 @@ def test_a_stopped_training_goes_on_to_the_same_bits(dataset, whole, tmp_path, m
 
 
 def test_a_finished_training_is_not_repeated(whole, monkeypatch):
-    """Resumed, it gives its checkpoint at once, without reading the data; with more steps it goes on."""
+    """Resumed, it gives its checkpoint at once, without reading the data."""
     monkeypatch.setattr(training, "read_rows", lambda *_: pytest.fail("reads the data"))
     assert train(PolicyTrainOptions(resume=whole)) == whole / "checkpoints" / "000008" / "pretrained_model"
 
@@ -315,6 +325,21 @@ def test_two_datasets_and_a_task_vector(dataset, tmp_path):
     assert features["observation.environment_state"].shape == (2,)
 
 
+@pytest.mark.parametrize("family", ["diffusion", "flow", "pi05"])
+def test_every_family_is_trained_and_goes_on(dataset, tmp_path, family):
+    """Two steps, a held-out loss, and a resumed third; no file of the checkpoint names the folder that it grew in."""
+    pytest.importorskip("diffusers")
+    out = tmp_path / "run"
+    train(options(dataset, out, policy=family, steps=2, hold_out=1, hold_out_every=1, log_every=1, save_every=0))
+    assert [bool(row["held_out_loss"]) for row in rows(out)] == [True, True]
+    folder = train(PolicyTrainOptions(resume=out, steps=3, quiet=True))
+    assert folder.parent.name == "000003" and CheckpointFacts.read(folder).family == family
+    assert not [file for file in folder.glob("*.json") if ".part" in file.read_text()]
+    tokenizers = [json.loads((folder / "policy_preprocessor.json").read_text())]
+    named = [step["config"].get("tokenizer_name") for step in tokenizers[0]["steps"]]
+    assert all(Path(name).is_dir() for name in named if name)
+
+
 def test_a_loss_that_is_not_finite_ends_the_training(dataset, tmp_path, monkeypatch):
     """It is an error that names the step and keeps the last checkpoint."""
 
@@ -368,7 +393,7 @@ def test_a_folder_is_not_overwritten_nor_mixed(dataset, whole, tmp_path, capsys)
         assert main(flags) == 2
         assert words in capsys.readouterr().err
     other = make_dataset(tmp_path, lengths=(22, 23))
-    assert main(["--resume", str(whole), "--dataset", str(other)]) == 2
+    assert main(["--resume", str(whole), "--dataset", str(other), "--steps", "20"]) == 2
     assert "the content is not that of the datasets which the training began with" in capsys.readouterr().err
     assert same(weights(whole), before)
 

@@ -1,0 +1,64 @@
+"""What docs/serving.md says of clients is so: protocols, ports, keys and limits."""
+
+import re
+from pathlib import Path
+
+from arena_newton.canonical import ACTION, STATE
+from arena_newton.policies.remote_address import DOORS, TOKEN_VARIABLE
+from arena_newton.policies.remote_client import MAX_FAILURES, MAX_REPLY
+from arena_newton.policies.remote_gr00t import Gr00tPolicy
+from arena_newton.policies.remote_openpi import ROBOARENA_IMAGE_KEY, OpenpiPolicy
+from arena_newton.policies.remote_vla_eval import VlaEvalPolicy
+from arena_newton.policies.serve import openpi_codec
+from arena_newton.policies.serve.handshake import RATE, ServedFacts, expected_facts
+
+ROOT = Path(__file__).parents[3]
+TEXT = (ROOT / "docs" / "serving.md").read_text().split("## Asking other servers")[1].split("\n## ")[0]
+PLAIN = " ".join(TEXT.split())
+
+
+def rows(title):
+    """Cells of the table whose first header cell is `title`."""
+    lines = TEXT[TEXT.index(f"| {title} |") :].split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_protocols_and_ports():
+    """Every protocol is in the table, with its usual port and the extra that it needs."""
+    named = {}
+    for doors, _, ports, _ in rows("`--policy remote:`"):
+        found = re.findall(r"`([\w+-]+)://", doors)
+        named |= dict(zip(found, ports.split(", "), strict=True))
+    assert set(named) <= set(DOORS) and {door for door in DOORS if "+" not in door} <= set(named)
+    assert all(int(port) == DOORS[door][2] for door, port in named.items())
+
+
+def test_keys_and_limits():
+    """Keys, names of slices and numbers are those of the code."""
+    keys = (openpi_codec.IMAGE_KEY, openpi_codec.STATE_KEY, openpi_codec.PROMPT_KEY, ROBOARENA_IMAGE_KEY)
+    assert all(f"`{key}`" in TEXT for key in keys)
+    assert ", ".join(f"`{name}`" for name in STATE) in PLAIN and ", ".join(f"`{name}`" for name in ACTION) in PLAIN
+    assert f"at most {MAX_REPLY >> 20} MiB" in PLAIN and f"{MAX_FAILURES} requests in a row" in PLAIN
+    assert f"must be {RATE:g}" in PLAIN and TOKEN_VARIABLE in PLAIN
+    sizes = [(c.camera.width, c.camera.height, c.camera.fit) for c in (OpenpiPolicy, VlaEvalPolicy, Gr00tPolicy)]
+    assert sizes == [(224, 224, "pad"), (224, 224, "pad"), (640, 480, "native")]
+    assert "224×224 with black bars (openpi, vla-eval)" in PLAIN and "640×480 for GR00T" in PLAIN
+
+
+def test_declarations():
+    """The table has every key of a declaration that is compared or followed."""
+    said = set(re.findall(r"`(\w+)`", " ".join(row[0] for row in rows("declared"))))
+    known = set(ServedFacts(**{name: () for name in ("action_names", "state_names")}).to_json())
+    known |= {"labels", "realign", "picture", "needs_picture", "chunk_length", "rate_hz"}
+    known |= {"action_names", "state_names"}
+    assert said == known - {"arena", "batched"} and expected_facts().rate_hz == RATE
+
+
+def test_links():
+    """Files and headings that the section links to exist."""
+    for target in re.findall(r"\]\(([^)]+)\)", TEXT):
+        file, _, heading = target.partition("#")
+        page = ROOT / "docs" / file if file else ROOT / "docs" / "serving.md"
+        assert page.is_file(), target
+        titles = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+        assert not heading or heading in {re.sub(r"[^\w -]", "", t.lower()).replace(" ", "-") for t in titles}, target
