@@ -205,6 +205,20 @@ def test_another_policy_after_a_restart():
     server.close()
 
 
+def test_greeting_that_broke_after_a_restart():
+    """A connection that greeted with garbage is not asked: the next request opens another one."""
+    server = started("openpi")
+    policy = client(server, retries=0)
+    server.close()
+    server = SocketServer("openpi", metadata=b"\xc1\xff", port=server.port)
+    for _ in range(2):
+        chunk = policy.act(observation(3))
+        assert set(chunk.errors) == {0, 1, 2} and "not MessagePack" in chunk.errors[0]
+    assert server.seen == []
+    policy.close()
+    server.close()
+
+
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "http"])
 def test_episode_that_the_server_does_not_know(protocol):
     """A server that says that it does not know the running episode stops the run."""
