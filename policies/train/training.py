@@ -14,7 +14,7 @@ import torch
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import tqdm
 
-from arena_newton.errors import InputError
+from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
 from arena_newton.policies.train import families
@@ -65,8 +65,14 @@ def train(options: PolicyTrainOptions) -> Path:
     if options.resume is None and any(one.name.isdigit() for one in out.glob("checkpoints/*")):
         raise InputError(f"--out {out}: holds a training already; --resume {out} goes on with it")
     device, processes = chosen_device(options.device)
-    with _group(device, processes), fast_kernels(device):
-        return _train(options, settings, out, device, processes, progress, checkpoint)
+    try:
+        with _group(device, processes), fast_kernels(device):
+            return _train(options, settings, out, device, processes, progress, checkpoint)
+    except torch.OutOfMemoryError as error:
+        told = " ".join(str(error).split())[:160]
+        raise ArenaError(
+            f"{device}: its memory is full ({told}); try a smaller --batch-size, or fewer datasets"
+        ) from None
 
 
 def _train(

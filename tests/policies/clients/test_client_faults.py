@@ -269,6 +269,21 @@ def test_bad_row_of_gr00t():
     server.close()
 
 
+def test_broken_state_is_not_sent_with_others():
+    """A world whose state is not finite is an error by itself and spoils no batch."""
+    server = started("gr00t")
+    policy = client(server)
+    server.seen.clear()
+    seen = observation(3)
+    seen.state[1, 5] = float("nan")
+    chunk = policy.act(seen)
+    assert set(chunk.errors) == {1} and "not finite" in chunk.errors[1]
+    ((_, data),) = server.seen
+    assert len(data["observation"]["state"]["joint_pos"]) == 2
+    policy.close()
+    server.close()
+
+
 def raw_server(reply):
     """A server that sends fixed bytes when it is asked."""
     listening = socket.create_server(("127.0.0.1", 0), backlog=64)
