@@ -1,0 +1,81 @@
+"""bench --what policy and start: parts add up, bars are judged at full size only, a start that fails is said."""
+
+import json
+import subprocess
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval import bench_policy, bench_start
+from arena_newton.eval.options import BenchOptions
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.policies.recipes.training_recipe import recipe
+from arena_newton.policies.train import families
+
+
+def small(folder):
+    """A tiny ACT that sees 64x64 pictures and answers v4."""
+    settings = recipe("act", "small")
+    ones = {
+        name: {"mean": torch.zeros(n), "std": torch.ones(n), "min": -torch.ones(n), "max": torch.ones(n)}
+        | {"q01": -torch.ones(n), "q99": torch.ones(n)}
+        for name, n in (("observation.state", 64), ("action", 40))
+    }
+    facts = CheckpointFacts(labels="v4", width=64, height=64, family="act", recipe="small")
+    families.build(settings, ones, "cpu").save(folder, facts)
+    return folder
+
+
+def test_parts_of_a_tick_are_measured(tmp_path, monkeypatch):
+    """Every part takes time, together no more than the whole; the environment keeps its own methods afterwards."""
+    monkeypatch.setattr(bench_policy, "WARM_UP", 2)
+    parts, made = bench_policy._parts, []
+
+    def kept(env, policy, play):
+        found = parts(env, policy, play)
+        made.append((env, policy, *found))
+        return found
+
+    monkeypatch.setattr(bench_policy, "_parts", kept)
+    options = BenchOptions(
+        policy_checkpoint=str(small(tmp_path / "act")), policy_tasks=("boxing",), policy_episodes=1, policy_steps=4
+    )
+    (figure,) = bench_policy.policy_figures(options)
+    ((env, policy, spent, whole),) = made
+    assert set(spent) == set(bench_policy.PARTS) and all(seconds > 0 for seconds in spent.values())
+    assert sum(spent.values()) <= whole
+    assert "step" not in vars(env.physics) and "act" not in vars(policy) and "render" not in vars(env)
+    assert figure.verdict == "-" and "physics" in figure.note and "4 ticks" in figure.note
+
+
+def test_a_checkpoint_that_is_not_there_is_named():
+    """A wrong --policy-checkpoint is bad input, not a figure that was missed."""
+    with pytest.raises(InputError, match="nowhere"):
+        list(bench_policy.policy_figures(BenchOptions(policy_checkpoint="/nowhere", policy_tasks=("boxing",))))
+
+
+def test_three_starts_with_two_caches(monkeypatch):
+    """The second start has the first one's cache, the third an empty one and one thread; off CUDA nothing is judged."""
+    calls = []
+
+    def fake(command, env, **options):
+        calls.append((env["WARP_CACHE_PATH"], command[-1]))
+        return SimpleNamespace(returncode=0, stderr="", stdout=json.dumps({"environment": 0.0}) + "\n")
+
+    monkeypatch.setattr(subprocess, "run", fake)
+    figures = list(bench_start.start_figures(BenchOptions()))
+    caches = [cache for cache, _ in calls]
+    assert caches[0] == caches[1] != caches[2] and calls[2][1].endswith(", 1)") and calls[0][1].endswith(", 0)")
+    assert [figure.bar for figure in figures] == [40.0, 8.0]
+    assert torch.cuda.is_available() or [figure.value for figure in figures] == [None, None]
+
+
+def test_a_start_that_fails_says_why(monkeypatch):
+    """The last words of the process are in the error."""
+    monkeypatch.setattr(
+        subprocess, "run", lambda *a, **k: SimpleNamespace(returncode=1, stderr="no\nmemory left", stdout="")
+    )
+    with pytest.raises(ArenaError, match="the first tick was not reached: no memory left"):
+        list(bench_start.start_figures(BenchOptions()))
