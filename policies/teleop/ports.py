@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 
 from arena_newton.errors import InputError
@@ -26,6 +27,12 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, port), family=family)
+    except socket.gaierror as error:
+        raise InputError(
+            f"--host {host}: no address of this machine ({(error.strerror or '').partition(' (')[0]})"
+        ) from None
     except (OSError, OverflowError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRNOTAVAIL:
+            raise InputError(f"--host {host}: no address of this machine") from None
         reason = error.strerror if isinstance(error, OSError) else "no such port"
         raise InputError(f"{flag} {port}: cannot be served at {host} ({reason}); name another port") from None
