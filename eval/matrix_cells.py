@@ -228,10 +228,10 @@ def check_policies(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCe
     entries = {entry.name: entry for entry in suite.policies}
     problems: dict[str, str] = {}
     facts: dict[str, CheckpointFacts | None] = {}
-    chunks: dict[str, int | None] = {}
+    chunks: dict[str, tuple[int | None, int | None]] = {}
     for cell in cells:
         if cell.spec not in facts:
-            facts[cell.spec] = chunks[cell.spec] = None
+            facts[cell.spec], chunks[cell.spec] = None, (None, None)
             try:
                 facts[cell.spec], chunks[cell.spec] = _said(cell.spec, entries[cell.policy])
             except InputError as error:
@@ -244,30 +244,42 @@ def check_policies(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCe
         where, known = f"{suite.path}: [[policies]] {cell.policy}", facts[cell.spec]
         if cell.spec.partition(":")[0] == "expert" and tasks.get(cell.task).expert is None:
             raise InputError(f"{where}: task {cell.task} has no expert; leave it out with tasks, or in [[cells]]")
-        chunk = chunks[cell.spec]
-        if chunk is not None and not cell.latency < (cell.replan or chunk) <= chunk:
-            raise InputError(
-                f"{where}: cell {cell.id}: latency {cell.latency} and replan {cell.replan or chunk} do not fit "
-                f"chunks of {chunk} actions; fewer ticks than executed actions, no more actions than a chunk has"
-            )
+        _check_chunk(f"{where}: cell {cell.id}", cell, *chunks[cell.spec])
         found.append(cell if known is None else _with_facts(where, cell, entries[cell.policy], known))
     return found
 
 
-def _said(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, int | None]:
-    """What the checkpoint of a spec says of itself, where it is one of ours, and how long its executed chunks are."""
+def _check_chunk(where: str, cell: SuiteCell, executed: int | None, predicted: int | None) -> None:
+    """Refuse more actions than a checkpoint predicts, and a latency that leaves nothing of what is executed."""
+    if cell.replan is not None and predicted is not None and cell.replan > predicted:
+        raise InputError(f"{where}: replan is {cell.replan}, the checkpoint predicts {predicted} actions")
+    length = cell.replan or executed
+    if length is not None and not cell.ensemble and cell.latency >= length:
+        raise InputError(
+            f"{where}: latency is {cell.latency} ticks, {length} actions of each chunk are executed; expected fewer"
+        )
+
+
+def _said(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, tuple[int | None, int | None]]:
+    """What the checkpoint of a spec says of itself, and of how many actions it executes and predicts at most.
+
+    None for what it does not say, such as one that is somebody else's.
+    """
     policies.check_spec(spec)
     scheme, _, argument = spec.partition(":")
     if scheme != CHECKPOINTS or entry.hub:
-        return None, None
+        return None, (None, None)
     folder = _checkpoint(argument)
     path = folder / CONFIG_FILE
     try:
         config = parse(read_regular(path.resolve(), MAX_CONFIG_BYTES))
     except ValueError as error:
         raise InputError(f"{path}: not readable as JSON ({error})") from None
-    chunk = config.get("n_action_steps") if isinstance(config, dict) else None
-    return CheckpointFacts.read(folder), chunk if isinstance(chunk, int) and chunk > 0 else None
+    sizes: list[int | None] = []
+    for keys in (("n_action_steps",), ("chunk_size", "horizon")):
+        values = [config.get(key) for key in keys] if isinstance(config, dict) else []
+        sizes.append(next((value for value in values if type(value) is int and value > 0), None))
+    return CheckpointFacts.read(folder), (sizes[0], sizes[1])
 
 
 def _checkpoint(argument: str) -> Path:

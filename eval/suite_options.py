@@ -31,7 +31,7 @@ class MatrixOptions:
     keep_going: bool = False
     """When a cell cannot be played, go on with the others and list it at the end."""
     accept_changes: bool = False
-    """Cells that were played under other conditions are played again; what they hold is moved to <out>/replaced."""
+    """Cells that were played under other conditions are played again; what they hold is moved to <out>/.replaced."""
     accept_code: bool = False
     """Keep finished cells that were played by other versions of the code or its libraries."""
     retry_errors: bool = False

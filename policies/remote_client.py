@@ -254,13 +254,16 @@ class RemoteClient[Q, R](Policy):
             torch.from_numpy(standing_state()[None]), None, np.ones(1, dtype=bool), "", "", "Stand still."
         )
         self._seeds[0], self._steps[0] = 0, 0
-        _, errors = self._try(self.infer_kind, self._beginning(0, ""), lambda content: content, reset=True)
+        errors: dict[int, RemoteError] = {}
+        begin = self._beginning(0, "")
+        if begin is not None:
+            _, errors = self._gather(self.reset_kind, {0: begin}, lambda content: content)
         if not errors:
             if self.batched:
                 request = self._batch(seen, host(seen.state), image, [0])
             else:
                 request = self._request(seen, host(seen.state), image, 0)
-            _, errors = self._try(self.infer_kind, request, self._probed)
+            _, errors = self._gather(self.infer_kind, {0: request}, self._probed)
         self._seeds.clear()
         self._steps.clear()
         if errors:
@@ -319,14 +322,6 @@ class RemoteClient[Q, R](Policy):
         chunk = self._batch_rows(content, 1)
         return self.checked(chunk[0])
 
-    def _try[T](
-        self, kind: str, request: Q | None, read: Callable[[object], T], *, reset: bool = False
-    ) -> tuple[dict[int, T], dict[int, RemoteError]]:
-        """One request of world 0 before the first episode; without a request nothing happens."""
-        if request is None:
-            return {}, {}
-        return self._gather(self.reset_kind if reset else kind, {0: request}, read)
-
     def _infer(
         self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]
     ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
@@ -334,8 +329,12 @@ class RemoteClient[Q, R](Policy):
         if not self.batched:
             requests = {world: self._request(seen, state, image, world) for world in worlds}
             return self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
+        # A server may refuse a batch for one row of it.
+        broken = [world for world in worlds if not np.isfinite(state[world]).all()]
+        errors = dict.fromkeys(broken, "the state holds a number that is not finite")
+        worlds = [world for world in worlds if world not in errors]
         if not worlds:
-            return {}, {}
+            return {}, errors
         request = self._batch(seen, state, image, worlds)
         got, failed = self._ask(
             self.infer_kind,
@@ -345,8 +344,8 @@ class RemoteClient[Q, R](Policy):
             weight=len(worlds),
         )
         if failed:
-            return {}, dict.fromkeys(worlds, failed[0])
-        chunks, errors = {}, {}
+            return {}, errors | dict.fromkeys(worlds, failed[0])
+        chunks = {}
         for world, rows in zip(worlds, got[0], strict=True):
             try:
                 chunks[world] = self.checked(rows)

@@ -153,7 +153,11 @@ class SocketLink(ServerLink[SocketRequest, object]):
             if isinstance(error.__cause__, EOFError):
                 raise AskAgain("the connection was closed before it was open") from error
             raise ValueError(f"no websocket ({cause(error)})") from error
-        return self.greet(end)
+        try:
+            return self.greet(end)
+        except Exception:  # without its greeting a connection is of no use
+            self.close()
+            raise
 
     def send(self, data: bytes) -> None:
         """Send a frame.

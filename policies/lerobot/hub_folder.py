@@ -27,6 +27,8 @@ def fetched(name: str) -> Path:
     """
     for cached in (True, False):
         try:
+            if not cached:  # fetching itself waits for as long as a hub that does not answer keeps the connection
+                huggingface_hub.HfApi().model_info(name, timeout=PATIENCE)
             found = huggingface_hub.snapshot_download(
                 name, allow_patterns=list(FILES), local_files_only=cached, etag_timeout=PATIENCE
             )

@@ -181,7 +181,7 @@ def picture_statistics(files: DatasetFiles, camera: str) -> dict[str, np.ndarray
         if name in entry:
             try:
                 values = np.asarray(entry[name], np.float64).reshape(3, 1, 1)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise InputError(f"{path}: {camera}: {name} is not a number per channel") from None
             if not np.isfinite(values).all():
                 raise InputError(f"{path}: {camera}: {name} is not finite")

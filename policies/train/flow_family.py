@@ -28,7 +28,14 @@ from arena_newton.policies.train.encoder_sources import (
     write_clip,
 )
 from arena_newton.policies.train.feature_scaling import Stats
-from arena_newton.policies.train.policy_model import ACTION, TrainableModel, new_policy, prepared, with_time_axis
+from arena_newton.policies.train.policy_model import (
+    ACTION,
+    TrainableModel,
+    finished,
+    new_policy,
+    prepared,
+    with_time_axis,
+)
 from arena_newton.policies.train.pretrained_weights import weights_folder
 from arena_newton.policies.train.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 
@@ -106,9 +113,9 @@ class FlowModel(TrainableModel):
         """As of every family, with the architecture of CLIP and the tokenizer."""
         encoder = self.policy.observation_encoder
         if self.own:
-            name = str((folder / CLIP_FOLDER).resolve())
+            name = str(finished(folder) / CLIP_FOLDER)
             self.policy.config.vision_encoder_name = self.policy.config.text_encoder_name = name
-            set_tokenizer_name(self.preprocess, str((folder / TOKENIZER_FOLDER).resolve()))
+            set_tokenizer_name(self.preprocess, str(finished(folder) / TOKENIZER_FOLDER))
         super().save(folder, facts, precision)
         parts = (encoder.vision_encoder.model, encoder.text_encoder.text_encoder) if self.own else (None, None)
         write_clip(folder / CLIP_FOLDER, self.clip, *parts)

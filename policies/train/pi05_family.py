@@ -37,6 +37,7 @@ from arena_newton.policies.train.policy_model import (
     STATE,
     WEIGHTS_FILE,
     TrainableModel,
+    finished,
     new_policy,
     prepared,
 )
@@ -144,7 +145,7 @@ class Pi05Model(TrainableModel):
     def save(self, folder: Path, facts: CheckpointFacts, precision: str = "float32") -> None:
         """As of every family, with the tokenizer. A policy in bfloat16 is written as it is."""
         if not self.tokenizer_name:
-            set_tokenizer_name(self.preprocess, str((folder / TOKENIZER_FOLDER).resolve()))
+            set_tokenizer_name(self.preprocess, str(finished(folder) / TOKENIZER_FOLDER))
         super().save(folder, facts, precision)
         self.tokenizer.save_pretrained(folder / TOKENIZER_FOLDER)
         sizes = self.recipe.network.get("gemma")

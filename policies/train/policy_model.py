@@ -17,6 +17,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from safetensors.torch import save_file
 
 from arena_newton.errors import InputError
+from arena_newton.files import PARTIAL
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Scaling, Stats, scalings, usable_stats
@@ -30,6 +31,7 @@ __all__ = [
     "WEIGHTS_FILE",
     "TrainableModel",
     "configuration",
+    "finished",
     "new_policy",
     "prepared",
     "with_time_axis",
@@ -238,6 +240,11 @@ class TrainableModel(abc.ABC):
 def new_policy(config: PreTrainedConfig) -> PreTrainedPolicy:
     """A policy of LeRobot with new weights."""
     return get_policy_class(config.type)(config)
+
+
+def finished(path: Path) -> Path:
+    """The absolute path that something will have when it is complete, without the endings of what is being written."""
+    return Path(*(part.removesuffix(PARTIAL) for part in path.resolve().parts))
 
 
 def with_time_axis(config: PreTrainedConfig, batch: Mapping[str, object]) -> dict[str, object]:

@@ -74,6 +74,8 @@ class PolicyTrainer:
         self.optimizer, self._lrs = _optimizer(model, recipe, self.device)
         self._parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._flat: torch.Tensor | None = None
+        self._used: list[torch.Tensor] = []
+        """Parameters on which the loss depends, whose gradients are in `_flat`."""
         self._graphs: list[torch.cuda.CUDAGraph] = []
         model.policy.train()
         if ranks > 1:
@@ -137,13 +139,16 @@ class PolicyTrainer:
     def _descend(self) -> None:
         """Batch, loss and gradient."""
         batch = self.batches(self._rows, shift=self.recipe.shift_px, colour=self.recipe.colour)
-        with self._precision():
+        # LeRobot makes some constants on the host and copies them, which no graph can hold; here they are made on the
+        # device.
+        with self.device if self.graphed else contextlib.nullcontext(), self._precision():
             loss = self.model.loss(batch, self.model.noise(len(self._rows)))
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self._loss.copy_(loss.detach())
         if self.ranks > 1:
-            gradients = [_gradient(p).reshape(-1) for p in self._parameters]
+            self._used = [p for p in self._parameters if p.grad is not None]
+            gradients = [p.grad.float().reshape(-1) for p in self._used if p.grad is not None]
             if self._flat is None:
                 self._flat = torch.cat(gradients)
             else:
@@ -163,8 +168,8 @@ class PolicyTrainer:
     def _update(self) -> None:
         """Clip the gradient and change the weights."""
         if self._flat is not None:
-            parts = self._flat.split([p.numel() for p in self._parameters])
-            for parameter, part in zip(self._parameters, parts, strict=True):
+            parts = self._flat.split([p.numel() for p in self._used])
+            for parameter, part in zip(self._used, parts, strict=True):
                 parameter.grad = part.view_as(parameter).to(parameter.dtype)
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.recipe.grad_clip)
         self._norm.copy_(norm.detach())
@@ -236,11 +241,6 @@ def _evaluating(model: TrainableModel) -> Iterator[None]:
         yield
     finally:
         model.policy.train()
-
-
-def _gradient(parameter: torch.Tensor) -> torch.Tensor:
-    """Gradient of a parameter in float32; zeros where the loss does not depend on it."""
-    return torch.zeros_like(parameter, dtype=torch.float32) if parameter.grad is None else parameter.grad.float()
 
 
 def _optimizer(

@@ -14,7 +14,7 @@ import torch
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import tqdm
 
-from arena_newton.errors import InputError
+from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
 from arena_newton.policies.train import families
@@ -31,6 +31,8 @@ from arena_newton.text import counted
 
 __all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
 
+BAND_TOLERANCE = 2
+"""Rows of a pad that a codec may have brightened next to the picture [px]."""
 TOKEN_ROWS = 4096
 """Rows whose prompts are made at once."""
 
@@ -65,8 +67,14 @@ def train(options: PolicyTrainOptions) -> Path:
     if options.resume is None and any(one.name.isdigit() for one in out.glob("checkpoints/*")):
         raise InputError(f"--out {out}: holds a training already; --resume {out} goes on with it")
     device, processes = chosen_device(options.device)
-    with _group(device, processes), fast_kernels(device):
-        return _train(options, settings, out, device, processes, progress, checkpoint)
+    try:
+        with _group(device, processes), fast_kernels(device):
+            return _train(options, settings, out, device, processes, progress, checkpoint)
+    except torch.OutOfMemoryError as error:
+        told = " ".join(str(error).split())[:160]
+        raise ArenaError(
+            f"{device}: its memory is full ({told}); try a smaller --batch-size, or fewer datasets"
+        ) from None
 
 
 def _train(
@@ -114,13 +122,12 @@ def _train(
         trainer.fix_steps(progress.steps)
     if progress is not None and checkpoint is not None:
         restore(trainer, checkpoint)
-    fit = "pad" if store.top or store.bottom else "native"
     facts = CheckpointFacts(
         labels=settings.labels,
         realign=settings.realign,
         width=store.width,
         height=store.height,
-        fit=fit,
+        fit=camera_fit(store),
         task_vector=vector,
         family=settings.family,
         recipe=settings.name,
@@ -185,6 +192,12 @@ def task_vector(store: FrameStore, settings: TrainingRecipe) -> tuple[str, ...]:
     if "" in store.tasks:
         raise InputError("--task-vector: an episode's dataset does not say which task it is of")
     return store.tasks
+
+
+def camera_fit(store: FrameStore) -> str:
+    """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
+    band = (store.height - store.width * 3 // 4) // 2
+    return "pad" if band > 0 and min(store.top, store.bottom) >= band - BAND_TOLERANCE else "native"
 
 
 def check_pictures(datasets: list[DatasetRows], settings: TrainingRecipe) -> None:

@@ -63,6 +63,7 @@ def test_wheel_holds_one_top_level_package(tmp_path):
         assert f"arena_newton/{floor}/__init__.py" in names
     assert "arena_newton/usd_scenes/football/scene.usda" in names
     assert "arena_newton/py.typed" in names
+    assert {f"arena_newton/eval/suites/{name}.toml" for name in ("paper", "tiny")} <= set(names)
     assert {f"arena_newton/eval/page/report.{ending}" for ending in ("html", "css", "js")} <= set(names)
 
 

@@ -423,7 +423,7 @@ def test_flags_of_a_cell(wide, tmp_path):
     far = run_options(file, cells["far/sonic/boxing/visual"], tmp_path)
     near = run_options(file, cells["still/twist2/boxing/base"], tmp_path)
     assert (far.remote_timeout, far.labels, far.worlds, far.checkpoint) == (5.0, "v4", 7, "weights.onnx")
-    assert (near.remote_timeout, near.labels, near.worlds, near.checkpoint) == (60.0, "v3.1", 2, None)
+    assert (near.remote_timeout, near.labels, near.worlds, near.checkpoint) == (60.0, None, 2, None)
     assert (near.max_steps, near.drive, near.seeds, near.policy) == (70, "twist2", (0, 1), "stand")
     assert far.out == str(tmp_path / "far/sonic/boxing/visual")
 

@@ -155,7 +155,7 @@ def checkpoints(tmp_path, monkeypatch):
     for name, said in facts.items():
         folder = tmp_path / name / "checkpoints/last/pretrained_model"
         folder.mkdir(parents=True)
-        (folder / "config.json").write_text('{"n_action_steps": 20}')
+        (folder / "config.json").write_text('{"n_action_steps": 20, "horizon": 40}')
         (folder / "model.safetensors").write_bytes(b"")
         said.write(folder)
     path = tmp_path / "learned.toml"
@@ -198,9 +198,9 @@ def test_one_entry_names_a_checkpoint_per_task_and_tracker(checkpoints):
             "trained_tasks is boxing vis_navi football",
         ),
         (lambda s: s.replace("{task}_", "boxing_"), r"trained on boxing, cell act.twist2/twist2/vis_navi/base plays"),
-        (lambda s: s + "latency = 20", "cell both.*latency20: latency 20 and replan 20 do not fit chunks of 20"),
-        (lambda s: s + "replan = 21", "latency 0 and replan 21 do not fit chunks of 20 actions"),
-        (lambda s: s + "replan = 5\nlatency = 5", "latency 5 and replan 5 do not fit chunks of 20 actions"),
+        (lambda s: s + "latency = 20", "cell both.*latency20: latency is 20 ticks, 20 actions of each chunk"),
+        (lambda s: s + "replan = 41", "replan is 41, the checkpoint predicts 40 actions"),
+        (lambda s: s + "replan = 5\nlatency = 5", "latency is 5 ticks, 5 actions of each chunk are executed"),
         (
             lambda s: s[: s.rindex("trained_on")] + 'trained_on = "sonic"',
             "trained_on is sonic, but checkpoint .* says twist2 sonic",

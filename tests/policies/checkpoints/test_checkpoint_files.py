@@ -1,11 +1,15 @@
 """Files of a checkpoint: the original's are read as its server does, foreign and damaged ones are one clear error."""
 
 import json
+import os
 import random
 import shutil
+import socket
+import subprocess
 import sys
 from pathlib import Path
 
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
@@ -196,6 +200,33 @@ def test_a_name_of_the_hub_that_is_not_here(tmp_path, monkeypatch, capsys):
     assert main(["run", "--task", "boxing", "--policy", "lerobot:no/such/folder", "--out", out]) == 2
     assert "--policy no/such/folder: no such file" in capsys.readouterr().err
     assert not Path(out).exists()
+
+
+def test_a_name_of_the_hub_that_was_fetched_before(checkpoints, tmp_path, monkeypatch):
+    """Is opened from the hub's cache, without a network, unless a folder of that name is here."""
+    cache = tmp_path / "models--owner--act"
+    shutil.copytree(checkpoints["act"], cache / "snapshots" / "0123456789")
+    (cache / "refs").mkdir()
+    (cache / "refs" / "main").write_text("0123456789")
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    policy = policies.get("lerobot:owner/act")
+    assert policy.describe() == LeRobotPolicy(checkpoints["act"]).describe()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "owner" / "act").mkdir(parents=True)
+    with pytest.raises(InputError, match="owner/act: holds no checkpoint"):
+        policies.get("lerobot:owner/act")
+
+
+def test_a_hub_that_does_not_answer(monkeypatch):
+    """Is given up after a few seconds, with one clear error."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        code = (
+            "from arena_newton.policies.lerobot import hub_folder as h; h.PATIENCE = 0.2; h.fetched('nobody/nothing')"
+        )
+        variables = dict(os.environ, HF_ENDPOINT=address, HF_HUB_OFFLINE="0")
+        done = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, timeout=60)
+    assert "InputError: --policy lerobot:nobody/nothing: is no folder here" in done.stderr
 
 
 def test_a_picture_of_another_size_is_refused(checkpoints):

@@ -205,6 +205,20 @@ def test_another_policy_after_a_restart():
     server.close()
 
 
+def test_greeting_that_broke_after_a_restart():
+    """A connection that greeted with garbage is not asked: the next request opens another one."""
+    server = started("openpi")
+    policy = client(server, retries=0)
+    server.close()
+    server = SocketServer("openpi", metadata=b"\xc1\xff", port=server.port)
+    for _ in range(2):
+        chunk = policy.act(observation(3))
+        assert set(chunk.errors) == {0, 1, 2} and "not MessagePack" in chunk.errors[0]
+    assert server.seen == []
+    policy.close()
+    server.close()
+
+
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "http"])
 def test_episode_that_the_server_does_not_know(protocol):
     """A server that says that it does not know the running episode stops the run."""
@@ -265,6 +279,21 @@ def test_bad_row_of_gr00t():
     server.behave = {1.0: "nan"}
     chunk = policy.act(observation(3))
     assert set(chunk.errors) == {1} and "(index 20) is nan" in chunk.errors[1]
+    policy.close()
+    server.close()
+
+
+def test_broken_state_is_not_sent_with_others():
+    """A world whose state is not finite is an error by itself and spoils no batch."""
+    server = started("gr00t")
+    policy = client(server)
+    server.seen.clear()
+    seen = observation(3)
+    seen.state[1, 5] = float("nan")
+    chunk = policy.act(seen)
+    assert set(chunk.errors) == {1} and "not finite" in chunk.errors[1]
+    ((_, data),) = server.seen
+    assert len(data["observation"]["state"]["joint_pos"]) == 2
     policy.close()
     server.close()
 

@@ -15,6 +15,7 @@ from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import open_door
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.rollout import Rollout
+from arena_newton.testing import check_policy
 
 DOORS = declared_servers()
 STEPS = 9
@@ -69,6 +70,16 @@ def test_actions_are_the_same_through_every_door(door):
     assert (policy.camera.width, policy.camera.height) == (SIZE, SIZE)
     for got, wanted in zip(ask(policy, [5, 6, 7, 8]), ask(NoisePolicy(), [5, 6, 7, 8]), strict=True):
         assert got.tobytes() == wanted.tobytes()
+    policy.close()
+    server.close()
+
+
+@pytest.mark.parametrize("door", ["own openpi", "own roboarena", "own vla-eval", "own arena", "gr00t"])
+def test_promises_of_a_policy_hold_through_every_door(door):
+    """Seeds, resets, neighbours, broken states: what a policy promises, its client promises too."""
+    server = DOORS[door]()
+    policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=1, backoff=0.01)
+    assert all(result.ok for result in check_policy(policy))
     policy.close()
     server.close()
 

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import random
 import shutil
 
 import numpy as np
@@ -19,6 +20,8 @@ from arena_newton.policies.train.augmentation import gathered_pictures
 from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
 from arena_newton.policies.train.demonstration_rows import read_rows, statistics
 from arena_newton.policies.train.frame_store import load_frames, made_frames
+from arena_newton.policies.train.training import camera_fit
+from tests.fuzz.mutants import damaged
 from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset
 
 CPU = torch.device("cpu")
@@ -220,6 +223,32 @@ def test_a_damaged_dataset_is_named(dataset, tmp_path, change, words):
     with pytest.raises(InputError, match=words) as error:
         read_rows(copy, "v4")
     assert str(copy) in str(error.value)
+
+
+def test_mutated_tables_are_refused_by_name(dataset, tmp_path):
+    """Hundreds of damaged statistics, descriptions and rows: read, or one error that names the dataset."""
+    copy, rng, refused = shutil.copytree(dataset, tmp_path / "copy"), random.Random(3), 0
+    files = [copy / "meta" / "stats.json", copy / "meta" / "info.json", next((copy / "data").rglob("*.parquet"))]
+    for file in files:
+        sound = file.read_bytes()
+        for _ in range(80):
+            file.write_bytes(damaged(sound, rng, text=file.suffix == ".json"))
+            try:
+                found = read_rows(copy, "v4")
+                statistics([found], found.episodes, "v4")
+            except InputError as error:
+                refused += 1
+                assert str(copy) in str(error)
+        file.write_bytes(sound)
+    assert refused > 80
+
+
+@pytest.mark.parametrize(("black", "fit"), [((8, 8), "pad"), ((7, 9), "pad"), ((0, 0), "native"), ((3, 20), "native")])
+def test_the_camera_of_black_rows(black, fit):
+    """Rows like those around a 4:3 picture mean a padded one; other dark edges do not."""
+    store = dataclasses.replace(made_frames(100, SIZE, CPU), top=black[0], bottom=black[1])
+    store = dataclasses.replace(store, pictures=torch.zeros(1, SIZE - sum(black), SIZE, 3, dtype=torch.uint8))
+    assert camera_fit(store) == fit
 
 
 def edit(dataset, change):
