@@ -27,12 +27,9 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, port), family=family)
-    except socket.gaierror as error:
-        raise InputError(
-            f"--host {host}: no address of this machine ({(error.strerror or '').partition(' (')[0]})"
-        ) from None
     except (OSError, OverflowError) as error:
-        if isinstance(error, OSError) and error.errno == errno.EADDRNOTAVAIL:
+        number = error.errno if isinstance(error, OSError) else None
+        if number == errno.EADDRNOTAVAIL or (number is not None and number < 0):  # below 0: of the search for names
             raise InputError(f"--host {host}: no address of this machine") from None
         reason = error.strerror if isinstance(error, OSError) else "no such port"
         raise InputError(f"{flag} {port}: cannot be served at {host} ({reason}); name another port") from None
