@@ -204,8 +204,9 @@ class TrainingLoop:
         return trainer.step, time.monotonic()
 
     def _save(self) -> Path:
-        """Write a checkpoint of this step; only the first process does."""
+        """Write a checkpoint of this step; only the first process does, once all hold the same."""
         trainer, options = self._trainer, self._options
+        trainer.check_agreement()
         progress = TrainingProgress(
             step=trainer.step,
             steps=self._total,

@@ -229,8 +229,10 @@ def test_a_killed_training_goes_on(dataset, tmp_path):
 
 
 def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
-    """As under torchrun on the CPU: the first process writes, and what it goes on with is both processes' network."""
-    out = tmp_path / "run"
+    """As under torchrun on the CPU: both processes hold the same weights at each checkpoint, which the first writes."""
+    out, agreed = tmp_path / "run", []
+    check = PolicyTrainer.check_agreement
+    monkeypatch.setattr(PolicyTrainer, "check_agreement", lambda self: (check(self), agreed.append(self.step)))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
@@ -246,7 +248,19 @@ def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
         second.kill()
     progress = training_state.TrainingProgress.read(out / "checkpoints" / "last")
     assert (progress.step, progress.processes, progress.batch_size) == (3, 2, 2)
+    assert agreed == [1, 2, 3]
     assert not torch.distributed.is_initialized()
+
+
+def test_processes_that_differ_are_refused(monkeypatch):
+    """Weights that drift apart end a training of several processes before they are saved."""
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, source: None)
+    trainer = plain_trainer(monkeypatch, 2, ranks=2)
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, operation: None)
+    trainer.check_agreement()
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, operation: tensor.add_(float(operation)))
+    with pytest.raises(ArenaError, match="2 processes hold different weights"):
+        trainer.check_agreement()
 
 
 def plain_trainer(monkeypatch, batch, rank=0, ranks=1, **more):
