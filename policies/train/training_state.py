@@ -37,6 +37,7 @@ from arena_newton.policies.train.policy_trainer import PolicyTrainer
 __all__ = [
     "PROGRESS_FILE",
     "TrainingProgress",
+    "check_new",
     "checkpoint_name",
     "last_checkpoint",
     "remove_older",
@@ -115,6 +116,16 @@ class TrainingProgress:
 def checkpoint_name(step: int) -> str:
     """Name of the folder of a step."""
     return f"{step:0{FEWEST_DIGITS}d}"
+
+
+def check_new(out: Path) -> None:
+    """Refuse a folder that holds checkpoints.
+
+    Raises:
+        InputError: It does.
+    """
+    if any(one.name.isdecimal() for one in out.glob(f"{CHECKPOINTS_DIR}/*")):
+        raise InputError(f"--out {out}: holds a training already; --resume {out} goes on with it")
 
 
 def last_checkpoint(out: Path, flag: str = "--resume") -> Path:
