@@ -103,11 +103,15 @@ class TrainingLoop:
 
         Raises:
             InputError: The folder cannot be made, or another process trains in it.
+            ArenaError: The loss is not finite, or the disk is full.
         """
         with _held(self._out) if self._processes.first else contextlib.nullcontext():
             if self._processes.first and self._new:
                 check_new(self._out)  # another one may have come and gone while this one decoded
-            return self._work()
+            try:
+                return self._work()
+            except OSError as error:  # of the log; checkpoints say it themselves
+                raise ArenaError(f"{self._out}: cannot be written ({error.strerror or error})") from error
 
     def _work(self) -> Path:
         options, trainer, first = self._options, self._trainer, self._processes.first

@@ -177,8 +177,10 @@ def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, 
         link.unlink(missing_ok=True)
         link.symlink_to(final.name)
         os.replace(link, parent / LAST_CHECKPOINT_LINK)
-    except OSError as error:
-        raise ArenaError(f"{final}: the checkpoint cannot be written ({error.strerror or error})") from error
+    except (OSError, SafetensorError) as error:  # safetensors says a full disk in an error of its own
+        shutil.rmtree(growing, ignore_errors=True)
+        reason = (error.strerror if isinstance(error, OSError) else None) or " ".join(str(error).split())[:160]
+        raise ArenaError(f"{final}: the checkpoint cannot be written ({reason})") from error
     return final
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import socket
@@ -29,6 +30,7 @@ from arena_newton.policies.train import (
     measured_training,
     training,
     training_bench,
+    training_log,
     training_loop,
     training_state,
 )
@@ -199,6 +201,32 @@ def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_pat
         assert CheckpointFacts.read(checkpoint_folder(out)).steps == 3
     train(PolicyTrainOptions(resume=out, quiet=True))
     assert same(weights(out), weights(whole)) and not list(out.rglob("*.part"))
+
+
+def test_a_full_disk_is_one_error(dataset, tmp_path, capsys):
+    """What safetensors and the log cannot write is a message with the path and code 1; no part of it takes space."""
+    out = tmp_path / "run"
+    given = ["--dataset", str(dataset), "--recipe", "small", "--device", "cpu", "--steps", "1", "--out", str(out)]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))  # bytes of a file; a write beyond fails
+    try:
+        assert main(given) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    error = capsys.readouterr().err
+    assert f"error: {out}/checkpoints/000001: the checkpoint cannot be written (" in error and "File too large" in error
+    assert not list((out / "checkpoints").iterdir())
+
+
+def test_a_log_on_a_full_disk_is_one_error(dataset, tmp_path, monkeypatch):
+    """A row of the log that cannot be written ends the training with the folder's name."""
+
+    def full(self, row):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(training_log.TrainingLog, "record", full)
+    with pytest.raises(ArenaError, match=r"run: cannot be written .No space left on device"):
+        train(options(dataset, tmp_path / "run"))
 
 
 CHILD = """
