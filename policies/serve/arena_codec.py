@@ -26,7 +26,7 @@ from arena_newton.policies.serve.policy_messages import (
     read_state,
     read_text,
 )
-from arena_newton.policies.serve.raw_arrays import MAX_FRAME, checked_array
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME, MAX_OBJECTS, checked_array
 from arena_newton.policies.serve.wire_error import WireError
 from arena_newton.text import plain_text
 
@@ -62,7 +62,7 @@ def unpack_begin(body: bytes) -> Begin:
     Raises:
         WireError: It is unfit.
     """
-    content = _object(body, "/reset") if body.strip() else {}
+    content = _request(body, "/reset") if body.strip() else {}
     return Begin(
         _world(content, "/reset"),
         read_count(content.get("seed"), "/reset", "seed", MAX_SEED),
@@ -106,7 +106,7 @@ def unpack_look(body: bytes) -> tuple[Look, bool]:
         WireError: It is unfit.
     """
     where = "/infer"
-    content = _object(body, where)
+    content = _request(body, where)
     seen = content.get("observation")
     if not isinstance(seen, dict):
         raise WireError(f"{where}: observation is {_kind(seen)}, expected an object")
@@ -188,6 +188,13 @@ def _kind(value: object) -> str:
 
 def _refused(constant: str) -> object:
     raise ValueError(f"{constant} is no JSON")
+
+
+def _request(body: bytes, where: str) -> dict[str, object]:
+    """The object of a request, which has few values; they are counted before anything is made of them."""
+    if sum(body.count(mark) for mark in (b",", b"[", b"{")) > MAX_OBJECTS:
+        raise WireError(f"{where}: more than {MAX_OBJECTS} values")
+    return _object(body, where)
 
 
 def _object(body: bytes, where: str) -> dict[str, object]:

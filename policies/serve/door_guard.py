@@ -11,10 +11,14 @@ from contextlib import contextmanager
 
 from arena_newton.errors import InputError
 
-__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "DoorGuard"]
+__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "DoorGuard"]
 
 ACCESS_TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 """Environment variable with the token that clients must send; the same of which clients take theirs."""
+STRANGERS = 64
+"""Connections that have not said yet who they are, at once; more are closed unread."""
+STRANGER_SECONDS = 10.0
+"""Time that a connection has to say who it is [s]."""
 HEALTH_PATHS = ("/healthz", "/health")
 """Routes that answer without a token: whether the server is there, and nothing else."""
 _SCHEMES = ("bearer", "api-key")
@@ -40,7 +44,7 @@ class DoorGuard:
                 f"{ACCESS_TOKEN_VARIABLE}: holds a space, a line end or another character that no token has"
             )
         self.connections = connections
-        self._inside = 0
+        self._inside = self._arrived = 0
         self._lock = threading.Lock()
 
     @property
@@ -61,7 +65,7 @@ class DoorGuard:
         if not self._token or path in HEALTH_PATHS:
             return None
         scheme, _, given = (authorization or "").partition(" ")
-        if scheme.lower() in _SCHEMES and hmac.compare_digest(given.strip().encode(), self._token.encode()):
+        if scheme.lower() in _SCHEMES and hmac.compare_digest(_bytes(given.strip()), _bytes(self._token)):
             return None
         return 401, "the token is missing or wrong (Authorization: Bearer)"
 
@@ -69,6 +73,18 @@ class DoorGuard:
     def full(self) -> bool:
         """Whether there are as many connections as there may be."""
         return self._inside >= self.connections
+
+    def arrives(self) -> bool:
+        """Count a connection from its first moment; False where there are too many, which is not counted."""
+        with self._lock:
+            room = self._arrived < self.connections + STRANGERS
+            self._arrived += room
+        return room
+
+    def leaves(self) -> None:
+        """A connection that had arrived is over."""
+        with self._lock:
+            self._arrived -= 1
 
     @contextmanager
     def inside(self) -> Iterator[bool]:
@@ -81,3 +97,8 @@ class DoorGuard:
         finally:
             with self._lock:
                 self._inside -= room
+
+
+def _bytes(text: str) -> bytes:
+    """Bytes of a header, also of one that is no text."""
+    return text.encode(errors="surrogateescape")

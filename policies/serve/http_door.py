@@ -6,15 +6,16 @@ may open a new one at any time. The original's client names no world, so there i
 
 from __future__ import annotations
 
+import math
 import socket
 import ssl
 import sys
 import threading
 import time
 import traceback
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -30,7 +31,7 @@ from arena_newton.policies.serve.arena_codec import (
     unpack_begin,
     unpack_look,
 )
-from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
+from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
 from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
 from arena_newton.policies.serve.raw_arrays import MAX_FRAME
@@ -50,19 +51,24 @@ _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "cl
 """Reason of a refusal → HTTP status; clients ask again after 503."""
 
 
+type _Taken = socket.socket | tuple[bytes, socket.socket]
+"""What the base class calls a request: of TCP the connection."""
+
+
 class _Handler(BaseHTTPRequestHandler):
     """One connection."""
 
     protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
     server_version, sys_version = "arena-newton", ""
-    timeout = IDLE_CONNECTION
+    timeout = STRANGER_SECONDS
     wbufsize = 1 << 16  # head and body of a reply leave together
     server: _Listener
 
     def handle(self) -> None:
         """Serve until the client leaves; one connection too many is told so."""
         self.begun: dict[str, str] = {}
-        with self.server.guard.inside() as self.room, self.server.listed(self.connection):
+        self.room = False
+        with self.server.listed(self.connection), ExitStack() as self.visit:
             super().handle()
 
     def do_GET(self) -> None:  # noqa: N802 (the name that http.server calls)
@@ -70,6 +76,7 @@ class _Handler(BaseHTTPRequestHandler):
         path = self.path.partition("?")[0]
         if self._refused(path):
             return
+        self.close_connection = self.close_connection or path in HEALTH_PATHS
         if path == "/healthz":
             self._send(200, b"OK\n", "text/plain")
         elif path in HEALTH_PATHS:
@@ -95,7 +102,8 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send(200, pack_begun(policy.facts))
             elif path == "/infer":
                 look, chunk = unpack_look(body)
-                self._send(200, pack_chunk(self.server.look(address, look), chunk=chunk))
+                actions = self.server.look(address, look) if chunk else self.server.next_action(address, look)
+                self._send(200, pack_chunk(actions, chunk=chunk))
             else:
                 self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
         except Refused as error:
@@ -106,12 +114,20 @@ class _Handler(BaseHTTPRequestHandler):
     def _refused(self, path: str) -> bool:
         headers = self.headers
         refusal = self.server.guard.refusal(path, headers.get("Authorization"), headers.get("Origin"))
-        if refusal is None and not self.room and path not in HEALTH_PATHS:
+        if refusal is None and path not in HEALTH_PATHS and not self._let_in():
             refusal = 503, f"there are {self.server.guard.connections} connections already"
         if refusal is not None:
             self.close_connection = True
             self._send(refusal[0], pack_failure(refusal[1]))
         return refusal is not None
+
+    def _let_in(self) -> bool:
+        """Whether there is room for this connection, which counts from its first request that may come in."""
+        if not self.room and self.visit.enter_context(self.server.guard.inside()):
+            self.room = True
+            self.server.known(self.connection)
+            self.connection.settimeout(IDLE_CONNECTION)
+        return self.room
 
     def _body(self) -> bytes | None:
         """The body of a request; None where it cannot be read and the client was told so."""
@@ -179,7 +195,10 @@ class _Listener(ThreadingHTTPServer):
         self.policy, self.guard, self.tls = policy, guard, tls
         self._worlds: OrderedDict[tuple[str, str], str] = OrderedDict()
         """Client's address and world → session that was begun there last."""
-        self._open: set[socket.socket] = set()
+        self._kept: OrderedDict[tuple[str, str], deque[np.ndarray]] = OrderedDict()
+        """Client's address and session → actions that a client which takes one at a time has not been given yet."""
+        self._open: dict[socket.socket, float] = {}
+        """Connection → when it must have said who it is [s]."""
         self._lock = threading.Lock()
 
     def get_request(self) -> tuple[socket.socket, tuple[str, int]]:
@@ -199,12 +218,45 @@ class _Listener(ThreadingHTTPServer):
     def listed(self, connection: socket.socket) -> Iterator[None]:
         """Remember a connection while it lasts."""
         with self._lock:
-            self._open.add(connection)
+            self._open[connection] = time.monotonic() + STRANGER_SECONDS
         try:
             yield
         finally:
             with self._lock:
-                self._open.discard(connection)
+                self._open.pop(connection, None)
+
+    def known(self, connection: socket.socket) -> None:
+        """A connection has been let in."""
+        with self._lock:
+            self._open[connection] = math.inf
+
+    def service_actions(self) -> None:
+        """Hang up on who sends the first request's head by drips; the base class calls this many times a second."""
+        now = time.monotonic()
+        with self._lock:
+            late = [connection for connection, end in self._open.items() if end < now]
+        for connection in late:
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def verify_request(self, request: object, client_address: object) -> bool:
+        """Whether a connection is read at all."""
+        return self.guard.arrives()
+
+    def process_request(self, request: _Taken, client_address: object) -> None:
+        """Give a connection its thread."""
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # no more threads
+            self.guard.leaves()
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: _Taken, client_address: object) -> None:
+        """Serve a connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.guard.leaves()
 
     def hang_up(self) -> None:
         """Close all connections: clients that keep one would go on asking."""
@@ -222,18 +274,42 @@ class _Listener(ThreadingHTTPServer):
         self.policy.begin(owner, replace(begin, session=session), held=False)
         begun[begin.session] = session
         with self._lock:
-            self._worlds[address, begin.session] = session
-            self._worlds.move_to_end((address, begin.session))
-            while len(self._worlds) > MOST_WORLDS:
-                self._worlds.popitem(last=False)
+            self._kept.pop((address, session), None)
+            _remember(self._worlds, (address, begin.session), session)
 
     def look(self, address: str, look: Look) -> np.ndarray:
         """The chunk of a world; a look without a seed is of the episode that was begun there last."""
+        session = self._known_session(address, look)
+        with self._lock:
+            self._kept.pop((address, session), None)
+        return self.policy.look(f"http {address}", replace(look, session=session), held=False).actions
+
+    def next_action(self, address: str, look: Look) -> np.ndarray:
+        """One action, shape [1, 40], of the world's last chunk, or of a new one where all of it is given."""
+        session = self._known_session(address, look)
+        with self._lock:
+            kept = self._kept.get((address, session))
+            if kept and look.step is None:
+                return kept.popleft()[None]
+        actions = self.look(address, look)
+        with self._lock:
+            _remember(self._kept, (address, session), deque(actions[1:]))
+        return actions[:1]
+
+    def _known_session(self, address: str, look: Look) -> str:
         session = _session(look.session, look.seed)
         if look.seed is None:
             with self._lock:
                 session = self._worlds.get((address, look.session), session)
-        return self.policy.look(f"http {address}", replace(look, session=session), held=False).actions
+        return session
+
+
+def _remember[V](values: OrderedDict[tuple[str, str], V], key: tuple[str, str], value: V) -> None:
+    """Keep a value, and forget the oldest beyond `MOST_WORLDS`."""
+    values[key] = value
+    values.move_to_end(key)
+    while len(values) > MOST_WORLDS:
+        values.popitem(last=False)
 
 
 def _session(world: str, seed: int | None) -> str:

@@ -13,7 +13,7 @@ from typing import cast
 import msgpack
 import numpy as np
 
-from arena_newton.policies.serve.raw_arrays import MAX_FRAME, checked_array, is_number_type
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME, MAX_OBJECTS, checked_array, is_number_type
 from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = [
@@ -35,8 +35,6 @@ __all__ = [
 type Value = None | bool | int | float | str | bytes | np.ndarray | list[Value] | dict[str, Value]
 """What a message holds."""
 
-MAX_OBJECTS = 65536
-"""Most values in a message, those inside others counted; bytes of an array are one."""
 MAX_LENGTH = 8192
 """Most entries of one map or list."""
 MAX_TEXT = 65536

@@ -126,6 +126,13 @@ class _Session:
     answer: np.ndarray | None = None
     """To the last look."""
 
+    def follows(self, step: int) -> bool:
+        """Whether a look may come so many actions into the episode: at most the last chunk behind the last look."""
+        if self.last is None:
+            return False
+        before = self.last[0]
+        return before is None or before <= step and (self.answer is None or step <= before + len(self.answer))
+
 
 @dataclass
 class _Job:
@@ -352,7 +359,7 @@ class PolicyServer:
         seed = begin.seed
         if seed is None:
             seed, self._unseeded = self._unseeded, self._unseeded + 1
-        row = self._row() if session is None else session.row
+        row = self._row(key[0]) if session is None else session.row
         session = self._sessions[key] = _Session(row, seed, task, held, time.monotonic())
         self._seeds[row], self._tasks[row] = seed, task.gym_id
         mask = np.zeros(self.max_sessions, dtype=bool)
@@ -365,9 +372,10 @@ class PolicyServer:
         self.counts.episodes += 1
         return session
 
-    def _row(self) -> int:
+    def _row(self, owner: str) -> int:
+        """A free row, or that of an idle session that no connection holds, or that is of the same connection."""
         if not self._free:
-            idle = [(s.used, key) for key, s in self._sessions.items() if not s.held]
+            idle = [(s.used, key) for key, s in self._sessions.items() if not s.held or key[0] == owner]
             used, key = min(idle, default=(time.monotonic(), ("", "")))
             if time.monotonic() - used < IDLE:
                 raise Refused("full", f"all {self.max_sessions} sessions are in use; --max-sessions of the server")
@@ -399,11 +407,11 @@ class PolicyServer:
                 session = None
             elif other:
                 raise Refused("unfit", f"the look is of seed {look.seed}, the session's episode of seed {session.seed}")
-        elif look.step:
+        if look.step and (session is None or not session.follows(look.step)):
             raise Refused(
                 "unknown_episode",
                 f"the look is {look.step} actions into an episode that the server does not know (it was started again, "
-                "or the session was idle and lost its row); begin the episode again",
+                "or the session was idle and lost its row, or began another episode); begin the episode again",
             )
         if session is None:
             session = self._begin(key, Begin(look.session, look.seed, look.task, look.instruction), job.held)
@@ -425,7 +433,7 @@ class PolicyServer:
             try:
                 if not isinstance(look, Look):
                     raise TypeError("no look")
-                content = zlib.crc32(look.state.tobytes())
+                content = zlib.crc32(look.state.tobytes(), zlib.crc32(look.instruction.encode()))
                 if look.image is not None:
                     content = zlib.crc32(look.image.tobytes(), content)
                 session = self._session(job, look, content)

@@ -9,10 +9,12 @@ import numpy as np
 
 from arena_newton.policies.serve.wire_error import WireError
 
-__all__ = ["MAX_FRAME", "checked_array", "is_number_type"]
+__all__ = ["MAX_FRAME", "MAX_OBJECTS", "checked_array", "is_number_type"]
 
 MAX_FRAME = 16 * 2**20
 """Longest message that is read [bytes]; a picture of 1920x1080 is 6.2 MB."""
+MAX_OBJECTS = 65536
+"""Most values in a message, those inside others counted; bytes of an array are one."""
 MAX_DIMENSIONS = 8
 """Most dimensions of an array."""
 _DTYPE = re.compile(r"[|<>=]?(?:b1|[iu][1248]|f[248])")

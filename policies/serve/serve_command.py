@@ -129,8 +129,13 @@ def _tls(options: ServeOptions) -> ssl.SSLContext | None:
     if options.tls_cert is None or options.tls_key is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+
+    def asked() -> str:  # a server that nobody watches cannot be asked on its terminal
+        raise InputError(f"--tls-key {options.tls_key}: has a pass phrase, expected a key without one")
+
     try:
-        context.load_cert_chain(Path(options.tls_cert).expanduser(), Path(options.tls_key).expanduser())
+        certificate, key = (Path(name).expanduser() for name in (options.tls_cert, options.tls_key))
+        context.load_cert_chain(certificate, key, asked)
     except (OSError, ssl.SSLError) as error:
         reason = getattr(error, "strerror", None) or "not a certificate with its key"
         raise InputError(f"--tls-cert {options.tls_cert}, --tls-key {options.tls_key}: {reason}") from None

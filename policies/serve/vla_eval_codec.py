@@ -10,6 +10,7 @@ github.com/allenai/vla-evaluation-harness at e1ee9ad. `task`, `seed`, `step` and
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -59,6 +60,8 @@ TYPES = ("hello", "observation", "action", "episode_start", "episode_end", "erro
 """Types of messages."""
 CHUNKS = "chunks"
 """Capability of a robot that executes whole chunks, and of a server that gives them."""
+MOST_PIXELS = 4096 * 4096
+"""Most pixels of all packed pictures in a message; one of a single colour is a thousandth of its size."""
 CAMERA = "front"
 """Name of the head camera among the pictures."""
 WHERE = "message"
@@ -99,7 +102,15 @@ def unpack_message(data: bytes | str) -> VlaEvalMessage:
     """
     if isinstance(data, str):
         raise WireError(f"{WHERE}: a text frame, expected MessagePack in a binary frame")
-    content = unpack(data, TEXT_KEYS, WHERE, _unpacked_picture)
+    left = MOST_PIXELS
+
+    def read_picture_of(item: Mapping[str, object], where: str) -> np.ndarray | None:
+        nonlocal left
+        picture = _unpacked_picture(item, where, left)
+        left -= 0 if picture is None else picture.size // 3
+        return picture
+
+    content = unpack(data, TEXT_KEYS, WHERE, read_picture_of)
     if not isinstance(content, dict):
         raise WireError(f"{WHERE}: {type(content).__name__}, expected a map")
     missing = [name for name in ("type", "payload", "seq", "timestamp") if name not in content]
@@ -242,8 +253,8 @@ def _packed_picture(array: np.ndarray, images: ImageFormat) -> Mapping[str, obje
     return {"__image__": True, "format": images, "data": file.getvalue(), "shape": list(array.shape)}
 
 
-def _unpacked_picture(content: Mapping[str, object], where: str) -> np.ndarray | None:
-    """The picture that a map stands for; None where it is another map."""
+def _unpacked_picture(content: Mapping[str, object], where: str, most: int) -> np.ndarray | None:
+    """The picture of at most `most` pixels that a map stands for; None where it is another map."""
     if content.get("__image__") is not True:
         return None
     form, data = content.get("format"), content.get("data")
@@ -256,6 +267,8 @@ def _unpacked_picture(content: Mapping[str, object], where: str) -> np.ndarray |
         with warnings.catch_warnings(action="error"), Image.open(io.BytesIO(data), formats=[_FORMATS[form]]) as file:
             if not all(low <= n <= high for n in file.size):  # before it is unpacked
                 raise WireError(f"{where}: a picture of {file.size[0]}x{file.size[1]}, expected {low} to {high} pixels")
+            if math.prod(file.size) > most:
+                raise WireError(f"{where}: pictures of more than {MOST_PIXELS} pixels in all")
             return np.asarray(file.convert("RGB")).copy()
     except WireError:
         raise

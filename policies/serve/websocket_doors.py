@@ -15,6 +15,7 @@ import threading
 import time
 import traceback
 from collections import deque
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
@@ -27,7 +28,7 @@ from websockets.sync.server import ServerConnection, serve
 from arena_newton.errors import ArenaError
 from arena_newton.policies.serve import openpi_codec, vla_eval_codec
 from arena_newton.policies.serve.arena_codec import pack_config, pack_failure
-from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
+from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
 from arena_newton.policies.serve.policy_messages import Begin, End, Look
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.raw_arrays import MAX_FRAME
@@ -38,10 +39,12 @@ __all__ = ["WebsocketDoor", "WebsocketProtocol"]
 type WebsocketProtocol = Literal["openpi", "roboarena", "vla-eval"]
 """What is spoken; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
 
-HANDSHAKE_SECONDS = 10.0
-"""Time that a client has to become a websocket [s]."""
 PING_SECONDS, PONG_SECONDS = 20.0, 300.0
 """Time between two pings, and time that a client has to answer one: compiling kernels holds up a robot [s]."""
+FAREWELL_SECONDS = 1.0
+"""Time that clients have, all together, to answer that the server closes [s]."""
+PAUSE = 0.05
+"""Pause after a connection that could not be taken, such as for want of file descriptors [s]."""
 INTERNAL_ERROR, FULL = 1011, 1013
 """Codes with which a socket is closed: a request failed, as openpi's server does it; too many connections."""
 
@@ -79,27 +82,61 @@ class WebsocketDoor:
             process_request=self._answer_http,
             compression=None,
             max_size=MAX_FRAME,
-            open_timeout=HANDSHAKE_SECONDS,
+            open_timeout=STRANGER_SECONDS,
             ping_interval=PING_SECONDS,
             ping_timeout=PONG_SECONDS,
             server_header=None,
             logger=logger,
         )
         self._open: set[ServerConnection] = set()
-        self._thread = threading.Thread(target=self._server.serve_forever, name="door", daemon=True)
+        self._closed = False
+        self._thread = threading.Thread(target=self._listen, name="door", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """End the door and its connections."""
+        self._closed = True
+        with suppress(OSError):  # which wakes who waits for a connection
+            self._server.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         with self._lock:
             connections = list(self._open)
-        for connection in connections:
-            try:
-                connection.close(1001, "the server is closing")
-            except (OSError, ConnectionClosed):
-                pass  # it was closed meanwhile
+        threads = [threading.Thread(target=_say_goodbye, args=[one], daemon=True) for one in connections]
+        for thread in threads:
+            thread.start()
+        end = time.monotonic() + FAREWELL_SECONDS
+        for thread in threads:
+            thread.join(max(end - time.monotonic(), 0.0))
+        for connection in connections:  # some clients never answer, or never read
+            with suppress(OSError):
+                connection.socket.shutdown(socket.SHUT_RDWR)
         self._thread.join(timeout=2.0)
+
+    def _listen(self) -> None:
+        """Take connections until the door closes.
+
+        The library's own loop ends at the first connection that cannot be taken, and its threads keep the process.
+        """
+        while not self._closed:
+            try:
+                connection, address = self._server.socket.accept()
+            except OSError:
+                time.sleep(PAUSE)
+                continue
+            if not self._guard.arrives():
+                connection.close()
+                continue
+            try:
+                threading.Thread(target=self._handle, args=[connection, address], daemon=True).start()
+            except RuntimeError:  # no more threads
+                self._guard.leaves()
+                connection.close()
+
+    def _handle(self, connection: socket.socket, address: object) -> None:
+        try:
+            self._server.handler(connection, address)
+        finally:
+            self._guard.leaves()
 
     def _answer_http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
         """A route; None lets the handshake of a socket go on."""
@@ -179,12 +216,14 @@ class WebsocketDoor:
                 if message.type in ("error", "record"):
                     continue
                 request = vla_eval_codec.unpack_request(message)
-                kept.setdefault(request.session, deque())
                 if isinstance(request, Look):
-                    actions = self._actions(owner, request, kept[request.session], whole=whole)
+                    rest = kept.pop(request.session, deque())
+                    actions = self._actions(owner, request, rest, whole=whole)
+                    if rest:
+                        kept[request.session] = rest
                     connection.send(vla_eval_codec.pack_action(actions, seq, time.time()))
                     continue
-                del kept[request.session]
+                kept.pop(request.session, None)
                 if isinstance(request, End):
                     self._policy.end(owner, request.session)
                 else:
@@ -199,6 +238,11 @@ class WebsocketDoor:
         if not kept:
             kept.extend(self._policy.look(owner, look).actions)
         return kept.popleft()
+
+
+def _say_goodbye(connection: ServerConnection) -> None:
+    with suppress(OSError, ConnectionClosed):  # it was closed meanwhile
+        connection.close(1001, "the server is closing")
 
 
 def _response(status: int, body: bytes, kind: str = "application/json") -> Response:

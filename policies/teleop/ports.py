@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 
 from arena_newton.errors import InputError
@@ -27,5 +28,8 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
+        number = error.errno if isinstance(error, OSError) else None
+        if number == errno.EADDRNOTAVAIL or (number is not None and number < 0):  # below 0: of the search for names
+            raise InputError(f"--host {host}: no address of this machine") from None
         reason = error.strerror if isinstance(error, OSError) else "no such port"
         raise InputError(f"{flag} {port}: cannot be served at {host} ({reason}); name another port") from None

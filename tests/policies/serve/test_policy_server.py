@@ -134,6 +134,47 @@ def test_an_episode_that_is_not_known_is_refused(made):
         server.look("a", look(0.1, seed=6, step=4))
 
 
+def test_an_episode_of_another_client_is_not_continued(made):
+    """Two clients that take each other's session are told, whichever of them began last, and neither goes on."""
+    server = made(Remembers())
+    for seed_of in ("first", "second"):
+        server.begin("a", Begin("", 5, "boxing"))
+        if seed_of == "first":
+            assert len(server.look("a", look(0.1, seed=5, step=0)).actions) == 4
+    for step in (4, 8):
+        with pytest.raises(Refused, match=f"{step} actions into an episode that the server does not know"):
+            server.look("a", look(0.2, seed=5, step=step))
+    server.look("a", look(0.3, seed=5, step=0))
+    with pytest.raises(Refused, match="5 actions into an episode") as caught:
+        server.look("a", look(0.2, seed=5, step=5))
+    assert caught.value.reason == "unknown_episode"
+    server.look("a", look(0.2, seed=5, step=3))  # it may execute fewer than it was given
+    with pytest.raises(Refused, match="2 actions into an episode"):
+        server.look("a", look(0.2, seed=5, step=2))
+
+
+def test_a_connection_of_many_episodes_keeps_no_rows(made, monkeypatch):
+    """RoboArena's protocol has no end of an episode: its idle sessions make room for the next of their connection."""
+    monkeypatch.setattr("arena_newton.policies.serve.policy_server.IDLE", 0.05)
+    server = made(Remembers(), max_sessions=2)
+    for number in range(5):
+        assert server.look("a", look(session=str(number))).actions.shape == (4, 40)
+        time.sleep(0.06)
+    with pytest.raises(Refused, match="all 2 sessions are in use"):
+        server.look("b", look())
+
+
+def test_another_sentence_is_another_look(made):
+    """The answer to one instruction is not that to another, which only looks the same."""
+    server = made(Remembers())
+    first = server.look("a", look(0.1, seed=1, step=0, instruction="Box.")).actions
+    assert np.array_equal(server.look("a", look(0.1, seed=1, step=0, instruction="Box.")).actions, first)
+    assert server.counts.repeated == 1
+    second = server.look("a", look(0.1, seed=1, step=3, instruction="Box."))
+    third = server.look("a", look(0.1, seed=1, step=3, instruction="Stop."))
+    assert server.counts.repeated == 1 and not np.array_equal(second.actions, third.actions)
+
+
 def test_rows_are_freed(made):
     """A session that ends or whose owner leaves frees its row; one too many is refused."""
     server = made(Remembers(), max_sessions=2)
@@ -165,7 +206,7 @@ def test_a_policy_fails_for_those_who_asked(made, capsys):
     for owner in "abcd":
         server.begin(owner, Begin("", 1, "boxing"))
     with pytest.raises(Refused, match=r"^the policy failed \(RuntimeError\); the server's console says more$"):
-        server.look("a", look(kind=1, step=4))
+        server.look("a", look(kind=1, step=0))
     assert "a secret of the server" in capsys.readouterr().err
     with pytest.raises(Refused, match="does not know"):
         server.look("a", look(step=8))

@@ -34,7 +34,8 @@ from arena_newton.policies.serve.serve_options import ServeOptions
         (["--policy", "dance"], "--policy dance: unknown policy"),
         (["--policy", "stand", "--protocol", "grpc"], "--protocol grpc: unknown, choose from openpi, roboarena"),
         (["--policy", "stand", "--port", "70000"], "--port 70000: expected 0 to 65535"),
-        (["--policy", "stand", "--host", "999.1.1.1", "--port", "0"], "--port 0: cannot be served at 999.1.1.1"),
+        (["--policy", "stand", "--host", "999.1.1.1", "--port", "0"], "--host 999.1.1.1: no address of this machine"),
+        (["--policy", "stand", "--host", "192.0.2.1", "--port", "0"], "--host 192.0.2.1: no address of this machine"),
         (["--policy", "stand", "--max-sessions", "0"], "--max-sessions 0: expected 1 to"),
         (["--policy", "stand", "--max-batch-size", "0"], "--max-batch-size 0: expected 1 to"),
         (["--policy", "stand", "--max-wait", "-1"], "--max-wait -1: expected seconds"),
@@ -151,6 +152,21 @@ def test_tls(served, tmp_path):
     policy = RemotePolicy(f"https://127.0.0.1:{two.port}", verify_ssl=False)
     policy.check()
     policy.close()
+
+
+def test_a_key_with_a_pass_phrase(capsys, tmp_path):
+    """A key that must be asked for is refused by name; nothing waits at a terminal."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs the program openssl (Debian package openssl)")
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-passout", "pass:secret", "-days", "2"]
+        + ["-subj", "/CN=localhost", "-keyout", str(key), "-out", str(cert)],
+        check=True,
+        capture_output=True,
+    )
+    assert main(["--policy", "stand", "--port", "0", "--tls-cert", str(cert), "--tls-key", str(key)]) == 2
+    assert capsys.readouterr().err == f"error: --tls-key {key}: has a pass phrase, expected a key without one\n"
 
 
 def observation(policy, values, mask):

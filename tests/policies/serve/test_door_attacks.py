@@ -1,0 +1,171 @@
+"""What hostile, deaf and half-open clients can do to the doors: nothing that another client notices."""
+
+import base64
+import json
+import os
+import resource
+import socket
+import struct
+import time
+import zlib
+from contextlib import ExitStack, suppress
+
+import msgpack
+import pytest
+from served_policies import Remembers, look, state
+
+from arena_newton.policies.serve import door_guard, openpi_codec, vla_eval_codec
+from arena_newton.policies.serve.arena_codec import unpack_look
+from arena_newton.policies.serve.wire_error import WireError
+
+pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+
+RESET = b"POST /reset HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer abc\r\nContent-Length: 2\r\n\r\n{}"
+
+
+def plain_socket(port, more=b""):
+    """A websocket made by hand, which answers nothing by itself, and the status that it got."""
+    connection = socket.create_connection(("127.0.0.1", port), timeout=10)
+    key = base64.b64encode(os.urandom(16))
+    connection.sendall(
+        b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: " + key + b"\r\n"
+        b"Sec-WebSocket-Version: 13\r\n" + more + b"\r\n"
+    )
+    return connection, int(connection.recv(4096).split()[1])
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_a_connection_that_cannot_be_taken_ends_no_door(served, protocol):
+    """A door whose process has no file descriptors left goes on when there are some again."""
+    one = served(Remembers(), protocol)
+    client = socket.socket()
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ExitStack() as filled:
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 8, limits[1]))
+            with suppress(OSError):
+                while True:
+                    filled.enter_context(open(os.devnull))
+            client.connect(("127.0.0.1", one.port))
+            time.sleep(0.3)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert one.http("GET", "/healthz") == (200, b"OK\n")
+    client.close()
+
+
+def test_deaf_clients_do_not_hold_up_the_end(served):
+    """A door closes at once, however many clients neither answer nor read."""
+    one = served(Remembers(), connections=8)
+    deaf = [plain_socket(one.port)[0] for _ in range(4)]
+    frame = openpi_codec.pack_request(look(seed=1, step=0))
+    frame = b"\x82\xfe" + struct.pack(">H", len(frame)) + bytes(4) + frame
+    deaf[0].settimeout(0.5)
+    with suppress(TimeoutError):
+        for _ in range(20000):  # until neither side's buffer takes any more
+            deaf[0].sendall(frame)
+    began = time.monotonic()
+    one.door.close()
+    assert time.monotonic() - began < 4.0
+    for client in deaf:
+        client.close()
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_strangers_take_no_room(served, protocol):
+    """Connections that have not shown a token do not count; beyond a number they are closed unread."""
+    one = served(Remembers(), protocol, token="abc", connections=2)
+    silent = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(10)]
+    time.sleep(0.2)
+    if protocol == "arena":
+        with socket.create_connection(("127.0.0.1", one.port), timeout=10) as client:
+            client.sendall(RESET)
+            assert client.recv(4096).startswith(b"HTTP/1.1 200 ")
+    else:
+        client, status = plain_socket(one.port, b"Authorization: Bearer abc\r\n")
+        assert status == 101
+        client.close()
+    more = [socket.create_connection(("127.0.0.1", one.port), timeout=10) for _ in range(door_guard.STRANGERS)]
+    assert more[-1].recv(1) == b""
+    for connection in silent + more:
+        connection.close()
+    for _ in range(100):  # what has left makes room
+        with suppress(OSError, ValueError):
+            if one.http("GET", "/health")[0] == 200:
+                break
+        time.sleep(0.05)
+    else:
+        pytest.fail("strangers that have left still count")
+
+
+def test_a_head_by_drips_is_hung_up_on(served, monkeypatch):
+    """Whoever sends the first request's head for ever is closed, so that strangers do not gather."""
+    monkeypatch.setattr("arena_newton.policies.serve.http_door.STRANGER_SECONDS", 0.5)
+    one = served(Remembers(), "arena")
+    began = time.monotonic()
+    with socket.create_connection(("127.0.0.1", one.port), timeout=10) as drips, pytest.raises(OSError, match="."):
+        while time.monotonic() - began < 8:
+            drips.sendall(b"G")
+            time.sleep(0.1)
+    assert time.monotonic() - began < 5
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_a_token_that_is_no_text(served, protocol):
+    """A token of bytes that are no characters is a wrong token, and no fault of the server."""
+    one = served(Remembers(), protocol, token="abc")
+    connection, status = plain_socket(one.port, b"Authorization: Bearer \xff\xfe\r\n")
+    assert status == 401
+    connection.close()
+
+
+def picture(width, height):
+    """A black PNG, which is a thousandth of what it unpacks to."""
+
+    def part(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    lines = zlib.compress(bytes(height * (1 + 3 * width)), 9)
+    data = b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", lines) + part(b"IEND", b"")
+    return {"__image__": True, "format": "png", "data": data, "shape": [height, width, 3]}
+
+
+def test_pictures_are_counted_together():
+    """A message of many large packed pictures is refused after the first of them."""
+    images = {f"camera {n}": picture(4096, 2048) for n in range(3)}
+    message = {"type": "observation", "payload": {"images": images}, "seq": 1, "timestamp": 0.0}
+    with pytest.raises(WireError, match="^message: pictures of more than 16777216 pixels in all$"):
+        vla_eval_codec.unpack_message(msgpack.packb(message))
+    images.popitem()
+    unpacked = vla_eval_codec.unpack_message(msgpack.packb(message)).payload["images"]
+    assert [p.shape for p in unpacked.values()] == [(2048, 4096, 3)] * 2
+
+
+def test_values_of_json_are_counted():
+    """A body that would become millions of Python objects is refused before it is read."""
+    body = b'{"observation": {"state": [' + b"[]," * 100_000 + b"1]}}"
+    with pytest.raises(WireError, match="^/infer: more than 65536 values$"):
+        unpack_look(body)
+
+
+def test_one_action_at_a_time(served):
+    """Without `return_chunk` a chunk is given one by one, as the original's server does; a reset ends it."""
+    one = served(Remembers(), "arena")
+    seen = {"observation": {"state": [float(v) for v in state(0.1)]}, "return_chunk": False, "task": "boxing"}
+
+    def asked():
+        status, reply = one.http("POST", "/infer", json.dumps(seen).encode())
+        assert status == 200 and list(reply) == ["action"]
+        return reply["action"]
+
+    one.http("POST", "/reset", b'{"seed": 3}')
+    one.policy.calls.clear()
+    first = [asked() for _ in range(5)]
+    assert len(one.policy.calls) == 2, "a chunk of four holds four actions"
+    one.http("POST", "/reset", b'{"seed": 3}')
+    assert [asked() for _ in range(5)] == first
+    chunk = json.loads(json.dumps(seen)) | {"return_chunk": True}
+    one.http("POST", "/reset", b'{"seed": 3}')
+    whole = one.http("POST", "/infer", json.dumps(chunk).encode())[1]["action_chunk"]
+    assert whole == first[:4]
