@@ -151,6 +151,8 @@ def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, por
         f"{options.protocol} at {scheme}://{options.host}:{port}, up to {options.max_sessions} episodes at once on "
         f"{server.device}; Ctrl-C ends",
     ]
+    asked = f"{options.protocol}+wss" if options.tls_cert else options.protocol
+    lines.append(f"eval asks it by --policy remote:{scheme if kind == 'http' else asked}://{options.host}:{port}")
     if not guard.wants_token and not _local(options.host):
         lines.append(f"warning: whoever reaches {options.host}:{port} can ask; set {ACCESS_TOKEN_VARIABLE} to a token")
     return lines

@@ -61,24 +61,26 @@ def content(out):
 
 @pytest.fixture(scope="module")
 def looped(tmp_path_factory):
-    """A small loop that was killed in recording and in training, then finished by the same command."""
+    """A small loop that was killed in recording, training and evaluation, then finished by the same command."""
     out = tmp_path_factory.mktemp("loop") / "out"
     killed("record", out)
     first = [record.index for record in load_run(out / "demonstrations").records]
     killed("train", out)
+    killed("record", out)  # after the training: at the first line of the evaluation's journal
+    assert len(load_run(out / "evaluation").records) == 1
     made = {path: path.stat().st_mtime_ns for path in sorted((out / "dataset").rglob("*")) if path.is_file()}
     code = main(["loop", *FLAGS, "--out", str(out)])
     return out, code, first, made
 
 
 def test_kills_cost_no_finished_stage(looped):
-    """After kill -9 in recording and in training the same command finishes; what was finished is not made again."""
+    """After kill -9 in three stages the same command finishes; what was finished is not made again."""
     out, code, first, made = looped
     assert code == 0 and len(first) == 1
     stages = content(out)
     assert list(stages) == ["record", "build", "train", "evaluate"]
     assert all(stage["finished"] for stage in stages.values())
-    assert [stage["attempts"] for stage in stages.values()] == [2, 1, 2, 1]
+    assert [stage["attempts"] for stage in stages.values()] == [2, 1, 2, 2]
     assert {path: path.stat().st_mtime_ns for path in made} == made
     assert len((out / "demonstrations" / "episodes.jsonl").read_text().splitlines()) == 2
     checkpoint = out / stages["train"]["checkpoint"]

@@ -93,6 +93,8 @@ def test_the_command_serves_until_it_is_interrupted(stop, protocol):
         first, second = process.stdout.readline(), process.stdout.readline()
         assert "chunks of 50 actions of v3.1 at 50 Hz, no picture" in first
         port = int(second.split("127.0.0.1:")[1].split(",")[0])
+        scheme = "http" if protocol == "arena" else protocol
+        assert process.stdout.readline() == f"eval asks it by --policy remote:{scheme}://127.0.0.1:{port}\n"
         if protocol == "openpi":
             with connect(f"ws://127.0.0.1:{port}") as client:
                 client.recv(timeout=10)
