@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
-from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
+from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe
 from arena_newton.policies.train import families
 from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
@@ -156,17 +156,18 @@ def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
     Raises:
         InputError: The family has no such recipe.
     """
+    named = recipe(options.policy, options.recipe)
     changes: dict[str, object] = {}
     if options.labels:
         changes["labels"] = options.labels
-        if options.labels != "v4":
-            changes["realign"] = 0.0
+        # Integrated yaw rates drift; a recipe of v3.1 says nothing of it.
+        changes["realign"] = (named.realign or REALIGN) if options.labels == "v4" else 0.0
     if options.task_vector:
         changes["use_task_vector"] = True
     if options.batch_size:
         changes["batch_size"] = options.batch_size
     if options.lr:
-        changes |= {"lr": options.lr, "lr_backbone": options.lr}
+        changes |= {"lr": options.lr, "lr_backbone": options.lr * named.lr_backbone / named.lr}
     if options.seed is not None:
         changes["seed"] = options.seed
     return recipe(options.policy, options.recipe, **changes)

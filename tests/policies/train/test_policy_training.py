@@ -39,7 +39,7 @@ from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.frame_store import made_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
-from arena_newton.policies.train.training import train
+from arena_newton.policies.train.training import chosen_recipe, train
 from tests.fuzz.mutants import damaged
 from tests.policies.train import narrow_network
 from tests.policies.train.made_stats import made_stats
@@ -399,6 +399,23 @@ def test_a_folder_belongs_to_one_process(dataset, whole, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "check_new", lambda out: None)  # it was not there yet when this one began
     with pytest.raises(InputError, match=r"holds a training already"):
         train(options(dataset, out, steps=1))
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({"policy": "act", "recipe": "paper", "labels": "v4"}, ("v4", 0.002, 1e-5, 1e-5)),
+        ({"policy": "act", "recipe": "fast", "labels": "v4"}, ("v4", 0.002, 1e-4, 1e-4)),
+        ({"policy": "act", "recipe": "fast", "labels": "v3.1"}, ("v3.1", 0.0, 1e-4, 1e-4)),
+        ({"policy": "flow", "recipe": "paper", "lr": 1e-3}, ("v3.1", 0.0, 1e-3, 1e-4)),
+    ],
+)
+def test_flags_change_what_belongs_together(flags, expected):
+    """--labels v4 has a realign with every recipe, and --lr keeps the ratio of the encoder's learning rate."""
+    found = chosen_recipe(PolicyTrainOptions(**flags))
+    labels, *rates = expected
+    assert found.labels == labels
+    assert [found.realign, found.lr, found.lr_backbone] == pytest.approx(rates)
 
 
 def test_two_datasets_and_a_task_vector(dataset, tmp_path):
