@@ -245,7 +245,7 @@ def resolve(options: RunOptions) -> RunConfig:
     scheme, _, target = options.policy.partition(":")
     if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
-        policy_path, ending = _existing("--policy", str(at)), "" if episode is None else f"#{episode}"
+        policy_path, ending = _existing("--policy", str(at), f"{scheme}:"), "" if episode is None else f"#{episode}"
     else:
         policy_path, ending = None, ""
     label = f"{scheme}:{_shown(policy_path)}{ending}" if policy_path else options.policy
@@ -476,13 +476,13 @@ def _decisive(scheme: str, path: Path) -> Path:
     return path / DATASET_FILE if (path / DATASET_FILE).is_file() else path
 
 
-def _existing(flag: str, given: str | None) -> Path | None:
+def _existing(flag: str, given: str | None, before: str = "") -> Path | None:
     """Absolute path of a file, for --policy also of a folder."""
     if given is None:
         return None
     path = Path(given).expanduser()
     if not given or not path.exists():
-        raise InputError(f"{flag} {given}: no such file")
+        raise InputError(f"{flag} {before}{given}: no such file{' or folder' if flag == '--policy' else ''}")
     if path.is_dir() and flag != "--policy":
         raise InputError(f"{flag} {given}: is a folder, expected a file")
     if not (path.is_file() or path.is_dir()):

@@ -25,7 +25,7 @@ from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import DATASET_FILE, Policy
 
-__all__ = ["FRONT", "DatasetObservations", "Samples", "predict"]
+__all__ = ["FRONT", "DatasetObservations", "Samples", "as_many_of_each", "predict"]
 
 FRONT = "observation.images.front"
 """Feature of the head camera's pictures."""
@@ -136,6 +136,21 @@ class DatasetObservations:
         """Close its videos."""
         if self._frames is not None:
             self._frames.close()
+
+
+def as_many_of_each(datasets: Sequence[DatasetObservations], task: str, number: int, per_episode: int) -> list[Samples]:
+    """Observations of a task from every dataset, as many of each, so that no source is the more frequent one.
+
+    Where one has fewer, fewer are taken of the others, again spread over all their episodes.
+
+    Raises:
+        InputError: As `DatasetObservations.sample`.
+    """
+    found = [data.sample(task, number, per_episode) for data in datasets]
+    while len(set(map(len, found))) > 1:
+        most = min(map(len, found))
+        found = [data.sample(task, most, per_episode) for data in datasets]
+    return found
 
 
 def predict(

@@ -12,7 +12,7 @@ from arena_newton import policies, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.action_map import ActionMap, Separation, draw, embed, separation, shifted
 from arena_newton.eval.journal import StorageError, write_atomic
-from arena_newton.eval.predicted_actions import DatasetObservations, Samples, predict
+from arena_newton.eval.predicted_actions import DatasetObservations, as_many_of_each, predict
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.table_options import TsneOptions
 from arena_newton.policies.base import Policy
@@ -95,9 +95,8 @@ def _task(
     task: str,
     options: TsneOptions,
 ) -> tuple[ActionMap, JsonObject]:
-    samples: list[Samples] = [data.sample(task, options.samples, options.frames) for data in datasets]
-    most = min(map(len, samples))  # both sources alike, so that 0.5 is chance
-    samples = [_some(one, most) for one in samples]
+    samples = as_many_of_each(datasets, task, options.samples, options.frames)  # so that 0.5 is chance
+    most = len(samples[0])
     answers = [
         predict(policy, data, one, batch=options.batch, seed=options.seed)
         for data, one in zip(datasets, samples, strict=True)
@@ -120,12 +119,6 @@ def _task(
         "largest_shifts": [{"number": name, "shift": round(by, 4)} for name, by in shifted(actions, sources)],
     }
     return one, result
-
-
-def _some(samples: Samples, number: int) -> Samples:
-    """The first samples."""
-    fields = {field.name: getattr(samples, field.name) for field in dataclasses.fields(samples)}
-    return Samples(**{name: value if name == "task" else value[:number] for name, value in fields.items()})
 
 
 def _separation(found: Separation) -> JsonObject:

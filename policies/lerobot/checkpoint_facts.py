@@ -61,7 +61,7 @@ class CheckpointFacts:
     device: str = ""
     """Where it was trained, such as `NVIDIA H200`."""
     datasets: tuple[Mapping[str, object], ...] = ()
-    """Of each dataset: `name`, `hash` of its `meta/info.json`, `episodes`, `frames`."""
+    """Of each dataset: `name`, `hash` of its content, `episodes`, `frames`."""
     options: Mapping[str, object] = field(default_factory=dict)
     """The training's resolved options."""
 

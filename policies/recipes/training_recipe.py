@@ -14,7 +14,7 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 
-__all__ = ["FAMILIES", "RECIPES", "TrainingRecipe", "paper_file", "recipe"]
+__all__ = ["FAMILIES", "REALIGN", "RECIPES", "TrainingRecipe", "paper_file", "recipe"]
 
 FAMILIES: dict[str, str] = {
     "act": "act",
@@ -34,6 +34,8 @@ BETAS = (0.9, 0.999)
 """Of AdamW where the policy's configuration has none: LeRobot's `AdamWConfig`."""
 GRAD_CLIP = 10.0
 """Norm of the gradient where the policy's configuration has none: LeRobot's `AdamConfig`, `AdamWConfig`."""
+REALIGN = 0.002
+"""Fraction of the gap to the measured heading that is closed each tick, of labels of v4: the experts' own rate."""
 _OPTIMIZER_FIELDS = ("optimizer_", "scheduler_")
 _SCHEDULES = ("constant", "cosine")
 _PRECISIONS = ("float32", "bfloat16")
@@ -227,7 +229,7 @@ def _read_paper(family: str) -> TrainingRecipe:
 
 _FAST: dict[str, object] = {
     "labels": "v4",
-    "realign": 0.002,
+    "realign": REALIGN,
     "steps": 15_000,
     "lr": 1e-4,
     "lr_backbone": 1e-4,
@@ -254,7 +256,7 @@ _SMALL: dict[str, object] = {
     "final_lr_fraction": 0.01,
     "precision": "float32",
     "labels": "v4",
-    "realign": 0.002,
+    "realign": REALIGN,
     "picture": 64,
     "shift_px": 2,
     "colour": 0.1,

@@ -71,7 +71,7 @@ class DatasetRows:
     picture_statistics: Mapping[str, np.ndarray]
     """Per channel on the scale 0 to 1, shape [3, 1, 1], and `count`."""
     hash: str
-    """SHA-256 of `meta/info.json`."""
+    """`content_hash`."""
 
     @property
     def frames(self) -> int:
@@ -99,6 +99,11 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
     Raises:
         InputError: It is no dataset of canonical states and actions with the head camera's pictures, or is damaged.
     """
+    if not (root / "meta" / "info.json").is_file():
+        raise InputError(
+            f"--dataset {root}: no LeRobot dataset, meta/info.json is missing; `python -m arena_newton.data build` "
+            "makes one of recordings"
+        )
     about = DatasetActions(root)
     files = about.files
     where = files.root / "meta" / "info.json"
@@ -127,8 +132,22 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
         height=shape[0],
         width=shape[1],
         picture_statistics=picture_statistics(files, camera),
-        hash=hashlib.sha256(where.read_bytes()).hexdigest(),
+        hash=content_hash(files, states, actions),
     )
+
+
+def content_hash(files: DatasetFiles, states: Sequence[np.ndarray], actions: Sequence[np.ndarray]) -> str:
+    """SHA-256 over `meta/info.json`, `meta/stats.json` (of the pictures too) and every number of states and actions.
+
+    `info.json` of the original's datasets says no more than how many episodes and rows there are.
+    """
+    digest = hashlib.sha256((files.root / "meta" / "info.json").read_bytes())
+    statistics_file = files.root / "meta" / "stats.json"
+    if statistics_file.is_file():
+        digest.update(statistics_file.read_bytes())
+    for numbers in (*states, *actions):
+        digest.update(np.ascontiguousarray(numbers).tobytes())
+    return digest.hexdigest()
 
 
 def shape_of(files: DatasetFiles, key: str) -> list[int]:

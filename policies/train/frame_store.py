@@ -168,13 +168,14 @@ def load_frames(
     top, bottom = black_rows(datasets, workers)
     check_memory(frames, height - top - bottom, width, device)
     pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
-    if not _decode(datasets, pictures, (top, bottom), workers, on_frames):
-        # Some picture is not black where the first ones of all episodes are.
+    black = _decode(datasets, pictures, (top, bottom), workers, on_frames)
+    if black != (top, bottom):
+        # Some picture is not black where the first ones of all episodes are: only what is black in all is cut off.
         del pictures
-        top = bottom = 0
-        check_memory(frames, height, width, device)
-        pictures = torch.empty((frames, height, width, 3), dtype=torch.uint8, device=device)
-        _decode(datasets, pictures, (0, 0), workers, on_frames)
+        top, bottom = black
+        check_memory(frames, height - top - bottom, width, device)
+        pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
+        _decode(datasets, pictures, black, workers, lambda count: None)
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     held = [number >= len(d.episodes) - hold_out for d in datasets for number in range(len(d.episodes))]
     return assembled(episodes, pictures, held, top, bottom)
@@ -203,8 +204,11 @@ def _decode(
     bands: tuple[int, int],
     workers: int,
     on_frames: Callable[[int], None],
-) -> bool:
-    """Decode every episode into its rows; False where a picture is not black in the bands that are cut off."""
+) -> tuple[int, int]:
+    """Decode every episode into its rows; returns how many rows of the bands that are cut off all pictures have black.
+
+    Where these are fewer than the bands, rows of pictures are missing.
+    """
     top, bottom = bands
     end = datasets[0].height - bottom
     work: list[tuple[DatasetRows, Frames, int, int]] = []
@@ -215,31 +219,34 @@ def _decode(
             work.append((dataset, reader, number, row))
             row += episode.length
 
-    def one(item: tuple[DatasetRows, Frames, int, int]) -> int:
+    def one(item: tuple[DatasetRows, Frames, int, int]) -> tuple[int, np.ndarray]:
         dataset, reader, number, row = item
         length = dataset.episodes[number].length
         frames = copy.copy(reader)  # with open files of its own: a decoder gives one frame after the other
         found = np.empty((length, *pictures.shape[1:]), np.uint8)
-        clean = True
+        most = np.zeros(dataset.height, np.uint8)
         for place, picture in enumerate(frames.episode(number)):
             if picture.shape[:2] != (dataset.height, dataset.width):
                 raise InputError(f"{dataset.root}: episode {number}: a picture has shape {list(picture.shape)}")
             found[place] = picture[top:end]
-            clean = clean and int(picture[:top].max(initial=0)) <= BLACK and int(picture[end:].max(initial=0)) <= BLACK
+            for band in (slice(0, top), slice(end, None)):
+                most[band] = np.maximum(most[band], picture[band].max(axis=(1, 2)))
         frames.close()
         pictures[row : row + length].copy_(torch.from_numpy(found))
-        return length if clean else -1
+        return length, most
 
+    brightest = np.zeros(datasets[0].height, np.uint8)
     with ThreadPoolExecutor(workers) as pool:
         running = pool.map(one, work)
         try:
-            for length in running:
-                if length < 0:
-                    return False
+            for length, most in running:
+                brightest = np.maximum(brightest, most)
                 on_frames(length)
         finally:
             pool.shutdown(cancel_futures=True)
-    return True
+    bright = np.flatnonzero(brightest > BLACK)
+    above, below = bright[bright < top], bright[bright >= end]
+    return (int(above[0]) if len(above) else top, len(brightest) - 1 - int(below[-1]) if len(below) else bottom)
 
 
 def assembled(

@@ -34,13 +34,13 @@ class PolicyTrainOptions:
     out: Path | None = None
     """Folder of the training; runs/<policy>_<recipe>_<dataset> by default."""
     steps: int = field(default=0, metadata=bounds(0, 10_000_000))
-    """Optimizer steps; 0: the recipe's, or what --minutes gives."""
+    """Optimizer steps; 0: the recipe's, or what --minutes gives. Not together with --minutes."""
     minutes: float = field(default=0.0, metadata=bounds(0.0, 100_000.0))
     """Time of the optimization [min], from its first step: the speed is measured, then the number of steps is fixed so
     that the schedule ends when the time is up; 0: no limit."""
     resume: Path | None = None
-    """Folder of a training to go on with, with its own options; only --device, --minutes, --save-every and the like
-    may differ."""
+    """Folder of a training to go on with, with its own options; only --device, --steps, --minutes (in all),
+    --save-every and the like may differ."""
     labels: str = ""
     """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted
     in memory."""
@@ -134,6 +134,8 @@ def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
         if options.against_lerobot and not options.dataset:
             raise InputError("--against-lerobot: LeRobot's loop reads a dataset; name one with --dataset")
         return
+    if options.steps and options.minutes:
+        raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.labels not in ("", "v3.1", "v4"):
         raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
     if options.resume is None and not options.dataset:

@@ -213,6 +213,23 @@ class PolicyTrainer:
             self._graphs.append(graph)
 
     @torch.no_grad()
+    def check_agreement(self) -> None:
+        """Make sure that all processes hold the same weights; they call this at the same step.
+
+        Raises:
+            ArenaError: They do not.
+        """
+        if self.ranks == 1:
+            return
+        weights = torch.cat([p.detach().reshape(-1).double() for p in self._parameters])
+        mine = torch.stack([weights.sum(), weights.square().sum()])
+        least, most = mine.clone(), mine.clone()
+        torch.distributed.all_reduce(least, torch.distributed.ReduceOp.MIN)
+        torch.distributed.all_reduce(most, torch.distributed.ReduceOp.MAX)
+        if not torch.equal(least, most):
+            raise ArenaError(f"the {self.ranks} processes hold different weights at step {self.step}")
+
+    @torch.no_grad()
     def held_out_loss(self) -> float:
         """Mean loss of held-out rows spread over their episodes, without augmentation; NaN where none are held out.
 

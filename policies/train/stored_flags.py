@@ -35,6 +35,9 @@ def resumed(options: PolicyTrainOptions, content: Mapping[str, object], where: P
             flag = "--" + one.name.replace("_", "-")
             raise InputError(f"{flag} {given}: the training in {options.resume} has {getattr(stored, one.name)}")
         changes[one.name] = given
+    for given_flag, other in (("steps", "minutes"), ("minutes", "steps")):  # either says how long a training is
+        if given_flag in changes:
+            changes.setdefault(other, getattr(empty, other))
     return dataclasses.replace(stored, **changes)  # type: ignore[arg-type]  # fields of the class
 
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
-from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
+from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe
 from arena_newton.policies.train import families
 from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
@@ -26,7 +26,7 @@ from arena_newton.policies.train.policy_options import PolicyTrainOptions, check
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
-from arena_newton.policies.train.training_state import TrainingProgress, last_checkpoint, restore
+from arena_newton.policies.train.training_state import TrainingProgress, check_new, last_checkpoint, restore
 from arena_newton.text import counted
 
 __all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
@@ -58,14 +58,22 @@ def train(options: PolicyTrainOptions) -> Path:
     if options.resume is not None:
         checkpoint = last_checkpoint(options.resume)
         progress = TrainingProgress.read(checkpoint)
-        options = resumed(options, progress.options, checkpoint)
+        quiet, before, options = (
+            options.quiet,
+            progress.options.get("minutes"),
+            resumed(options, progress.options, checkpoint),
+        )
         check_numbers(options)
+        if options.minutes and options.minutes != before:  # another time: the number of steps is fixed again
+            progress = dataclasses.replace(progress, steps=0)
         if 0 < (options.steps or progress.steps) <= progress.step:  # it came to its end
+            if not quiet:
+                print(f"finished already, after {counted(progress.step, 'step')}: {checkpoint / PRETRAINED_MODEL_DIR}")
             return checkpoint / PRETRAINED_MODEL_DIR
     settings = chosen_recipe(options)
     out = options.out or default_folder(options)
-    if options.resume is None and any(one.name.isdigit() for one in out.glob("checkpoints/*")):
-        raise InputError(f"--out {out}: holds a training already; --resume {out} goes on with it")
+    if options.resume is None:
+        check_new(out)
     device, processes = chosen_device(options.device)
     try:
         with _group(device, processes), fast_kernels(device):
@@ -148,17 +156,18 @@ def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
     Raises:
         InputError: The family has no such recipe.
     """
+    named = recipe(options.policy, options.recipe)
     changes: dict[str, object] = {}
     if options.labels:
         changes["labels"] = options.labels
-        if options.labels != "v4":
-            changes["realign"] = 0.0
+        # Integrated yaw rates drift; a recipe of v3.1 says nothing of it.
+        changes["realign"] = (named.realign or REALIGN) if options.labels == "v4" else 0.0
     if options.task_vector:
         changes["use_task_vector"] = True
     if options.batch_size:
         changes["batch_size"] = options.batch_size
     if options.lr:
-        changes |= {"lr": options.lr, "lr_backbone": options.lr}
+        changes |= {"lr": options.lr, "lr_backbone": options.lr * named.lr_backbone / named.lr}
     if options.seed is not None:
         changes["seed"] = options.seed
     return recipe(options.policy, options.recipe, **changes)

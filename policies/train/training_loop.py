@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import fcntl
 import math
+import os
 import signal
 import threading
 import time
@@ -23,6 +25,7 @@ from arena_newton.policies.train.stored_flags import plain_options
 from arena_newton.policies.train.training_log import TrainingLog
 from arena_newton.policies.train.training_state import (
     TrainingProgress,
+    check_new,
     checkpoint_name,
     remove_older,
     write_checkpoint,
@@ -81,6 +84,7 @@ class TrainingLoop:
         self._options, self._out, self._trainer = options, out, trainer
         self._facts, self._processes = facts, processes
         self._before = progress.minutes if progress is not None else 0.0
+        self._new = progress is None
         self._total = trainer.recipe.steps
         if options.minutes and not options.steps and not (progress is not None and progress.steps):
             self._total = 0  # until the speed is measured
@@ -95,13 +99,23 @@ class TrainingLoop:
         return self._before + (time.monotonic() - self._started) / 60.0
 
     def work(self) -> Path:
-        """Take all steps; returns the folder of the last checkpoint."""
+        """Take all steps; returns the folder of the last checkpoint.
+
+        Raises:
+            InputError: The folder cannot be made, or another process trains in it.
+            ArenaError: The loss is not finite, or the disk is full.
+        """
+        with _held(self._out) if self._processes.first else contextlib.nullcontext():
+            if self._processes.first and self._new:
+                check_new(self._out)  # another one may have come and gone while this one decoded
+            try:
+                return self._work()
+            except OSError as error:  # of the log; checkpoints say it themselves
+                raise ArenaError(f"{self._out}: cannot be written ({error.strerror or error})") from error
+
+    def _work(self) -> Path:
         options, trainer, first = self._options, self._trainer, self._processes.first
         if first:
-            try:
-                self._out.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(f"--out {self._out}: cannot be made ({error.strerror})") from None
             remove_older(self._out, 0)
         log = TrainingLog(self._out, step=trainer.step, quiet=options.quiet) if first else None
         begin = trainer.step
@@ -204,8 +218,9 @@ class TrainingLoop:
         return trainer.step, time.monotonic()
 
     def _save(self) -> Path:
-        """Write a checkpoint of this step; only the first process does."""
+        """Write a checkpoint of this step; only the first process does, once all hold the same."""
         trainer, options = self._trainer, self._options
+        trainer.check_agreement()
         progress = TrainingProgress(
             step=trainer.step,
             steps=self._total,
@@ -220,6 +235,25 @@ class TrainingLoop:
             self._last = write_checkpoint(self._out, trainer, facts, progress)
             remove_older(self._out, options.keep)
         return self._last or self._out / CHECKPOINTS_DIR / checkpoint_name(trainer.step)
+
+
+@contextlib.contextmanager
+def _held(out: Path) -> Iterator[None]:
+    """A training's folder, made and kept from other processes: two of them would remove each other's files."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be made ({error.strerror})") from None
+    try:
+        with contextlib.suppress(OSError):  # some network disks have no locks
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(f"--out {out}: another process trains in it") from None
+        yield
+    finally:
+        os.close(folder)
 
 
 def _wait(device: torch.device) -> None:

@@ -37,6 +37,7 @@ from arena_newton.policies.train.policy_trainer import PolicyTrainer
 __all__ = [
     "PROGRESS_FILE",
     "TrainingProgress",
+    "check_new",
     "checkpoint_name",
     "last_checkpoint",
     "remove_older",
@@ -117,6 +118,16 @@ def checkpoint_name(step: int) -> str:
     return f"{step:0{FEWEST_DIGITS}d}"
 
 
+def check_new(out: Path) -> None:
+    """Refuse a folder that holds checkpoints.
+
+    Raises:
+        InputError: It does.
+    """
+    if any(one.name.isdecimal() for one in out.glob(f"{CHECKPOINTS_DIR}/*")):
+        raise InputError(f"--out {out}: holds a training already; --resume {out} goes on with it")
+
+
 def last_checkpoint(out: Path, flag: str = "--resume") -> Path:
     """The last whole checkpoint of a training.
 
@@ -166,8 +177,10 @@ def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, 
         link.unlink(missing_ok=True)
         link.symlink_to(final.name)
         os.replace(link, parent / LAST_CHECKPOINT_LINK)
-    except OSError as error:
-        raise ArenaError(f"{final}: the checkpoint cannot be written ({error.strerror or error})") from error
+    except (OSError, SafetensorError) as error:  # safetensors says a full disk in an error of its own
+        shutil.rmtree(growing, ignore_errors=True)
+        reason = (error.strerror if isinstance(error, OSError) else None) or " ".join(str(error).split())[:160]
+        raise ArenaError(f"{final}: the checkpoint cannot be written ({reason})") from error
     return final
 
 

@@ -15,7 +15,7 @@ from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION  # noqa: E402
 from arena_newton.errors import InputError  # noqa: E402
 from arena_newton.eval.__main__ import main  # noqa: E402
 from arena_newton.eval.action_map import embed, separation, shifted  # noqa: E402
-from arena_newton.eval.predicted_actions import FRONT, DatasetObservations, predict  # noqa: E402
+from arena_newton.eval.predicted_actions import FRONT, DatasetObservations, as_many_of_each, predict  # noqa: E402
 from arena_newton.pictures.settings import CameraConfig  # noqa: E402
 from arena_newton.policies.base import POLICIES  # noqa: E402
 from tests.policies.original_dataset import features, write_dataset  # noqa: E402
@@ -123,6 +123,15 @@ def test_uniformly_spaced_frames_of_each_episode(made):
     few = data.sample("boxing", 20, 10)
     assert sorted(set(few.episodes.tolist())) == [0, 3] and len(few) == 20
     assert len(data.sample("boxing", 1000, 10)) == 40
+
+
+def test_a_smaller_source_leaves_the_other_spread(made, tmp_path):
+    """As many observations of each source, and of the larger one from its first episode to its last."""
+    root, _ = make_dataset(tmp_path / "few", "sonic", 0.0, lengths=(25, 30))
+    sources = [DatasetObservations(made[0][0]), DatasetObservations(root)]
+    larger, smaller = as_many_of_each(sources, "boxing", 40, 10)
+    assert len(larger) == len(smaller) == 20
+    assert sorted(set(larger.episodes.tolist())) == [0, len(LENGTHS) - 1]
 
 
 def test_each_observation_is_answered_alone(made):

@@ -198,7 +198,7 @@ def test_a_name_of_the_hub_that_is_not_here(tmp_path, monkeypatch, capsys):
     assert main(["run", "--task", "boxing", "--policy", "lerobot:nobody/nothing", "--out", out]) == 2
     assert "lerobot:nobody/nothing: is no folder here, and the Hugging Face hub" in capsys.readouterr().err
     assert main(["run", "--task", "boxing", "--policy", "lerobot:no/such/folder", "--out", out]) == 2
-    assert "--policy no/such/folder: no such file" in capsys.readouterr().err
+    assert "--policy lerobot:no/such/folder: no such file or folder" in capsys.readouterr().err
     assert not Path(out).exists()
 
 

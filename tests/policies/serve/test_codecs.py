@@ -1,7 +1,7 @@
 """The bytes of each protocol: golden frames read and written, and what no codec lets in.
 
-The golden frames were written by hand from the formats that each codec names as its source, and agree with what their
-own packers write (plain `msgpack.packb` with their hooks).
+The golden frames were made with plain `msgpack.packb` and hooks written after the formats that each codec names as its
+source, not with the codecs and not with installed servers of those projects.
 """
 
 import base64

@@ -70,6 +70,26 @@ def test_a_late_picture_keeps_its_rows(tmp_path):
     assert store.pictures[15, 0].min() > 60 and store.pictures[0, 0].max() <= frame_store.BLACK
 
 
+def test_dark_beginnings_do_not_hide_the_pad(tmp_path):
+    """Only rows that are black in every picture are cut off, so that a padded camera is known as one."""
+
+    def dark_first(number, size, seed):
+        found = np.full((number, size, size, 3), 90, np.uint8)
+        found[:, :BAND] = found[:, -BAND:] = 0
+        found[0, : BAND + 12] = 0
+        return found
+
+    dark = make_dataset(tmp_path, lengths=(21, 23), pictures=dark_first)
+    counted = []
+    kept = load_frames([read_rows(dark, "v3.1")], CPU, jobs=1, on_frames=counted.append)
+    # A row of slack: the codec may leave traces of the picture in the pad.
+    assert BAND - 1 <= kept.top <= BAND and BAND - 1 <= kept.bottom <= BAND
+    assert camera_fit(kept) == "pad"
+    assert counted == [21, 23]
+    frames = Frames(dark)
+    assert all(np.array_equal(kept.pictures[row], frames[row][kept.top : SIZE - kept.bottom]) for row in (0, 1, 20, 43))
+
+
 def test_actions_are_of_the_wanted_protocol(dataset, rows, tmp_path):
     """A v3.1 dataset gives v4 as `encode_v4` makes it, a v4 dataset the same bits, and v3.1 back."""
     about = DatasetActions(dataset)

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import socket
@@ -29,6 +30,7 @@ from arena_newton.policies.train import (
     measured_training,
     training,
     training_bench,
+    training_log,
     training_loop,
     training_state,
 )
@@ -37,11 +39,11 @@ from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.frame_store import made_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
-from arena_newton.policies.train.training import train
+from arena_newton.policies.train.training import chosen_recipe, train
 from tests.fuzz.mutants import damaged
 from tests.policies.train import narrow_network
 from tests.policies.train.made_stats import made_stats
-from tests.policies.train.small_dataset import info, make_dataset
+from tests.policies.train.small_dataset import info, make_dataset, padded
 
 STEPS = 8
 
@@ -168,6 +170,12 @@ def test_a_stopped_training_goes_on_to_the_same_bits(dataset, whole, tmp_path, m
     assert [row["loss"] for row in rows(out)] == [row["loss"] for row in rows(whole)]
 
 
+def test_a_finished_training_says_so(whole, capsys):
+    """The command line's --resume of a finished training names its checkpoint."""
+    assert main(["--resume", str(whole)]) == 0
+    assert f"finished already, after {STEPS} steps: {whole}/checkpoints/00000{STEPS}/" in capsys.readouterr().out
+
+
 def test_a_finished_training_is_not_repeated(whole, monkeypatch):
     """Resumed, it gives its checkpoint at once, without reading the data."""
     monkeypatch.setattr(training, "read_rows", lambda *_: pytest.fail("reads the data"))
@@ -193,6 +201,32 @@ def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_pat
         assert CheckpointFacts.read(checkpoint_folder(out)).steps == 3
     train(PolicyTrainOptions(resume=out, quiet=True))
     assert same(weights(out), weights(whole)) and not list(out.rglob("*.part"))
+
+
+def test_a_full_disk_is_one_error(dataset, tmp_path, capsys):
+    """What safetensors and the log cannot write is a message with the path and code 1; no part of it takes space."""
+    out = tmp_path / "run"
+    given = ["--dataset", str(dataset), "--recipe", "small", "--device", "cpu", "--steps", "1", "--out", str(out)]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))  # bytes of a file; a write beyond fails
+    try:
+        assert main(given) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    error = capsys.readouterr().err
+    assert f"error: {out}/checkpoints/000001: the checkpoint cannot be written (" in error and "File too large" in error
+    assert not list((out / "checkpoints").iterdir())
+
+
+def test_a_log_on_a_full_disk_is_one_error(dataset, tmp_path, monkeypatch):
+    """A row of the log that cannot be written ends the training with the folder's name."""
+
+    def full(self, row):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(training_log.TrainingLog, "record", full)
+    with pytest.raises(ArenaError, match=r"run: cannot be written .No space left on device"):
+        train(options(dataset, tmp_path / "run"))
 
 
 CHILD = """
@@ -229,8 +263,10 @@ def test_a_killed_training_goes_on(dataset, tmp_path):
 
 
 def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
-    """As under torchrun on the CPU: the first process writes, and what it goes on with is both processes' network."""
-    out = tmp_path / "run"
+    """As under torchrun on the CPU: both processes hold the same weights at each checkpoint, which the first writes."""
+    out, agreed = tmp_path / "run", []
+    check = PolicyTrainer.check_agreement
+    monkeypatch.setattr(PolicyTrainer, "check_agreement", lambda self: (check(self), agreed.append(self.step)))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
@@ -246,7 +282,19 @@ def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
         second.kill()
     progress = training_state.TrainingProgress.read(out / "checkpoints" / "last")
     assert (progress.step, progress.processes, progress.batch_size) == (3, 2, 2)
+    assert agreed == [1, 2, 3]
     assert not torch.distributed.is_initialized()
+
+
+def test_processes_that_differ_are_refused(monkeypatch):
+    """Weights that drift apart end a training of several processes before they are saved."""
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, source: None)
+    trainer = plain_trainer(monkeypatch, 2, ranks=2)
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, operation: None)
+    trainer.check_agreement()
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, operation: tensor.add_(float(operation)))
+    with pytest.raises(ArenaError, match="2 processes hold different weights"):
+        trainer.check_agreement()
 
 
 def plain_trainer(monkeypatch, batch, rank=0, ranks=1, **more):
@@ -315,6 +363,61 @@ def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
     assert rates[-1] == pytest.approx(low, rel=0.3) and rates[30] == pytest.approx(max(rates) / 2, rel=0.15)
 
 
+def test_another_time_on_resume_is_kept(dataset, tmp_path, monkeypatch):
+    """--resume with more --minutes trains on, with a schedule that ends then; --steps in its place does as well."""
+    clock = [1000.0]
+    monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    advance = PolicyTrainer.advance
+
+    def slow(self):
+        advance(self)
+        clock[0] += 1.0
+
+    monkeypatch.setattr(PolicyTrainer, "advance", slow)
+    out = tmp_path / "run"
+    assert 27 <= CheckpointFacts.read(train(options(dataset, out, steps=0, minutes=0.5))).steps <= 30
+    again = PolicyTrainOptions(resume=out, minutes=1.0, quiet=True)
+    facts = CheckpointFacts.read(train(again))
+    assert 56 <= facts.steps <= 60 and 0.9 <= facts.minutes <= 1.0
+    assert CheckpointFacts.read(train(again)).steps == facts.steps
+    assert CheckpointFacts.read(train(PolicyTrainOptions(resume=out, steps=62, quiet=True))).steps == 62
+
+
+def test_a_folder_belongs_to_one_process(dataset, whole, tmp_path, monkeypatch):
+    """A second training in the folder of a running one is refused, and one that was finished meanwhile is kept."""
+    out = tmp_path / "run"
+    refused = []
+
+    def second():
+        with pytest.raises(InputError, match=r"another process trains in it") as caught:
+            train(options(dataset, out, steps=1))
+        refused.append(caught.value)
+
+    interrupt(monkeypatch, 2, second)
+    train(options(dataset, out, steps=3))
+    assert len(refused) == 1 and [one.name for one in sorted((out / "checkpoints").iterdir())] == ["000003", "last"]
+    monkeypatch.setattr(training, "check_new", lambda out: None)  # it was not there yet when this one began
+    with pytest.raises(InputError, match=r"holds a training already"):
+        train(options(dataset, out, steps=1))
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({"policy": "act", "recipe": "paper", "labels": "v4"}, ("v4", 0.002, 1e-5, 1e-5)),
+        ({"policy": "act", "recipe": "fast", "labels": "v4"}, ("v4", 0.002, 1e-4, 1e-4)),
+        ({"policy": "act", "recipe": "fast", "labels": "v3.1"}, ("v3.1", 0.0, 1e-4, 1e-4)),
+        ({"policy": "flow", "recipe": "paper", "lr": 1e-3}, ("v3.1", 0.0, 1e-3, 1e-4)),
+    ],
+)
+def test_flags_change_what_belongs_together(flags, expected):
+    """--labels v4 has a realign with every recipe, and --lr keeps the ratio of the encoder's learning rate."""
+    found = chosen_recipe(PolicyTrainOptions(**flags))
+    labels, *rates = expected
+    assert found.labels == labels
+    assert [found.realign, found.lr, found.lr_backbone] == pytest.approx(rates)
+
+
 def test_two_datasets_and_a_task_vector(dataset, tmp_path):
     """Merged training: the vector has a number per task, and LeRobot's network takes it as a token."""
     other = make_dataset(tmp_path, lengths=(22,), task="football", labels="v4")
@@ -360,6 +463,8 @@ BAD = [
     (["--steps", "-1"], "--steps -1: expected a number from 0"),
     (["--minutes", "nan"], "--minutes nan: expected a number"),
     (["--labels", "v5"], "--labels v5: unknown"),
+    (["--steps", "3", "--minutes", "1"], "--steps: is given by --minutes too; drop one of them"),
+    (["--dataset", "."], "--dataset .: no LeRobot dataset, meta/info.json is missing; `python -m arena_newton.data"),
     (["--device", "tpu"], "--device tpu: unknown"),
     (["--hold-out", "9"], "--hold-out 9: "),
     (["--recipe", "fast"], "pictures of 64x64 pixels, recipe act/fast takes 224x224"),
@@ -394,6 +499,10 @@ def test_a_folder_is_not_overwritten_nor_mixed(dataset, whole, tmp_path, capsys)
         assert words in capsys.readouterr().err
     other = make_dataset(tmp_path, lengths=(22, 23))
     assert main(["--resume", str(whole), "--dataset", str(other), "--steps", "20"]) == 2
+    assert "the content is not that of the datasets which the training began with" in capsys.readouterr().err
+    dark = make_dataset(tmp_path / "dark", pictures=lambda *given: padded(*given) // 2)
+    shutil.copy(dataset / "meta" / "info.json", dark / "meta")  # other pictures, which the original's file does not say
+    assert main(["--resume", str(whole), "--dataset", str(dark), "--steps", "20"]) == 2
     assert "the content is not that of the datasets which the training began with" in capsys.readouterr().err
     assert same(weights(whole), before)
 
