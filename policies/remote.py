@@ -14,6 +14,7 @@ import json
 import select
 import socket
 import ssl
+import threading
 import time
 from typing import Any, cast
 
@@ -83,7 +84,15 @@ class _Connection(ServerLink[bytes, _Reply]):
 
     def get(self, route: str, timeout: float) -> _Reply:
         """Status and content of a page that the server may have."""
-        return self._exchange("GET", route, None, time.monotonic() + timeout)
+        self.busy = True
+        late = threading.Timer(timeout, self.abort)  # a head by drips never meets the socket's own time limit
+        late.daemon = True
+        late.start()
+        try:
+            return self._exchange("GET", route, None, time.monotonic() + timeout)
+        finally:
+            late.cancel()
+            self.busy = False
 
     def _exchange(self, method: str, route: str, body: bytes | None, end: float) -> tuple[int, bytes]:
         if self._http is not None and self._dropped():

@@ -12,9 +12,10 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import ClassVar, Literal
+from dataclasses import replace
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 import torch
@@ -206,8 +207,11 @@ class RemoteClient[Q, R](Policy):
         where = f"--policy remote:{self.url}"
         # `--labels v4` is a statement; v3.1 is also what is meant where nothing is said.
         asked = self.protocol.name if self.protocol is not LABELS["v3.1"] else None
-        compare_facts(facts, expected_facts(asked or facts.labels or self.protocol.name), where)
-        self.told = facts
+        try:
+            compare_facts(facts, expected_facts(asked or facts.labels or self.protocol.name), where)
+        except InputError as error:
+            raise InputError(self.masked(str(error))) from None
+        self.told = replace(facts, facts=cast(Json, self.without_token(facts.facts)))
         if facts.labels is not None:
             self.protocol, self.labels = LABELS[facts.labels], facts.labels
         if facts.needs_picture is not None:
@@ -519,6 +523,17 @@ class RemoteClient[Q, R](Policy):
     def one_line(self, said: object) -> str:
         """What a server said, on one line and without the token."""
         return one_line(self.masked(str(said)))
+
+    def without_token(self, value: object) -> object:
+        """JSON of a server without the token, which one that repeats what it is sent would put into the results."""
+        match value:
+            case str():
+                return self.masked(value)
+            case Mapping():
+                return {self.masked(str(key)): self.without_token(one) for key, one in value.items()}
+            case list():
+                return [self.without_token(one) for one in value]
+        return value
 
     def masked(self, text: str) -> str:
         """A text without the token."""

@@ -325,7 +325,7 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
         names, errors = self._gather(" (get_modality_config)", {0: self._packed("get_modality_config")}, lambda c: c)
         if errors:
             raise self.refusal(errors[0])
-        self.names = read_modalities(names[0], where)
+        self.names = read_modalities(self.without_token(names[0]), where)
         self.take(self._completed(facts))
         self.batched = True
         self.needs_image = self.names.video is not None

@@ -9,7 +9,9 @@ from __future__ import annotations
 import http.client
 import logging
 import socket
+import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -317,7 +319,12 @@ def http_page(owner: SocketClient, route: str) -> bytes:
         connection = http.client.HTTPSConnection(
             address.host, address.port, timeout=owner.timeout, context=owner.context
         )
+    late: threading.Timer | None = None
     try:
+        connection.connect()
+        late = threading.Timer(owner.timeout, _cut, [connection.sock])  # also of one that drips
+        late.daemon = True
+        late.start()
         connection.request("GET", address.path + route, headers=owner.headers)
         reply = connection.getresponse()
         data = reply.read(MOST_PAGE)
@@ -325,7 +332,15 @@ def http_page(owner: SocketClient, route: str) -> bytes:
     except (OSError, http.client.HTTPException, ValueError):
         return b""
     finally:
+        if late is not None:
+            late.cancel()
         connection.close()
+
+
+def _cut(connection: socket.socket) -> None:
+    """End what another thread waits for."""
+    with suppress(OSError):  # it was closed meanwhile
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _closed(error: ConnectionClosed) -> str:

@@ -6,6 +6,7 @@ every protocol. What a server does not declare is None here: nobody can compare 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -134,6 +135,10 @@ def read_facts(content: object, where: str) -> ServedFacts:
         raise _unfit(where, "policy", policy)
     if not isinstance(facts, Mapping) or not all(isinstance(key, str) for key in facts):
         raise _unfit(where, "facts", facts)
+    try:
+        json.dumps(facts, allow_nan=False)  # results hold them; MessagePack knows more than JSON
+    except (TypeError, ValueError, RecursionError):
+        raise _unfit(where, "facts", "something that is not JSON") from None
     if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < 1e6):
         raise _unfit(where, "rate_hz", rate)
     realign = content.get("realign")

@@ -1,6 +1,12 @@
 """What servers declare is compared before the first episode; what they do not declare is tried, assumed and said."""
 
 import copy
+import http.client
+import json
+import socket
+import threading
+import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -12,7 +18,9 @@ from arena_newton.errors import InputError
 from arena_newton.policies.label_reader import V4Policy
 from arena_newton.policies.remote_address import DOORS, read_address
 from arena_newton.policies.remote_gr00t import read_modalities
-from arena_newton.policies.serve.handshake import ServedPicture
+from arena_newton.policies.remote_websocket import http_page
+from arena_newton.policies.serve.handshake import ServedPicture, read_facts
+from arena_newton.policies.serve.wire_error import WireError
 
 NAMES = tuple(action_names("v3.1"))
 
@@ -52,6 +60,51 @@ def test_what_differs_is_refused(protocol, other, text):
     with pytest.raises(InputError) as caught:
         checked(server_of(protocol, facts(**other)))
     assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("protocol", ["http", "openpi", "vla-eval", "gr00t"])
+def test_a_server_that_repeats_the_token(protocol, monkeypatch):
+    """What a server declares holds no token in results or messages, also where it repeats what it was sent."""
+    monkeypatch.setenv("ARENA_POLICY_TOKEN", "se-cret")
+    server = server_of(protocol, facts(facts={"a": [{"b se-cret": "Bearer se-cret"}]}, policy="se-cret"))
+    told = json.dumps(checked(server).describe())
+    assert "se-cret" not in told and "Bearer ***" in told
+    with pytest.raises(InputError) as caught:
+        checked(server_of(protocol, facts(action_names=("se-cret",) * 40)))
+    assert "se-cret" not in str(caught.value) and "is ***, of" in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [b"bytes", float("nan"), np.zeros(2)])
+def test_facts_that_results_cannot_hold(value):
+    """Facts that are no JSON are refused before the first episode, not after the last."""
+    with pytest.raises(WireError, match="declares facts as 'something that is not JSON'"):
+        read_facts({"arena": 1, "facts": {"weights": value}}, "server")
+
+
+@pytest.mark.parametrize("scheme", ["http", "roboarena"])
+def test_a_page_by_drips(scheme):
+    """A page whose head never ends is given up at the deadline."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    address = f"127.0.0.1:{listening.getsockname()[1]}"
+
+    def drip():
+        connection, _ = listening.accept()
+        with connection, suppress(OSError):
+            connection.sendall(b"HTTP/1.1 200 OK\r\n")
+            for _ in range(60):
+                connection.sendall(b"a: b\r\n")
+                time.sleep(0.1)
+
+    threading.Thread(target=drip, daemon=True).start()
+    policy = policies.get(f"remote:{scheme}://{address}", timeout=0.5)
+    began = time.monotonic()
+    if scheme == "http":
+        with pytest.raises((OSError, http.client.HTTPException)):
+            policy._connect().get("/config", 0.5)
+    else:
+        assert http_page(policy, "/config") == b""
+    assert time.monotonic() - began < 3.0
+    listening.close()
 
 
 @pytest.mark.parametrize("protocol", ["http", "openpi", "roboarena", "vla-eval"])
