@@ -120,7 +120,7 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
     late, chunk = config.flags.latency_ticks, getattr(policy, "chunk_size", 1)
     if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than the policy's chunk of {chunk} has")
-    return config, read_by(policy, config.labels)
+    return config, read_by(policy, config.labels, late)
 
 
 def _play(

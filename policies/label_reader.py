@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 __all__ = ["V4Policy", "measured_yaw", "read_by"]
 
 
-def read_by(policy: Policy, labels: str) -> Policy:
+def read_by(policy: Policy, labels: str, late: int = 0) -> Policy:
     """The policy as the world understands it.
 
     Args:
         policy: Whose actions are of `labels`.
         labels: Name of the protocol.
+        late: Ticks from a look to the first action of its chunk, as `rollout.Rollout` delays them.
 
     Returns:
         The policy itself where it answers v3.1, else one that decodes its chunks.
@@ -35,7 +36,7 @@ def read_by(policy: Policy, labels: str) -> Policy:
     own = getattr(policy, "labels", None)  # a plug-in need not know of protocols
     if own is not None and own != wanted.name:
         raise InputError(f"--labels {labels}: policy {policy.name} gives actions of {own}; leave the flag out")
-    return policy if wanted is LABELS["v3.1"] else V4Policy(policy)
+    return policy if wanted is LABELS["v3.1"] else V4Policy(policy, late)
 
 
 def measured_yaw(state: torch.Tensor) -> torch.Tensor:
@@ -53,9 +54,14 @@ class V4Policy(Policy):
 
     labels = "v3.1"
 
-    def __init__(self, policy: Policy):
-        """Take the policy whose actions are of v4."""
-        self.policy = policy
+    def __init__(self, policy: Policy, late: int = 0):
+        """Take the policy whose actions are of v4.
+
+        Args:
+            policy: The policy.
+            late: Ticks from a look to the first action of its chunk.
+        """
+        self.policy, self._late = policy, late
         self.name = policy.name
         self.needs_image, self.camera = policy.needs_image, policy.camera
         self.chunk_size = policy.chunk_size
@@ -78,7 +84,7 @@ class V4Policy(Policy):
     def attach(self, env: World) -> None:
         """Take the worlds whose headings are integrated."""
         self.policy.attach(env)
-        self._decoder = V4Decoder(env.worlds, env.torch_device, realign=self._realign)
+        self._decoder = V4Decoder(env.worlds, env.torch_device, realign=self._realign, late=self._late)
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Begin new episodes at their heading."""
@@ -99,7 +105,7 @@ class V4Policy(Policy):
             shape = f"a chunk of shape {list(actions.shape)}, expected [{worlds}, n, {ACTION_WIDTH}]"
             raise InputError(f"policy {self.name}: {shape} with n of at least 1")
         if self._decoder is None:  # used without an environment, as a policy server does
-            self._decoder = V4Decoder(worlds, actions.device, realign=self._realign)
+            self._decoder = V4Decoder(worlds, actions.device, realign=self._realign, late=self._late)
         if self._realign:
             # A policy that gives a chunk in pieces looks at the first one only; which those are depends on others.
             looked = getattr(self.policy, "looked", None)

@@ -199,7 +199,15 @@ class V4Decoder:
     fraction is closed each tick, so that after k ticks (1 - realign)^k of it is left. It is rounded as rates are.
     """
 
-    def __init__(self, worlds: int, device: str | torch.device = "cpu", *, yaw0: float = 0.0, realign: float = 0.0):
+    def __init__(
+        self,
+        worlds: int,
+        device: str | torch.device = "cpu",
+        *,
+        yaw0: float = 0.0,
+        realign: float = 0.0,
+        late: int = 0,
+    ):
         """All worlds at the beginning of an episode.
 
         Args:
@@ -207,10 +215,14 @@ class V4Decoder:
             device: Torch device of the chunks.
             yaw0: Yaw at the beginning of an episode, in its own frame [rad].
             realign: Fraction of the gap to the measured yaw that is closed each tick; 0: none, and yaws are exact.
+            late: Ticks between a measurement and the first action of the chunk that is decoded next: actions of the
+                chunk before it that are still to be executed.
         """
         self._start, self._realign = yaw0, realign
         self._turned = torch.zeros(worlds, dtype=torch.int64, device=device)
         """Yaw since the beginning [RATE_STEP ticks]."""
+        self._last = torch.zeros((worlds, late + 1), dtype=torch.int64, device=device)
+        """The same after each of the last ticks that were decoded, the latest one at the end."""
         self._gap = torch.zeros(worlds, dtype=torch.float64, device=device)
         """Measured minus commanded yaw at the last measurement [rad]."""
         self._age = torch.zeros(worlds, dtype=torch.int64, device=device)
@@ -220,10 +232,11 @@ class V4Decoder:
         """Begin new episodes in the worlds of `mask`, bool, shape [worlds]; in all without one."""
         chosen = self._mask(mask)
         self._turned[chosen] = 0
+        self._last[chosen] = 0
         self._gap[chosen], self._age[chosen] = 0.0, 0
 
     def measure(self, yaw: torch.Tensor, mask: np.ndarray | torch.Tensor | None = None) -> None:
-        """Take the measured heading at the tick at which the next chunk begins.
+        """Take the measured heading, `late` ticks before the next chunk begins.
 
         Args:
             yaw: Of the robot in the episode's frame [rad], shape [worlds]; one that is not finite measures no gap.
@@ -232,7 +245,7 @@ class V4Decoder:
         if not self._realign:
             return
         chosen = self._mask(mask)
-        gap = yaw.double() - (self._start + self._turned.double() * (RATE_STEP * robot.TICK))
+        gap = yaw.double() - (self._start + self._last[:, 0].double() * (RATE_STEP * robot.TICK))
         gap = torch.nan_to_num(gap, nan=0.0, posinf=0.0, neginf=0.0)
         gap = torch.remainder(gap + np.pi, 2.0 * np.pi) - np.pi
         self._gap = torch.where(chosen, gap, self._gap)
@@ -259,6 +272,8 @@ class V4Decoder:
             closed = closed.div(RATE_STEP * robot.TICK).round().to(torch.int64)
             turned = turned + closed[:, 1:] - closed[:, :1]
             self._age = torch.where(chosen, ages[:, -1], self._age)
+        last = torch.cat([self._last, turned], dim=1)[:, -self._last.shape[1] :]
+        self._last = torch.where(chosen[:, None], last, self._last)
         self._turned = torch.where(chosen, turned[:, -1], self._turned)
         yaw = self._start + turned.double() * (RATE_STEP * robot.TICK) + 0.0 * rate  # keeps NaN and infinity
         roll, pitch = exact[..., V4["roll_pitch"]].unbind(-1)

@@ -127,3 +127,16 @@ def test_a_loop_with_drift_stays_near_the_robot(length):
     first = again.act(SimpleNamespace(state=state_of([0.3]), mask=np.ones(1, bool))).actions
     again.reset([0], ["boxing"])
     assert torch.equal(first, again.act(SimpleNamespace(state=state_of([0.3]), mask=np.ones(1, bool))).actions)
+
+
+@pytest.mark.parametrize("late", [0, 5, 15])
+def test_a_look_is_compared_with_the_heading_of_its_own_tick(late):
+    """A robot that is where it was told to be has no gap, however many ticks before its chunk the policy looks."""
+    policy = V4Policy(Turning(0.5, 20, RATE), late)
+    policy.reset([0], ["boxing"])
+    commanded = [0.0] * (late + 1)  # it stands until the first chunk begins
+    for _ in range(6):
+        seen = SimpleNamespace(state=state_of([commanded[-1 - late]]), mask=np.ones(1, bool))
+        commanded += yaws(policy.act(seen).actions)[0].tolist()
+    turned = np.diff(commanded[late:])
+    assert np.allclose(turned, 0.5 * robot.TICK, atol=1e-6)
