@@ -51,8 +51,11 @@ _OPTIONAL = {
 }
 _EXTRA_PURPOSES = {
     "data": "datasets in LeRobot's format",
-    "plots": "charts",
+    "gr00t": "`--policy remote:gr00t://`",
+    "plots": "charts, and maps of predicted actions",
+    "policies": "policies of the families diffusion, flow and pi05",
     "rerun": "`--viewer rerun`",
+    "serve": "a policy server; `--policy remote:` of a websocket",
     "teleop": "a person drives the robot; viewers of a run",
     "train": "LeRobot's trainer",
 }

@@ -60,9 +60,9 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
         server.start(options.task)
         door = open_door(server, options, guard, tls)
         try:
-            for line in _greeting(server, options, guard, door.port):
-                say(line)
             with contextlib.suppress(KeyboardInterrupt):
+                for line in _greeting(server, options, guard, door.port):
+                    say(line)
                 (stop or threading.Event()).wait()
         finally:
             door.close()

@@ -14,11 +14,12 @@ SCRIPT = Path(sys.executable).with_name("arena-newton")
 
 
 def test_every_program_of_the_package_has_a_command():
-    """What `python -m` runs has a command; builders, examples, the reader's other process and the front doors aside."""
+    """What `python -m` runs has a command; builders, examples, processes of commands and front doors aside."""
     doors = {
         "arena_newton/__main__.py",
         "arena_newton/probe.py",
         "arena_newton/data/film_process.py",
+        "policies/train/measured_training.py",
         "trackers/__main__.py",
         "usd_scenes/g1/build.py",
     }

@@ -89,6 +89,7 @@ def test_what_is_imported_is_a_dependency():
     extras = [line for lines in project["optional-dependencies"].values() for line in lines]
     named = {Requirement(line).name for line in [*project["dependencies"], *extras]}
     names = {"PIL": "pillow", "pxr": "usd-core", "warp": "warp-lang", "cv2": "opencv-python-headless"}
+    names |= {"zmq": "pyzmq", "sklearn": "scikit-learn", "huggingface_hub": "huggingface-hub"}
     names |= {"mujoco_warp": "mujoco-warp", "rsl_rl": "rsl-rl-lib"}
     # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
     known = {*sys.stdlib_module_names, "arena_newton", "tensordict"}

@@ -156,13 +156,14 @@ def test_a_stopped_training_goes_on_to_the_same_bits(dataset, whole, tmp_path, m
     out = tmp_path / "run"
     flags = ["--recipe", "small", "--dataset", str(dataset), "--out", str(out), "--device", "cpu", "--quiet"]
     flags += ["--steps", str(STEPS), "--hold-out", "1", "--hold-out-every", "4", "--log-every", "2"]
+    handler = signal.getsignal(signal.SIGTERM)
     with monkeypatch.context() as patch:
         interrupt(patch, 5, lambda: os.kill(os.getpid(), number))
         assert main(flags) == 130
     assert f"stopped after 5 steps; go on with: python -m arena_newton.policies.train --resume {out}" in (
         capsys.readouterr().out
     )
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == handler
     torch.manual_seed(999)
     assert main(["--resume", str(out)]) == 0
     assert same(weights(out), weights(whole))
