@@ -286,7 +286,11 @@ class _Loop:
         """One run of the product in its folder; its journal makes it resumable."""
         config = resolve(options)
         folder = ResultsFolder(Path(str(options.out)), config, versions())
-        folder.check()
+        try:
+            folder.check()
+        except InputError as error:
+            again = f"or remove {folder.path}, and the loop's command plays this stage again"
+            raise InputError(f"{error}, {again}") from None
         return execute(folder, self.factories)
 
     def _record(self) -> int:

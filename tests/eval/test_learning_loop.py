@@ -137,6 +137,17 @@ def test_another_loop_is_refused(looped, capsys):
     assert "is not empty and holds no loop" in capsys.readouterr().err
 
 
+def test_a_stage_of_other_code_says_how_to_go_on(tmp_path):
+    """A stage whose folder was begun by other code names the folder to remove, not a flag that the loop lacks."""
+    options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
+    stage = tmp_path / "demonstrations"
+    stage.mkdir()
+    (stage / "config.json").write_text("{}")
+    with pytest.raises(InputError) as caught:
+        learning_loop._Loop(options, tmp_path, None, LoopParts()).play()
+    assert str(caught.value).endswith(f", or remove {stage}, and the loop's command plays this stage again")
+
+
 def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
     """An interruption in training is code 130 and the command to continue; the next call resumes the training."""
 
