@@ -265,7 +265,7 @@ class Gr00tLink(ServerLink[bytes, bytes]):
             self.exchange("", pack_gr00t({"endpoint": "ping"}), time.monotonic() + timeout)
         except (OSError, AskAgain, zmq.ZMQError, TimeoutError):
             return False
-        except ValueError:
+        except (ValueError, WireError):
             return True
         finally:
             self.close()

@@ -193,7 +193,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
             self.open(time.monotonic() + timeout)
         except (OSError, AskAgain):
             return False
-        except ValueError:
+        except (ValueError, WireError):
             return True
         finally:
             self.close()
