@@ -202,6 +202,7 @@ class Gr00tLink(ServerLink[bytes, bytes]):
     """One ZMQ socket that asks and waits for the answer; it is used by one thread at a time."""
 
     final = (OSError, ValueError, zmq.ZMQError)
+    gone = (OSError, AskAgain, zmq.ZMQError)
 
     def __init__(self, url: str, address: str):
         """Name the server, for messages and for ZMQ."""
@@ -259,17 +260,9 @@ class Gr00tLink(ServerLink[bytes, bytes]):
         self._connected = False
         self._socket.connect(self._address)
 
-    def alive(self, timeout: float) -> bool:
-        """Whether the server answers a ping."""
-        try:
-            self.exchange("", pack_gr00t({"endpoint": "ping"}), time.monotonic() + timeout)
-        except (OSError, AskAgain, zmq.ZMQError, TimeoutError):
-            return False
-        except (ValueError, WireError):
-            return True
-        finally:
-            self.close()
-        return True
+    def probe(self, end: float) -> object:
+        """A ping."""
+        return self.exchange("", pack_gr00t({"endpoint": "ping"}), end)
 
     def abort(self) -> None:
         """Break off the exchange that another thread waits for, which then closes; or close an idle connection."""

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from arena_newton.errors import ArenaError
 from arena_newton.policies.remote_address import cause
+from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = ["AskAgain", "RemoteError", "ServerLink", "episode_lost"]
 
@@ -42,6 +43,8 @@ class ServerLink[Q, R]:
     """What a repeated attempt may cure."""
     final: ClassVar[tuple[type[Exception], ...]] = (OSError, ValueError)
     """What it does not."""
+    gone: ClassVar[tuple[type[Exception], ...]] = (OSError, AskAgain)
+    """What says that nobody is there."""
 
     def __init__(self, url: str):
         """Name the server; nothing is sent yet."""
@@ -102,9 +105,21 @@ class ServerLink[Q, R]:
         """Why the same should be asked again later; an empty text where the reply is one."""
         return ""
 
+    def probe(self, end: float) -> object:
+        """Ask something that changes nothing, until `end` of the monotonic clock [s]."""
+        raise TypeError(f"{type(self).__name__} defines no probe()")
+
     def alive(self, timeout: float) -> bool:
-        """Whether the server answers a request that changes nothing."""
-        raise TypeError(f"{type(self).__name__} defines no alive()")
+        """Whether the server answers a request that changes nothing; one that answers something else is there, too."""
+        try:
+            self.probe(time.monotonic() + timeout)
+        except self.gone:
+            return False
+        except (ValueError, WireError):
+            return True
+        finally:
+            self.close()
+        return True
 
     def abort(self) -> None:
         """Break off the exchange that another thread waits for, or close an idle connection."""

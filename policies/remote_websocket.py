@@ -187,17 +187,9 @@ class SocketLink(ServerLink[SocketRequest, object]):
                 raise ValueError(f"the reply is longer than {MAX_REPLY >> 20} MiB") from error
             raise AskAgain(_closed(error)) from error
 
-    def alive(self, timeout: float) -> bool:
-        """Whether a server opens a websocket and greets; one that answers something else is there, too."""
-        try:
-            self.open(time.monotonic() + timeout)
-        except (OSError, AskAgain):
-            return False
-        except (ValueError, WireError):
-            return True
-        finally:
-            self.close()
-        return True
+    def probe(self, end: float) -> object:
+        """Open a websocket and be greeted."""
+        return self.open(end)
 
     def abort(self) -> None:
         """Break off the exchange that another thread waits for, or close an idle connection."""

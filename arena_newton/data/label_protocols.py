@@ -219,10 +219,8 @@ class V4Decoder:
                 chunk before it that are still to be executed.
         """
         self._start, self._realign = yaw0, realign
-        self._turned = torch.zeros(worlds, dtype=torch.int64, device=device)
-        """Yaw since the beginning [RATE_STEP ticks]."""
-        self._last = torch.zeros((worlds, late + 1), dtype=torch.int64, device=device)
-        """The same after each of the last ticks that were decoded, the latest one at the end."""
+        self._turned = torch.zeros((worlds, late + 1), dtype=torch.int64, device=device)
+        """Yaw since the beginning after each of the last ticks that were decoded [RATE_STEP ticks], the latest last."""
         self._gap = torch.zeros(worlds, dtype=torch.float64, device=device)
         """Measured minus commanded yaw at the last measurement [rad]."""
         self._age = torch.zeros(worlds, dtype=torch.int64, device=device)
@@ -232,7 +230,6 @@ class V4Decoder:
         """Begin new episodes in the worlds of `mask`, bool, shape [worlds]; in all without one."""
         chosen = self._mask(mask)
         self._turned[chosen] = 0
-        self._last[chosen] = 0
         self._gap[chosen], self._age[chosen] = 0.0, 0
 
     def measure(self, yaw: torch.Tensor, mask: np.ndarray | torch.Tensor | None = None) -> None:
@@ -245,7 +242,7 @@ class V4Decoder:
         if not self._realign:
             return
         chosen = self._mask(mask)
-        gap = yaw.double() - (self._start + self._last[:, 0].double() * (RATE_STEP * robot.TICK))
+        gap = yaw.double() - (self._start + self._turned[:, 0].double() * (RATE_STEP * robot.TICK))
         gap = torch.nan_to_num(gap, nan=0.0, posinf=0.0, neginf=0.0)
         gap = torch.remainder(gap + np.pi, 2.0 * np.pi) - np.pi
         self._gap = torch.where(chosen, gap, self._gap)
@@ -264,7 +261,7 @@ class V4Decoder:
         exact = chunk.double()
         rate = exact[..., V4["yaw_rate"].start]
         steps = torch.nan_to_num(rate, nan=0.0).clamp(-MAX_RATE, MAX_RATE).div(RATE_STEP).round().to(torch.int64)
-        turned = self._turned[:, None] + steps.cumsum(dim=1)
+        turned = self._turned[:, -1:] + steps.cumsum(dim=1)
         chosen = self._mask(mask)
         if self._realign:
             ages = self._age[:, None] + torch.arange(chunk.shape[1] + 1, device=chunk.device)
@@ -272,9 +269,8 @@ class V4Decoder:
             closed = closed.div(RATE_STEP * robot.TICK).round().to(torch.int64)
             turned = turned + closed[:, 1:] - closed[:, :1]
             self._age = torch.where(chosen, ages[:, -1], self._age)
-        last = torch.cat([self._last, turned], dim=1)[:, -self._last.shape[1] :]
-        self._last = torch.where(chosen[:, None], last, self._last)
-        self._turned = torch.where(chosen, turned[:, -1], self._turned)
+        last = torch.cat([self._turned, turned], dim=1)[:, -self._turned.shape[1] :]
+        self._turned = torch.where(chosen[:, None], last, self._turned)
         yaw = self._start + turned.double() * (RATE_STEP * robot.TICK) + 0.0 * rate  # keeps NaN and infinity
         roll, pitch = exact[..., V4["roll_pitch"]].unbind(-1)
         matrix = matrix_from_quat(quat_from_euler(torch.stack([yaw, pitch, roll], dim=-1)))
@@ -285,5 +281,5 @@ class V4Decoder:
 
     def _mask(self, mask: np.ndarray | torch.Tensor | None) -> torch.Tensor:
         if mask is None:
-            return torch.ones_like(self._turned, dtype=torch.bool)
-        return torch.as_tensor(mask, dtype=torch.bool, device=self._turned.device)
+            return torch.ones_like(self._age, dtype=torch.bool)
+        return torch.as_tensor(mask, dtype=torch.bool, device=self._age.device)
