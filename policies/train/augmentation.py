@@ -43,6 +43,7 @@ def gathered_pictures(store: FrameStore, rows: torch.Tensor, *, shift: int = 0, 
         pictures = pictures.mul_(change[:, :1] * change[:, 1:]).clamp_(0.0, 1.0)
     if not (store.top or store.bottom):
         return pictures
-    whole = pictures.new_zeros((batch, 3, store.height, width))
+    # Channels last, as the pictures are stored and as a GPU's convolutions read them.
+    whole = pictures.new_zeros((batch, store.height, width, 3)).permute(0, 3, 1, 2)
     whole[:, :, store.top : store.top + height] = pictures
     return whole

@@ -71,6 +71,9 @@ class PolicyTrainer:
         self._rows = torch.zeros(recipe.batch_size, dtype=torch.int64, device=self.device)
         self._loss = torch.zeros((), device=self.device)
         self._norm = torch.zeros((), device=self.device)
+        if self.device.type == "cuda":
+            # Convolutions on tensor cores read channels last, in any other order each copies its input and output.
+            model.policy.to(memory_format=torch.channels_last)
         self.optimizer, self._lrs = _optimizer(model, recipe, self.device)
         self._parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._flat: torch.Tensor | None = None
@@ -170,7 +173,7 @@ class PolicyTrainer:
         if self._flat is not None:
             parts = self._flat.split([p.numel() for p in self._used])
             for parameter, part in zip(self._used, parts, strict=True):
-                parameter.grad = part.view_as(parameter).to(parameter.dtype)
+                parameter.grad = torch.empty_like(parameter).copy_(part.view_as(parameter))
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.recipe.grad_clip)
         self._norm.copy_(norm.detach())
         self.optimizer.step()

@@ -264,7 +264,10 @@ def _read_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
         number = int(parts[1])
         if tensor.dim() and tensor.shape != parameters[number].shape:
             raise InputError(f"{path}: {name[:80]} has shape {list(tensor.shape)}, another network's")
-        state.setdefault(number, {})[parts[2]] = tensor
+        # In the memory format of its parameter, as fused optimizers need it; a file has one format only.
+        state.setdefault(number, {})[parts[2]] = (
+            torch.empty_like(parameters[number], dtype=tensor.dtype).copy_(tensor) if tensor.dim() else tensor
+        )
     # Settings are the recipe's: learning rates follow from the step.
     optimizer.load_state_dict({"state": state, "param_groups": own["param_groups"]})
 
