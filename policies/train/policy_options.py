@@ -69,7 +69,7 @@ class PolicyTrainOptions:
     graph: bool = True
     """On CUDA: capture batch and step in one CUDA graph."""
     jobs: int = field(default=0, metadata=bounds(0, 1024))
-    """Threads that decode pictures; 0: one per core that the process may use."""
+    """Cores that decode pictures, four or more by a process each, fewer by threads; 0: all that may be used."""
     quiet: bool = False
     """Show no progress bar."""
 
