@@ -11,9 +11,9 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.policy_model import ACTION, TrainableModel, new_policy, prepared, with_time_axis
-from arena_newton.policies.train.resnet_weights import load_resnet
+from arena_newton.policies.train.resnet_weights import check_resnet, load_resnet
 
-__all__ = ["DiffusionModel", "build"]
+__all__ = ["DiffusionModel", "build", "check_weights"]
 
 
 class DiffusionModel(TrainableModel):
@@ -48,6 +48,11 @@ class DiffusionModel(TrainableModel):
     def is_backbone(self, parameter: str) -> bool:
         """Those of the ResNet."""
         return parameter.startswith("diffusion.rgb_encoder") and ".backbone." in parameter
+
+
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """As of `families.check_weights`."""
+    check_resnet(recipe, weights)
 
 
 def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: str | Path | None) -> DiffusionModel:

@@ -88,6 +88,7 @@ def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch
 
 
 def _trainer(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch.device) -> PolicyTrainer:
+    families.check_weights(settings, options.weights or None)
     store, stats = _data(options, settings, device)
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)

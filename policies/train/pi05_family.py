@@ -41,10 +41,10 @@ from arena_newton.policies.train.policy_model import (
     new_policy,
     prepared,
 )
-from arena_newton.policies.train.pretrained_weights import checksum, read_safetensors, weights_folder
+from arena_newton.policies.train.pretrained_weights import check_safetensors, checksum, read_safetensors, weights_folder
 from arena_newton.policies.train.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 
-__all__ = ["BASE_FILES", "PADDED", "TOKENIZER", "Pi05Model", "build", "load_base", "prompts"]
+__all__ = ["BASE_FILES", "PADDED", "TOKENIZER", "Pi05Model", "build", "check_weights", "load_base", "prompts"]
 
 TOKENIZER = "google/paligemma-3b-pt-224"
 """Tokenizer that LeRobot's processors of pi0.5 name."""
@@ -218,6 +218,25 @@ def load_base(policy: PreTrainedPolicy, path: Path) -> str:
     return wanted
 
 
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """As of `families.check_weights`."""
+    folder = _base(recipe, weights)
+    if folder is not None and not _holds_tokenizer(folder) and not isinstance(recipe.network.get("gemma"), Mapping):
+        weights_folder(TOKENIZER, "tokenizer of PaliGemma", TOKENIZER_FILES)
+
+
+def _base(recipe: TrainingRecipe, weights: str | Path | None) -> Path | None:
+    """Folder of the base weights; none where a recipe has new ones."""
+    if weights is None and isinstance(recipe.network.get("gemma"), Mapping):
+        return None
+    name = str(weights if weights is not None else recipe.network["pretrained_path"])
+    folder = weights_folder(name, "pi0.5 base weights", BASE_FILES)
+    if not (folder / WEIGHTS_FILE).is_file():
+        raise InputError(f"--weights {folder}: holds no {WEIGHTS_FILE} of pi0.5")
+    check_safetensors(folder / WEIGHTS_FILE)
+    return folder
+
+
 def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: str | Path | None) -> Pi05Model:
     """pi0.5 of a recipe; see `families.build`."""
     config, usable = prepared(recipe, stats, device)
@@ -229,17 +248,13 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
             f"recipe {recipe.name}: time_sampling_beta_beta is {config.time_sampling_beta_beta}, expected 1"
         )
     sizes = recipe.network.get("gemma")
-    base = weights if weights is not None else recipe.network["pretrained_path"]
-    folder = None
+    folder = _base(recipe, weights)
     if isinstance(sizes, Mapping):
-        folder = weights_folder(weights, "pi0.5 base weights", BASE_FILES) if weights is not None else None
         tokenizer, name = _tokenizer(folder) if folder and _holds_tokenizer(folder) else (made_tokenizer(), "")
         with gemma_of(sizes):
             policy = new_policy(config)
     else:
-        folder = weights_folder(str(base), "pi0.5 base weights", BASE_FILES)
-        if not (folder / WEIGHTS_FILE).is_file():
-            raise InputError(f"--weights {folder}: holds no {WEIGHTS_FILE} of pi0.5")
+        assert folder is not None
         tokenizer, name = _tokenizer(folder)
         policy = new_policy(config)
     loaded = load_base(policy, folder / WEIGHTS_FILE) if folder else ""

@@ -95,6 +95,7 @@ def _train(
     checkpoint: Path | None,
 ) -> Path:
     speaks = processes.first and not options.quiet
+    families.check_weights(settings, options.weights or None)
     datasets = [read_rows(root, settings.labels) for root in options.dataset]
     if progress is not None:
         _check_same_data(datasets, progress)
