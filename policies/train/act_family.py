@@ -38,6 +38,10 @@ class ActModel(TrainableModel):
             loss = loss + divergence * config.kl_weight
         return loss
 
+    def compiled_parts(self) -> list[nn.Module]:
+        """The whole network."""
+        return [self.policy.model]
+
     def is_backbone(self, parameter: str) -> bool:
         """Those of the ResNet."""
         return parameter.startswith("model.backbone")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import nn
 
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Stats
@@ -44,6 +45,12 @@ class DiffusionModel(TrainableModel):
         predicted = self.policy.diffusion.unet(noisy, time, global_cond=seen)
         wanted = drawn["noise"] if self.policy.config.prediction_type == "epsilon" else actions
         return self.mean_error((predicted - wanted) ** 2, batch)
+
+    def compiled_parts(self) -> list[nn.Module]:
+        """The vision encoders and the U-Net."""
+        encoders = self.policy.diffusion.rgb_encoder
+        each = list(encoders) if self.policy.config.use_separate_rgb_encoder_per_camera else [encoders]
+        return [*each, self.policy.diffusion.unet]
 
     def is_backbone(self, parameter: str) -> bool:
         """Those of the ResNet."""

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
+from torch import nn
 from transformers import CLIPTextModel, CLIPVisionModel, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.utils import logging as transformers_logging
 
@@ -106,6 +107,10 @@ class FlowModel(TrainableModel):
         config = self.policy.config
         ids, mask = tokenized(self.tokenizer, list(tasks), config.tokenizer_max_length, config.tokenizer_padding_side)
         return {TOKENS: ids.to(self.device), MASK: mask.to(self.device)}
+
+    def compiled_parts(self) -> list[nn.Module]:
+        """CLIP's vision encoder and the transformer; the text encoder is frozen."""
+        return [self.policy.observation_encoder.vision_encoder, self.policy.noise_predictor]
 
     def is_backbone(self, parameter: str) -> bool:
         """Those of CLIP's vision encoder."""

@@ -23,6 +23,7 @@ from arena_newton.policies.train import families
 from arena_newton.policies.train.demonstration_rows import ACTION_KEY, STATE_KEY, VECTOR_KEY, read_rows, statistics
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.frame_store import FrameStore, load_frames, made_frames
+from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.policy_options import TrainingBenchOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import chosen_device, fast_kernels, make_batches
@@ -88,12 +89,16 @@ def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch
 
 
 def _trainer(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch.device) -> PolicyTrainer:
+    if options.compile:
+        check_compiler(device)
     families.check_weights(settings, options.weights or None)
     store, stats = _data(options, settings, device)
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
     vector = store.tasks if settings.use_task_vector else ()
-    return PolicyTrainer(model, make_batches(model, store, vector), settings, graph=options.graph)
+    return PolicyTrainer(
+        model, make_batches(model, store, vector), settings, graph=options.graph, compiled=options.compile
+    )
 
 
 def measured(options: TrainingBenchOptions) -> SpeedFigure:

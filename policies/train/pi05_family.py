@@ -17,6 +17,7 @@ import torch
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
+from torch import nn
 from transformers import PreTrainedTokenizerBase
 
 from arena_newton.errors import InputError
@@ -72,6 +73,7 @@ class Pi05Model(TrainableModel):
 
     # LeRobot makes masks on the host in every forward pass, and the prompt with the state is text.
     capturable: ClassVar[bool] = False
+    compilable: ClassVar[bool] = False
     reads_task: ClassVar[bool] = True
 
     def __init__(
@@ -137,6 +139,10 @@ class Pi05Model(TrainableModel):
         tokenized(self.tokenizer, prompts(known, torch.full((len(known), state.shape[-1]), BEYOND)), longest)
         ids, mask = tokenized(self.tokenizer, prompts(tasks, state), longest)
         return {TOKENS: ids.to(self.device), MASK: mask.to(self.device)}
+
+    def compiled_parts(self) -> list[nn.Module]:
+        """None: what is compiled ends at each of the masks that are made on the host."""
+        return []
 
     def is_backbone(self, parameter: str) -> bool:
         """Those of the vision tower."""

@@ -21,6 +21,7 @@ from arena_newton.policies.train import families
 from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
 from arena_newton.policies.train.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.policy_model import TrainableModel
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -95,6 +96,8 @@ def _train(
     checkpoint: Path | None,
 ) -> Path:
     speaks = processes.first and not options.quiet
+    if options.compile:
+        check_compiler(device)
     families.check_weights(settings, options.weights or None)
     datasets = [read_rows(root, settings.labels) for root in options.dataset]
     if progress is not None:
@@ -124,7 +127,15 @@ def _train(
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
     batches = make_batches(model, store, vector)
-    trainer = PolicyTrainer(model, batches, settings, graph=options.graph, rank=processes.rank, ranks=processes.count)
+    trainer = PolicyTrainer(
+        model,
+        batches,
+        settings,
+        graph=options.graph,
+        compiled=options.compile,
+        rank=processes.rank,
+        ranks=processes.count,
+    )
     if options.steps:
         trainer.fix_steps(options.steps)
     elif progress is not None and progress.steps:
