@@ -25,10 +25,8 @@ __all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "needed_me
 
 BLACK = 12
 """Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
-NETWORK_BYTES = 6 * 2**30
-"""Memory of a GPU that is left to the network, its optimizer and its activations (ACT, batch 64, bf16: 2.6 GB)."""
 HOST_BYTES = 2**30
-"""The same of the host, for tests and small networks."""
+"""Memory of the host that is left to everything else."""
 
 
 @dataclass(frozen=True)
@@ -106,28 +104,28 @@ def needed_memory(frames: int, height: int, width: int) -> int:
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes of a device that rows may take, those of the network left out."""
+    """Bytes of a device that rows and a network may take."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
-        return int(free) - NETWORK_BYTES
+        return int(free)
     for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else ():
         if line.startswith("MemAvailable:"):
             return int(line.split()[1]) * 1024 - HOST_BYTES
     return 2**62
 
 
-def check_memory(frames: int, height: int, width: int, device: torch.device) -> None:
-    """Refuse what does not fit.
+def check_memory(frames: int, height: int, width: int, device: torch.device, network: int) -> None:
+    """Refuse what does not fit beside a network that needs so many bytes.
 
     Raises:
         InputError: The device has too little free memory; the message says how much is missing.
     """
-    needed, free = needed_memory(frames, height, width), free_memory(device)
+    needed, free = needed_memory(frames, height, width), free_memory(device) - network
     if needed > free:
         raise InputError(
             f"--dataset: {frames} pictures of {width}x{height} need {needed / 1e9:.1f} GB of memory on {device}, "
-            f"{max(0, free) / 1e9:.1f} GB are free beside the network: name fewer datasets, record smaller pictures, "
-            "or use a device with more memory"
+            f"{max(0, free) / 1e9:.1f} GB are free beside the network, for which {network / 1e9:.1f} GB are kept: name "
+            "fewer datasets, record smaller pictures, or use a device with more memory"
         )
 
 
@@ -138,6 +136,7 @@ def load_frames(
     hold_out: int = 0,
     jobs: int = 0,
     processes: int | None = None,
+    network: int = 0,
     on_frames: Callable[[int], None] = lambda count: None,
 ) -> FrameStore:
     """Decode all pictures onto a device.
@@ -148,6 +147,7 @@ def load_frames(
         hold_out: Last episodes of each dataset that are held out.
         jobs: Cores that decode, an episode each; 0: all that the process may use.
         processes: Processes that decode instead of threads; by default as `decoding_processes` says.
+        network: Memory that the network needs beside the pictures [bytes] (`network_bytes`).
         on_frames: Is told after each episode how many pictures were decoded.
 
     Raises:
@@ -173,7 +173,7 @@ def load_frames(
     with DecoderPool(height, width, threads=cores, processes=count, device=device) as pool:
         top, bottom = black_rows(pool, films, height)
         while True:
-            check_memory(frames, height - top - bottom, width, device)
+            check_memory(frames, height - top - bottom, width, device, network)
             pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
             black = _decode(pool, films, pictures, (top, bottom), on_frames)
             if black == (top, bottom):
@@ -261,7 +261,9 @@ def assembled(
     )
 
 
-def made_frames(frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500) -> FrameStore:
+def made_frames(
+    frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500, network: int = 0
+) -> FrameStore:
     """Rows of noise, for measurements without a dataset.
 
     Args:
@@ -270,12 +272,13 @@ def made_frames(frames: int, size: int, device: torch.device, *, seed: int = 0, 
         device: Where they are wanted.
         seed: Of the noise.
         length: Rows of an episode.
+        network: Memory that the network needs beside them [bytes].
 
     Raises:
         InputError: They do not fit.
     """
     band = size // 8
-    check_memory(frames, size - 2 * band, size, device)
+    check_memory(frames, size - 2 * band, size, device, network)
     generator = torch.Generator(device).manual_seed(seed)
     pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
     for start in range(0, frames, length):

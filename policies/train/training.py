@@ -22,6 +22,7 @@ from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
 from arena_newton.policies.train.frame_store import FrameStore, load_frames
 from arena_newton.policies.train.network_compiler import check_compiler
+from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_model import TrainableModel
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -107,7 +108,10 @@ def _train(
     total = sum(dataset.frames for dataset in datasets)
     with tqdm(total=total, unit="picture", desc="decoding", disable=None if speaks else True, leave=False) as bar:
         jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
-        store = load_frames(datasets, device, hold_out=options.hold_out, jobs=jobs, on_frames=bar.update)
+        network = network_bytes(settings, device)
+        store = load_frames(
+            datasets, device, hold_out=options.hold_out, jobs=jobs, network=network, on_frames=bar.update
+        )
     if speaks:
         size = store.pictures.numel() / 1e9
         print(
