@@ -42,8 +42,7 @@ class Routines:
         """
         if not device.is_cuda or not any(LINKED in kernel.adj.source for kernel in module.kernels.values()):
             return
-        folder = Path(wp.config.kernel_cache_dir, module.get_module_identifier(block_dim))
-        if (folder / module._get_compile_output_name(device, block_dim=block_dim)).exists():
+        if Path(wp.config.kernel_cache_dir, module.get_module_identifier(block_dim)).exists():
             return
         work = [self._one(arguments) for arguments in asked(module, block_dim, device.get_cuda_compile_arch())]
         for one in work:
