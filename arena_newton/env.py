@@ -91,7 +91,7 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
-        with loading(self.engine, device, camera=camera is not None):
+        with loading(self.engine, device, camera=camera is not None, suite=self.spec.suite):
             self._build(tracker, device, variant_file, fast_physics, drive, camera, threads)
 
     def _build(

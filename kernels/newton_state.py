@@ -63,6 +63,10 @@ def _put_back(mask: wp.array[wp.int32], saved: wp.array2d[Any], rows: wp.array2d
         rows[world, column] = saved[world, column]
 
 
+for _words in (wp.int32, wp.uint8):  # all of them now: one that a launch adds compiles the whole module again
+    wp.overload(_put_back, [wp.array[wp.int32], wp.array2d[_words], wp.array2d[_words]])
+
+
 def launch_put_back(mask: wp.array, saved: wp.array, rows: wp.array) -> None:
     """Copy the rows of the masked worlds (int32, 1 = copy) from `saved` into `rows`, both [worlds, n]."""
     launch(_put_back, rows.shape, [mask, saved], [rows])

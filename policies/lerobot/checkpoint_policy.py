@@ -86,11 +86,6 @@ class LeRobotPolicy(Policy):
         self._seeds: list[int] = []
         self._looks: list[int] = []
 
-    @property
-    def depends_on_worlds(self) -> bool:  # type: ignore[override]
-        """On a GPU: that one size of the forward pass makes rows independent there is not proved."""
-        return torch.cuda.is_available() if self._device is None else self._device.type != "cpu"
-
     def check(self) -> None:
         """Load the weights.
 

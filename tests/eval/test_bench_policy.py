@@ -62,7 +62,7 @@ def test_three_starts_with_two_caches(monkeypatch):
 
     def fake(command, env, **options):
         calls.append((env["WARP_CACHE_PATH"], command[-1]))
-        return SimpleNamespace(returncode=0, stderr="", stdout=json.dumps({"environment": 0.0}) + "\n")
+        return SimpleNamespace(returncode=0, stderr="", stdout=json.dumps({"environment": 2.0}) + "\n")
 
     monkeypatch.setattr(subprocess, "run", fake)
     figures = list(bench_start.start_figures(BenchOptions()))
@@ -70,6 +70,9 @@ def test_three_starts_with_two_caches(monkeypatch):
     assert caches[0] == caches[1] != caches[2] and calls[2][1].endswith(", 1)") and calls[0][1].endswith(", 0)")
     assert [figure.bar for figure in figures] == [40.0, 8.0]
     assert torch.cuda.is_available() or [figure.value for figure in figures] == [None, None]
+    for figure in figures:  # what comes before the environment is said, but not judged
+        assert "environment 2.0 s" in figure.note and "not in the figure: interpreter and libraries" in figure.note
+        assert figure.value == 2.0 or figure.note.startswith("2.0 s, judged on CUDA only")
 
 
 def test_a_start_that_fails_says_why(monkeypatch):

@@ -26,7 +26,8 @@ def test_captured_loss_is_the_loss(family, precision):
     parameter = next(p for p in model.policy.parameters() if p.requires_grad)
 
     def step():
-        with torch.autocast("cuda", torch.bfloat16, enabled=precision == "bfloat16", cache_enabled=False):
+        # LeRobot makes constants on the host, which no graph can hold; as in training they are made on the device.
+        with torch.device("cuda"), torch.autocast("cuda", torch.bfloat16, precision == "bfloat16", cache_enabled=False):
             loss = model.loss(batch, noise)
         loss.backward()
         return loss
