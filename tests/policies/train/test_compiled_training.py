@@ -77,6 +77,15 @@ def test_a_compiled_training_is_the_training(dataset, tmp_path, compiler):
     assert losses(tmp_path / "compiled") == pytest.approx(losses(tmp_path / "plain"), rel=1e-4)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_compiled_step_is_captured(dataset, tmp_path, compiler):
+    """On a GPU compiled networks are part of the step's graph, with the losses of a step that is neither."""
+    plain, compiled = tmp_path / "plain", tmp_path / "compiled"
+    train(options(dataset, plain, device="cuda", graph=False))
+    train(options(dataset, compiled, device="cuda", compile=True))
+    assert losses(compiled) == pytest.approx(losses(plain), rel=0.02)
+
+
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name not in UNCOMPILED])
 def test_nearly_all_parameters_are_compiled(family):
     """What a family has compiled holds nearly all parameters that learn, and keeps their names."""
