@@ -120,6 +120,11 @@ class Frames:
         part = self._parts[episode]
         return self.read(part, number - self._starts[episode])
 
+    @property
+    def parts(self) -> list[VideoPart]:
+        """Where the pictures of each episode are."""
+        return list(self._parts)
+
     def read(self, part: VideoPart, number: int) -> np.ndarray:
         """Frame `number` of an episode, uint8, shape [H, W, 3].
 

@@ -12,9 +12,9 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.policy_model import ACTION, FRONT, PAD, TrainableModel, new_policy, prepared
-from arena_newton.policies.train.resnet_weights import load_resnet
+from arena_newton.policies.train.resnet_weights import check_resnet, load_resnet
 
-__all__ = ["ActModel", "build", "with_batch_norm"]
+__all__ = ["ActModel", "build", "check_weights", "with_batch_norm"]
 
 _COUNTER = "num_batches_tracked"
 """A number of `BatchNorm2d` that `FrozenBatchNorm2d` has not."""
@@ -38,6 +38,10 @@ class ActModel(TrainableModel):
             loss = loss + divergence * config.kl_weight
         return loss
 
+    def compiled_parts(self) -> list[nn.Module]:
+        """The whole network."""
+        return [self.policy.model]
+
     def is_backbone(self, parameter: str) -> bool:
         """Those of the ResNet."""
         return parameter.startswith("model.backbone")
@@ -56,6 +60,11 @@ def with_batch_norm(network: nn.Module) -> None:
             setattr(network, name, batch_norm)
         else:
             with_batch_norm(module)
+
+
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """As of `families.check_weights`."""
+    check_resnet(recipe, weights)
 
 
 def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: str | Path | None) -> ActModel:

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import nn
 
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.policy_model import ACTION, TrainableModel, new_policy, prepared, with_time_axis
-from arena_newton.policies.train.resnet_weights import load_resnet
+from arena_newton.policies.train.resnet_weights import check_resnet, load_resnet
 
-__all__ = ["DiffusionModel", "build"]
+__all__ = ["DiffusionModel", "build", "check_weights"]
 
 
 class DiffusionModel(TrainableModel):
@@ -45,9 +46,20 @@ class DiffusionModel(TrainableModel):
         wanted = drawn["noise"] if self.policy.config.prediction_type == "epsilon" else actions
         return self.mean_error((predicted - wanted) ** 2, batch)
 
+    def compiled_parts(self) -> list[nn.Module]:
+        """The vision encoders and the U-Net."""
+        encoders = self.policy.diffusion.rgb_encoder
+        each = list(encoders) if self.policy.config.use_separate_rgb_encoder_per_camera else [encoders]
+        return [*each, self.policy.diffusion.unet]
+
     def is_backbone(self, parameter: str) -> bool:
         """Those of the ResNet."""
         return parameter.startswith("diffusion.rgb_encoder") and ".backbone." in parameter
+
+
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """As of `families.check_weights`."""
+    check_resnet(recipe, weights)
 
 
 def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: str | Path | None) -> DiffusionModel:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
+from types import ModuleType
 
 import torch
 
@@ -18,7 +19,7 @@ from arena_newton.policies.recipes.training_recipe import FAMILIES, TrainingReci
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.policy_model import TrainableModel
 
-__all__ = ["Model", "build"]
+__all__ = ["Model", "build", "check_weights"]
 
 Model = TrainableModel
 """What `build` returns."""
@@ -42,8 +43,25 @@ def build(
     Raises:
         InputError: Weights are not there or do not fit, or statistics are missing.
     """
-    if recipe.family not in FAMILIES:
-        raise InputError(f"--policy {recipe.family}: unknown, choose from {', '.join(FAMILIES)}")
-    found = importlib.import_module(_MODULES[recipe.family]).build(recipe, stats, torch.device(device), weights)
+    found = _module(recipe).build(recipe, stats, torch.device(device), weights)
     assert isinstance(found, TrainableModel)
     return found
+
+
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None = None) -> None:
+    """Make sure that pretrained weights are there, before anything that takes time; they are not loaded.
+
+    Args:
+        recipe: Sizes and options.
+        weights: As of `build`. What is on the hub and not in its cache is downloaded.
+
+    Raises:
+        InputError: They are not there, or obviously those of something else.
+    """
+    _module(recipe).check_weights(recipe, weights)
+
+
+def _module(recipe: TrainingRecipe) -> ModuleType:
+    if recipe.family not in FAMILIES:
+        raise InputError(f"--policy {recipe.family}: unknown, choose from {', '.join(FAMILIES)}")
+    return importlib.import_module(_MODULES[recipe.family])

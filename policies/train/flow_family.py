@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
+from torch import nn
 from transformers import CLIPTextModel, CLIPVisionModel, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.utils import logging as transformers_logging
 
@@ -39,10 +40,12 @@ from arena_newton.policies.train.policy_model import (
 from arena_newton.policies.train.pretrained_weights import weights_folder
 from arena_newton.policies.train.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 
-__all__ = ["FlowModel", "build"]
+__all__ = ["FlowModel", "build", "check_weights"]
 
 CLIP_FILES = ("*.json", "*.txt", "model.safetensors")
 """Files of a CLIP that are used."""
+WEIGHTS_FILES = ("*.safetensors", "*.bin")
+"""Files one of which holds weights, as transformers writes them."""
 
 
 class FlowModel(TrainableModel):
@@ -105,6 +108,10 @@ class FlowModel(TrainableModel):
         ids, mask = tokenized(self.tokenizer, list(tasks), config.tokenizer_max_length, config.tokenizer_padding_side)
         return {TOKENS: ids.to(self.device), MASK: mask.to(self.device)}
 
+    def compiled_parts(self) -> list[nn.Module]:
+        """CLIP's vision encoder and the transformer; the text encoder is frozen."""
+        return [self.policy.observation_encoder.vision_encoder, self.policy.noise_predictor]
+
     def is_backbone(self, parameter: str) -> bool:
         """Those of CLIP's vision encoder."""
         return parameter.startswith("observation_encoder.vision_encoder")
@@ -132,6 +139,23 @@ def _strings(task: object, rows: int) -> list[str]:
     return list(task)
 
 
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """As of `families.check_weights`."""
+    if weights is not None or not isinstance(recipe.network.get("clip"), Mapping):
+        _clip_folder(recipe, weights)
+
+
+def _clip_folder(recipe: TrainingRecipe, weights: str | Path | None) -> tuple[Path, ClipShape]:
+    """Folder of a recipe's CLIP, and its architecture, which fits."""
+    name = str(weights if weights is not None else recipe.network["vision_encoder_name"])
+    folder = weights_folder(name, "CLIP", CLIP_FILES)
+    clip = read_clip(folder)
+    _check(clip, recipe, folder)
+    if not any(one.is_file() for pattern in WEIGHTS_FILES for one in folder.glob(pattern)):
+        raise InputError(f"{folder}: holds no weights of CLIP ({', '.join(WEIGHTS_FILES)})")
+    return folder, clip
+
+
 def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: str | Path | None) -> FlowModel:
     """Flow matching of a recipe; see `families.build`."""
     config, usable = prepared(recipe, stats, device)
@@ -145,9 +169,8 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
             policy = new_policy(config)
     else:
         name = str(weights if weights is not None else recipe.network["vision_encoder_name"])
-        folder = weights_folder(name, "CLIP", CLIP_FILES)
-        clip, tokenizer, own = read_clip(folder), read_tokenizer(folder), False
-        _check(clip, int(config.tokenizer_max_length), recipe, folder)
+        folder, clip = _clip_folder(recipe, weights)
+        tokenizer, own = read_tokenizer(folder), False
         with clip_from(lambda: _whole(CLIPVisionModel, folder), lambda: _whole(CLIPTextModel, folder)):
             policy = new_policy(config)
         config.vision_encoder_name = config.text_encoder_name = str(folder.resolve()) if Path(name).is_dir() else name
@@ -158,9 +181,10 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
     return model
 
 
-def _check(clip: ClipShape, tokens: int, recipe: TrainingRecipe, folder: Path) -> None:
+def _check(clip: ClipShape, recipe: TrainingRecipe, folder: Path) -> None:
     """A CLIP of other sizes would fail in the first step, with a message about shapes."""
     size, longest = clip.vision.image_size, clip.text.max_position_embeddings
+    tokens = int(str(recipe.network["tokenizer_max_length"]))
     if size != recipe.picture:
         raise InputError(f"{folder}: sees pictures of {size} pixels, the recipe's have {recipe.picture}")
     if longest < tokens:

@@ -6,10 +6,9 @@ when a batch is made: a quarter of the memory.
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,16 +18,15 @@ import torch
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.data.frame_reader import Frames
 from arena_newton.errors import InputError
+from arena_newton.policies.train.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
 from arena_newton.policies.train.demonstration_rows import DatasetRows, EpisodeRows
 
 __all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "needed_memory"]
 
 BLACK = 12
 """Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
-NETWORK_BYTES = 6 * 2**30
-"""Memory of a GPU that is left to the network, its optimizer and its activations (ACT, batch 64, bf16: 2.6 GB)."""
 HOST_BYTES = 2**30
-"""The same of the host, for tests and small networks."""
+"""Memory of the host that is left to everything else."""
 
 
 @dataclass(frozen=True)
@@ -106,28 +104,28 @@ def needed_memory(frames: int, height: int, width: int) -> int:
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes of a device that rows may take, those of the network left out."""
+    """Bytes of a device that rows and a network may take."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
-        return int(free) - NETWORK_BYTES
+        return int(free)
     for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else ():
         if line.startswith("MemAvailable:"):
             return int(line.split()[1]) * 1024 - HOST_BYTES
     return 2**62
 
 
-def check_memory(frames: int, height: int, width: int, device: torch.device) -> None:
-    """Refuse what does not fit.
+def check_memory(frames: int, height: int, width: int, device: torch.device, network: int) -> None:
+    """Refuse what does not fit beside a network that needs so many bytes.
 
     Raises:
         InputError: The device has too little free memory; the message says how much is missing.
     """
-    needed, free = needed_memory(frames, height, width), free_memory(device)
+    needed, free = needed_memory(frames, height, width), free_memory(device) - network
     if needed > free:
         raise InputError(
             f"--dataset: {frames} pictures of {width}x{height} need {needed / 1e9:.1f} GB of memory on {device}, "
-            f"{max(0, free) / 1e9:.1f} GB are free beside the network: name fewer datasets, record smaller pictures, "
-            "or use a device with more memory"
+            f"{max(0, free) / 1e9:.1f} GB are free beside the network, for which {network / 1e9:.1f} GB are kept: name "
+            "fewer datasets, record smaller pictures, or use a device with more memory"
         )
 
 
@@ -137,6 +135,8 @@ def load_frames(
     *,
     hold_out: int = 0,
     jobs: int = 0,
+    processes: int | None = None,
+    network: int = 0,
     on_frames: Callable[[int], None] = lambda count: None,
 ) -> FrameStore:
     """Decode all pictures onto a device.
@@ -145,11 +145,14 @@ def load_frames(
         datasets: Read with `read_rows`; their pictures must have one size.
         device: Where the rows are wanted.
         hold_out: Last episodes of each dataset that are held out.
-        jobs: Threads that decode, an episode each; 0: one per core that the process may use.
+        jobs: Cores that decode, an episode each; 0: all that the process may use.
+        processes: Processes that decode instead of threads; by default as `decoding_processes` says.
+        network: Memory that the network needs beside the pictures [bytes] (`network_bytes`).
         on_frames: Is told after each episode how many pictures were decoded.
 
     Raises:
         InputError: The pictures differ in size, do not fit, or cannot be decoded; or no episode is left to train on.
+        ArenaError: A process that decodes ended, or there is no memory for it.
     """
     height, width = datasets[0].height, datasets[0].width
     for dataset in datasets[1:]:
@@ -164,45 +167,50 @@ def load_frames(
                 f"--hold-out {hold_out}: {dataset.root} has {len(dataset.episodes)} episodes, none would be left"
             )
     frames = sum(dataset.frames for dataset in datasets)
-    workers = jobs or len(os.sched_getaffinity(0))
-    top, bottom = black_rows(datasets, workers)
-    check_memory(frames, height - top - bottom, width, device)
-    pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
-    black = _decode(datasets, pictures, (top, bottom), workers, on_frames)
-    if black != (top, bottom):
-        # Some picture is not black where the first ones of all episodes are: only what is black in all is cut off.
-        del pictures
-        top, bottom = black
-        check_memory(frames, height - top - bottom, width, device)
-        pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
-        _decode(datasets, pictures, black, workers, lambda count: None)
+    cores = jobs or len(os.sched_getaffinity(0))
+    count = decoding_processes(cores, frames) if processes is None else processes
+    films = episode_films(datasets)
+    with DecoderPool(height, width, threads=cores, processes=count, device=device) as pool:
+        top, bottom = black_rows(pool, films, height)
+        while True:
+            check_memory(frames, height - top - bottom, width, device, network)
+            pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
+            black = _decode(pool, films, pictures, (top, bottom), on_frames)
+            if black == (top, bottom):
+                break
+            # Some picture is not black where the first ones of all episodes are: only what is black in all is cut off.
+            del pictures
+            (top, bottom), on_frames = black, lambda count: None
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     held = [number >= len(d.episodes) - hold_out for d in datasets for number in range(len(d.episodes))]
     return assembled(episodes, pictures, held, top, bottom)
 
 
-def black_rows(datasets: Sequence[DatasetRows], workers: int) -> tuple[int, int]:
-    """Rows above and below that are black in the first picture of every episode; none where a whole picture is."""
-
-    def brightest(dataset: DatasetRows) -> np.ndarray:
-        frames, row, most = Frames(dataset.root, dataset.camera), 0, np.zeros(dataset.height, np.uint8)
-        for episode in dataset.episodes:
-            most = np.maximum(most, frames[row].max(axis=(1, 2)))
+def episode_films(datasets: Sequence[DatasetRows]) -> list[EpisodeFilm]:
+    """Where the pictures of all episodes are, and their rows."""
+    found: list[EpisodeFilm] = []
+    row = 0
+    for dataset in datasets:
+        parts = Frames(dataset.root, dataset.camera).parts
+        for number, (episode, part) in enumerate(zip(dataset.episodes, parts, strict=True)):
+            found.append(EpisodeFilm(dataset.root, number, part.path, part.first, part.frames, row))
             row += episode.length
-        frames.close()
-        return most
+    return found
 
-    with ThreadPoolExecutor(workers) as pool:
-        most = np.max(list(pool.map(brightest, datasets)), axis=0)
-    bright = np.flatnonzero(most > BLACK)
-    return (int(bright[0]), int(len(most) - 1 - bright[-1])) if len(bright) else (0, 0)
+
+def black_rows(pool: DecoderPool, films: Sequence[EpisodeFilm], height: int) -> tuple[int, int]:
+    """Rows above and below that are black in the first picture of every episode; none where a whole picture is."""
+    firsts = [dataclasses.replace(film, frames=1) for film in films]
+    brightest = [above for _, (above, _) in pool.decode(firsts, height, 0, lambda row, pictures: None)]
+    bright = np.flatnonzero(np.max(brightest, axis=0) > BLACK)
+    return (int(bright[0]), int(height - 1 - bright[-1])) if len(bright) else (0, 0)
 
 
 def _decode(
-    datasets: Sequence[DatasetRows],
+    pool: DecoderPool,
+    films: Sequence[EpisodeFilm],
     pictures: torch.Tensor,
     bands: tuple[int, int],
-    workers: int,
     on_frames: Callable[[int], None],
 ) -> tuple[int, int]:
     """Decode every episode into its rows; returns how many rows of the bands that are cut off all pictures have black.
@@ -210,43 +218,17 @@ def _decode(
     Where these are fewer than the bands, rows of pictures are missing.
     """
     top, bottom = bands
-    end = datasets[0].height - bottom
-    work: list[tuple[DatasetRows, Frames, int, int]] = []
-    row = 0
-    for dataset in datasets:
-        reader = Frames(dataset.root, dataset.camera, open_files=1)
-        for number, episode in enumerate(dataset.episodes):
-            work.append((dataset, reader, number, row))
-            row += episode.length
+    above, below = np.zeros(top, np.uint8), np.zeros(bottom, np.uint8)
 
-    def one(item: tuple[DatasetRows, Frames, int, int]) -> tuple[int, np.ndarray]:
-        dataset, reader, number, row = item
-        length = dataset.episodes[number].length
-        frames = copy.copy(reader)  # with open files of its own: a decoder gives one frame after the other
-        found = np.empty((length, *pictures.shape[1:]), np.uint8)
-        most = np.zeros(dataset.height, np.uint8)
-        for place, picture in enumerate(frames.episode(number)):
-            if picture.shape[:2] != (dataset.height, dataset.width):
-                raise InputError(f"{dataset.root}: episode {number}: a picture has shape {list(picture.shape)}")
-            found[place] = picture[top:end]
-            for band in (slice(0, top), slice(end, None)):
-                most[band] = np.maximum(most[band], picture[band].max(axis=(1, 2)))
-        frames.close()
-        pictures[row : row + length].copy_(torch.from_numpy(found))
-        return length, most
+    def put(row: int, found: np.ndarray) -> None:
+        pictures[row : row + len(found)].copy_(torch.from_numpy(found))
 
-    brightest = np.zeros(datasets[0].height, np.uint8)
-    with ThreadPoolExecutor(workers) as pool:
-        running = pool.map(one, work)
-        try:
-            for length, most in running:
-                brightest = np.maximum(brightest, most)
-                on_frames(length)
-        finally:
-            pool.shutdown(cancel_futures=True)
-    bright = np.flatnonzero(brightest > BLACK)
-    above, below = bright[bright < top], bright[bright >= end]
-    return (int(above[0]) if len(above) else top, len(brightest) - 1 - int(below[-1]) if len(below) else bottom)
+    for number, (brightest_above, brightest_below) in pool.decode(films, top, bottom, put):
+        np.maximum(above, brightest_above, out=above)
+        np.maximum(below, brightest_below, out=below)
+        on_frames(films[number].frames)
+    bright, dark = np.flatnonzero(above > BLACK), np.flatnonzero(below > BLACK)
+    return int(bright[0]) if len(bright) else top, bottom - 1 - int(dark[-1]) if len(dark) else bottom
 
 
 def assembled(
@@ -279,7 +261,9 @@ def assembled(
     )
 
 
-def made_frames(frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500) -> FrameStore:
+def made_frames(
+    frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500, network: int = 0
+) -> FrameStore:
     """Rows of noise, for measurements without a dataset.
 
     Args:
@@ -288,12 +272,13 @@ def made_frames(frames: int, size: int, device: torch.device, *, seed: int = 0, 
         device: Where they are wanted.
         seed: Of the noise.
         length: Rows of an episode.
+        network: Memory that the network needs beside them [bytes].
 
     Raises:
         InputError: They do not fit.
     """
     band = size // 8
-    check_memory(frames, size - 2 * band, size, device)
+    check_memory(frames, size - 2 * band, size, device, network)
     generator = torch.Generator(device).manual_seed(seed)
     pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
     for start in range(0, frames, length):

@@ -23,6 +23,8 @@ from arena_newton.policies.train import families
 from arena_newton.policies.train.demonstration_rows import ACTION_KEY, STATE_KEY, VECTOR_KEY, read_rows, statistics
 from arena_newton.policies.train.feature_scaling import Stats
 from arena_newton.policies.train.frame_store import FrameStore, load_frames, made_frames
+from arena_newton.policies.train.network_compiler import check_compiler
+from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_options import TrainingBenchOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import chosen_device, fast_kernels, make_batches
@@ -76,23 +78,29 @@ def _made_statistics() -> dict[str, dict[str, torch.Tensor]]:
 
 def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch.device) -> tuple[FrameStore, Stats]:
     """Rows on the device and their statistics."""
+    network = network_bytes(settings, device)
     if not options.dataset:
-        return made_frames(options.frames, settings.picture, device), _made_statistics()
+        return made_frames(options.frames, settings.picture, device, network=network), _made_statistics()
     datasets = [read_rows(root, settings.labels) for root in options.dataset]
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     arrays = statistics(datasets, episodes, settings.labels)
     stats = {key: {name: torch.from_numpy(values) for name, values in of.items()} for key, of in arrays.items()}
     ones = torch.ones(len({episode.task for episode in episodes}))
     stats[VECTOR_KEY] = {"mean": 0 * ones, "std": ones}
-    return load_frames(datasets, device), stats
+    return load_frames(datasets, device, network=network), stats
 
 
 def _trainer(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch.device) -> PolicyTrainer:
+    if options.compile:
+        check_compiler(device)
+    families.check_weights(settings, options.weights or None)
     store, stats = _data(options, settings, device)
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
     vector = store.tasks if settings.use_task_vector else ()
-    return PolicyTrainer(model, make_batches(model, store, vector), settings, graph=options.graph)
+    return PolicyTrainer(
+        model, make_batches(model, store, vector), settings, graph=options.graph, compiled=options.compile
+    )
 
 
 def measured(options: TrainingBenchOptions) -> SpeedFigure:

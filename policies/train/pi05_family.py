@@ -17,6 +17,7 @@ import torch
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
+from torch import nn
 from transformers import PreTrainedTokenizerBase
 
 from arena_newton.errors import InputError
@@ -41,10 +42,10 @@ from arena_newton.policies.train.policy_model import (
     new_policy,
     prepared,
 )
-from arena_newton.policies.train.pretrained_weights import checksum, read_safetensors, weights_folder
+from arena_newton.policies.train.pretrained_weights import check_safetensors, checksum, read_safetensors, weights_folder
 from arena_newton.policies.train.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 
-__all__ = ["BASE_FILES", "PADDED", "TOKENIZER", "Pi05Model", "build", "load_base", "prompts"]
+__all__ = ["BASE_FILES", "PADDED", "TOKENIZER", "Pi05Model", "build", "check_weights", "load_base", "prompts"]
 
 TOKENIZER = "google/paligemma-3b-pt-224"
 """Tokenizer that LeRobot's processors of pi0.5 name."""
@@ -72,6 +73,7 @@ class Pi05Model(TrainableModel):
 
     # LeRobot makes masks on the host in every forward pass, and the prompt with the state is text.
     capturable: ClassVar[bool] = False
+    compilable: ClassVar[bool] = False
     reads_task: ClassVar[bool] = True
 
     def __init__(
@@ -137,6 +139,10 @@ class Pi05Model(TrainableModel):
         tokenized(self.tokenizer, prompts(known, torch.full((len(known), state.shape[-1]), BEYOND)), longest)
         ids, mask = tokenized(self.tokenizer, prompts(tasks, state), longest)
         return {TOKENS: ids.to(self.device), MASK: mask.to(self.device)}
+
+    def compiled_parts(self) -> list[nn.Module]:
+        """None: what is compiled ends at each of the masks that are made on the host."""
+        return []
 
     def is_backbone(self, parameter: str) -> bool:
         """Those of the vision tower."""
@@ -218,6 +224,25 @@ def load_base(policy: PreTrainedPolicy, path: Path) -> str:
     return wanted
 
 
+def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """As of `families.check_weights`."""
+    folder = _base(recipe, weights)
+    if folder is not None and not _holds_tokenizer(folder) and not isinstance(recipe.network.get("gemma"), Mapping):
+        weights_folder(TOKENIZER, "tokenizer of PaliGemma", TOKENIZER_FILES)
+
+
+def _base(recipe: TrainingRecipe, weights: str | Path | None) -> Path | None:
+    """Folder of the base weights; none where a recipe has new ones."""
+    if weights is None and isinstance(recipe.network.get("gemma"), Mapping):
+        return None
+    name = str(weights if weights is not None else recipe.network["pretrained_path"])
+    folder = weights_folder(name, "pi0.5 base weights", BASE_FILES)
+    if not (folder / WEIGHTS_FILE).is_file():
+        raise InputError(f"--weights {folder}: holds no {WEIGHTS_FILE} of pi0.5")
+    check_safetensors(folder / WEIGHTS_FILE)
+    return folder
+
+
 def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: str | Path | None) -> Pi05Model:
     """pi0.5 of a recipe; see `families.build`."""
     config, usable = prepared(recipe, stats, device)
@@ -229,17 +254,13 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
             f"recipe {recipe.name}: time_sampling_beta_beta is {config.time_sampling_beta_beta}, expected 1"
         )
     sizes = recipe.network.get("gemma")
-    base = weights if weights is not None else recipe.network["pretrained_path"]
-    folder = None
+    folder = _base(recipe, weights)
     if isinstance(sizes, Mapping):
-        folder = weights_folder(weights, "pi0.5 base weights", BASE_FILES) if weights is not None else None
         tokenizer, name = _tokenizer(folder) if folder and _holds_tokenizer(folder) else (made_tokenizer(), "")
         with gemma_of(sizes):
             policy = new_policy(config)
     else:
-        folder = weights_folder(str(base), "pi0.5 base weights", BASE_FILES)
-        if not (folder / WEIGHTS_FILE).is_file():
-            raise InputError(f"--weights {folder}: holds no {WEIGHTS_FILE} of pi0.5")
+        assert folder is not None
         tokenizer, name = _tokenizer(folder)
         policy = new_policy(config)
     loaded = load_base(policy, folder / WEIGHTS_FILE) if folder else ""

@@ -15,6 +15,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config, make_
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 from safetensors.torch import save_file
+from torch import nn
 
 from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
@@ -100,6 +101,8 @@ class TrainableModel(abc.ABC):
 
     capturable: ClassVar[bool] = True
     """Whether `loss` and its backward pass can be captured in a CUDA graph."""
+    compilable: ClassVar[bool] = True
+    """Whether `compiled_parts` can be compiled."""
     reads_task: ClassVar[bool] = False
     """Whether the policy reads the task's instruction."""
 
@@ -151,6 +154,10 @@ class TrainableModel(abc.ABC):
             noise: What `noise` returns; drawn here where it is not given. Dropout, and ACT's latent, draw from torch's
                 own generator, which a CUDA graph advances.
         """
+
+    @abc.abstractmethod
+    def compiled_parts(self) -> list[nn.Module]:
+        """Networks of the policy that `loss` calls, for `torch.compile`; together nearly all of its work."""
 
     def noise(self, rows: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
         """Random numbers of a batch's loss, on the device; safe in a CUDA graph that knows the generator."""

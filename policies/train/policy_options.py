@@ -16,6 +16,10 @@ MOST_TRAININGS = 16
 """Most trainings that are measured side by side."""
 
 
+UNCOMPILED = ("pi05",)
+"""Families that --compile refuses."""
+
+
 def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]:
     """Metadata of a flag whose number is within these bounds."""
     return {"range": (low, high)}
@@ -68,8 +72,10 @@ class PolicyTrainOptions:
     """Steps between rows of the log."""
     graph: bool = True
     """On CUDA: capture batch and step in one CUDA graph."""
+    compile: bool = False
+    """Compile the network with torch.compile, which takes a minute or so at the first step; not for pi05."""
     jobs: int = field(default=0, metadata=bounds(0, 1024))
-    """Threads that decode pictures; 0: one per core that the process may use."""
+    """Cores that decode pictures, four or more by a process each, fewer by threads; 0: all that may be used."""
     quiet: bool = False
     """Show no progress bar."""
 
@@ -98,6 +104,8 @@ class TrainingBenchOptions:
     """Pretrained weights, as of a training."""
     graph: bool = True
     """On CUDA: capture batch and step in one CUDA graph."""
+    compile: bool = False
+    """Compile the network with torch.compile; not for pi05."""
     against_lerobot: bool = False
     """Measure LeRobot's own loop too, its data loader on the dataset; needs --dataset."""
     workers: int = field(default=4, metadata=bounds(0, 256))
@@ -121,6 +129,10 @@ def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
     for flag, value, known in (("--policy", options.policy, FAMILIES), ("--recipe", options.recipe, RECIPES)):
         if value not in known:
             raise InputError(f"{flag} {value}: unknown, choose from {', '.join(known)}")
+    if options.compile and options.policy in UNCOMPILED:
+        raise InputError(
+            f"--compile: {options.policy} cannot be compiled: LeRobot makes its masks on the host in every forward pass"
+        )
     for folder in options.dataset:
         if not folder.is_dir():
             raise InputError(f"--dataset {folder}: no such folder")

@@ -17,6 +17,7 @@ import torch
 from arena_newton.errors import ArenaError
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.network_compiler import compile_networks, compiler_errors, uncompiled
 from arena_newton.policies.train.policy_model import TrainableModel
 
 __all__ = ["PolicyTrainer"]
@@ -40,6 +41,7 @@ class PolicyTrainer:
         recipe: TrainingRecipe,
         *,
         graph: bool = True,
+        compiled: bool = False,
         rank: int = 0,
         ranks: int = 1,
     ):
@@ -50,8 +52,13 @@ class PolicyTrainer:
             batches: Where batches come from.
             recipe: Settings; `steps` is the end of the schedule.
             graph: On CUDA: capture a step in a graph, where the model can be captured.
+            compiled: Compile the networks, at the first step.
             rank: Number of this process.
             ranks: Number of processes.
+
+        Raises:
+            InputError: The family cannot be compiled.
+            ArenaError: No episode is long enough.
         """
         self.model, self.batches, self.recipe = model, batches, recipe
         self.rank, self.ranks = rank, ranks
@@ -74,12 +81,17 @@ class PolicyTrainer:
         if self.device.type == "cuda":
             # Convolutions on tensor cores read channels last, in any other order each copies its input and output.
             model.policy.to(memory_format=torch.channels_last)
+        self._compiled = compiled
+        if compiled:
+            compile_networks(model)
         self.optimizer, self._lrs = _optimizer(model, recipe, self.device)
         self._parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._flat: torch.Tensor | None = None
         self._used: list[torch.Tensor] = []
         """Parameters on which the loss depends, whose gradients are in `_flat`."""
         self._graphs: list[torch.cuda.CUDAGraph] = []
+        self._began = False
+        """Whether a step was taken, with which everything is compiled."""
         model.policy.train()
         if ranks > 1:
             for tensor in model.policy.state_dict().values():
@@ -106,6 +118,14 @@ class PolicyTrainer:
 
     def advance(self) -> None:
         """Take one step; on CUDA it is launched, not awaited."""
+        if self._compiled and not self._began:
+            with compiler_errors():
+                self._advance()
+        else:
+            self._advance()
+        self._began = True
+
+    def _advance(self) -> None:
         if self.graphed and not self._graphs:
             self._capture()
         self._prepare(self.step)
@@ -245,7 +265,7 @@ class PolicyTrainer:
         chosen = self.held[np.linspace(0, len(self.held) - 1, count * size).round().astype(np.int64)]
         rows = torch.from_numpy(chosen).to(self.device)
         total = torch.zeros((), device=self.device)
-        with _evaluating(self.model):
+        with _evaluating(self.model), uncompiled() if self._compiled else contextlib.nullcontext():
             torch.manual_seed(step_seed(self.recipe.seed, -1))
             for part in rows.split(size):
                 with self._precision():

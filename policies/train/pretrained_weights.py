@@ -12,12 +12,12 @@ from pathlib import Path
 import torch
 from huggingface_hub import constants, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 
 from arena_newton.errors import InputError
 
-__all__ = ["PATIENCE", "checksum", "read_safetensors", "weights_folder"]
+__all__ = ["PATIENCE", "check_safetensors", "checksum", "read_safetensors", "weights_folder"]
 
 PATIENCE = 10.0
 """How long the hub is waited for [s]."""
@@ -65,6 +65,19 @@ def read_safetensors(path: Path) -> dict[str, torch.Tensor]:
     """
     try:
         return load_file(path)
+    except (OSError, SafetensorError, ValueError) as error:
+        raise InputError(f"{path}: not readable as safetensors ({error})") from None
+
+
+def check_safetensors(path: Path) -> None:
+    """Make sure that a file of tensors is there and as long as its header says; none is read.
+
+    Raises:
+        InputError: It is not.
+    """
+    try:
+        with safe_open(path, framework="pt"):
+            pass
     except (OSError, SafetensorError, ValueError) as error:
         raise InputError(f"{path}: not readable as safetensors ({error})") from None
 

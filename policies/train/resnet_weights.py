@@ -12,13 +12,16 @@ import torchvision
 from torch import nn
 
 from arena_newton.errors import InputError
-from arena_newton.policies.train.pretrained_weights import PATIENCE, read_safetensors, weights_folder
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
+from arena_newton.policies.train.pretrained_weights import PATIENCE, check_safetensors, read_safetensors, weights_folder
 
-__all__ = ["load_resnet"]
+__all__ = ["check_resnet", "find_resnet", "load_resnet"]
 
 _SEQUENTIAL = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
 """Children of LeRobot's diffusion encoder → names of torchvision."""
 _FILES = ("*.safetensors", "*.pth", "*.bin", "*.json")
+DEFAULT_BACKBONE = "resnet18"
+"""LeRobot's, where a recipe names none."""
 _HEAD = "fc."
 """The layer that names ImageNet's classes; no policy has it."""
 
@@ -35,7 +38,9 @@ def load_resnet(backbone: nn.Module, kind: str, wanted: object) -> None:
     Raises:
         InputError: They are not there, or are those of another network.
     """
-    tensors = {name: value for name, value in _read(kind, wanted).items() if not name.startswith(_HEAD)}
+    path = find_resnet(kind, wanted)
+    found = _read(path) if isinstance(path, Path) else path.get_state_dict(progress=False, check_hash=True)
+    tensors = {name: value for name, value in found.items() if not name.startswith(_HEAD)}
     if isinstance(backbone, nn.Sequential):
         numbers = {name: number for number, name in _SEQUENTIAL.items()}
         tensors = {
@@ -51,7 +56,30 @@ def load_resnet(backbone: nn.Module, kind: str, wanted: object) -> None:
     backbone.load_state_dict({name: value for name, value in tensors.items() if name in own}, strict=False)
 
 
-def _read(kind: str, wanted: object) -> dict[str, torch.Tensor]:
+def check_resnet(recipe: TrainingRecipe, weights: str | Path | None) -> None:
+    """Make sure that the weights of a recipe's vision encoder are there.
+
+    Raises:
+        InputError: They are not.
+    """
+    wanted = weights if weights is not None else recipe.network.get("pretrained_backbone_weights")
+    if wanted is not None:
+        find_resnet(str(recipe.network.get("vision_backbone", DEFAULT_BACKBONE)), wanted)
+
+
+def find_resnet(kind: str, wanted: object) -> Path | torchvision.models.WeightsEnum:
+    """Where pretrained weights are; nothing is loaded.
+
+    Args:
+        kind: As of `load_resnet`.
+        wanted: As of `load_resnet`.
+
+    Returns:
+        A file, or torchvision's weights, which are in its cache or at their address.
+
+    Raises:
+        InputError: They are not there.
+    """
     text = str(wanted)
     if text.endswith("_V1") or "_Weights." in text:
         return _torchvision(kind, text)
@@ -63,6 +91,12 @@ def _read(kind: str, wanted: object) -> dict[str, torch.Tensor]:
             raise InputError(f"--weights {folder}: holds no weights of a {kind} ({', '.join(_FILES[:3])})")
         path = files[0]
     if path.suffix == ".safetensors":
+        check_safetensors(path)
+    return path
+
+
+def _read(path: Path) -> dict[str, torch.Tensor]:
+    if path.suffix == ".safetensors":
         return read_safetensors(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -73,13 +107,13 @@ def _read(kind: str, wanted: object) -> dict[str, torch.Tensor]:
     return content
 
 
-def _torchvision(kind: str, name: str) -> dict[str, torch.Tensor]:
-    """Torchvision's weights, from its cache or its address."""
+def _torchvision(kind: str, name: str) -> torchvision.models.WeightsEnum:
+    """Torchvision's weights, which are in its cache or at their address."""
     enum = torchvision.models.get_model_weights(kind)
     short = name.rpartition(".")[2]
     if short not in enum.__members__:
         raise InputError(f"weights {name}: unknown, torchvision has {', '.join(enum.__members__)} of {kind}")
-    weights = enum[short]
+    weights: torchvision.models.WeightsEnum = enum[short]
     cached = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rpartition("/")[2]
     if not cached.is_file():
         try:
@@ -90,5 +124,4 @@ def _torchvision(kind: str, name: str) -> dict[str, torch.Tensor]:
                 f"ResNet weights {name}: not in {cached}, and {weights.url} does not give them ({error}); "
                 f"--weights FILE takes a local copy"
             ) from None
-    found: dict[str, torch.Tensor] = weights.get_state_dict(progress=False, check_hash=True)
-    return found
+    return weights

@@ -13,7 +13,7 @@ __all__ = ["plain", "plain_options", "read_options", "resumed"]
 
 FREE_ON_RESUME = frozenset(
     ("resume", "out", "dataset", "steps", "minutes", "device", "save_every", "keep", "hold_out_every", "log_every")
-    + ("graph", "jobs", "quiet")
+    + ("graph", "compile", "jobs", "quiet")
 )
 """Flags that may differ when a training goes on; datasets must have the content that they had."""
 
@@ -26,7 +26,8 @@ def resumed(options: PolicyTrainOptions, content: Mapping[str, object], where: P
     """
     stored = read_options(content, where)
     empty = PolicyTrainOptions()
-    changes: dict[str, object] = {"resume": options.resume, "out": options.resume}
+    # A machine without a compiler goes on with what another one has begun.
+    changes: dict[str, object] = {"resume": options.resume, "out": options.resume, "compile": options.compile}
     for one in dataclasses.fields(PolicyTrainOptions):
         given = getattr(options, one.name)
         if one.name in changes or given == getattr(empty, one.name):

@@ -21,6 +21,8 @@ from arena_newton.policies.train import families
 from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
 from arena_newton.policies.train.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.network_compiler import check_compiler
+from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_model import TrainableModel
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -95,6 +97,9 @@ def _train(
     checkpoint: Path | None,
 ) -> Path:
     speaks = processes.first and not options.quiet
+    if options.compile:
+        check_compiler(device)
+    families.check_weights(settings, options.weights or None)
     datasets = [read_rows(root, settings.labels) for root in options.dataset]
     if progress is not None:
         _check_same_data(datasets, progress)
@@ -103,7 +108,10 @@ def _train(
     total = sum(dataset.frames for dataset in datasets)
     with tqdm(total=total, unit="picture", desc="decoding", disable=None if speaks else True, leave=False) as bar:
         jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
-        store = load_frames(datasets, device, hold_out=options.hold_out, jobs=jobs, on_frames=bar.update)
+        network = network_bytes(settings, device)
+        store = load_frames(
+            datasets, device, hold_out=options.hold_out, jobs=jobs, network=network, on_frames=bar.update
+        )
     if speaks:
         size = store.pictures.numel() / 1e9
         print(
@@ -123,7 +131,15 @@ def _train(
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
     batches = make_batches(model, store, vector)
-    trainer = PolicyTrainer(model, batches, settings, graph=options.graph, rank=processes.rank, ranks=processes.count)
+    trainer = PolicyTrainer(
+        model,
+        batches,
+        settings,
+        graph=options.graph,
+        compiled=options.compile,
+        rank=processes.rank,
+        ranks=processes.count,
+    )
     if options.steps:
         trainer.fix_steps(options.steps)
     elif progress is not None and progress.steps:

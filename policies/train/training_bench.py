@@ -67,6 +67,7 @@ def bench(options: TrainingBenchOptions) -> list[tuple[int, list[SpeedFigure]]]:
         each = " + ".join(f"{one.steps_per_s:.1f}" for one in figures)
         total = sum(one.steps_per_s for one in figures)
         kind = "one graph a step" if figures[0].graphed else "no graph"
+        kind += ", compiled" if options.compile else ""
         line = f"{count} at once: {each} = {total:.1f} steps/s" if count > 1 else f"alone: {total:.1f} steps/s"
         memory = f", {max(one.memory for one in figures):.1f} GB each" if device.type == "cuda" else ""
         print(f"{line} ({kind}{memory}){_verdict(name, settings, total) if count == 1 else ''}", flush=True)

@@ -15,13 +15,16 @@ from arena_newton.data import Frames
 from arena_newton.data.label_protocols import encode_v4
 from arena_newton.data.lerobot_reader import DatasetActions
 from arena_newton.errors import InputError
-from arena_newton.policies.train import frame_store
+from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
+from arena_newton.policies.train import families, frame_store
 from arena_newton.policies.train.augmentation import gathered_pictures
 from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
 from arena_newton.policies.train.demonstration_rows import read_rows, statistics
 from arena_newton.policies.train.frame_store import load_frames, made_frames
+from arena_newton.policies.train.network_memory import SIZES, network_bytes
 from arena_newton.policies.train.training import camera_fit
 from tests.fuzz.mutants import damaged
+from tests.policies.train.made_stats import made_stats
 from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset
 
 CPU = torch.device("cpu")
@@ -211,10 +214,33 @@ def test_what_does_not_fit_is_refused(rows, monkeypatch):
     monkeypatch.setattr(frame_store, "free_memory", lambda device: 500_000)
     with pytest.raises(InputError, match=r"92 pictures of 64x48 need 0.0 GB of memory on cpu, 0.0 GB are free"):
         load_frames([rows], CPU)
+    monkeypatch.setattr(frame_store, "free_memory", lambda device: 10_000_000_000)
+    with pytest.raises(InputError, match=r"0\.0 GB are free beside the network, for which 10\.0 GB are kept"):
+        load_frames([rows], CPU, network=10_000_000_000)
+    load_frames([rows], CPU, network=9_900_000_000, jobs=1)
     with pytest.raises(InputError, match="--hold-out 3: .* has 3 episodes, none would be left"):
         load_frames([rows], CPU, hold_out=3)
     with pytest.raises(InputError, match="pictures of 32x64 pixels, .* has 64x64"):
         load_frames([rows, dataclasses.replace(rows, width=32)], CPU)
+
+
+@pytest.mark.parametrize("family", ["act", "diffusion"])
+def test_memory_of_a_network_is_that_of_its_parameters(family):
+    """The table has as many parameters as the paper's network."""
+    paper = recipe(family, "paper", network={"pretrained_backbone_weights": None})
+    counted = sum(p.numel() for p in families.build(paper, made_stats(), "cpu").policy.parameters())
+    assert SIZES[family].parameters == pytest.approx(counted, rel=0.02)
+
+
+def test_memory_of_a_network_depends_on_family_and_batch():
+    """pi0.5 keeps more than its weights with moments need, ACT less than 6 GB; nothing of the host is kept."""
+    cuda = torch.device("cuda")
+    found = {family: network_bytes(recipe(family, "paper"), cuda) / 1e9 for family in SIZES}
+    assert 2.6 < found["act"] < 6.0 and 35.0 < found["pi05"] < 80.0
+    assert all(6.0 < found[family] < 20.0 for family in ("diffusion", "flow"))
+    assert network_bytes(recipe("act", "paper", batch_size=128), cuda) > 1e9 * found["act"]
+    assert network_bytes(recipe("pi05", "small"), cuda) < 3e9
+    assert network_bytes(recipe("pi05", "paper"), CPU) == 0 and set(SIZES) == set(FAMILIES)
 
 
 def test_made_frames_have_the_form_of_a_dataset():
