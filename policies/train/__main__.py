@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from arena_newton.command_line import exit_code
 from arena_newton.extras import require
 from arena_newton.flags import parse_flags
-from arena_newton.policies.train.lean_import import import_lerobot
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions, check_numbers
 
 __all__ = ["main"]
@@ -33,7 +32,6 @@ def _train(arguments: list[str]) -> None:
     options = parse_flags(PolicyTrainOptions, arguments, PROG)
     check_numbers(options)  # before the libraries are loaded
     _require(options.policy)
-    import_lerobot()
     from arena_newton.policies.train.training import train
 
     train(options)
