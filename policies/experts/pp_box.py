@@ -52,30 +52,38 @@ FIST = 0.055
 READY = 0.28
 """Distance of the palms ahead of the pelvis before that [m]."""
 PASSING = (0.10, 0.12)
-"""Errors at the two places on the way that do not matter [m, rad]."""
-AT_PLACE = (0.045, 0.06)
-"""Errors in front of box and shelf that the arms compensate [m, rad]."""
+"""Errors at the places on the way, and in front of box and shelf, that do not matter [m, rad]: the arms compensate."""
+BEYOND = 0.06
+"""How much farther than to box and shelf it is led [m], so that it goes on while it still walks. Whoever learns from
+these demonstrations knows no phase and no clock: where they wait for the last centimetres, or for a time, it waits
+for ever (docs/experts.md)."""
 ALIGN_GAIN = 1.5
 """Integral gain on palms and wrists while they align [1/s]."""
 LEARNING = 0.4
 """Time in which the hands get near the box before that begins [s]."""
-SOONEST = 1.0
+SOONEST = 0.6
 """Least time of aligning [s]."""
 ALIGNED = 0.025
 """Error of the palms that is good enough [m]."""
 ASIDE = 0.107
-"""Gap between fist and box when the hands align [m]."""
+"""Gap between fist and box when the hands begin to align [m]."""
+ASIDE_LEAST = 0.04
+"""The same when they have aligned for long [m]."""
+CREEPING = 0.05
+"""Speed of each hand towards the box while they align [m/s]: how far they are can be seen."""
+WAITING = 0.2
+"""Time before that begins [s]."""
 CLOSING = 0.15
-"""Speed of each hand when closing [m/s]."""
+"""Speed of each hand when closing [m/s]; twice as fast where it presses too little."""
 OVERLAP = 0.09
 """How much deeper than it gets each palm is commanded into the box [m]: about 100 N/m times this, 10-12 N a side.
 Below 8 N weak arms drop the box in the carry."""
 TURNED = 0.08
 """How much deeper into a box that stands turned between the fists [m/rad]: they slide on its faces, and press less."""
-SERVO = 3.0
+SERVO = 5.0
 """Gain of the squeeze [1/s]: speed of a hand for what the overlap lacks. It ends with the lift, since a turned box
 comes to lie flat between the fists only when they press, and is then narrower."""
-SQUEEZED = 1.2
+SQUEEZED = 0.4
 """Least time of the squeeze [s]."""
 DEEPEST = 0.17
 """Most that a palm is commanded into the box [m]."""
@@ -117,16 +125,16 @@ FARTHEST = 0.52
 """Largest distance ahead of the pelvis to which the palms are commanded at the shelf [m]."""
 BEND = 0.15
 """Waist pitch at the shelf [rad]."""
-SETTLED = 1.2
-"""Time in which a walk ends: the pelvis rises, and moves back by 6 cm [s]."""
+SETTLED = 0.4
+"""Least time of reaching into the shelf [s]."""
 SINKING = 0.05
 """Speed of the box from the lift to the height in which it is carried over the deck [m/s]."""
 LOWERING = 0.08
 """Speed of the box on its way down [m/s]."""
 SUNK = 0.06
 """How much farther than to the deck the hands are commanded down [m]: arms that follow roughly get there too."""
-DOWN = 0.008
-"""Height above the deck at which the box counts as put down [m]."""
+DOWN = (0.006, 0.02)
+"""Heights above the deck at which the box counts as put down; one is drawn an episode [m]."""
 TURNING = 0.35
 """Yaw rate of the turn to the shelf [rad/s]: at 0.6 SONIC dropped four more boxes of 60."""
 OPENING = 0.5
@@ -214,7 +222,7 @@ class PPBoxExpert(Expert):
         self._lean = self._deep = zero
         self._angles = torch.zeros(worlds, 2, 3, device=device)
         self._stand = self._spot = torch.zeros(worlds, 3, device=device)
-        self._off = self._near = self._inside = self._aside = self._pace = zero
+        self._off = self._near = self._inside = self._aside = self._pace = self._down = zero
 
     def begin(self, mask: Tensor, style: Style) -> None:
         """Draw the style and go to the box."""
@@ -227,6 +235,7 @@ class PPBoxExpert(Expert):
         self._inside = drawn("inside", self._inside, INSIDE - 0.01, INSIDE + 0.01)
         self._aside = drawn("spot", self._aside, -0.10, 0.10)
         self._pace = drawn("pace", self._pace, 0.9, 1.0)
+        self._down = drawn("down", self._down, *DOWN)
         self.walk.begin(mask)
         self.haul.begin(mask)
         self.haul.to(mask, self.sight.pose)
@@ -339,12 +348,12 @@ class PPBoxExpert(Expert):
         self._approach(done("retreat", away > BACK))
         enter("leave", "stand", off > BACK)
         enter("open", "leave", (self.half >= self._opened()) & (clock > LET_GO))
-        flat = self._deck_top() + self._box_half[2] + DOWN
-        sunk = self.underside < self._deck_top() - SUNK + DOWN
+        flat = self._deck_top() + self._box_half[2] + self._down
+        sunk = self.underside < self._deck_top() - SUNK + self._down
         enter("lower", "open", (self._centre()[:, 2] < flat) | sunk)
         enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - SHORT) | (self.grip[:, 0] >= FARTHEST)))
-        enter("step in", "reach", near(haul, AT_PLACE))
-        self.haul.to(enter("carry", "step in", near(haul, PASSING)), self._spot)
+        enter("step in", "reach", near(haul, PASSING))
+        self.haul.to(enter("carry", "step in", near(haul, PASSING)), beyond(self._spot))
         self._choose_spot(enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING))
         enter("back", "turn", away > BACK)
         lifted = done("lift", self._underside() > self._table + LIFTED)
@@ -353,8 +362,8 @@ class PPBoxExpert(Expert):
         state.enter("retreat", lifted & ~held)
         enter("close", "lift", (self._overlap() > self._deep - SHORT) & (clock > SQUEEZED))
         enter("align", "close", (clock > SOONEST) & (self._missing() < ALIGNED))
-        enter("step up", "align", near(walk, AT_PLACE))
-        self.walk.to(enter("approach", "step up", near(walk, PASSING) & (state.clock > 0)), self._stand)
+        enter("step up", "align", near(walk, PASSING))
+        self.walk.to(enter("approach", "step up", near(walk, PASSING) & (state.clock > 0)), beyond(self._stand))
 
     def _watch(self, mask: Tensor) -> None:
         """Leave the usual order where the box rests somewhere else than between the hands."""
@@ -407,7 +416,9 @@ class PPBoxExpert(Expert):
         ready = torch.cat([self._ready, middle[:, 2:]], dim=1)
         self.grip = select(mask & before, ready, select(mask & aligning, middle, self.grip))
         self._level = select(mask & (before | aligning), middle[:, 2], self._level)
-        self.half = select(mask & (before | aligning), self._wide() + FIST + ASIDE, self.half)
+        crept = CREEPING * (state.clock - WAITING).clamp(min=0.0) * aligning
+        apart = (ASIDE - crept).clamp(min=ASIDE_LEAST)
+        self.half = select(mask & (before | aligning), self._wide() + FIST + apart, self.half)
         lean = (LEAN * (self._reached()[:, 0] - UPRIGHT)).clamp(0.0, MOST_LEAN)
         self._lean = select(mask & aligning, lean, self._lean.masked_fill(mask & before, 0.0))
         learn = (mask & aligning & (state.clock > LEARNING))[:, None].expand(-1, 2)
@@ -416,7 +427,7 @@ class PPBoxExpert(Expert):
         angles = self.wrists.lead(level, learn, dt)
         self._angles = select(mask & (before | aligning), angles, self._angles)
 
-        closing = dt * (SERVO * (self._deep - self._overlap())).clamp(-CLOSING, CLOSING)
+        closing = dt * (SERVO * (self._deep - self._overlap())).clamp(-CLOSING, 2.0 * CLOSING)
         squeezed = torch.maximum(self.half - closing, self._box_half[:2].amin() + FIST - DEEPEST)
         self.half = select(mask & state.at("close", "lift"), squeezed, self.half)
         opening = torch.minimum(self.half + OPENING * dt, self._opened())
@@ -471,3 +482,8 @@ def pose_before(point: Tensor, yaw: Tensor, distance: Tensor) -> Tensor:
     """
     ahead = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
     return torch.cat([point - distance[:, None] * ahead, yaw[:, None]], dim=1)
+
+
+def beyond(pose: Tensor) -> Tensor:
+    """Poses that are `BEYOND` farther ahead than others; x, y [m], yaw [rad], shape [worlds, 3]."""
+    return pose_before(pose[:, :2], pose[:, 2], torch.full_like(pose[:, 2], -BEYOND))
