@@ -39,9 +39,10 @@ _REPORTING = """__main__ action_map bench bench_figure bench_policy bench_record
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
-_TRAINING = """__main__ act_family augmentation batching demonstration_rows diffusion_family families feature_scaling
-    flow_family frame_store measured_training pi05_family policy_model policy_options policy_trainer pretrained_weights
-    prompts resnet_weights stored_flags training training_bench training_log training_loop training_state"""
+_TRAINING = """__main__ act_family augmentation batching decoder_pool decoder_process demonstration_rows
+    diffusion_family families feature_scaling flow_family frame_store measured_training network_compiler
+    network_memory pi05_family policy_model policy_options policy_trainer pretrained_weights prompts
+    resnet_weights stored_flags training training_bench training_log training_loop training_state"""
 UNHASHED = (
     *(f"data/{name}.py" for name in _DATASETS.split()),
     *(f"eval/{name}.py" for name in _REPORTING.split()),
