@@ -32,13 +32,12 @@ from arena_newton.data.film_process import SlotMemory, packed, unpacked
 from arena_newton.errors import ArenaError
 from arena_newton.files import PARTIAL
 from arena_newton.interrupts import Uninterrupted
+from arena_newton.own_processes import environment, pin, unpin
 
 __all__ = ["FilmPool"]
 
 PROGRAM = "arena_newton.data.film_process"
 """Module that each process runs."""
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Set to 1 for a process: its libraries would start a thread per core, which it never uses."""
 PATIENCE = 1.0
 """Time after which whoever waits for a process looks at all of them again [s]."""
 STOP_PATIENCE = 10.0
@@ -74,16 +73,9 @@ class _Slots:
         self.reels: Sequence[Reel] = ()
         self.messages: dict[int, list[tuple[_Worker, bytes]]] = {}
         """What is said of each slot as long as the films are `reels`."""
-        self._pinned = device.type == "cuda" and self._pin(memory.size, device)
-
-    def _pin(self, size: int, device: torch.device) -> bool:
-        """Whether the memory could be pinned; into other memory a GPU copies too, and whoever asks it waits."""
-        with torch.cuda.device(device):
-            if int(torch.cuda.cudart().cudaHostRegister(self.pictures[0].data_ptr(), size, 0)) == 0:
-                return True
-            with contextlib.suppress(RuntimeError):  # CUDA keeps the error for whatever is launched next
-                torch.zeros(1, device=device)
-        return False
+        self._whole = torch.from_numpy(np.ndarray((memory.size,), np.uint8, memory.memory))
+        self._pinned = device.type == "cuda" and pin(self._whole, device)
+        """Into memory that is not pinned a GPU copies too, and whoever asks it waits."""
 
     def fill(self, slot: int, pictures: torch.Tensor, depths: torch.Tensor | None) -> torch.cuda.Event | None:
         """Copy pictures and depths; from a GPU on torch's stream, the event says when they are there."""
@@ -99,7 +91,7 @@ class _Slots:
     def close(self) -> None:
         """Give the memory back."""
         if self._pinned:
-            torch.cuda.cudart().cudaHostUnregister(self.pictures[0].data_ptr())
+            unpin(self._whole)
         os.close(self.fd)
 
 
@@ -143,16 +135,13 @@ class FilmPool(Filming):
 
     def _start(self, number: int) -> _Worker:
         ours, theirs = socket.socketpair()
-        root = str(Path(__file__).resolve().parents[2])
-        environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-        environment["PYTHONPATH"] = os.pathsep.join([path for path in sys.path if path] + [root])
         with theirs:
             files = theirs.fileno(), *(slots.fd for slots in self._cameras.values())
             # A session of its own: Ctrl-C is the recorder's, which still needs the films.
             process = subprocess.Popen(
                 [sys.executable, "-P", "-m", PROGRAM, str(theirs.fileno()), str(os.getpid())],
                 pass_fds=files,
-                env=environment,
+                env=environment(one_thread=True),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 start_new_session=True,

@@ -27,17 +27,15 @@ from typing import Self
 import numpy as np
 import torch
 
-import arena_newton
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interrupts import Uninterrupted
+from arena_newton.own_processes import environment, pin, unpin
 from arena_newton.policies.train.decoder_process import SLOTS, EpisodeDecoder, chunk, mapped
 
 __all__ = ["DecoderPool", "EpisodeFilm", "decoding_processes"]
 
 PROGRAM = "arena_newton.policies.train.decoder_process"
 """Module that each process runs."""
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Set to 1 for a process: its libraries would start a thread per core, which it never uses."""
 PROCESS_CORES = 4
 """Cores from which on processes decode: threads of one process use little more than one."""
 MOST_PROCESSES = 32
@@ -148,9 +146,7 @@ class DecoderPool:
                 f"decoding: no {total / 1e6:.0f} MB of memory that {count} processes could share "
                 f"({error.strerror or error}); --jobs 1 needs none"
             ) from error
-        root = str(Path(arena_newton.__file__).resolve().parents[1])
-        environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-        environment["PYTHONPATH"] = os.pathsep.join([*(path for path in sys.path if path), root])
+        variables = environment(one_thread=True)
         for number in range(count):
             facts = self._fd, number, self._slot, height, width
             command = [sys.executable, "-P", "-m", PROGRAM, *map(str, facts)]
@@ -160,7 +156,7 @@ class DecoderPool:
                     process = subprocess.Popen(
                         command,
                         pass_fds=(self._fd,),
-                        env=environment,
+                        env=variables,
                         stdin=subprocess.PIPE,
                         stdout=subprocess.PIPE,
                         bufsize=0,
@@ -171,19 +167,15 @@ class DecoderPool:
                 slots = mapped(self._fd, number, self._slot)
                 self._workers.append(_Worker(process, slots))
         if device.type == "cuda":
-            with torch.cuda.device(device):
-                self._pin(device)
+            self._pin(device)
 
     def _pin(self, device: torch.device) -> None:
         """Let a GPU read the memory itself; where it cannot be pinned, it is read all the same."""
         for worker in self._workers:
             view = torch.from_numpy(np.ndarray((SLOTS * self._slot,), np.uint8, worker.slots))
-            if int(torch.cuda.cudart().cudaHostRegister(view.data_ptr(), len(view), 0)) == 0:
-                self._pinned.append(view)
-                continue
-            with contextlib.suppress(RuntimeError):  # CUDA keeps the error for whatever is launched next
-                torch.zeros(1, device=device)
-            return
+            if not pin(view, device):
+                return
+            self._pinned.append(view)
 
     def decode(self, films: Sequence[EpisodeFilm], top: int, bottom: int, put: Put) -> Iterator[tuple[int, Brightest]]:
         """Decode episodes; what is not read to its end is broken off.
@@ -305,7 +297,7 @@ class DecoderPool:
                     assert pipe is not None
                     pipe.close()
             while self._pinned:
-                torch.cuda.cudart().cudaHostUnregister(self._pinned.pop().data_ptr())
+                unpin(self._pinned.pop())
             for worker in self._workers:
                 with contextlib.suppress(BufferError):  # an error on its way out still shows its pictures
                     worker.slots.close()

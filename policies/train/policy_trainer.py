@@ -90,8 +90,6 @@ class PolicyTrainer:
         self._used: list[torch.Tensor] = []
         """Parameters on which the loss depends, whose gradients are in `_flat`."""
         self._graphs: list[torch.cuda.CUDAGraph] = []
-        self._began = False
-        """Whether a step was taken, with which everything is compiled."""
         model.policy.train()
         if ranks > 1:
             for tensor in model.policy.state_dict().values():
@@ -118,12 +116,8 @@ class PolicyTrainer:
 
     def advance(self) -> None:
         """Take one step; on CUDA it is launched, not awaited."""
-        if self._compiled and not self._began:
-            with compiler_errors():
-                self._advance()
-        else:
+        with compiler_errors() if self._compiled else contextlib.nullcontext():
             self._advance()
-        self._began = True
 
     def _advance(self) -> None:
         if self.graphed and not self._graphs:

@@ -60,11 +60,8 @@ def train(options: PolicyTrainOptions) -> Path:
     if options.resume is not None:
         checkpoint = last_checkpoint(options.resume)
         progress = TrainingProgress.read(checkpoint)
-        quiet, before, options = (
-            options.quiet,
-            progress.options.get("minutes"),
-            resumed(options, progress.options, checkpoint),
-        )
+        quiet, before = options.quiet, progress.options.get("minutes")
+        options = resumed(options, progress.options, checkpoint)
         check_numbers(options)
         if options.minutes and options.minutes != before:  # another time: the number of steps is fixed again
             progress = dataclasses.replace(progress, steps=0)

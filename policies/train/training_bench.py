@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.own_processes import environment
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train import families
 from arena_newton.policies.train.demonstration_rows import CAMERA_KEY, read_rows, statistics
@@ -89,16 +89,14 @@ def _verdict(device: str, settings: TrainingRecipe, speed: float) -> str:
 def _at_once(options: TrainingBenchOptions, count: int) -> list[SpeedFigure]:
     """Figures of so many trainings, each in a process of its own, that begin together."""
     flags = dataclasses.asdict(options) | {"dataset": [str(one.resolve()) for one in options.dataset]}
-    root = str(Path(__file__).resolve().parents[3])
-    # Of a source tree whose folder is not installed; libraries may take it out of this process' own path.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*[path for path in sys.path if path], root])}
+    variables = environment()
     command = _command(json.dumps(flags))
     processes: list[subprocess.Popen[str]] = []
     try:
         for _ in range(count):
             processes.append(
                 subprocess.Popen(
-                    command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+                    command, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
                 )
             )
         for process in processes:

@@ -345,8 +345,8 @@ def test_training_lowers_the_loss(monkeypatch):
     assert sum(losses[-4:]) < 0.8 * sum(losses[:4]), losses
 
 
-def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
-    """--minutes fixes the number of steps by the measured speed; with the last one the cosine reaches its end."""
+def a_second_a_step(monkeypatch):
+    """A clock by which each step takes a second."""
     clock = [1000.0]
     monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     advance = PolicyTrainer.advance
@@ -356,6 +356,11 @@ def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
         clock[0] += 1.0
 
     monkeypatch.setattr(PolicyTrainer, "advance", slow)
+
+
+def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
+    """--minutes fixes the number of steps by the measured speed; with the last one the cosine reaches its end."""
+    a_second_a_step(monkeypatch)
     folder = train(options(dataset, tmp_path / "run", steps=0, minutes=1.0, log_every=1, save_every=0))
     facts = CheckpointFacts.read(folder)
     assert 57 <= facts.steps <= 60 and 0.95 <= facts.minutes <= 1.0
@@ -366,15 +371,7 @@ def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
 
 def test_another_time_on_resume_is_kept(dataset, tmp_path, monkeypatch):
     """--resume with more --minutes trains on, with a schedule that ends then; --steps in its place does as well."""
-    clock = [1000.0]
-    monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    advance = PolicyTrainer.advance
-
-    def slow(self):
-        advance(self)
-        clock[0] += 1.0
-
-    monkeypatch.setattr(PolicyTrainer, "advance", slow)
+    a_second_a_step(monkeypatch)
     out = tmp_path / "run"
     assert 27 <= CheckpointFacts.read(train(options(dataset, out, steps=0, minutes=0.5))).steps <= 30
     again = PolicyTrainOptions(resume=out, minutes=1.0, quiet=True)
