@@ -317,7 +317,10 @@ def _card(target: str) -> PolicyCard:
         InputError: There is none.
     """
     if target:
-        return read_card(Path(target).expanduser())
+        folder = Path(target).expanduser()
+        if not folder.is_dir():
+            raise InputError(f"--policy learned:{target}: no such folder")
+        return read_card(folder)
     card = shipped_card()
     if card is None:
         raise InputError(NOT_SHIPPED)

@@ -30,11 +30,11 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
-_REPORTING = """__main__ action_map bench bench_figure bench_learned bench_policy bench_recording bench_start certify config console
-    cost_table document engines evaluated_cells folder html_report identity journal learned_row learning_loop
-    loop_report matrix_cells options original_format pack_command pack_options paper_claims paper_numbers
-    predicted_actions progress recording records report rerecord results rounds stats success_film suite_call
-    suite_figures suite_file suite_folder suite_options suite_records suite_run suite_tables table_entries
+_REPORTING = """__main__ action_map bench bench_figure bench_learned bench_policy bench_recording bench_start
+    certify config console cost_table document engines evaluated_cells folder html_report identity journal learned_row
+    learning_loop loop_report matrix_cells options original_format pack_command pack_options paper_claims
+    paper_numbers predicted_actions progress recording records report rerecord results rounds stats success_film
+    suite_call suite_figures suite_file suite_folder suite_options suite_records suite_run suite_tables table_entries
     table_options table_text tables tables_command tsne_command wording"""
 _CHECKS = "agreement axes certificate context finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
@@ -43,13 +43,12 @@ _TRAINING = """__main__ act_family augmentation batching decoder_pool decoder_pr
     diffusion_family families feature_scaling flow_family frame_store measured_training network_compiler
     network_memory pi05_family policy_model policy_options policy_trainer pretrained_weights prompts
     resnet_weights stored_flags training training_bench training_log training_loop training_state"""
-_PACKING = "checkpoint_packing learned_card"
 UNHASHED = (
     *(f"data/{name}.py" for name in _DATASETS.split()),
     *(f"eval/{name}.py" for name in _REPORTING.split()),
     *(f"eval/certification/{name}.py" for name in _CHECKS.split()),
     "viewing.py",
-    *(f"policies/learned/{name}.py" for name in _PACKING.split()),
+    "policies/learned/checkpoint_packing.py",
     "policies/recipes",
     *(f"policies/train/{name}.py" for name in _TRAINING.split()),
     "trackers/evaluate.py",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +90,7 @@ class LearnedPolicy(Policy):
         for first in range(0, len(serving), size):
             some = serving[first : first + size]
             filled = [*some, *([some[0]] * (size - len(some)))]
-            with torch.inference_mode():
+            with torch.inference_mode(), _one_thread(device):
                 seen = pictures[filled].to(device).permute(0, 3, 1, 2).float() / 255.0
                 given = state[filled].to(device, torch.float32)
                 tasks = None if vector is None else self._normalised(TASK_VECTOR, vector.expand(size, -1))
@@ -155,6 +156,24 @@ class LearnedPolicy(Policy):
         self.check_task(task)
         known = self.checkpoint.facts.task_vector
         return torch.tensor([float(name == task) for name in known], device=device) if known else None
+
+
+@contextlib.contextmanager
+def _one_thread(device: torch.device) -> Iterator[None]:
+    """Computes on one core of the CPU.
+
+    A look is too small for two: where the machine is busy they lose more by waiting for each other. And an answer then
+    has the same bits on machines with another number of cores.
+    """
+    before = torch.get_num_threads()
+    alone = device.type == "cpu" and before != 1
+    if alone:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if alone:
+            torch.set_num_threads(before)
 
 
 def from_spec(argument: str | None, *, device: str | torch.device | None = None) -> LearnedPolicy:
