@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -71,6 +73,20 @@ def test_answers_are_those_of_lerobot(tmp_path, changes):
     for seed, actions in first.items():
         torch.testing.assert_close(actions, second[seed], atol=1e-5, rtol=0)
     assert (first[1] - first[2]).abs().max() > 1e-3
+
+
+def test_lerobot_is_not_imported(packed):
+    """A packed policy is read, loaded and run without LeRobot and torchvision, whose import takes seconds."""
+    code = (
+        "import sys, torch; from arena_newton import policies; from arena_newton.policies import Observation\n"
+        f"policy = policies.get('learned:{packed}'); policy.check()\n"
+        "picture = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)\n"
+        "seen = Observation(torch.zeros(1, 64), picture, [True], 'boxing', 'boxing', 'Strike.')\n"
+        "assert policy.act(seen).actions.shape == (1, 6, 40)\n"
+        "print(sorted({'lerobot', 'torchvision', 'draccus', 'transformers'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
 
 
 def test_a_task_vector_decides(packed):
