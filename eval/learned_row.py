@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from arena_newton.errors import InputError
 from arena_newton.eval.document import CONFIG_FILE
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.results import Results, RunRecord, load_run, results_json
@@ -27,12 +28,14 @@ def row_options(flags: RunOptions, folder: Path) -> RunOptions | None:
         None where the run has no such row, or no policy comes with this build.
 
     Raises:
-        InputError: The card is damaged.
+        InputError: The card is damaged, or the row's folder is a link.
     """
     card = shipped_card() if flags.seeing else None
     tracker = next((name for name in card.trackers if name in flags.tracker), None) if card is not None else None
     if card is None or tracker is None:
         return None
+    if (folder / ROW_FOLDER).is_symlink():
+        raise InputError(f"{folder / ROW_FOLDER}: is a link; a run writes inside its own folder only")
     return dataclasses.replace(
         flags, seeing=False, policy="learned", task=card.tasks[:1], tracker=(tracker,), out=str(folder / ROW_FOLDER)
     )
@@ -45,6 +48,8 @@ def row_results(run: RunRecord) -> Results | None:
         InputError: Its folder is damaged.
     """
     folder = run.folder / ROW_FOLDER
-    if run.document["options"].get("seeing") is not True or not (folder / CONFIG_FILE).is_file():
+    if run.document["options"].get("seeing") is not True or folder.is_symlink():
+        return None
+    if not (folder / CONFIG_FILE).is_file():
         return None
     return results_json(load_run(folder))

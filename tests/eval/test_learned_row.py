@@ -75,6 +75,17 @@ def test_the_default_run_has_a_row_that_sees(shipped, tmp_path, capsys):
     assert "  3 episodes, all finished" in again and rows(again) == rows(printed)
 
 
+def test_a_row_that_is_a_link_is_refused(shipped, tmp_path, capsys):
+    """A link in place of the row's folder is not written through."""
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    assert main(["--device", "cpu", "--out", str(out)], stand_ins()) == 0
+    (out / "learned").rename(elsewhere)
+    (out / "learned").symlink_to(elsewhere)
+    capsys.readouterr()
+    assert main(["resume", str(out)], stand_ins()) == 2
+    assert "learned: is a link; a run writes inside its own folder only" in capsys.readouterr().err
+
+
 def test_a_row_that_was_interrupted_is_resumed(shipped, tmp_path, capsys):
     """Ctrl-C in the row keeps the experts' table; resume of the whole folder plays the rest."""
 

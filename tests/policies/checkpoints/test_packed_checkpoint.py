@@ -1,6 +1,7 @@
 """Packed policies: the same answers as LeRobot's, in half the size, and clear refusals."""
 
 import json
+import random
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from arena_newton.policies.learned.learned_card import CARD_FILE, PolicyCard, re
 from arena_newton.policies.learned.learned_policy import LearnedPolicy
 from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from tests.fuzz.mutants import damaged
 
 TASKS = ("boxing", "vis_navi")
 OURS = {
@@ -29,6 +31,8 @@ OURS = {
     "trackers": ("twist2",),
 }
 CARD = PolicyCard(tasks=("boxing",))
+MUTANTS = 60
+"""Of each small file; each costs a hash of the weights."""
 
 
 @pytest.fixture(scope="module")
@@ -216,6 +220,26 @@ def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp
     with pytest.raises(InputError, match=said) as error:
         LearnedPolicy(folder)
     assert "config.json" in str(error.value)
+
+
+def test_mutated_files_are_read_or_refused(packed, tmp_path):
+    """Hundreds of damaged small files: each is read, or is one error of one line; nothing else is raised."""
+    folder = copy(packed, tmp_path)
+    names = [path.name for path in folder.iterdir() if path.name not in ("card.md", "model.safetensors")]
+    rng, refused = random.Random(5), 0
+    for name in sorted(names):
+        whole = (folder / name).read_bytes()
+        for _ in range(MUTANTS):
+            (folder / name).write_bytes(damaged(whole, rng, text=name.endswith(".json")))
+            try:
+                read_card(folder)
+                read_act_checkpoint(folder)
+            except InputError as error:
+                refused += 1
+                assert "\n" not in str(error) and str(folder) in str(error)
+        (folder / name).write_bytes(whole)
+    assert refused > MUTANTS * len(names) / 2
+    read_act_checkpoint(folder)
 
 
 def test_damaged_files_are_one_error(packed, tmp_path):
