@@ -10,10 +10,12 @@ from pathlib import Path
 
 from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
+from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.bench_figure import BenchFigure
 from arena_newton.eval.bench_policy import PARTS, random_checkpoint, timed_parts
 from arena_newton.eval.options import BenchOptions
+from arena_newton.extras import require
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.learned.checkpoint_packing import pack
 from arena_newton.policies.learned.learned_card import PolicyCard, shipped_card
@@ -34,6 +36,12 @@ ROUNDS = 3
 def learned_figures(options: BenchOptions) -> Iterator[BenchFigure]:
     """Time of a tick of `--policy learned` as a multiple of the expert's, same task, tracker, worlds and number."""
     card = shipped_card()
+    if card is None:
+        try:
+            require("policies", "learned")
+        except InputError as error:  # the other figures of `all` need no such library
+            yield BenchFigure("learned / expert, CPU", BAR, "x", True, None, str(error))
+            return
     with tempfile.TemporaryDirectory() as folder:
         spec, task, words = "learned", card.tasks[0] if card is not None else "vis_navi", "the policy of the package"
         if card is None:
