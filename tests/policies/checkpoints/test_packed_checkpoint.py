@@ -133,6 +133,28 @@ def test_the_number_of_worlds_changes_nothing(packed):
     assert all(torch.equal(alone[seed], together[seed]) for seed in alone)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_packed_rows_are_independent_on_a_gpu(packed):
+    """On CUDA each forward pass has one size: 1 and 20 worlds give the same bits, those of the CPU to 1e-3."""
+    policy = LearnedPolicy(packed, device="cuda")
+    many = follow(policy, [*range(100, 119), 1], 3)
+    assert torch.equal(follow(policy, [1], 3)[1], many[1])
+    torch.testing.assert_close(many[1], follow(LearnedPolicy(packed), [1], 3)[1], atol=1e-3, rtol=0)
+
+
+def test_the_number_of_cores_changes_nothing(packed):
+    """With one thread of torch or several, an answer has the same bits, and the number is what it was afterwards."""
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        alone = follow(LearnedPolicy(packed), [4], 1)[4]
+        torch.set_num_threads(3)
+        assert torch.equal(follow(LearnedPolicy(packed), [4], 1)[4], alone)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_worlds_that_cannot_be_served_get_an_error(packed):
     """A state that is not finite is its world's error; worlds that do not ask are left alone."""
     policy, look = LearnedPolicy(packed), seen([1, 2, 3], [0, 0, 0], [True, True, False])
