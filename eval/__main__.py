@@ -22,6 +22,7 @@ from arena_newton.eval.options import (
     ReportOptions,
     RunOptions,
 )
+from arena_newton.eval.pack_options import PackOptions
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.flags import folders_named, parse_flags
 
@@ -39,6 +40,7 @@ OVERVIEW = f"""commands:
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
   {PROG} tsne [flags]            map what one policy answers to the observations of two datasets
+  {PROG} pack <checkpoint> [flags] make a trained policy the one that ships: half precision, a card, 32 MB
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
@@ -95,13 +97,19 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
     from arena_newton.doctor import versions
     from arena_newton.eval.config import resolve
     from arena_newton.eval.folder import ResultsFolder, results_folder
+    from arena_newton.eval.learned_row import row_options
 
     config = resolve(options)
     folder = ResultsFolder(results_folder(options.out), config, versions())
     folder.check()
+    row = row_options(config.flags, folder.path)
+    beside = None
+    if row is not None:
+        beside = ResultsFolder(results_folder(row.out), resolve(row), versions())
+        beside.check()
     from arena_newton.eval.run import execute
 
-    return execute(folder, factories)
+    return execute(folder, factories, beside)
 
 
 def _record(arguments: list[str], factories: Factories | None) -> int:
@@ -134,6 +142,7 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
     folders = _folders(arguments, "report")
     options = parse_flags(ReportOptions, arguments, f"{PROG} report")
     from arena_newton.eval import report, tables
+    from arena_newton.eval.learned_row import row_results
     from arena_newton.eval.results import load_run
 
     if options.table or len(folders) > 1:
@@ -147,7 +156,7 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
     if options.json:
         print(json.dumps(results, indent=2))
         return 0
-    print(report.table(results))
+    print(report.table(results, row_results(run)))
     for note in report.notes(run, results):
         print(note)
     print(f"report: {folder / 'report.html'}")
@@ -268,6 +277,18 @@ def _tsne(arguments: list[str], factories: Factories | None) -> int:
     return tsne_command.run(options)
 
 
+def _pack(arguments: list[str], factories: Factories | None) -> int:
+    if _wants_help(arguments):
+        parse_flags(PackOptions, ["--help"], f"{PROG} pack <checkpoint>")
+    if not arguments or arguments[0].startswith("-"):
+        raise InputError(f"pack: name the checkpoint, or the folder of a training: {PROG} pack <checkpoint>")
+    given = Path(arguments.pop(0)).expanduser()
+    options = parse_flags(PackOptions, arguments, f"{PROG} pack")
+    from arena_newton.eval import pack_command
+
+    return pack_command.run(given, options)
+
+
 _COMMANDS = {
     "run": _run,
     "record": _record,
@@ -277,6 +298,7 @@ _COMMANDS = {
     "loop": _loop,
     "tables": _tables,
     "tsne": _tsne,
+    "pack": _pack,
     "matrix": _matrix,
     "bench": _bench,
     "engines": _engines,

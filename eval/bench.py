@@ -26,6 +26,7 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.bench_figure import BenchFigure
+from arena_newton.eval.bench_learned import learned_figures
 from arena_newton.eval.bench_policy import policy_figures
 from arena_newton.eval.bench_recording import recording_figures
 from arena_newton.eval.bench_start import start_figures
@@ -305,6 +306,11 @@ def _help(options: BenchOptions) -> Iterator[BenchFigure]:
     yield BenchFigure("python -m arena_newton.eval --help", 1.0, "s", True, statistics.median(times))
 
 
+def _learned(options: BenchOptions) -> Iterator[BenchFigure]:
+    with _cores(2):
+        yield from learned_figures(options)
+
+
 def _tests(options: BenchOptions) -> Iterator[BenchFigure]:
     root = Path(arena_newton.__file__).resolve().parent.parent
     for cold, minutes in ((False, 6.0), (True, 15.0)):
@@ -331,5 +337,6 @@ _ITEMS: dict[str, Callable[[BenchOptions], Iterator[BenchFigure]]] = {
     "recording": recording_figures,
     "episodes": _episodes,
     "policy": policy_figures,
+    "learned": _learned,
     "start": start_figures,
 }

@@ -23,7 +23,7 @@ from arena_newton.interfaces import Policy
 from arena_newton.policies.label_reader import read_by
 from arena_newton.rollout import Rollout
 
-__all__ = ["policy_figures", "random_checkpoint"]
+__all__ = ["PARTS", "policy_figures", "random_checkpoint", "timed_parts"]
 
 BARS = {"vis_navi": 30.0, "boxing": 15.0}
 """Seconds for 60 episodes with ACT on one H200, kernels cached."""
@@ -39,15 +39,22 @@ WARM_UP = 45
 TIMED = 200
 """Ticks of the run whose parts are timed; each part then waits for the device, so that its time is its own."""
 PARTS = ("physics", "pictures", "tracker", "policy")
+"""Parts of a tick whose times are told apart."""
 
 
-def random_checkpoint(folder: Path) -> Path:
-    """A checkpoint of ACT at full size with random weights, whose actions stay near standing."""
+def random_checkpoint(folder: Path, name: str = "fast", tasks: tuple[str, ...] = ()) -> Path:
+    """A checkpoint of a recipe of ACT with random weights, whose actions stay near standing.
+
+    Args:
+        folder: To write.
+        name: Of the recipe.
+        tasks: Of its task vector, where the recipe has one.
+    """
     from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
     from arena_newton.policies.recipes.training_recipe import recipe
     from arena_newton.policies.train import families
 
-    settings = recipe("act", "fast", labels="v3.1", realign=0.0)
+    settings = recipe("act", name, labels="v3.1", realign=0.0)
 
     def around(mean: torch.Tensor, deviation: float) -> dict[str, torch.Tensor]:
         spread = torch.full_like(mean, deviation)
@@ -58,10 +65,13 @@ def random_checkpoint(folder: Path) -> Path:
         "observation.state": around(torch.zeros(STATE_WIDTH), 1.0),
         "action": around(torch.from_numpy(STAND_ACTION).clone(), 1e-4),
     }
+    if settings.use_task_vector:
+        stats["observation.environment_state"] = around(torch.zeros(len(tasks)), 1.0)
     assert stats["action"]["mean"].shape == (ACTION_WIDTH,)
+    facts = CheckpointFacts(task_vector=tasks if settings.use_task_vector else ())
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        families.build(settings, stats, "cpu").save(folder, CheckpointFacts(family="act", recipe="fast"))
+        families.build(settings, stats, "cpu").save(folder, facts)
     return folder
 
 
@@ -103,7 +113,9 @@ def _figure(options: BenchOptions, task: str, spec: str, cuda: bool, random: boo
         began = time.perf_counter()
         results = Rollout(env, policy, episodes, max_steps=steps).run()
         seconds = time.perf_counter() - began
-        parts, timed = _parts(env, policy, lambda: Rollout(env, policy, episodes, max_steps=min(steps, TIMED)).run())
+        parts, timed = timed_parts(
+            env, policy, lambda: Rollout(env, policy, episodes, max_steps=min(steps, TIMED)).run()
+        )
     finally:
         policy.close()
         env.close()
@@ -120,8 +132,8 @@ def _figure(options: BenchOptions, task: str, spec: str, cuda: bool, random: boo
     return BenchFigure(name, BARS.get(task, BARS["vis_navi"]), "s", True, None, f"{seconds:.1f} s, {reason}: {note}")
 
 
-def _parts(env: ArenaEnv, policy: Policy, play: Callable[[], object]) -> tuple[dict[str, float], float]:
-    """Seconds of each part and of the whole; the device is waited for before and after each."""
+def timed_parts(env: ArenaEnv, policy: Policy, play: Callable[[], object]) -> tuple[dict[str, float], float]:
+    """Seconds of each part of a tick and of the whole; the device is waited for before and after each."""
     spent = dict.fromkeys(PARTS, 0.0)
 
     def wait() -> None:

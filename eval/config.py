@@ -27,6 +27,7 @@ from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
+from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import is_printable, plain_text
 
@@ -38,7 +39,7 @@ __all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "recorded_ca
 
 DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
-POLICY_PATH_SCHEMES = ("lerobot", "replay")
+POLICY_PATH_SCHEMES = ("learned", "lerobot", "replay")
 """Policies whose text after the colon is a path."""
 DRIVES: Mapping[str, DriveGains | None] = {
     "auto": None,
@@ -233,6 +234,11 @@ def resolve(options: RunOptions) -> RunConfig:
     tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
     if quick and options.policy == "expert":  # a task that was added may have none
         tasks = tuple(name for name in tasks if task_specs.get(name).expert is not None)
+    scheme, _, target = options.policy.partition(":")
+    if scheme == "learned":
+        card = _card(target)
+        tasks = card.tasks if quick else tasks
+        card.check_tasks(tasks)
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
     used = tuple(options.tracker) or several
@@ -242,7 +248,6 @@ def resolve(options: RunOptions) -> RunConfig:
     for tracker in used:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
-    scheme, _, target = options.policy.partition(":")
     if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at), f"{scheme}:"), "" if episode is None else f"#{episode}"
@@ -262,6 +267,7 @@ def resolve(options: RunOptions) -> RunConfig:
         seeds=tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS),
         repeats=repeats,
         strip=options.strip or quick,
+        seeing=options.seeing or (quick and options.policy == "expert" and not options.record),
         follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,
@@ -302,6 +308,23 @@ def resolve(options: RunOptions) -> RunConfig:
         scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
         code_hash=code_hash(),
     )
+
+
+def _card(target: str) -> PolicyCard:
+    """The card of `--policy learned`, or of `learned:<folder>`.
+
+    Raises:
+        InputError: There is none.
+    """
+    if target:
+        folder = Path(target).expanduser()
+        if not folder.is_dir():
+            raise InputError(f"--policy learned:{target}: no such folder")
+        return read_card(folder)
+    card = shipped_card()
+    if card is None:
+        raise InputError(NOT_SHIPPED)
+    return card
 
 
 def _check_flags(options: RunOptions) -> None:

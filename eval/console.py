@@ -8,6 +8,7 @@ from pathlib import Path
 from arena_newton.eval import report, stats
 from arena_newton.eval.config import RunConfig
 from arena_newton.eval.folder import BREAK_FILE, setting
+from arena_newton.eval.learned_row import row_results
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import duration, simulated
 from arena_newton.eval.records import JsonObject
@@ -81,7 +82,7 @@ def failed(group: str, error: OSError) -> str:
 
 def result(run: RunRecord, results: Results, resume: str, seconds: float) -> None:
     """Print the table, what a reader must know besides it, why episodes ended as errors, and the command to resume."""
-    print(f"\n{report.table(results)}")
+    print(f"\n{report.table(results, row_results(run))}")
     for note in report.notes(run, results):
         print(note)
     reasons = stats.error_reasons(run.records)

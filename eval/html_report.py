@@ -111,11 +111,13 @@ def page(
     notes: Sequence[str],
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
+    cells: int,
     reasons: Sequence[ErrorReason],
 ) -> str:
     """The page as text, the same for the same content byte for byte.
 
-    `head` and `rows` are the table: a row per cell, then a row per suite; `notes` what a reader must know besides it.
+    `head` and `rows` are the table: so many `cells`, a row each, then a row per suite; `notes` what a reader must know
+    besides it.
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
@@ -130,7 +132,7 @@ def page(
         facts=_facts(document, results),
         notes=notes,
         changes=document.get("variant_changes") or [],
-        table=_table(head, rows, len(results["cells"])),
+        table=_table(head, rows, cells),
         outcomes=OUTCOMES,
         ticks=TICKS,
         cells=_bars(results["cells"]),

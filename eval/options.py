@@ -35,7 +35,8 @@ class RunOptions:
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
     Without --task, --mode, --seeds, --repeats and --max-steps the experts solve all seven tasks through both trackers,
-    a few episodes each (about two minutes on two CPU cores), and the report opens with film strips. As soon as one of
+    a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where one comes with
+    the package, and the report opens with film strips. As soon as one of
     them is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
@@ -47,8 +48,9 @@ class RunOptions:
     """Weights of the one tracker named: a .safetensors or official .onnx file (SONIC: a folder or two files with a
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
-    """Policy that decides it: expert, stand, lerobot:<checkpoint or training>, replay:<clip, or actions of --actions>,
-    replay:<LeRobot dataset>#<episode, or all>, remote:<url>."""
+    """Policy that decides it: expert, stand, learned (the one that comes with the package; learned:<folder of eval
+    pack>), lerobot:<checkpoint or training>, replay:<clip, or actions of --actions>, replay:<LeRobot
+    dataset>#<episode, or all>, remote:<url>."""
     labels: str | None = None
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
     itself when none is named, and v3.1 where it says nothing."""
@@ -131,6 +133,8 @@ class RunOptions:
     """For --policy remote: ask for one world after the other, in their order."""
     remote_insecure: bool = False
     """For --policy remote: do not check the certificate of an https server."""
+    seeing: Annotated[bool, tyro.conf.Suppress] = False
+    """Also play a few episodes of the policy that comes with the package (the default run)."""
     series: Annotated[int | None, tyro.conf.Suppress] = None
     """Series of demonstrations whose seeds are played instead of the evaluation's (`eval record`)."""
     keep: Annotated[int | None, tyro.conf.Suppress] = None
@@ -280,7 +284,8 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: help tick generator throughput camera pictures recording episodes policy start tests, or `all`
+    """What to measure: help tick generator throughput camera pictures recording episodes policy learned start tests, or
+    `all`
     (all but tests)."""
     checkpoint: str | None = None
     """Weights of TWIST2; those that come with the package when none are named."""
@@ -308,6 +313,8 @@ class BenchOptions:
     """Episodes of `policy`, all at once; 0: 60 on CUDA, for which the figures to reach are, and 2 on the CPU."""
     policy_steps: int = 0
     """Ticks of an episode of `policy` at most; 0: what the rules or the length of usual successes say."""
+    learned_ticks: int = 300
+    """Ticks of an episode of `learned`, and of the expert's beside it."""
     json: bool = False
     """Print one JSON array instead of the table."""
 

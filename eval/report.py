@@ -8,6 +8,7 @@ import json
 
 from arena_newton.eval import html_report
 from arena_newton.eval.journal import write_atomic
+from arena_newton.eval.learned_row import ROW_FOLDER, row_results
 from arena_newton.eval.original_format import write_original
 from arena_newton.eval.results import Results, RunRecord, results_json
 from arena_newton.eval.stats import ResultCell, Suite, error_reasons, outside_suites
@@ -67,13 +68,21 @@ def _suite_text(suite: Suite) -> list[str]:
     ]
 
 
-def _rows(results: Results) -> list[list[str]]:
-    return [_cell_text(cell) for cell in results["cells"]] + [_suite_text(suite) for suite in results["suites"]]
+def _cells(results: Results, beside: Results | None) -> list[ResultCell]:
+    return [*results["cells"], *(beside["cells"] if beside is not None else [])]
 
 
-def table(results: Results) -> str:
-    """The result table as Markdown with aligned columns; it is also what the command line prints."""
-    return markdown_table(_HEAD, _rows(results), left=4)
+def _rows(results: Results, beside: Results | None) -> list[list[str]]:
+    cells = [_cell_text(cell) for cell in _cells(results, beside)]
+    return cells + [_suite_text(suite) for suite in results["suites"]]
+
+
+def table(results: Results, beside: Results | None = None) -> str:
+    """The result table as Markdown with aligned columns; it is also what the command line prints.
+
+    `beside` are the results of `learned_row`, whose cells come after the run's own.
+    """
+    return markdown_table(_HEAD, _rows(results, beside), left=4)
 
 
 def table_csv(results: Results) -> str:
@@ -114,6 +123,12 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     if "seed_range" in results["config"]:
         noise = " and disturbed execution" if results["config"].get("disturbance") else ""
         found.append(f"Demonstrations with seeds of their own range{noise}: no benchmark result.")
+    beside = row_results(run)
+    if beside is not None:
+        more = "" if beside["complete"] else f", of which {beside['finished']} of {beside['planned']} are finished"
+        found.append(
+            f"The episodes of policy learned{more}, their strips and a report of their own are in {ROW_FOLDER}/."
+        )
     late, replan = results["config"].get("latency_ticks", 0), results["config"].get("replan")
     if late:
         found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's look.")
@@ -136,7 +151,7 @@ def _markdown(run: RunRecord, results: Results) -> str:
     lines = [f"# HumanoidArena results {escaped(results['config_hash'])}", ""]
     lines += [f"> {escaped(note)}" for note in notes(run, results)]
     lines += [f"> The scene is a variant: {escaped(text)}" for text in run.document.get("variant_changes", [])]
-    lines += ["", table(results)]
+    lines += ["", table(results, row_results(run))]
     lines += [
         "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
         "seed rates pooled); the interval is Wilson's; AFR is falls per episode; falls at start happened while the",
@@ -172,7 +187,11 @@ def _markdown(run: RunRecord, results: Results) -> str:
 
 def _html(run: RunRecord, results: Results) -> str:
     reasons = error_reasons(run.records)
-    return html_report.page(run, results, notes=notes(run, results), head=_HEAD, rows=_rows(results), reasons=reasons)
+    beside = row_results(run)
+    rows, cells = _rows(results, beside), len(_cells(results, beside))
+    return html_report.page(
+        run, results, notes=notes(run, results), head=_HEAD, rows=rows, cells=cells, reasons=reasons
+    )
 
 
 def write_reports(run: RunRecord) -> Results:
@@ -183,7 +202,7 @@ def write_reports(run: RunRecord) -> Results:
     """
     results = results_json(run)
     write_atomic(run.folder / "results.json", json.dumps(results, indent=2) + "\n")
-    write_atomic(run.folder / "table.md", table(results))
+    write_atomic(run.folder / "table.md", table(results, row_results(run)))
     write_atomic(run.folder / "table.csv", table_csv(results))
     write_atomic(run.folder / "report.md", _markdown(run, results))
     write_atomic(run.folder / "report.html", _html(run, results))

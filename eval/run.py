@@ -17,6 +17,7 @@ from pathlib import Path
 import warp as wp
 
 from arena_newton import policies, trackers
+from arena_newton.command_line import INTERRUPTED
 from arena_newton.data.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
@@ -28,7 +29,7 @@ from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress, kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
-from arena_newton.eval.results import load_run
+from arena_newton.eval.results import Results, RunRecord, load_run
 from arena_newton.files import file_label
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
@@ -62,8 +63,8 @@ class Factories:
     """Raises InputError for a file that is not a scene of the task."""
 
 
-def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
-    """Run or continue the run of a folder that was checked.
+def execute(folder: ResultsFolder, factories: Factories | None = None, beside: ResultsFolder | None = None) -> int:
+    """Run or continue the run of a folder that was checked, and that of a folder inside, whose rows join its table.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -74,29 +75,57 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
         RunStopped: Simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
     quiet_warp()
-    factories, config = factories or Factories(), folder.config
+    factories = factories or Factories()
+    began = time.perf_counter()
+    if not _played(folder, factories):
+        return INTERRUPTED
+    whole, code = True, 0
+    try:
+        if beside is not None:
+            whole = _played(beside, factories)
+            if whole:
+                code = _exit_code(beside, *_reported(beside))
+    finally:  # whatever happened to the other, this one is told
+        loaded, results = _reported(folder)
+        console.result(loaded, results, _command(folder, "resume"), time.perf_counter() - began)
+        for line in recording.outcome_lines(folder.config, folder.path, loaded.records):
+            print(line)
+    return max(code, _exit_code(folder, loaded, results)) if whole else INTERRUPTED
+
+
+def _command(folder: ResultsFolder, name: str) -> str:
+    """The command line that does something to a folder."""
+    return f"python -m arena_newton.eval {name} {shlex.quote(str(folder.path))}"
+
+
+def _played(folder: ResultsFolder, factories: Factories) -> bool:
+    """Play what is missing in a folder; False when it was interrupted."""
+    config = folder.config
     try:
         config, policy = _check_parts(config, factories)
     except SystemExit as stop:
         parts = f"--tracker {' '.join(config.flags.tracker)} or --policy {config.policy_label}"
         raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
-    began = time.perf_counter()
-    command = "python -m arena_newton.eval {} " + shlex.quote(str(folder.path))
     with contextlib.ExitStack() as ended:
         ended.callback(policy.close)
         viewer = _viewer(config, folder.path)
         if viewer is not None:
             ended.callback(viewer.close)
-        if not _play(config, folder, factories, policy, viewer, command.format("resume")):
-            return 130
+        return _play(config, folder, factories, policy, viewer, _command(folder, "resume"))
+
+
+def _reported(folder: ResultsFolder) -> tuple[RunRecord, Results]:
+    """Write the reports of a folder."""
     try:
         loaded = load_run(folder.path)
-        results = report.write_reports(loaded)
+        return loaded, report.write_reports(loaded)
     except StorageError as error:
-        raise StorageError(f"{error}; free space, then: {command.format('report')}") from None
-    console.result(loaded, results, command.format("resume"), time.perf_counter() - began)
-    for line in recording.outcome_lines(config, folder.path, loaded.records):
-        print(line)
+        raise StorageError(f"{error}; free space, then: {_command(folder, 'report')}") from None
+
+
+def _exit_code(folder: ResultsFolder, loaded: RunRecord, results: Results) -> int:
+    """0 when the run has all that was asked for, 1 otherwise."""
+    config = folder.config
     if config.flags.keep is not None:
         kept = sum(record.outcome == "success" for record in loaded.records)
         return 0 if kept >= config.flags.keep * len(_groups(config.episodes)) else 1

@@ -119,6 +119,7 @@ POLICIES: Registry[Policy] = Registry(
     lambda: Policy,
     {
         "expert": "arena_newton.policies.experts:from_spec",
+        "learned": "arena_newton.policies.learned.learned_policy:from_spec",
         "lerobot": "arena_newton.policies.lerobot.checkpoint_policy:from_spec",
         "remote": "arena_newton.policies.remote:from_spec",
         "replay": "arena_newton.policies.replay:from_spec",

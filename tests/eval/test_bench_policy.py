@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import bench_policy, bench_start
+from arena_newton.eval import bench_learned, bench_policy, bench_start
 from arena_newton.eval.options import BenchOptions
+from arena_newton.policies.learned import learned_card
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import families
+from tests.made_packed import packed
 
 
 def small(folder):
@@ -31,14 +33,14 @@ def small(folder):
 def test_parts_of_a_tick_are_measured(tmp_path, monkeypatch):
     """Every part takes time, together no more than the whole; the environment keeps its own methods afterwards."""
     monkeypatch.setattr(bench_policy, "WARM_UP", 2)
-    parts, made = bench_policy._parts, []
+    parts, made = bench_policy.timed_parts, []
 
     def kept(env, policy, play):
         found = parts(env, policy, play)
         made.append((env, policy, *found))
         return found
 
-    monkeypatch.setattr(bench_policy, "_parts", kept)
+    monkeypatch.setattr(bench_policy, "timed_parts", kept)
     options = BenchOptions(
         policy_checkpoint=str(small(tmp_path / "act")), policy_tasks=("boxing",), policy_episodes=1, policy_steps=4
     )
@@ -48,6 +50,16 @@ def test_parts_of_a_tick_are_measured(tmp_path, monkeypatch):
     assert sum(spent.values()) <= whole
     assert "step" not in vars(env.physics) and "act" not in vars(policy) and "render" not in vars(env)
     assert figure.verdict == "-" and "physics" in figure.note and "4 ticks" in figure.note
+
+
+def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch):
+    """Ticks of both, in turn, as a ratio that is judged; the note says where the time of the one that sees goes."""
+    monkeypatch.setattr(learned_card, "SHIPPED", packed(tmp_path / "policy", ("boxing",)))
+    for name, value in (("WARM_UP", 2), ("ROUNDS", 1), ("WORLDS", (1,))):
+        monkeypatch.setattr(bench_learned, name, value)
+    (figure,) = bench_learned.learned_figures(BenchOptions(learned_ticks=6))
+    assert figure.value > 0.0 and figure.bar == 2.0 and figure.verdict in ("pass", "MISS")
+    assert "boxing, 1 world" in figure.name and "pictures" in figure.note and "policy of the package" in figure.note
 
 
 def test_a_checkpoint_that_is_not_there_is_named():

@@ -17,6 +17,7 @@ from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.config import resolve
 from arena_newton.eval.options import RunOptions
+from arena_newton.policies.learned import learned_card
 from arena_newton.tasks import football
 
 TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
@@ -27,6 +28,7 @@ SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "1", "--seeds"
 def test_default_run(tmp_path, capsys, monkeypatch):
     """Without flags the experts do their tasks through both trackers, with full budgets, film strips and a report."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(learned_card, "SHIPPED", tmp_path / "none")  # its row: test_learned_row.py
     filmed = []
     # These worlds have nothing to draw.
     monkeypatch.setattr(run, "_recorder", lambda config, folder, tracker: filmed.append((config.flags.strip, tracker)))

@@ -1,0 +1,102 @@
+"""`python -m arena_newton.eval pack`: a trained checkpoint becomes a small policy with a card of what it reaches."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from arena_newton import tasks
+from arena_newton.errors import InputError
+from arena_newton.eval.evaluated_cells import EvaluatedCell, read_cells
+from arena_newton.eval.pack_options import ENOUGH, PackOptions
+from arena_newton.policies.learned.checkpoint_packing import pack, packed_digest, training_command
+from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, CellResult, PolicyCard, read_card
+from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
+from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
+from arena_newton.rules import MODES
+
+__all__ = ["run"]
+
+
+def run(given: Path, options: PackOptions) -> int:
+    """Write the packed policy, and print what it is.
+
+    Raises:
+        InputError: The checkpoint or a flag is unfit, or the results are of another policy.
+    """
+    folder = checkpoint_folder(given, "pack")
+    checkpoint = read_act_checkpoint(folder)
+    facts = checkpoint.facts
+    before = read_card(folder) if (folder / CARD_FILE).is_file() else None  # of one that is packed again
+    digests = (checkpoint.digest, packed_digest(folder))
+    found = _results([Path(name).expanduser() for name in options.results], digests)
+    trained = facts.task_vector or facts.tasks
+    chosen = options.tasks or (_solved(found, trained, facts.trackers) if options.results else trained)
+    for task in chosen:
+        tasks.get(task)
+    if not chosen:
+        why = f"none is solved at {100 * ENOUGH:.0f} %" if options.results else "the checkpoint names none"
+        raise InputError(f"--tasks: {why}; name those that it is offered for")
+    out = SHIPPED if options.out is None else Path(options.out).expanduser()
+    words = ["python", "-m", "arena_newton.eval", "pack", given.name]
+    for flag, values in (("--tasks", options.tasks), ("--results", [Path(name).name for name in options.results])):
+        words += [flag, *values] if values else []
+    card = PolicyCard(
+        tasks=tuple(dict.fromkeys(chosen)),
+        command=options.command or training_command(facts.options) or (before.command if before is not None else ""),
+        packed_by=" ".join(map(shlex.quote, words)),
+        note=options.note or (before.note if before is not None else ""),
+        results=found,
+    )
+    card = pack(folder, out, card)
+    print(f"{out}: {card.bytes / 1e6:.2f} MB, weights {card.weights}, tasks {', '.join(card.tasks)}")
+    for one in card.results:
+        print(f"  {one.task} {one.tracker} {one.mode}: {one.successes}/{one.episodes}")
+    spec = "learned" if out == SHIPPED else f"learned:{out}"
+    print(f"run it: python -m arena_newton.eval --task {card.tasks[0]} --policy {shlex.quote(spec)}")
+    return 0
+
+
+def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResult, ...]:
+    """What a checkpoint reached: its cells, chunks executed as it says itself, without latency.
+
+    Raises:
+        InputError: A folder is unfit, or holds no cell of this checkpoint.
+    """
+    if not folders:
+        return ()
+    cells = [cell for cell in read_cells(folders).cells if cell.weights in digests]
+    plain = [cell for cell in cells if not cell.latency and cell.replan is None and not cell.ensemble]
+    if not plain:
+        where = " ".join(map(str, folders))
+        raise InputError(
+            f"--results {where}: no cell of this checkpoint (weights {' or '.join(digests)}), its chunks executed whole"
+        )
+    plain.sort(key=_order)
+    return tuple(
+        CellResult(
+            task=cell.task,
+            tracker=cell.tracker,
+            mode=cell.mode,
+            episodes=len(cell.records),
+            successes=sum(cell.held().values()),
+            falls=sum(cell.held("fall").values()),
+        )
+        for cell in plain
+    )
+
+
+def _order(cell: EvaluatedCell) -> tuple[int, str, int]:
+    names = tasks.names()
+    return names.index(cell.task) if cell.task in names else len(names), cell.tracker, MODES.index(cell.mode)
+
+
+def _solved(found: Sequence[CellResult], trained: Sequence[str], trackers: Sequence[str]) -> tuple[str, ...]:
+    """Tasks solved often enough in mode base through every tracker of the training, the best first."""
+    rates: dict[str, list[float]] = {}
+    for one in found:
+        if one.mode == "base" and one.tracker in (trackers or (one.tracker,)):
+            rates.setdefault(one.task, []).append(one.rate)
+    solved = [task for task in trained if min(rates.get(task, [0.0])) >= ENOUGH]
+    return tuple(sorted(solved, key=lambda task: -min(rates[task])))

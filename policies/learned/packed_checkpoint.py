@@ -1,0 +1,263 @@
+"""A checkpoint of ACT as files, read without LeRobot: sizes, statistics and weights, all checked.
+
+What is read is what LeRobot writes (`config.json`, the processors' files, `model.safetensors`), JSON and safetensors
+only. Whatever a look would be computed differently by is refused, so that a packed policy answers as LeRobot does.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.errors import InputError
+from arena_newton.foreign import check_size, read_bytes
+from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
+from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
+
+__all__ = ["PROCESSOR_FILES", "WEIGHTS_NAME", "ActCheckpoint", "Spread", "read_act_checkpoint", "read_weights"]
+
+WEIGHTS_NAME = "model.safetensors"
+"""File of the weights."""
+PROCESSOR_FILES = ("policy_preprocessor.json", "policy_postprocessor.json")
+"""Files of what comes before and after the network."""
+STEPS = {
+    "policy_preprocessor.json": (
+        "rename_observations_processor",
+        "to_batch_processor",
+        "device_processor",
+        "normalizer_processor",
+    ),
+    "policy_postprocessor.json": ("unnormalizer_processor", "device_processor"),
+}
+"""Steps of ACT's processors in LeRobot 0.6; others would change a look."""
+NORMALISES = ("normalizer_processor", "unnormalizer_processor")
+"""Steps with statistics."""
+FRONT, STATE, TASK_VECTOR = "observation.images.front", "observation.state", "observation.environment_state"
+"""Keys of the observations."""
+KINDS = {FRONT: "VISUAL", STATE: "STATE", TASK_VECTOR: "ENV", "action": "ACTION"}
+"""Feature → its kind in a configuration."""
+MOST_JSON = 8 << 20
+"""Largest JSON file that is read [bytes]."""
+MOST_WEIGHTS = 1 << 30
+"""Largest file of weights that is read [bytes]; ACT at full size in float32 has 0.2 GB."""
+MOST_WIDTH, MOST_LAYERS, MOST_CHUNK = 4096, 32, 4096
+"""Largest sizes that a configuration may name."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation by which numbers are normalised."""
+
+    mean: torch.Tensor
+    std: torch.Tensor
+    eps: float
+
+    def normalised(self, value: torch.Tensor) -> torch.Tensor:
+        """As the network receives it."""
+        return (value - self.mean) / (self.std + self.eps)
+
+    def restored(self, value: torch.Tensor) -> torch.Tensor:
+        """From the network's units."""
+        return value * self.std + self.mean
+
+    def to(self, device: torch.device) -> Spread:
+        """The same on a device."""
+        return Spread(self.mean.to(device), self.std.to(device), self.eps)
+
+
+@dataclass(frozen=True)
+class ActCheckpoint:
+    """What a checkpoint of ACT says, checked; without its weights."""
+
+    folder: Path
+    sizes: ActSizes
+    executed: int
+    """Actions of an answer that are executed before the next look."""
+    facts: CheckpointFacts
+    spreads: Mapping[str, Spread]
+    """Feature → how it is normalised; a feature that is not here goes in, or comes out, as it is."""
+    digest: str
+    """First 12 hex digits of the SHA-256 of the weights."""
+    files: tuple[str, ...]
+    """Names of its files, the weights' first."""
+    trains_latent: bool
+    """Whether the file has weights of the latent's encoder, which only training uses."""
+
+    def network(self) -> ActNetwork:
+        """The network with its weights, on the CPU, in float32.
+
+        Raises:
+            InputError: They do not fit.
+        """
+        path = self.folder / WEIGHTS_NAME
+        network = ActNetwork(self.sizes)
+        weights = read_weights(path)
+        kept = {name: value for name, value in weights.items() if not name.startswith("model.vae_encoder")}
+        try:
+            network.load(kept if self.trains_latent else weights)
+        except (KeyError, RuntimeError) as error:
+            said = " ".join(str(error).split())[:300]
+            raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
+        return network
+
+
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """Tensors of a file by name, as they are stored.
+
+    Raises:
+        InputError: It is damaged, or holds something else than floating-point numbers.
+    """
+    check_size(path, MOST_WEIGHTS)
+    try:
+        with safe_open(path, framework="pt") as file:
+            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: not readable as safetensors ({error})") from None
+    for name, value in found.items():
+        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+            raise InputError(f"{path}: {name} holds something else than finite floating-point numbers")
+    return found
+
+
+def read_act_checkpoint(folder: Path) -> ActCheckpoint:
+    """Read a folder with `config.json`, without its weights.
+
+    Raises:
+        InputError: It is no ACT of our observations and actions, or a file is damaged; the message names file and
+            field.
+    """
+    config = _json(folder / CONFIG_FILE)
+    kind = config.get("type")
+    if kind != "act":
+        raise InputError(f"{folder / CONFIG_FILE}: type is {kind!r:.60}; only act is packed, whose looks are cheap")
+    facts = CheckpointFacts.read(folder)
+    if facts is None:
+        raise InputError(f"{folder}: holds no {FACTS_FILE}, which says how its actions are read")
+    sizes = _sizes(folder / CONFIG_FILE, config, facts)
+    executed = _count(folder / CONFIG_FILE, config, "n_action_steps", sizes.chunk_size)
+    spreads, files = _spreads(folder, sizes)
+    weights = folder / WEIGHTS_NAME
+    check_size(weights, MOST_WEIGHTS)
+    with weights.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    names = (WEIGHTS_NAME, CONFIG_FILE, FACTS_FILE, *PROCESSOR_FILES, *files)
+    return ActCheckpoint(folder, sizes, executed, facts, spreads, digest, names, config.get("use_vae") is True)
+
+
+def _json(path: Path) -> dict[str, object]:
+    try:
+        content = json.loads(read_bytes(path, MOST_JSON))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error})") from None
+    return _object(path, "the file", content)
+
+
+def _object(path: Path, where: str, value: object) -> dict[str, object]:
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: {where} is {type(value).__name__}, expected an object")
+    return value
+
+
+def _count(path: Path, config: Mapping[str, object], name: str, most: int) -> int:
+    value = config.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
+        raise InputError(f"{path}: {name} is {value!r:.40}, expected 1 to {most}")
+    return value
+
+
+def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> ActSizes:
+    """Sizes of the network; whatever it would need besides is refused."""
+    expected: dict[str, list[int]] = {FRONT: [3, facts.height, facts.width], STATE: [STATE_WIDTH]}
+    if facts.task_vector:
+        expected[TASK_VECTOR] = [len(facts.task_vector)]
+    for field, wanted in (("input_features", expected), ("output_features", {"action": [ACTION_WIDTH]})):
+        given = _object(path, field, config.get(field))
+        shapes = {name: _object(path, f"{field}.{name}", one).get("shape") for name, one in given.items()}
+        kinds = {name: _object(path, f"{field}.{name}", one).get("type") for name, one in given.items()}
+        if shapes != wanted or any(kinds[name] != KINDS[name] for name in wanted):
+            raise InputError(f"{path}: {field} is {str(shapes)[:200]}, expected {wanted}")
+    refused: dict[str, tuple[str | int | None, ...]]
+    refused = {
+        "n_obs_steps": (1,),
+        "replace_final_stride_with_dilation": (0, False),
+        "temporal_ensemble_coeff": (None,),
+    }
+    refused |= {"vision_backbone": tuple(BLOCKS), "feedforward_activation": tuple(ACTIVATIONS)}
+    refused |= {"pre_norm": (True, False), "use_vae": (True, False), "use_peft": (None, False)}
+    for name, allowed in refused.items():
+        value = config.get(name)
+        if not isinstance(value, str | int | None) or value not in allowed:
+            known = " or ".join(str(one) for one in allowed)
+            raise InputError(f"{path}: {name} is {value!r:.60}, expected {known} in a packed policy")
+    limits = {"dim_model": MOST_WIDTH, "dim_feedforward": 4 * MOST_WIDTH, "n_heads": 64, "latent_dim": MOST_WIDTH}
+    limits |= {"n_encoder_layers": MOST_LAYERS, "n_decoder_layers": MOST_LAYERS, "chunk_size": MOST_CHUNK}
+    numbers = {name: _count(path, config, name, most) for name, most in limits.items()}
+    if numbers["dim_model"] % numbers["n_heads"] or numbers["dim_model"] % 4:
+        raise InputError(f"{path}: dim_model is {numbers['dim_model']}, expected a multiple of n_heads and of 4")
+    words = {one.name: config[one.name] for one in fields(ActSizes) if one.name in refused}
+    return ActSizes(state=STATE_WIDTH, tasks=len(facts.task_vector), actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
+
+
+def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str]]:
+    """How features are normalised, and the files that say so."""
+    found: dict[str, Spread] = {}
+    files = []
+    for name in PROCESSOR_FILES:
+        path = folder / name
+        steps = _json(path).get("steps")
+        registered = [one.get("registry_name") if isinstance(one, dict) else None for one in _list(path, steps)]
+        if tuple(registered) != STEPS[name]:
+            raise InputError(f"{path}: steps are {str(registered)[:200]}, expected {', '.join(STEPS[name])}")
+        for index, step in enumerate(_list(path, steps)):
+            options = _object(path, f"steps[{index}].config", step.get("config") or {})
+            if options.get("rename_map"):
+                raise InputError(f"{path}: steps[{index}] renames observations, which a packed policy does not")
+            if step["registry_name"] in NORMALISES:
+                state, part = _statistics(path, index, step, options, sizes)
+                files.append(state)
+                outputs = name == PROCESSOR_FILES[1]
+                found |= {key: one for key, one in part.items() if (key == "action") == outputs}
+    return found, files
+
+
+def _list(path: Path, value: object) -> list[dict[str, object]]:
+    if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+        raise InputError(f"{path}: steps is not a list of objects")
+    return value
+
+
+def _statistics(
+    path: Path, index: int, step: Mapping[str, object], options: Mapping[str, object], sizes: ActSizes
+) -> tuple[str, dict[str, Spread]]:
+    """A normalising step's file, and the spreads that its modes ask for."""
+    where, state = f"steps[{index}]", step.get("state_file")
+    if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):
+        raise InputError(f"{path}: {where}.state_file is {state!r:.60}, expected a name of a safetensors file")
+    modes = _object(path, f"{where}.config.norm_map", options.get("norm_map"))
+    eps = options.get("eps", 1e-8)
+    if not isinstance(eps, int | float) or not 0.0 <= eps < 1.0:
+        raise InputError(f"{path}: {where}.config.eps is {eps!r:.40}, expected 0 to 1")
+    tensors = read_weights(path.parent / state)
+    shapes = {FRONT: (3, 1, 1), STATE: (sizes.state,), TASK_VECTOR: (sizes.tasks,), "action": (sizes.actions,)}
+    found = {}
+    for feature, shape in shapes.items():
+        mode = modes.get(KINDS[feature], "IDENTITY")
+        known = any(name.startswith(f"{feature}.") for name in tensors)
+        if mode == "IDENTITY" or not known:
+            continue
+        if mode != "MEAN_STD":
+            raise InputError(
+                f"{path}: {where} normalises {KINDS[feature]} by {mode!r:.40}, expected MEAN_STD or IDENTITY"
+            )
+        mean, std = tensors.get(f"{feature}.mean"), tensors.get(f"{feature}.std")
+        if mean is None or std is None or mean.shape != shape or std.shape != shape:
+            raise InputError(f"{path.parent / state}: {feature} has no mean and std of shape {list(shape)}")
+        found[feature] = Spread(mean.float(), std.float(), float(eps))
+    return state, found

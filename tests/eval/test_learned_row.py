@@ -1,0 +1,230 @@
+"""The policy that ships: its row in the default run, its flags, and its card with results."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from eval_fakes import FakePolicy, factories
+
+from arena_newton import policies
+from arena_newton.errors import InputError
+from arena_newton.eval import run
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.config import resolve
+from arena_newton.eval.folder import stored_options
+from arena_newton.eval.options import RunOptions
+from arena_newton.policies.learned import learned_card
+from arena_newton.policies.learned.learned_card import read_card
+from tests.made_packed import checkpoint, packed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A packed policy for VisNavi and Boxing through TWIST2."""
+    return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"))
+
+
+@pytest.fixture
+def shipped(folder, monkeypatch):
+    """It comes with the package."""
+    monkeypatch.setattr(learned_card, "SHIPPED", folder)
+    monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
+    return folder
+
+
+@pytest.fixture
+def absent(tmp_path, monkeypatch):
+    """No policy comes with the package."""
+    monkeypatch.setattr(learned_card, "SHIPPED", tmp_path / "nowhere")
+    monkeypatch.setattr(run, "_recorder", lambda *_: None)
+
+
+def stand_ins(**changes):
+    """Worlds and experts that are none; the learned policy is the real one."""
+
+    def policy(spec, **options):
+        return policies.get(spec, **options) if spec.startswith("learned") else FakePolicy(spec, **options)
+
+    return factories(policy=policy, **changes)
+
+
+def rows(text):
+    """Cells of the last table of a text: task, tracker, policy, mode, episodes."""
+    found = re.findall(r"^\| (\w+) +\| (\w+) +\| (\S+) +\| (\w+) +\| +(\d+) \|", text, re.M)
+    return [row for row in found if row[0].islower()]
+
+
+def test_the_default_run_has_a_row_that_sees(shipped, tmp_path, capsys):
+    """Experts' rows, then one of the learned policy: its first task and tracker, in table, pages and report."""
+    out = tmp_path / "out"
+    assert main(["--device", "cpu", "--out", str(out)], stand_ins()) == 0
+    printed = capsys.readouterr().out
+    assert rows(printed)[-1] == ("vis_navi", "twist2", "learned", "base", "3")
+    assert sum(row[2] == "learned" for row in rows(printed)) == 1 and printed.count("| task ") == 1
+    assert "report of their own are in learned/" in printed
+    assert rows((out / "table.md").read_text()) == rows(printed) == rows((out / "report.md").read_text())
+    assert "learned" in (out / "report.html").read_text()
+    results = json.loads((out / "learned" / "results.json").read_text())
+    assert results["config"]["policy_facts"]["weights"] == read_card(shipped).weights and results["complete"]
+    assert all(cell["policy"] == "expert" for cell in json.loads((out / "results.json").read_text())["cells"])
+    assert main(["report", str(out)]) == 0
+    assert rows(capsys.readouterr().out) == rows(printed)
+    assert main(["resume", str(out)], stand_ins()) == 0
+    again = capsys.readouterr().out
+    assert "  3 episodes, all finished" in again and rows(again) == rows(printed)
+
+
+def test_a_row_that_is_a_link_is_refused(shipped, tmp_path, capsys):
+    """A link in place of the row's folder is not written through."""
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    assert main(["--device", "cpu", "--out", str(out)], stand_ins()) == 0
+    (out / "learned").rename(elsewhere)
+    (out / "learned").symlink_to(elsewhere)
+    capsys.readouterr()
+    assert main(["resume", str(out)], stand_ins()) == 2
+    assert "learned: is a link; a run writes inside its own folder only" in capsys.readouterr().err
+
+
+def test_a_row_that_was_interrupted_is_resumed(shipped, tmp_path, capsys):
+    """Ctrl-C in the row keeps the experts' table; resume of the whole folder plays the rest."""
+
+    class Interrupting(FakePolicy):
+        def act(self, observation):
+            raise KeyboardInterrupt
+
+    def policy(spec, **options):
+        return (Interrupting if spec == "learned" else FakePolicy)(spec, **options)
+
+    out = tmp_path / "out"
+    assert main(["--device", "cpu", "--out", str(out)], factories(policy=policy)) == 130
+    assert rows(capsys.readouterr().out)[0][2] == "expert" and stored_options(out).seeing
+    assert main(["resume", str(out)], factories()) == 2  # another policy than the one that began
+    assert "policy_facts" in capsys.readouterr().err
+    assert main(["resume", str(out)], factories(policy=lambda spec, **o: FakePolicy(spec, **o))) == 2
+    for path in sorted((out / "learned").rglob("*"), reverse=True):
+        path.unlink() if path.is_file() else path.rmdir()
+    capsys.readouterr()
+    assert main(["resume", str(out)], stand_ins()) == 0
+    assert rows(capsys.readouterr().out)[-1][2] == "learned"
+
+
+@pytest.mark.parametrize(
+    "flags", [["--task", "vis_navi"], ["--repeats", "2"], ["--policy", "stand"], ["--tracker", "sonic"]]
+)
+def test_other_runs_have_no_such_row(shipped, flags, tmp_path):
+    """A run that says what it wants, or whose trackers the policy does not know, has the experts' rows alone."""
+    assert main([*flags, "--device", "cpu", "--out", str(tmp_path / "o")], stand_ins()) == 0
+    assert not (tmp_path / "o" / "learned").exists()
+
+
+def test_without_weights_the_default_run_goes_on(absent, tmp_path, capsys):
+    """A build without such a policy plays the experts alone; naming it is one clear error."""
+    assert main(["--device", "cpu", "--out", str(tmp_path / "out")], stand_ins()) == 0
+    assert {row[2] for row in rows(capsys.readouterr().out)} == {"expert"}
+    for flags in (["list", "--policy", "learned"], ["--policy", "learned", "--task", "boxing", "--out", "x"]):
+        assert main(flags) == 2
+        assert "--policy learned: no policy comes with this build; learned:<folder> takes" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no policy comes with this build"):
+        policies.get("learned")
+
+
+def test_it_plays_the_tasks_of_its_card(shipped, folder, tmp_path, capsys):
+    """Without --task these are all of its card; another task is one error that names them; a folder may be named."""
+    assert {episode.task for episode in resolve(RunOptions(policy="learned")).episodes} == {"vis_navi", "boxing"}
+    assert main(["list", "--policy", "learned", "--task", "boxing", "football"]) == 2
+    assert "--policy learned: does vis_navi, boxing (card.md says how well), not football" in capsys.readouterr().err
+    short = ["--task", "boxing", "--repeats", "1", "--seeds", "0", "--device", "cpu", "--engine", "mujoco"]
+    assert main([*short, "--policy", f"learned:{folder}", "--out", str(tmp_path / "a")], stand_ins()) == 0
+    config = json.loads((tmp_path / "a" / "config.json").read_text())["config"]
+    assert config["policy"] == f"learned:{folder.name}" and config["labels"] == "v4"
+    for flag in (["--replan", "2"], ["--ensemble"]):
+        assert main([*short, "--policy", "learned", *flag]) == 2
+        assert "belongs to --policy lerobot" in capsys.readouterr().err
+    for bad in ("learned:", f"learned:{tmp_path / 'none'}"):
+        assert main([*short, "--policy", bad]) == 2
+        assert "--policy learned" in capsys.readouterr().err
+
+
+def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
+    """`eval pack` offers the tasks that the results show as solved, best first, and writes all cells into the card."""
+    made, out = checkpoint(tmp_path / "made"), tmp_path / "packed"
+    assert main(["pack", str(made), "--out", str(out)]) == 0
+    assert read_card(out).tasks == ("boxing", "vis_navi") and not read_card(out).results
+    digest = read_card(out).weights
+    played = ["--policy", f"learned:{out}", "--task", "boxing", "vis_navi", "--mode", "base", "visual"]
+    played += ["--seeds", "0", "--repeats", "4", "--device", "cpu", "--engine", "mujoco"]
+    assert main([*played, "--out", str(tmp_path / "played")], stand_ins()) == 0
+    cells = json.loads((tmp_path / "played" / "results.json").read_text())["cells"]
+    solved = [cell["task"] for cell in cells if cell["mode"] == "base" and cell["sr"] >= 0.75]
+    capsys.readouterr()
+    code = main(["pack", str(made), "--out", str(out), "--results", str(tmp_path / "played")])
+    error = capsys.readouterr().err
+    assert (code, bool(error)) == ((0, False) if solved else (2, True))
+    assert solved or "--tasks: none is solved at 75 %" in error
+    command = ["pack", str(made), "--out", str(out), "--results", str(tmp_path / "played"), "--tasks", "vis_navi"]
+    assert main([*command, "--note", "Made for a test."]) == 0
+    card = read_card(out)
+    assert card.tasks == ("vis_navi",) and card.weights == digest and len(card.results) == 4
+    for one in card.results:
+        cell = next(c for c in cells if (c["task"], c["mode"]) == (one.task, one.mode))
+        assert (one.successes, one.falls, one.episodes) == (cell["successes"], cell["falls"], 4)
+    page = (out / "card.md").read_text()
+    assert "Made for a test." in page and page.count("| boxing | twist2 |") == 2
+    assert main(["pack", str(out), "--out", str(out), "--tasks", "boxing"]) == 0
+    assert read_card(out).note == "Made for a test."
+    other = checkpoint(tmp_path / "other", seed=9, tasks=("vis_navi", "boxing"))
+    capsys.readouterr()
+    weights = (other / "model.safetensors").read_bytes()
+    (other / "model.safetensors").write_bytes(weights[:-4] + b"\x00\x00\x00\x00")
+    assert main(["pack", str(other), "--out", str(tmp_path / "p"), "--results", str(tmp_path / "played")]) == 2
+    assert "no cell of this checkpoint" in capsys.readouterr().err and not (tmp_path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["pack"], "pack: name the checkpoint"),
+        (["pack", "nowhere"], "pack:nowhere: no such folder"),
+        (["pack", "."], "holds no checkpoint"),
+    ],
+)
+def test_pack_refuses_what_is_no_checkpoint(arguments, said, tmp_path, monkeypatch, capsys):
+    """One line, exit code 2."""
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("tasks", []),
+        ("tasks", "boxing"),
+        ("steps", "4"),
+        ("gpu_minutes", True),
+        ("results", [{"task": "boxing"}]),
+        ("results", [dict(task="a", tracker="b", mode="base", episodes=2, successes=3, falls=0)]),
+        ("datasets", [1]),
+        ("format", 2),
+    ],
+)
+def test_a_damaged_card_is_one_error(folder, tmp_path, field, value):
+    """The message names the file and the field."""
+    card = json.loads((folder / "card.json").read_text())
+    (tmp_path / "card.json").write_text(json.dumps(card | {field: value}))
+    with pytest.raises(InputError, match=rf"card\.json: .*{field}") as error:
+        read_card(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_what_ships_fits(capsys):
+    """The policy in the package, if it has one, is whole, at most 32 MB, and solves what it is offered for."""
+    card = learned_card.shipped_card()
+    if card is None:
+        pytest.skip("no policy comes with this build")
+    assert sum(path.stat().st_size for path in learned_card.SHIPPED.iterdir()) <= 32_000_000
+    assert policies.get("learned").describe()["weights"] == card.weights
+    base = {(one.task, one.tracker): one.rate for one in card.results if one.mode == "base"}
+    assert card.trackers and all(base[task, tracker] >= 0.75 for task in card.tasks for tracker in card.trackers)
+    assert card.command and card.gpu_minutes > 0 and all(Path(str(one["name"])).name for one in card.datasets)

@@ -1,0 +1,298 @@
+"""Packed policies: the same answers as LeRobot's, in half the size, and clear refusals."""
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+from made_checkpoints import CHUNK, edit, facts, follow, save, seen
+from safetensors.torch import load_file, save_file
+
+from arena_newton.errors import InputError
+from arena_newton.policies import Observation
+from arena_newton.policies.learned import checkpoint_packing
+from arena_newton.policies.learned.checkpoint_packing import pack, packed_digest, training_command
+from arena_newton.policies.learned.learned_card import CARD_FILE, PolicyCard, read_card
+from arena_newton.policies.learned.learned_policy import LearnedPolicy
+from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
+from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from tests.fuzz.mutants import damaged
+
+TASKS = ("boxing", "vis_navi")
+OURS = {
+    "family": "act",
+    "labels": "v4",
+    "realign": 0.002,
+    "task_vector": TASKS,
+    "tasks": TASKS,
+    "trackers": ("twist2",),
+}
+CARD = PolicyCard(tasks=("boxing",))
+MUTANTS = 60
+"""Of each small file; each costs a hash of the weights."""
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A tiny checkpoint of ours, with the encoder of a latent that only training uses."""
+    folder = tmp_path_factory.mktemp("trained") / "act"
+    options = {"flags": {"policy": "act", "recipe": "small", "dataset": ["/data/sets/navi"], "steps": 4, "out": "/x/y"}}
+    said = facts(**OURS, steps=4, minutes=1.5, device="a device", options=options)
+    return save(folder, "act", facts=said, use_vae=True, n_vae_encoder_layers=1)
+
+
+@pytest.fixture(scope="module")
+def packed(trained, tmp_path_factory):
+    """Its packed form."""
+    out = tmp_path_factory.mktemp("packed") / "act"
+    pack(trained, out, CARD)
+    return out
+
+
+def copy(folder, tmp_path):
+    """A packed policy that a test may damage."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"pre_norm": True, "n_encoder_layers": 2, "n_decoder_layers": 2},
+        {"feedforward_activation": "gelu", "n_heads": 4, "latent_dim": 5},
+    ],
+    ids=["post-norm", "pre-norm", "gelu"],
+)
+def test_answers_are_those_of_lerobot(tmp_path, changes):
+    """The same files give the same actions, to 1e-5, through LeRobot and through our own forward pass."""
+    folder = save(tmp_path / "act", "act", facts=facts(**OURS), spread=1.0, **changes)
+    pack(folder, tmp_path / "out", CARD)
+    ours, theirs = LearnedPolicy(tmp_path / "out"), LeRobotPolicy(tmp_path / "out")
+    first, second = follow(ours, [1, 2], 2), follow(theirs, [1, 2], 2)
+    assert ours.chunk_size == theirs.chunk_size == CHUNK and ours.labels == theirs.labels == "v4"
+    assert ours.realign == theirs.realign and ours.camera == theirs.camera
+    for seed, actions in first.items():
+        torch.testing.assert_close(actions, second[seed], atol=1e-5, rtol=0)
+    assert (first[1] - first[2]).abs().max() > 1e-3
+
+
+def test_lerobot_is_not_imported(packed):
+    """A packed policy is read, loaded and run without LeRobot and torchvision, whose import takes seconds."""
+    code = (
+        "import sys, torch; from arena_newton import policies; from arena_newton.policies import Observation\n"
+        f"policy = policies.get('learned:{packed}'); policy.check()\n"
+        "picture = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)\n"
+        "seen = Observation(torch.zeros(1, 64), picture, [True], 'boxing', 'boxing', 'Strike.')\n"
+        "assert policy.act(seen).actions.shape == (1, 6, 40)\n"
+        "print(sorted({'lerobot', 'torchvision', 'draccus', 'transformers'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
+
+
+def test_a_task_vector_decides(packed):
+    """The task is an input: another one changes the answer."""
+    policy = LearnedPolicy(packed)
+    policy.card = PolicyCard(tasks=TASKS)
+    answers = [policy.act(seen([5], [0], task=task)).actions for task in TASKS]
+    assert not torch.equal(*answers)
+
+
+def test_one_task_needs_no_vector(tmp_path):
+    """A checkpoint of one task without a task vector is packed; one of two cannot tell them apart and is refused."""
+    folder = save(tmp_path / "one", "act", facts=facts(family="act", tasks=("boxing",)))
+    pack(folder, tmp_path / "out", CARD)
+    ours, theirs = (kind(tmp_path / "out") for kind in (LearnedPolicy, LeRobotPolicy))
+    torch.testing.assert_close(follow(ours, [3], 1)[3], follow(theirs, [3], 1)[3], atol=1e-5, rtol=0)
+    facts(family="act", tasks=TASKS).write(folder)
+    with pytest.raises(InputError, match="was trained on 2 tasks without a task vector"):
+        pack(folder, tmp_path / "other", CARD)
+
+
+def test_packed_weights_are_the_trained_ones(trained, packed):
+    """Matrices are the trained ones rounded to float16, vectors the same bits; what only training uses is left out."""
+    before, after = load_file(trained / "model.safetensors"), load_file(packed / "model.safetensors")
+    assert set(after) == {name for name in before if not name.startswith("model.vae_encoder")} < set(before)
+    for name, value in after.items():
+        assert value.dtype == (torch.float16 if value.dim() >= 2 else torch.float32), name
+        assert torch.equal(value, before[name].to(value.dtype)), name
+    network = read_act_checkpoint(packed).network()
+    for name in ("action_head.weight", "encoder.layers.0.linear1.weight", "decoder.norm.bias"):
+        stored = network.state_dict()[name]
+        assert stored.dtype == torch.float32 and torch.equal(stored, after[f"model.{name}"].float())
+    assert packed_digest(trained) == packed_digest(packed) == read_card(packed).weights
+
+
+def test_the_number_of_worlds_changes_nothing(packed):
+    """On the CPU an episode is the same for any number of worlds, bit for bit, whenever the others ask."""
+    alone = {seed: follow(LearnedPolicy(packed), [seed], 2)[seed] for seed in (1, 2, 3)}
+    together = follow(LearnedPolicy(packed), [1, 2, 3], 2, asks=[0, 2, 5])
+    assert all(torch.equal(alone[seed], together[seed]) for seed in alone)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_packed_rows_are_independent_on_a_gpu(packed):
+    """On CUDA each forward pass has one size: 1 and 20 worlds give the same bits, those of the CPU to 1e-3."""
+    policy = LearnedPolicy(packed, device="cuda")
+    many = follow(policy, [*range(100, 119), 1], 3)
+    assert torch.equal(follow(policy, [1], 3)[1], many[1])
+    torch.testing.assert_close(many[1], follow(LearnedPolicy(packed), [1], 3)[1], atol=1e-3, rtol=0)
+
+
+def test_the_number_of_cores_changes_nothing(packed):
+    """With one thread of torch or several, an answer has the same bits, and the number is what it was afterwards."""
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        alone = follow(LearnedPolicy(packed), [4], 1)[4]
+        torch.set_num_threads(3)
+        assert torch.equal(follow(LearnedPolicy(packed), [4], 1)[4], alone)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_worlds_that_cannot_be_served_get_an_error(packed):
+    """A state that is not finite is its world's error; worlds that do not ask are left alone."""
+    policy, look = LearnedPolicy(packed), seen([1, 2, 3], [0, 0, 0], [True, True, False])
+    look.state[1, 7] = float("nan")
+    answer = policy.act(look)
+    assert list(answer.errors) == [1] and "not finite" in answer.errors[1]
+    assert torch.equal(answer.actions[0], policy.act(seen([1], [0])).actions[0])
+    blind = Observation(look.state, None, look.mask, "boxing", "boxing", "Strike.")
+    with pytest.raises(InputError, match=r"expected pictures of \[64, 64, 3\], was given none"):
+        policy.act(blind)
+
+
+def test_the_card_says_what_the_training_was(packed):
+    """The card has data, command, minutes and size, and names nothing of the machine of the training."""
+    card, page = read_card(packed), (packed / "card.md").read_text()
+    assert (card.tasks, card.trackers, card.steps, card.gpu_minutes) == (("boxing",), ("twist2",), 4, 1.5)
+    files = [path for path in packed.iterdir() if not path.name.startswith("card.")]
+    assert card.bytes == sum(path.stat().st_size for path in files)
+    assert "1.5 on a device" in page and "| tasks | boxing |" in page
+    assert not any(b"/data" in path.read_bytes() for path in packed.iterdir() if path.suffix in (".json", ".md"))
+
+
+def test_the_command_of_a_training():
+    """A training's flags become its command, defaults and paths of its machine left out."""
+    flags = {"policy": "act", "recipe": "compact", "dataset": ["/a/navi", "/b/boxing"], "steps": 20, "out": "/x/y"}
+    wanted = "python -m arena_newton.policies.train --policy act --dataset navi boxing --recipe compact --steps 20"
+    assert training_command({"flags": flags | {"device": "cuda", "lr": 0.0}}) == wanted
+    assert training_command({}) == ""
+
+
+def test_a_task_that_it_does_not_do_is_refused(packed):
+    """Tasks of the card alone are offered; a card that names one which the vector lacks is damaged."""
+    policy = LearnedPolicy(packed)
+    policy.check_task("boxing")
+    with pytest.raises(InputError, match=r"--policy learned: does boxing \(card.md says how well\), not football"):
+        policy.check_task("football")
+    with pytest.raises(InputError, match="--tasks football: the checkpoint was trained on boxing, vis_navi"):
+        pack(packed, packed, PolicyCard(tasks=("football",)))
+
+
+def test_what_is_too_large_is_not_packed(trained, tmp_path, monkeypatch):
+    """More than 32 MB is refused before anything is written; the message names the recipe that fits."""
+    monkeypatch.setattr(checkpoint_packing, "MOST_BYTES", 1_000_000)
+    with pytest.raises(InputError, match="MB in half precision, at most 1 are shipped; train it with --recipe compact"):
+        pack(trained, tmp_path / "out", CARD)
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_families_are_refused(checkpoints, tmp_path):
+    """Diffusion Policy and flow matching are not packed."""
+    for family, name in (("diffusion", "diffusion"), ("flow", "multi_task_dit")):
+        with pytest.raises(InputError, match=f"type is '{name}'; only act is packed"):
+            pack(checkpoints[family], tmp_path / family, CARD)
+
+
+def test_a_foreign_folder_is_not_overwritten(trained, tmp_path):
+    """A folder with something else in it is refused and kept; an earlier packed policy is replaced."""
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty and holds no packed policy"):
+        pack(trained, tmp_path, CARD)
+    assert (tmp_path / "note.txt").read_text() == "mine"
+    pack(trained, tmp_path / "out", CARD)
+    assert pack(trained, tmp_path / "out", PolicyCard(tasks=TASKS)).tasks == TASKS
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"n_obs_steps": 2}, "n_obs_steps is 2"),
+        ({"vision_backbone": "resnet50"}, "vision_backbone is 'resnet50'"),
+        ({"feedforward_activation": "glu"}, "feedforward_activation is 'glu'"),
+        ({"dim_model": 10**9}, "dim_model is 1000000000"),
+        ({"n_heads": 3}, "multiple of n_heads"),
+        ({"n_action_steps": 11}, "n_action_steps is 11, expected 1 to 10"),
+        ({"temporal_ensemble_coeff": 0.01}, "temporal_ensemble_coeff is 0.01"),
+        ({"replace_final_stride_with_dilation": True}, "replace_final_stride_with_dilation is True"),
+        ({"input_features": {}}, "input_features is"),
+        ({"chunk_size": True}, "chunk_size is True"),
+    ],
+)
+def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp_path, changes, said):
+    """Whatever our forward pass does not compute is one error that names file and field."""
+    folder = copy(packed, tmp_path)
+    edit(folder / "config.json", **changes)
+    with pytest.raises(InputError, match=said) as error:
+        LearnedPolicy(folder)
+    assert "config.json" in str(error.value)
+
+
+def test_mutated_files_are_read_or_refused(packed, tmp_path):
+    """Hundreds of damaged small files: each is read, or is one error of one line; nothing else is raised."""
+    folder = copy(packed, tmp_path)
+    names = [path.name for path in folder.iterdir() if path.name not in ("card.md", "model.safetensors")]
+    rng, refused = random.Random(5), 0
+    for name in sorted(names):
+        whole = (folder / name).read_bytes()
+        for _ in range(MUTANTS):
+            (folder / name).write_bytes(damaged(whole, rng, text=name.endswith(".json")))
+            try:
+                read_card(folder)
+                read_act_checkpoint(folder)
+            except InputError as error:
+                refused += 1
+                assert "\n" not in str(error) and str(folder) in str(error)
+        (folder / name).write_bytes(whole)
+    assert refused > MUTANTS * len(names) / 2
+    read_act_checkpoint(folder)
+
+
+def test_damaged_files_are_one_error(packed, tmp_path):
+    """Weights of another network, torn files, unknown steps and renamed observations are refused, each by its file."""
+    folder = copy(packed, tmp_path)
+
+    def refused(said, kept):
+        with pytest.raises(InputError, match=said):
+            LearnedPolicy(folder).check()
+        for name, content in kept.items():
+            (folder / name).write_bytes(content)
+        LearnedPolicy(folder).check()
+
+    whole = {path.name: path.read_bytes() for path in folder.iterdir()}
+    weights = load_file(folder / "model.safetensors")
+    save_file({k: v for k, v in weights.items() if "action_head" not in k}, folder / "model.safetensors")
+    refused("model.safetensors: does not hold the weights of this network", whole)
+    save_file(weights | {"model.stray": torch.zeros(1)}, folder / "model.safetensors")
+    refused("does not hold the weights of this network.*stray", whole)
+    save_file(weights | {"model.action_head.bias": torch.full((40,), float("inf"))}, folder / "model.safetensors")
+    refused("action_head.bias holds something else than finite", whole)
+    for name in whole:
+        if name != "card.md":
+            (folder / name).write_bytes(whole[name][: len(whole[name]) // 2])
+            refused(name.split(".")[0], whole)
+    steps = json.loads(whole["policy_preprocessor.json"])
+    steps["steps"][0]["config"]["rename_map"] = {"a": "b"}
+    (folder / "policy_preprocessor.json").write_text(json.dumps(steps))
+    refused("renames observations", whole)
+    steps["steps"][0] = {"registry_name": "tokenizer_processor", "config": {}}
+    (folder / "policy_preprocessor.json").write_text(json.dumps(steps))
+    refused("policy_preprocessor.json: steps are", whole)
+    edit(folder / CARD_FILE, tasks=["football"])
+    refused("card.json: tasks names football, which its task vector lacks", whole)
