@@ -249,6 +249,24 @@ def test_a_launch_waits_for_the_thread_that_loads_its_module(tmp_path, monkeypat
         assert wp.Module.load is plain
 
 
+def test_ctrl_c_while_threads_are_waited_for_changes_nothing(monkeypatch):
+    """Whoever interrupts the end of a building finds Warp as it was."""
+    plain = wp.Module.load
+
+    def interrupted(*given, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(kernel_loading, "MOST_THREADS", 2)
+    monkeypatch.setattr(kernel_loading, "kernel_modules", lambda engine, **kind: ("arena_newton.kernels.fall",))
+    monkeypatch.setattr(kernel_loading, "_loaded", set())
+    monkeypatch.setattr(kernel_loading.ThreadPoolExecutor, "shutdown", interrupted)
+    with pytest.raises(KeyboardInterrupt), kernel_loading.loading("mujoco", "cpu", camera=False):
+        assert wp.Module.load is not plain
+    assert wp.Module.load is plain
+    with kernel_loading._loading:
+        pass
+
+
 def test_a_module_that_cannot_be_built_fails_where_it_is_launched(tmp_path, monkeypatch):
     """A broken kernel that nobody launches stops no environment; its launch raises as without threads."""
     text = "import warp as wp\n@wp.kernel\ndef broken(x: wp.array[float]):\n    x[0] = wp.no_such_thing(x[0])\n"
