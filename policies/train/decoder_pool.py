@@ -292,7 +292,8 @@ class DecoderPool:
         *lines, rest = worker.received.split(b"\n")
         worker.received = bytearray(rest)
         for line in lines:
-            yield json.loads(line)
+            if line.startswith(b"{"):  # else what the start of an interpreter prints here and there
+                yield json.loads(line)
 
     def close(self) -> None:
         """End the processes and give their memory back."""

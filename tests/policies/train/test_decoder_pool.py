@@ -202,6 +202,14 @@ def test_threads_decode_where_no_process_starts(rows, monkeypatch, owner, name):
     assert not decoders() and not shared_files()
 
 
+def test_words_of_an_interpreters_start_are_no_messages(rows, tmp_path, monkeypatch):
+    """A machine whose interpreter greets on its output decodes all the same."""
+    (tmp_path / "sitecustomize.py").write_text('print("Welcome")\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    wanted = load_frames([rows], CPU, jobs=1, processes=0)
+    assert torch.equal(load_frames([rows], CPU, processes=2).pictures, wanted.pictures)
+
+
 def test_processes_start_where_the_standard_input_is_closed():
     """Whoever started the training may have closed its input: memory is not in its position."""
     root = Path(decoder_pool.__file__).parents[3]
