@@ -23,6 +23,8 @@ __all__ = ["Routines", "asked"]
 
 LINKED = "cholesky"
 """Word in the source of every kernel of mujoco_warp that links such routines."""
+BUILDER = build.build_lto_solver
+"""Warp's own, which other threads may be listening to instead."""
 
 
 class Routines:
@@ -65,7 +67,7 @@ def asked(module: wp.Module, block_dim: int, arch: int) -> list[dict[str, object
         arch: Architecture of the GPU, such as 90.
     """
     found: list[dict[str, object]] = []
-    parameters = inspect.signature(build.build_lto_solver)
+    parameters = inspect.signature(BUILDER)
 
     def listen(*args: object, **kwargs: object) -> tuple[str, bytes]:
         arguments = dict(parameters.bind(*args, **kwargs).arguments)
@@ -82,4 +84,4 @@ def asked(module: wp.Module, block_dim: int, arch: int) -> list[dict[str, object
 
 def _compile(arguments: dict[str, object]) -> object:
     nobody = SimpleNamespace(ltoirs={}, ltoirs_decl={}, fatbins={})
-    return build.build_lto_solver(**arguments, builder=nobody)
+    return BUILDER(**arguments, builder=nobody)

@@ -167,11 +167,13 @@ class _Loader:
         return self
 
     def __exit__(self, *error: object) -> None:
-        for one in self._work.values():
-            one.cancel()
-        self._pool.shutdown(wait=True)
-        self._linkers.shutdown(wait=True, cancel_futures=True)
-        self._patch.__exit__(None, None, None)
+        try:
+            for one in self._work.values():
+                one.cancel()
+            self._pool.shutdown(wait=True)
+            self._linkers.shutdown(wait=True, cancel_futures=True)
+        finally:  # a Ctrl-C ends the waiting
+            self._patch.__exit__(None, None, None)
 
     def start(self, module: wp.Module, device: wp.Device, block_dim: int | None) -> None:
         """Load a module by a thread, unless this one did before."""

@@ -24,6 +24,8 @@ __all__ = ["Note", "rehearsed", "replaced", "walk_solver"]
 Note = Callable[[wp.Module, wp.Device, int | None], None]
 """Takes a module that a launch needs, its device and its block dimension (None: the module's own)."""
 
+ROUTINES = ("array_scan", "radix_sort_pairs", "segmented_sort_pairs")
+"""Functions of `wp.utils` that compute without a kernel: a sort would take what no launch has written for addresses."""
 SUGGESTED_BLOCK = (256, 1)
 """Answer to who asks for the best block size: it sizes a grid and chooses no kernel."""
 
@@ -115,6 +117,16 @@ def rehearsed(note: Note, *protected: object) -> Iterator[None]:
 
         return method
 
+    def own_routine(name: str) -> Callable[..., None]:
+        plain = getattr(wp.utils, name)
+
+        @functools.wraps(plain)
+        def routine(*args: object, **kw: object) -> None:
+            if not here():
+                plain(*args, **kw)
+
+        return routine
+
     with contextlib.ExitStack() as stack:
         for owner, name, held in (
             (wp.Module, "load", noted_load),
@@ -123,6 +135,7 @@ def rehearsed(note: Note, *protected: object) -> Iterator[None]:
             (wp, "capture_if", both),
             (wp, "copy", own_copy),
             *((wp.array, name, own_method(name)) for name in ("zero_", "fill_", "assign")),
+            *((wp.utils, name, own_routine(name)) for name in ROUTINES),
         ):
             stack.enter_context(replaced(owner, name, held))
         yield

@@ -21,9 +21,11 @@ def environment(*, one_thread: bool = False) -> dict[str, str]:
     Args:
         one_thread: Libraries of the process start no threads.
     """
-    # Also of a source tree whose folder is not installed; libraries may take it out of this process' own path.
-    root = str(Path(__file__).resolve().parents[1])
-    found = os.environ | {"PYTHONPATH": os.pathsep.join([*(path for path in sys.path if path), root])}
+    # A source tree takes itself out of this process' own path: before another version, which may be installed too.
+    paths, root = [path for path in sys.path if path], Path(__file__).resolve().parents[1]
+    if root not in [Path(path).resolve() for path in paths]:
+        paths.insert(0, str(root))
+    found = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     return found | dict.fromkeys(ONE_THREAD, "1") if one_thread else found
 
 

@@ -30,7 +30,8 @@ class OpenVideo:
             OSError: It is absent or no video (also `av.error.FFmpegError`, which PyAV raises).
         """
         self.path = path
-        self._container = av.open(str(path))
+        # A title in another encoding is no damage: nobody reads it.
+        self._container = av.open(str(path), metadata_errors="replace")
         self._stream = self._container.streams.video[0]
         if self._stream.codec_context is None:
             self._container.close()

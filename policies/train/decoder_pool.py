@@ -8,6 +8,7 @@ episode of any length needs no more of it.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import mmap
 import os
@@ -138,7 +139,10 @@ class DecoderPool:
         self._slot = pages * mmap.ALLOCATIONGRANULARITY
         total = count * SLOTS * self._slot
         try:
-            self._fd = os.memfd_create("arena_newton_decoded", os.MFD_CLOEXEC)
+            memory = os.memfd_create("arena_newton_decoded", os.MFD_CLOEXEC)
+            # 0 to 2 are the processes' own; they are free where whoever started this one closed them.
+            self._fd = fcntl.fcntl(memory, fcntl.F_DUPFD_CLOEXEC, 3)
+            os.close(memory)
             # Taken at once: memory that is missing later would be a signal that kills whoever writes into it.
             os.posix_fallocate(self._fd, 0, total)
         except OSError as error:
@@ -152,6 +156,7 @@ class DecoderPool:
             command = [sys.executable, "-P", "-m", PROGRAM, *map(str, facts)]
             with self._whole:
                 try:
+                    slots = mapped(self._fd, number, self._slot)
                     # A session of its own: Ctrl-C is the training's, which ends its processes itself.
                     process = subprocess.Popen(
                         command,
@@ -164,7 +169,6 @@ class DecoderPool:
                     )
                 except OSError:  # the user's limit of processes, or of memory: those that there are decode
                     break
-                slots = mapped(self._fd, number, self._slot)
                 self._workers.append(_Worker(process, slots))
         if device.type == "cuda":
             self._pin(device)
@@ -178,7 +182,7 @@ class DecoderPool:
             self._pinned.append(view)
 
     def decode(self, films: Sequence[EpisodeFilm], top: int, bottom: int, put: Put) -> Iterator[tuple[int, Brightest]]:
-        """Decode episodes; what is not read to its end is broken off.
+        """Decode episodes; what is not read to its end is broken off, and the processes with it: threads decode then.
 
         Args:
             films: The episodes.
@@ -247,27 +251,31 @@ class DecoderPool:
                 _tell(worker, about | {"top": top, "bottom": bottom})
 
         left = len(films)
-        with selectors.DefaultSelector() as selector:
-            for worker in self._workers:
-                give(worker)
-                assert worker.process.stdout is not None
-                selector.register(worker.process.stdout, selectors.EVENT_READ, worker)
-            while left:
-                for key, _ in selector.select():
-                    worker = key.data
-                    for message in self._heard(worker, films):
-                        film = films[worker.film]
-                        match message:
-                            case {"slot": int(slot), "start": int(start), "count": int(count)}:
-                                at = slot * self._slot
-                                put(film.row + start, np.ndarray((count, *shape), np.uint8, worker.slots, at))
-                                _tell(worker, {"free": slot})
-                            case {"above": above, "below": below}:
-                                number, left = worker.film, left - 1
-                                give(worker)
-                                yield number, (np.array(above, np.uint8), np.array(below, np.uint8))
-                            case {"error": str(reason)}:
-                                raise InputError(f"{film}: {reason}")
+        try:
+            with selectors.DefaultSelector() as selector:
+                for worker in self._workers:
+                    give(worker)
+                    assert worker.process.stdout is not None
+                    selector.register(worker.process.stdout, selectors.EVENT_READ, worker)
+                while left:
+                    for key, _ in selector.select():
+                        worker = key.data
+                        for message in self._heard(worker, films):
+                            film = films[worker.film]
+                            match message:
+                                case {"slot": int(slot), "start": int(start), "count": int(count)}:
+                                    at = slot * self._slot
+                                    put(film.row + start, np.ndarray((count, *shape), np.uint8, worker.slots, at))
+                                    _tell(worker, {"free": slot})
+                                case {"above": above, "below": below}:
+                                    number, left = worker.film, left - 1
+                                    give(worker)
+                                    yield number, (np.array(above, np.uint8), np.array(below, np.uint8))
+                                case {"error": str(reason)}:
+                                    raise InputError(f"{film}: {reason}")
+        finally:
+            if left:
+                self.close()  # what they would still say belongs to no later decoding
 
     def _heard(self, worker: _Worker, films: Sequence[EpisodeFilm]) -> Iterator[dict[str, object]]:
         """What a process has said.
@@ -284,7 +292,8 @@ class DecoderPool:
         *lines, rest = worker.received.split(b"\n")
         worker.received = bytearray(rest)
         for line in lines:
-            yield json.loads(line)
+            if line.startswith(b"{"):  # else what the start of an interpreter prints here and there
+                yield json.loads(line)
 
     def close(self) -> None:
         """End the processes and give their memory back."""

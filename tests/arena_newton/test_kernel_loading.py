@@ -108,6 +108,19 @@ def test_a_rehearsal_changes_nothing(solver):
     assert contents(d)["Data.qpos"] != before["Data.qpos"], "a real step does change them"
 
 
+def test_a_rehearsal_sorts_nothing(solver, monkeypatch):
+    """A model of so many geoms that pairs are found by sorting is walked too; what no launch wrote is not sorted."""
+    m, d, told, sorts = solver.mjw_model, solver.mjw_data, [], []
+    monkeypatch.setattr(m.opt, "broadphase", mujoco_warp.BroadphaseType.SAP_SEGMENTED)
+    monkeypatch.setattr(wp.utils, "segmented_sort_pairs", lambda *given: sorts.append(given))
+    monkeypatch.setattr(wp.utils, "array_scan", lambda *given: sorts.append(given))
+    with kernel_rehearsal.rehearsed(lambda module, device, block: told.append(module.name), m, d):
+        kernel_rehearsal.walk_solver(m, d, mujoco_warp.set_const_fixed)
+    assert not sorts and len(set(told)) > 40
+    wp.utils.array_scan()
+    assert sorts == [()], "what was held back is put back"
+
+
 @wp.kernel
 def count(x: wp.array[float]):
     """Add one."""
@@ -179,6 +192,24 @@ def test_linked_routines_are_compiled_once_ahead(monkeypatch, tmp_path):
     np.testing.assert_allclose(b.numpy(), np.diag(np.arange(1.0, 9.0)), rtol=1e-6)
 
 
+def test_routines_are_compiled_while_another_module_is_listened_to(monkeypatch):
+    """Threads that compile routines call Warp's own function while another thread has a listener in its position."""
+    built, inside, done = [], threading.Event(), threading.Event()
+    monkeypatch.setattr(kernel_links, "BUILDER", lambda *, M, builder: built.append(M))
+
+    def slow(*given, **more):
+        inside.set()
+        assert done.wait(30)
+
+    monkeypatch.setattr(kernel_links.context, "ModuleBuilder", slow)
+    with ThreadPoolExecutor(1) as pool:
+        asking = pool.submit(kernel_links.asked, factor.module, 32, 90)
+        assert inside.wait(30)
+        kernel_links._compile({"M": 8})
+        done.set()
+        assert built == [8] and asking.result() == []
+
+
 def test_adjoints_are_left_out_where_nobody_takes_them():
     """Newton's and mujoco_warp's modules have no adjoints; those of the differentiable kernels keep theirs."""
     kernel_loading.forward_only()
@@ -216,6 +247,24 @@ def test_a_launch_waits_for_the_thread_that_loads_its_module(tmp_path, monkeypat
     assert wp.Module.load is plain
     with kernel_loading.loading("mujoco", "cpu", camera=False):  # a second environment has nothing to load
         assert wp.Module.load is plain
+
+
+def test_ctrl_c_while_threads_are_waited_for_changes_nothing(monkeypatch):
+    """Whoever interrupts the end of a building finds Warp as it was."""
+    plain = wp.Module.load
+
+    def interrupted(*given, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(kernel_loading, "MOST_THREADS", 2)
+    monkeypatch.setattr(kernel_loading, "kernel_modules", lambda engine, **kind: ("arena_newton.kernels.fall",))
+    monkeypatch.setattr(kernel_loading, "_loaded", set())
+    monkeypatch.setattr(kernel_loading.ThreadPoolExecutor, "shutdown", interrupted)
+    with pytest.raises(KeyboardInterrupt), kernel_loading.loading("mujoco", "cpu", camera=False):
+        assert wp.Module.load is not plain
+    assert wp.Module.load is plain
+    with kernel_loading._loading:
+        pass
 
 
 def test_a_module_that_cannot_be_built_fails_where_it_is_launched(tmp_path, monkeypatch):

@@ -250,7 +250,7 @@ def test_only_successes_are_kept_in_rounds(recorded, tmp_path, capsys):
     assert json.loads((folder / "results.json").read_text())["complete"] is True
 
 
-def test_a_policys_picture_is_rendered_once(recorded, tmp_path, monkeypatch):
+def test_a_picture_for_a_policy_is_rendered_once(recorded, tmp_path, monkeypatch):
     """Where the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
     renders = []
     render = Camera.render

@@ -105,6 +105,17 @@ def test_lerobot_gives_the_same(made):
         assert np.array_equal(read[row]["observation.images.front"].permute(1, 2, 0).numpy(), frames[row])
 
 
+def test_a_title_in_another_encoding_is_no_damage(made, tmp_path):
+    """Text in a film that is not UTF-8 is nobody's business: its pictures are read."""
+    root, decoded = made
+    copy = Path(shutil.copytree(root, tmp_path / "d"))
+    for video in (copy / "videos" / "observation.images.front").rglob("*.mp4"):
+        encoder = b"Lavf"
+        assert encoder in video.read_bytes()
+        video.write_bytes(video.read_bytes().replace(encoder, "Läuf".encode("latin-1")))
+    assert np.array_equal(Frames(copy)[ROWS], decoded["front"][ROWS])
+
+
 def test_mistakes_are_named(made, tmp_path):
     """A camera or row that is not there, a torn video and a folder that is no dataset are named."""
     root, _ = made

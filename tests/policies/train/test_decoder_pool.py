@@ -92,6 +92,26 @@ def test_processes_find_a_late_bright_picture(tmp_path):
 
 
 @pytest.mark.parametrize("processes", [0, 2])
+def test_what_is_broken_off_is_in_nobodys_pictures(rows, processes):
+    """A decoding that is given up after an episode leaves nothing to the next one."""
+    films = episode_films([rows])
+    wanted, found = (np.zeros((rows.frames, SIZE, SIZE, 3), np.uint8) for _ in range(2))
+
+    def put_into(pictures):
+        return lambda row, part: pictures.__setitem__(slice(row, row + len(part)), part)
+
+    with DecoderPool(SIZE, SIZE, threads=1) as pool:
+        list(pool.decode(films, 0, 0, put_into(wanted)))
+    with DecoderPool(SIZE, SIZE, threads=1, processes=processes) as pool:
+        given_up = pool.decode(films, 0, 0, put_into(np.zeros_like(found)))
+        next(given_up)
+        given_up.close()
+        assert sorted(number for number, _ in pool.decode(films[::-1], 0, 0, put_into(found))) == [0, 1, 2]
+    assert np.array_equal(found, wanted)
+    assert not decoders() and not shared_files()
+
+
+@pytest.mark.parametrize("processes", [0, 2])
 def test_a_damaged_film_is_named(dataset, tmp_path, processes):
     """A film that is cut or of zeros gives one error with dataset and episode, and no process remains."""
     copy = shutil.copytree(dataset, tmp_path / "copy")
@@ -167,16 +187,38 @@ def test_no_memory_to_share_is_an_error(rows):
     assert not decoders() and not shared_files()
 
 
-def test_threads_decode_where_no_process_starts(rows, monkeypatch):
-    """A system that lets no process start costs time and nothing else."""
+@pytest.mark.parametrize(
+    ("owner", "name"), [(decoder_pool.subprocess, "Popen"), (decoder_pool, "mapped")], ids=["process", "memory"]
+)
+def test_threads_decode_where_no_process_starts(rows, monkeypatch, owner, name):
+    """A system that lets no process start, or has no memory to map, costs time and nothing else."""
 
     def refused(*given, **more):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
     wanted = load_frames([rows], CPU, jobs=1, processes=0)
-    monkeypatch.setattr(decoder_pool.subprocess, "Popen", refused)
+    monkeypatch.setattr(owner, name, refused)
     assert torch.equal(load_frames([rows], CPU, jobs=1, processes=2).pictures, wanted.pictures)
-    assert not shared_files()
+    assert not decoders() and not shared_files()
+
+
+def test_words_of_an_interpreters_start_are_no_messages(rows, tmp_path, monkeypatch):
+    """A machine whose interpreter greets on its output decodes all the same."""
+    (tmp_path / "sitecustomize.py").write_text('print("Welcome")\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    wanted = load_frames([rows], CPU, jobs=1, processes=0)
+    assert torch.equal(load_frames([rows], CPU, processes=2).pictures, wanted.pictures)
+
+
+def test_processes_start_where_the_standard_input_is_closed():
+    """Whoever started the training may have closed its input: memory is not in its position."""
+    root = Path(decoder_pool.__file__).parents[3]
+    code = (
+        "import os; os.close(0)\nfrom arena_newton.policies.train.decoder_pool import DecoderPool\n"
+        "with DecoderPool(64, 64, threads=1, processes=1) as pool:\n    assert pool._fd > 2\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), *filter(None, sys.path)])}
+    subprocess.run([sys.executable, "-P", "-c", code], env=environment, check=True)
 
 
 @pytest.mark.parametrize(
