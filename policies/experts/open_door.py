@@ -39,8 +39,8 @@ PHASES = {
     "through": math.inf,
 }
 """Longest times [s]; `retreat` is only there after a lever that was missed."""
-ON_LEVER = 0.10
-"""Distance of the pressed point from the lever's pivot [m]: 2.5 N·m/rad to 20° are 9 N there."""
+ON_LEVER = 0.09
+"""Distance of the pressed point from the lever's pivot [m]: 2.5 N·m/rad to 20° are 10 N there."""
 SIDE = 0.17
 """The robot stands this far to the left of that point [m]: the point is in front of the right shoulder."""
 STAND = 0.38
@@ -53,11 +53,14 @@ ALIGN_GAIN = 1.6
 """Integral gain on the palm [1/s]."""
 UP = 0.7
 """Time in which the arm is raised before that begins [s]."""
-LOWER, BELOW = 0.25, 0.34
+LOWER, BELOW = 0.35, 0.40
 """Speed of the pressing command [m/s], and how far below the lever it goes [m]: the arm is soft, and with 14 cm the
 lever stopped at 17°."""
 RELEASED, AJAR = math.radians(20.0), math.radians(4.0)
 """Angles [rad] of the lever and of the leaf that tell that the latch is released."""
+DEEP = math.radians(28.0)
+"""Angle of the lever from which the robot pushes [rad], and the hand goes on pressing until the leaf is ajar: who learns
+from these demonstrations foresees the push, and at 20° would let go a moment too soon."""
 SLIPPED = 0.08
 """A palm this far below the lever with the latch closed has missed it [m]."""
 RAISED = (0.26, -0.16, 0.36)
@@ -179,7 +182,8 @@ class OpenDoorExpert(Expert):
         if again.any():
             self.walk.to(again, self._before(torch.full_like(self._ready, STAND + BACK)))
         states.enter("retreat", again)
-        states.enter("push", pressing & released)
+        deep = (self._lever_angle() < -DEEP) | (self._leaf_angle() > AJAR)
+        states.enter("push", pressing & (deep | released & states.late))
 
         yaw = self._yaw()
         miss = rotate_xy(-yaw, lever[:, :2] - palm[:, :2])
@@ -205,21 +209,24 @@ class OpenDoorExpert(Expert):
         states.enter("step in", again)
 
     def _reach(self, command: MotionCommand, mask: Tensor, dt: float) -> None:
-        """The right hand at the lever."""
+        """The right hand at the lever; both at the leaf."""
         states = self.states
         raised, holding = states.at("step in", "retreat"), states.at("lower", "press")
+        opening = states.at("push") & (self._leaf_angle() < AJAR)
         down = (SINKING * states.clock).clamp_max(ABOVE - TOUCHING) * states.at("lower")
         pressed = ABOVE - TOUCHING + (LOWER * states.clock).clamp_max(TOUCHING + BELOW)
         wanted = self._lever()
-        wanted[:, 2] += ABOVE - down - pressed * states.at("press")
-        wanted = select(holding, wanted, self._over(self._raised))
+        wanted[:, 2] += ABOVE - down - pressed * states.at("press") - (ABOVE + BELOW) * opening
+        wanted = select(holding | opening, wanted, self._over(self._raised))
         both = torch.stack([self.palms.measured()[:, 0], wanted], dim=1)
         learn = torch.zeros(len(wanted), 2, dtype=torch.bool, device=wanted.device)
         learn[:, 1] = mask & (states.at("lower") | states.at("step in") & (states.clock > UP))
         point = self.palms.lead(both, learn, dt)[:, 1]
-        right = select(raised | holding, point, command.hand_point[:, 1])
-        command.hand_point = torch.stack([command.hand_point[:, 0], right], dim=1)
-        command.reach[:, 1] = (raised | holding).to(command.reach.dtype)
+        pushing = select(states.at("push"), self._pushing, command.hand_point)
+        right = select(raised | holding | opening, point, pushing[:, 1])
+        command.hand_point = torch.stack([pushing[:, 0], right], dim=1)
+        command.reach[:, 0] = states.at("push").to(command.reach.dtype)
+        command.reach[:, 1] = (raised | holding | states.at("push")).to(command.reach.dtype)
         command.waist[:, 2] = LEAN * holding
 
     def _over(self, local: Tensor) -> Tensor:
@@ -228,12 +235,10 @@ class OpenDoorExpert(Expert):
         return self.sight.root_position + turned
 
     def _push(self, command: MotionCommand) -> None:
-        """Both hands ahead, feet behind, straight through the doorway."""
+        """Feet behind, straight through the doorway."""
         pushing, yaw = self.states.at("push"), self._yaw()
         right_of_middle = torch.stack([torch.zeros_like(self._lane), -self._lane], dim=1)
         point = self._doorway()[:, :2] + rotate_xy(yaw, right_of_middle)
         velocity = along(self.sight.pose, point, yaw, self._forward)
         command.velocity = select(pushing, velocity, command.velocity)
-        command.hand_point = select(pushing, self._pushing, command.hand_point)
-        command.reach = select(pushing, torch.ones_like(command.reach), command.reach)
         command.foot_offset = PUSH_OFFSET * pushing
