@@ -43,7 +43,7 @@ ON_LEVER = 0.09
 """Distance of the pressed point from the lever's pivot [m]: 2.5 N·m/rad to 20° are 10 N there."""
 SIDE = 0.17
 """The robot stands this far to the left of that point [m]: the point is in front of the right shoulder."""
-STAND = 0.38
+STAND = 0.34
 """Pelvis before the lever when pressing [m]; from 0.47 m one tracker's fist stops 5 cm short and presses air."""
 ABOVE = 0.14
 """Height of the fist over the lever when it begins to sink [m]."""
