@@ -59,8 +59,8 @@ lever stopped at 17°."""
 RELEASED, AJAR = math.radians(20.0), math.radians(4.0)
 """Angles [rad] of the lever and of the leaf that tell that the latch is released."""
 DEEP = math.radians(28.0)
-"""Angle of the lever from which the robot pushes [rad], and the hand goes on pressing until the leaf is ajar: who learns
-from these demonstrations foresees the push, and at 20° would let go a moment too soon."""
+"""Angle of the lever from which the robot pushes [rad]; the hand goes on pressing until the leaf is ajar. Who learns from
+these demonstrations foresees the push, and at 20° would let go a moment too soon."""
 SLIPPED = 0.08
 """A palm this far below the lever with the latch closed has missed it [m]."""
 RAISED = (0.26, -0.16, 0.36)
@@ -98,7 +98,8 @@ class OpenDoorExpert(Expert):
         self._doorway, self._frame = sight.frame(DOORWAY), sight.scene.marker(DOORWAY).body_id
         self._handle = sight.scene.body_id(HANDLE)
         self._leaf_angle, self._lever_angle = sight.joint(LEAF), sight.joint(HANDLE_HINGE)
-        self.walk = Walk(sight, NavigationLimits(forward=0.55, turn=0.9, position_gain=1.3, arrive_position=0.045, arrive_heading=0.06))
+        limits = NavigationLimits(forward=0.55, turn=0.9, position_gain=1.3, arrive_position=0.045, arrive_heading=0.06)
+        self.walk = Walk(sight, limits)
         self.palms = Palms(sight, gain=ALIGN_GAIN)
         self.states = Phases(PHASES, worlds, device)
         self._learned = torch.zeros(worlds, 2, device=device)

@@ -10,8 +10,10 @@ import torch
 from arena_newton import policies, seeding, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.open_door import (
-    BEYOND,
+    AJAR,
     BELOW,
+    BEYOND,
+    DEEP,
     LEARN,
     LOWER,
     ON_LEVER,
@@ -122,7 +124,7 @@ def test_the_lever_is_in_front_of_the_right_shoulder(door):
 
 
 def test_it_goes_on_while_it_still_walks(door):
-    """Both walks end `PASSING` before their goals, the arm up since the first: nothing waits for the last centimetres."""
+    """Both walks end `PASSING` before their goals, the arm up since the first: nothing waits for centimetres."""
     sight, expert = door
     every = torch.ones(2, dtype=torch.bool)
     for following in ("step in", "lower"):
@@ -149,15 +151,19 @@ def test_the_hand_never_pauses_at_the_lever(door):
 
 
 def test_a_released_latch_is_pushed_and_passed(door):
-    """A lever at 20° leads to the push, a robot inside with the leaf open to the end; without the leaf it goes on."""
+    """A lever that is `DEEP` leads to the push, a robot inside with the leaf open to the end; without the leaf it goes on."""
     sight, expert = door
     at_the_lever(sight, expert)
     sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 1.08)
     assert after(expert, 1.2) == ["press"] * 2
-    sight.angles["lever"] = torch.tensor([-0.30, -0.36])
+    sight.angles["lever"] = torch.tensor([-0.95, -1.05]) * DEEP
     assert after(expert, 0.1) == ["press", "push"]
-    sight.angles["lever"] = torch.full((2,), -0.36)
+    sight.angles["lever"] = torch.full((2,), -1.05 * DEEP)
     assert after(expert, 0.1) == ["push"] * 2
+    every = torch.ones(2, dtype=torch.bool)
+    low = expert.command(every, 0.1).hand_point[:, 1, 2]
+    sight.angles["leaf"] = torch.full((2,), 1.05 * AJAR)
+    assert (expert.command(every, 0.1).hand_point[:, 1, 2] > low + 0.3).all()  # it presses until the leaf is ajar
     sight.pose = torch.cat([sight.at((0.1, 0.6), 0.0)[:, :2], sight.pose[:, 2:]], dim=1)
     sight.angles["leaf"] = torch.tensor([1.2, 0.7])
     assert after(expert, 0.1) == ["through", "push"]
