@@ -1,8 +1,8 @@
 """OpenDoor's expert: press the lever from above with the right fist, then lean the walk into the leaf and go through.
 
-A tracker leaves the hand 5 to 20 cm from where it is commanded, so the fist first stops above the lever while an
-integral removes what is missing; nothing is corrected by steps while the hand presses. The lever is pressed 10 cm from
-its pivot. The push is limited by balance: feet set 8 cm behind the pelvis lean the robot into the leaf.
+A tracker leaves the hand 5 to 20 cm from where it is commanded: an integral removes what is missing while the robot
+steps in with the arm raised, and while the fist sinks to the lever without a pause. The lever is pressed 9 cm from its
+pivot. The push is limited by balance: feet set 8 cm behind the pelvis lean the robot into the leaf.
 
 Read from the head camera's picture: door, lever and their distance, in view at the spawn pose wherever the door is
 drawn (1.1 to 2.3 m ahead); that the lever is down or the leaf ajar; the fist above or below the lever. The true
@@ -53,14 +53,14 @@ ALIGN_GAIN = 1.6
 """Integral gain on the palm [1/s]."""
 UP = 0.7
 """Time in which the arm is raised before that begins [s]."""
-LOWER, BELOW = 0.35, 0.40
+PRESSING, BELOW = 0.35, 0.40
 """Speed of the pressing command [m/s], and how far below the lever it goes [m]: the arm is soft, and with 14 cm the
 lever stopped at 17°."""
 RELEASED, AJAR = math.radians(20.0), math.radians(4.0)
 """Angles [rad] of the lever and of the leaf that tell that the latch is released."""
 DEEP = math.radians(28.0)
-"""Angle of the lever from which the robot pushes [rad]; the hand goes on pressing until the leaf is ajar. Who learns from
-these demonstrations foresees the push, and at 20° would let go a moment too soon."""
+"""Angle of the lever from which the robot pushes [rad]; the hand goes on pressing until the leaf is ajar. Who learns
+from these demonstrations foresees the push, and at 20° would let go a moment too soon."""
 SLIPPED = 0.08
 """A palm this far below the lever with the latch closed has missed it [m]."""
 RAISED = (0.26, -0.16, 0.36)
@@ -215,7 +215,7 @@ class OpenDoorExpert(Expert):
         raised, holding = states.at("step in", "retreat"), states.at("lower", "press")
         opening = states.at("push") & (self._leaf_angle() < AJAR)
         down = (SINKING * states.clock).clamp_max(ABOVE - TOUCHING) * states.at("lower")
-        pressed = ABOVE - TOUCHING + (LOWER * states.clock).clamp_max(TOUCHING + BELOW)
+        pressed = ABOVE - TOUCHING + (PRESSING * states.clock).clamp_max(TOUCHING + BELOW)
         wanted = self._lever()
         wanted[:, 2] += ABOVE - down - pressed * states.at("press") - (ABOVE + BELOW) * opening
         wanted = select(holding | opening, wanted, self._over(self._raised))

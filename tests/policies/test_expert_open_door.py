@@ -15,9 +15,9 @@ from arena_newton.policies.experts.open_door import (
     BEYOND,
     DEEP,
     LEARN,
-    LOWER,
     ON_LEVER,
     PASSING,
+    PRESSING,
     SIDE,
     SINKING,
     STAND,
@@ -144,14 +144,14 @@ def test_the_hand_never_pauses_at_the_lever(door):
     sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 0.95 + TOUCHING)
     every, heights = torch.ones(2, dtype=torch.bool), []
     expert.palms.gain = 0.0  # of the command itself
-    while expert.phases() != ["press"] * 2 or LOWER * float(expert.states.clock[0]) < BELOW - 0.05:
+    while expert.phases() != ["press"] * 2 or PRESSING * float(expert.states.clock[0]) < BELOW - 0.05:
         heights.append(expert.command(every, 0.1).hand_point[:, 1, 2])
     sunk = -torch.diff(torch.stack(heights), dim=0)
     assert len(heights) > 15 and (sunk > 0.9 * 0.1 * SINKING).sum() >= sunk.numel() - 2
 
 
 def test_a_released_latch_is_pushed_and_passed(door):
-    """A lever that is `DEEP` leads to the push, a robot inside with the leaf open to the end; without the leaf it goes on."""
+    """A lever that is `DEEP` leads to the push, a robot inside with the leaf open to the end; else it goes on."""
     sight, expert = door
     at_the_lever(sight, expert)
     sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 1.08)
