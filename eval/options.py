@@ -176,7 +176,7 @@ class RecordOptions:
     disturb: bool = True
     """Add slow noise to what is executed, not to the recorded action, so that recoveries are recorded."""
     disturb_scale: float = 1.0
-    """Factor of the noise, beside that of each task (0.5 in pp_box, double_desk and open_door; 1 in the others)."""
+    """Factor of the noise, beside that of each task (0.5 in pp_box and double_desk, which grasp; 1 in the others)."""
     seed_series: int = 0
     """Number of the series of seeds: another one gives other episodes."""
     cameras: tuple[str, ...] = ("front",)

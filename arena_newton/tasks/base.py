@@ -330,7 +330,7 @@ class TaskSpec:
     """Factor of `noise_levels.NoiseLevels` when its demonstrations are recorded: as much as an expert survives.
 
     Measured, engine mujoco, tracker sonic, successes at 0, 0.35, 0.5 and 1: P&PBox 7/8, 6/8, 8/12, 2/12; DoubleDesk
-    8/8, 8/8, 11/12, 6/12 (docs/recording.md). Tasks whose hands must meet a thing take 0.5, the others 1."""
+    8/8, 8/8, 11/12, 6/12 (docs/recording.md). Tasks that grasp take 0.5, the others bear it whole."""
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
     overlaps: tuple[Overlap, ...] = ()
