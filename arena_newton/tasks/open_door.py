@@ -141,6 +141,5 @@ TASK = TaskSpec(
     success=ByRules(paper=DoorPassedRule(), released=DoorOpenRule()),
     judge=OpenDoorJudge,
     predicates=PREDICATES,
-    disturbance=0.5,
     expert="arena_newton.policies.experts.open_door:OpenDoorExpert",
 )
