@@ -9,7 +9,21 @@ import torch
 
 from arena_newton import policies, seeding, trackers
 from arena_newton.env import ArenaEnv
-from arena_newton.policies.experts.open_door import LEARN, ON_LEVER, SIDE, STAND, OpenDoorExpert
+from arena_newton.policies.experts.open_door import (
+    AJAR,
+    BELOW,
+    BEYOND,
+    DEEP,
+    LEARN,
+    ON_LEVER,
+    PASSING,
+    PRESSING,
+    SIDE,
+    SINKING,
+    STAND,
+    TOUCHING,
+    OpenDoorExpert,
+)
 from arena_newton.policies.experts.style import Style
 from arena_newton.rollout import Rollout
 from arena_newton.rotations import rotate_xy
@@ -85,53 +99,88 @@ def after(expert, seconds, worlds=2):
 
 
 def at_the_lever(sight, expert):
-    """Lead the expert to `align`, with the robot where it wants to be."""
-    for walk, wait in (("approach", "raise"), ("step in", "align")):
-        assert after(expert, 0.1) == [walk] * 2 or expert.phases() == [wait] * 2
-        sight.pose = expert.walk.goal.clone()
+    """Lead the expert to `lower`, with the robot `PASSING` short of the lever, where it goes on."""
+    for walk, following in (("approach", "step in"), ("step in", "lower")):
+        assert after(expert, 0.1) == [walk] * 2
+        sight.pose = short_of(expert.walk.goal, 0.9 * PASSING[0])
         expert.walk.to(torch.ones(2, dtype=torch.bool), expert.walk.goal)  # a robot that jumps has left its path
-        assert after(expert, 0.2) == [wait] * 2
-        if wait == "raise":
-            assert after(expert, 1.4) == ["step in"] * 2
+        assert after(expert, 0.1) == [following] * 2
+
+
+def short_of(pose, distance):
+    """Poses so far behind others [m], shape [worlds, 3]."""
+    ahead = torch.stack([pose[:, 2].cos(), pose[:, 2].sin()], dim=1)
+    return torch.cat([pose[:, :2] - distance * ahead, pose[:, 2:]], dim=1)
 
 
 def test_the_lever_is_in_front_of_the_right_shoulder(door):
-    """When it presses, the robot faces the door, and the point to press is `STAND` ahead and `SIDE` to its right."""
+    """The robot is led to where the point to press is `STAND` less `BEYOND` ahead and `SIDE` to its right."""
     sight, expert = door
     at_the_lever(sight, expert)
-    pressed = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 0.95)
-    local = rotate_xy(-sight.pose[:, 2], pressed[:, :2] - sight.pose[:, :2])
-    assert torch.allclose(local, torch.tensor([STAND, -SIDE]).expand(2, 2), atol=1e-5)
-    assert torch.allclose(sight.pose[:, 2], sight.doors[:, 2] + math.pi / 2, atol=1e-5)
+    pressed, goal = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 0.95), expert.walk.goal
+    local = rotate_xy(-goal[:, 2], pressed[:, :2] - goal[:, :2])
+    assert torch.allclose(local, torch.tensor([STAND - BEYOND, -SIDE]).expand(2, 2), atol=1e-5)
+    assert torch.allclose(goal[:, 2], sight.doors[:, 2] + math.pi / 2, atol=1e-5)
+
+
+def test_it_goes_on_while_it_still_walks(door):
+    """Both walks end `PASSING` before their goals, the arm up since the first: nothing waits for centimetres."""
+    sight, expert = door
+    every = torch.ones(2, dtype=torch.bool)
+    for following in ("step in", "lower"):
+        sight.pose = short_of(expert.walk.goal, 1.2 * PASSING[0])
+        expert.walk.to(every, expert.walk.goal)
+        command = expert.command(every, 0.1)
+        assert (command.velocity[:, 0] > 0.1).all() and expert.phases() != [following] * 2
+        sight.pose = short_of(expert.walk.goal, 0.8 * PASSING[0])
+        assert after(expert, 0.1) == [following] * 2
+    assert (expert.command(every, 0.1).reach[:, 1] == 1).all()
+
+
+def test_the_hand_never_pauses_at_the_lever(door):
+    """From `lower` until the press has reached its end the commanded palm sinks with every decision."""
+    sight, expert = door
+    at_the_lever(sight, expert)
+    sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 0.95 + TOUCHING)
+    every, heights = torch.ones(2, dtype=torch.bool), []
+    expert.palms.gain = 0.0  # of the command itself
+    while expert.phases() != ["press"] * 2 or PRESSING * float(expert.states.clock[0]) < BELOW - 0.05:
+        heights.append(expert.command(every, 0.1).hand_point[:, 1, 2])
+    sunk = -torch.diff(torch.stack(heights), dim=0)
+    assert len(heights) > 15 and (sunk > 0.9 * 0.1 * SINKING).sum() >= sunk.numel() - 2
 
 
 def test_a_released_latch_is_pushed_and_passed(door):
-    """A lever at 20° leads to the push, a robot inside with the leaf open to the end; without the leaf it goes on."""
+    """A lever that is `DEEP` leads to the push, a robot inside with the leaf open to the end; else it goes on."""
     sight, expert = door
     at_the_lever(sight, expert)
     sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 1.08)
-    assert after(expert, 2.6) == ["press"] * 2
-    sight.angles["lever"] = torch.tensor([-0.30, -0.36])
+    assert after(expert, 1.2) == ["press"] * 2
+    sight.angles["lever"] = torch.tensor([-0.95, -1.05]) * DEEP
     assert after(expert, 0.1) == ["press", "push"]
-    sight.angles["lever"] = torch.full((2,), -0.36)
+    sight.angles["lever"] = torch.full((2,), -1.05 * DEEP)
     assert after(expert, 0.1) == ["push"] * 2
+    every = torch.ones(2, dtype=torch.bool)
+    low = expert.command(every, 0.1).hand_point[:, 1, 2]
+    sight.angles["leaf"] = torch.full((2,), 1.05 * AJAR)
+    assert (expert.command(every, 0.1).hand_point[:, 1, 2] > low + 0.3).all()  # it presses until the leaf is ajar
     sight.pose = torch.cat([sight.at((0.1, 0.6), 0.0)[:, :2], sight.pose[:, 2:]], dim=1)
     sight.angles["leaf"] = torch.tensor([1.2, 0.7])
     assert after(expert, 0.1) == ["through", "push"]
 
 
 def test_a_missed_lever_is_tried_again_from_a_better_stance(door):
-    """A palm that is below a closed latch leads back to `raise`, and the stance moves by part of what it missed."""
+    """A palm that is below a closed latch leads back to `step in`, and the stance moves by part of what it missed."""
     sight, expert = door
     at_the_lever(sight, expert)
-    before = sight.pose.clone()
+    before = expert.walk.goal.clone()
     sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1] - 0.05), 1.08)  # 5 cm short
-    assert after(expert, 2.6) == ["press"] * 2
+    assert after(expert, 1.2) == ["press"] * 2
     sight.hands[:, 1, 2] = 0.85
     assert after(expert, 0.1) == ["retreat"] * 2
     sight.pose = expert.walk.goal.clone()
-    assert after(expert, 0.2) == ["raise"] * 2
-    assert after(expert, 1.4) == ["step in"] * 2
+    expert.walk.to(torch.ones(2, dtype=torch.bool), expert.walk.goal)
+    assert after(expert, 0.2) == ["step in"] * 2
     moved = rotate_xy(-before[:, 2], expert.walk.goal[:, :2] - before[:, :2])
     assert torch.allclose(moved, torch.tensor([0.05 * LEARN, 0.0]).expand(2, 2), atol=1e-5)
 
@@ -144,7 +193,7 @@ def test_phases_end_without_progress(door):
     for _ in range(70):
         expert.command(torch.ones(2, dtype=torch.bool), 0.5)
         seen |= set(expert.phases())
-    assert seen == {"approach", "raise", "step in", "align", "press", "retreat"}
+    assert seen == {"approach", "step in", "lower", "press", "retreat"}
 
 
 def test_worlds_outside_the_mask_keep_their_state(door):
@@ -153,7 +202,7 @@ def test_worlds_outside_the_mask_keep_their_state(door):
     at_the_lever(sight, expert)
     sight.hands = sight.hands + 1.2
     before = [expert.states.clock.clone(), expert.walk.goal.clone(), expert.palms.correction.clone()]
-    assert after(expert, 2.6, worlds=1) == ["press", "align"]
+    assert after(expert, 1.2, worlds=1) == ["press", "lower"]
     assert torch.equal(expert.states.clock[1], before[0][1]) and torch.equal(expert.walk.goal[1], before[1][1])
     assert torch.equal(expert.palms.correction[1], before[2][1])
     assert not torch.equal(expert.palms.correction[0], before[2][0])
@@ -180,7 +229,7 @@ def test_doors_through_twist2_whatever_runs_beside():
         results = Rollout(env, policy, batch, max_steps=ticks).run()
         if len(batch) == 2:
             assert [r.outcome for r in results] == ["success", "success"]
-            order = ["approach", "raise", "step in", "align", "press", "push"]
+            order = ["approach", "step in", "lower", "press", "push"]
             assert all([name for name, _ in r.phases] == order for r in results)
         kept.append(torch.stack(actions)[:300])
     assert len(kept[1]) == 300 and torch.equal(kept[0], kept[1])
