@@ -61,7 +61,7 @@ PASSED = 0.40
 TWIST = 0.9
 """Waist yaw at most [rad], by which the head turns to what it looks at: the nearer bag while it searches, then the
 target that it has seen, so that a learner without memory still sees on the way what the way is for."""
-LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "step up": 6.0, "strike": 3.5}
+LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "go round": 6.0, "step up": 6.0, "strike": 3.5}
 """Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the last steps, after which it
 strikes from where it is; one strike, after which the robot moves by the error of its palm."""
 
@@ -70,10 +70,14 @@ FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
 BEST_FLANK = (math.radians(56), math.radians(68))
 """The one preferred, drawn between these."""
 OTHER = 1.5
-"""Price of the side of the target that leads towards the bag's post, at its highest, as a length of way [m]."""
-FUNNEL = 0.35
-"""The robot comes to the ready pose up to this far around the bag from the line on which it then steps up, drawn [rad]:
-a learner sees how the last steps correct that."""
+"""Price of the side of the target that leads towards the bag's post, at its highest, as a length of way [m] ..."""
+BEHIND = 3.0
+"""... and what is added where the target is on the post's half of the bag, so that the azimuth alone decides."""
+COME = (math.radians(6), math.radians(62))
+"""Bearing of the target at which the robot comes to the bag, drawn between these, less than at the stance: where the
+target is straight ahead, a learner that has not decided for a side comes the same way, and sees how to go round."""
+ROUND = 0.82
+"""Distance from the bag's axis there [m]."""
 STAND = 0.45
 """Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
 READY = (0.66, 0.76)
@@ -97,6 +101,8 @@ LEAN = 0.25
 """Waist pitch of a strike [rad]."""
 BEYOND = 0.06
 """Both poses are walked to as if they were this much farther ahead [m]: the robot still walks when it goes on."""
+COME_WITHIN = (0.22, 0.60)
+"""Errors before it goes round, seen from `BEYOND` that pose, that do not matter [m, rad]."""
 READY_WITHIN = (0.16, 0.30)
 """Errors at the ready pose, seen from `BEYOND` it, that do not matter [m, rad]."""
 STAND_WITHIN = (0.16, 0.25)
@@ -158,9 +164,10 @@ class BoxingExpert(Expert):
         """The right hand strikes, shape [worlds]."""
         self.stand = torch.zeros(worlds, 3, device=device)
         """Pose in front of the bag: x, y [m], yaw [rad], shape [worlds, 3]."""
+        self._first = torch.zeros(worlds, 3, device=device)
         self._tries = torch.zeros(worlds, dtype=torch.long, device=device)
         self._correction = torch.zeros(worlds, 3, device=device)
-        self._flank, self._ready, self._pace, self._funnel = (torch.zeros(worlds, device=device) for _ in range(4))
+        self._flank, self._ready, self._pace, self._come = (torch.zeros(worlds, device=device) for _ in range(4))
         self._aside = torch.zeros(worlds, 2, device=device)
 
     def begin(self, mask: Tensor, style: Style) -> None:
@@ -170,7 +177,7 @@ class BoxingExpert(Expert):
         self.seen = self.seen & ~mask
         self._flank = select(mask, style.uniform("flank", *BEST_FLANK), self._flank)
         self._ready = select(mask, style.uniform("ready", *READY), self._ready)
-        self._funnel = select(mask, style.uniform("funnel", -FUNNEL, FUNNEL), self._funnel)
+        self._come = select(mask, style.uniform("come", *COME), self._come)
         self._pace = select(mask, style.uniform("pace", *PACE), self._pace)
         aside = torch.stack([style.uniform(f"aside {axis}", -ASIDE, ASIDE) for axis in "xy"], dim=1)
         self._aside = select(mask, aside, self._aside)
@@ -197,13 +204,16 @@ class BoxingExpert(Expert):
         self._acting = self._phases.names()
 
         self._phases.advance(mask, dt)
-        approaching, stepping = self._phases.at("approach"), self._phases.at("step up")
-        near = torch.where(approaching, READY_WITHIN[0], STAND_WITHIN[0])
-        turn = torch.where(approaching, READY_WITHIN[1], STAND_WITHIN[1])
-        there = (answer.distance < near) & (answer.heading_error.abs() < turn)
-        onward = mask & (there | answer.arrived | self._phases.late)
-        self._step_up(onward & approaching, self.stand)
-        self._phases.enter("strike", onward & stepping)
+        going = [self._phases.at(name) for name in ("approach", "go round", "step up")]
+        onward = mask & (answer.arrived | self._phases.late)
+        for at, within in zip(going, (COME_WITHIN, READY_WITHIN, STAND_WITHIN), strict=True):
+            near = (answer.distance < within[0]) & (answer.heading_error.abs() < within[1])
+            onward = onward | (mask & at & near)
+        approaching, rounding, stepping = (onward & at for at in going)
+        self._walk.to(approaching, beyond(self._first), Floor(self._boxes, *ROOM))
+        self._phases.enter("go round", approaching)
+        self._step_up(rounding, self.stand)
+        self._phases.enter("strike", stepping)
         return command
 
     def phases(self) -> list[str]:
@@ -264,27 +274,36 @@ class BoxingExpert(Expert):
         bag, bearing = self._bag()
         flank = torch.tensor(FLANKS, device=pose.device)
         side = bearing[:, None] - flank  # [W, C]: bearing of the robot from the bag
-        come = side + self._funnel[:, None]
 
         def before(angle: Tensor, distance: Tensor | float) -> Tensor:
             return bag[:, None] + distance * torch.stack([torch.cos(angle), torch.sin(angle)], dim=2)
 
-        ready, stand = before(come, self._ready[:, None, None]), before(side, STAND)
+        ready, stand = before(side, self._ready[:, None, None]), before(side, STAND)
         room = signed_distance(torch.cat([ready, stand], dim=1), self._boxes[:, 1::2])
         tight = (0.40 - room.view(len(pose), 2, -1).amin(dim=1)).clamp_min(0.0)
         far = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
-        other = (flank.sign() * torch.cos(bearing)[:, None]).clamp_min(0.0)
-        price = far + OTHER * other + 20.0 * tight + 0.5 * (flank.abs() - self._flank[:, None]).abs()
+        other = flank.sign() * torch.cos(bearing)[:, None]
+        behind = (other > 0.0) & (torch.sin(bearing)[:, None] < 0.0)
+        price = far + OTHER * other.clamp_min(0.0) + BEHIND * behind
+        price = price + 20.0 * tight + 0.5 * (flank.abs() - self._flank[:, None]).abs()
         order = price.argsort(dim=1)
         pick = torch.gather(order, 1, (self._tries // (SHIFTS + 1) % len(FLANKS))[:, None])
 
-        def chosen(points: Tensor, angle: Tensor) -> Tensor:
-            xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
-            return torch.cat([xy, wrap_angle(torch.gather(angle, 1, pick) + math.pi)], dim=1)
+        def chosen(values: Tensor) -> Tensor:
+            index = pick if values.ndim == 2 else pick[..., None].expand(-1, 1, 2)
+            return torch.gather(values, 1, index)[:, 0]
 
-        self._walk.to(mask, beyond(chosen(ready, come)), Floor(self._boxes, *ROOM))
-        self.stand = select(mask, chosen(stand, side), self.stand)
+        facing = wrap_angle(chosen(side) + math.pi)[:, None]
+        self._first = select(mask, torch.cat([chosen(ready), facing], dim=1), self._first)
+        self.stand = select(mask, torch.cat([chosen(stand), facing], dim=1), self.stand)
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
+        here = torch.atan2(pose[:, 1] - bag[:, 1], pose[:, 0] - bag[:, 0])
+        sign, most = flank[pick[:, 0]].sign(), flank[pick[:, 0]].abs()
+        present = wrap_angle(bearing - here) * sign
+        come = bearing - sign * torch.minimum(torch.maximum(self._come, present), most)
+        way = torch.stack([torch.cos(come), torch.sin(come)], dim=1)
+        goal = torch.cat([bag + ROUND * way, wrap_angle(come + math.pi)[:, None]], dim=1)
+        self._walk.to(mask, beyond(goal), Floor(self._boxes, *ROOM))
         self._phases.enter("approach", mask)
 
     def _try_again(self, mask: Tensor) -> None:
