@@ -46,8 +46,8 @@ GLANCES = 2
 """Decisions at which the target was in view before it counts as seen: one picture may be a coincidence of a step."""
 PLACES = {
     "beside 1": (0, 0.68, 0.25, -1.60),
-    "behind 1": (0, 0.75, -1.15, -2.40),
-    "behind 2": (1, -0.20, -1.15, 2.60),
+    "behind 1": (0, 0.75, -1.35, -2.40),
+    "behind 2": (1, -0.20, -1.25, 2.60),
     "beside 2": (1, -1.00, 0.10, 1.40),
     "before 2": (1, 0.20, 1.40, 0.00),
 }
