@@ -46,8 +46,8 @@ GLANCES = 2
 """Decisions at which the target was in view before it counts as seen: one picture may be a coincidence of a step."""
 PLACES = {
     "beside 1": (0, 0.68, 0.25, -1.60),
-    "behind 1": (0, 0.75, -1.15, -2.40),
-    "behind 2": (1, -0.20, -1.15, 2.60),
+    "behind 1": (0, 0.75, -1.35, -2.40),
+    "behind 2": (1, -0.20, -1.25, 2.60),
     "beside 2": (1, -1.00, 0.10, 1.40),
     "before 2": (1, 0.20, 1.40, 0.00),
 }
@@ -61,7 +61,7 @@ PASSED = 0.40
 TWIST = 0.9
 """Waist yaw at most [rad], by which the head turns to what it looks at: the nearer bag while it searches, then the
 target that it has seen, so that a learner without memory still sees on the way what the way is for."""
-LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "step up": 6.0, "strike": 3.5}
+LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "go round": 6.0, "step up": 6.0, "strike": 3.5}
 """Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the last steps, after which it
 strikes from where it is; one strike, after which the robot moves by the error of its palm."""
 
@@ -69,8 +69,15 @@ FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
 """Bearing of the target from the bag's axis minus that of the robot [rad]: positive is on the robot's right."""
 BEST_FLANK = (math.radians(56), math.radians(68))
 """The one preferred, drawn between these."""
-FAVOUR = 0.35
-"""Longest detour for the side that an episode favours [m]."""
+OTHER = 1.5
+"""Price of the side of the target that leads towards the bag's post, at its highest, as a length of way [m] ..."""
+BEHIND = 3.0
+"""... and what is added where the target is on the post's half of the bag, so that the azimuth alone decides."""
+COME = (math.radians(6), math.radians(62))
+"""Bearing of the target at which the robot comes to the bag, drawn between these, less than at the stance: where the
+target is straight ahead, a learner that has not decided for a side comes the same way, and sees how to go round."""
+ROUND = 0.82
+"""Distance from the bag's axis there [m]."""
 STAND = 0.45
 """Distance of pelvis and bag axis when striking [m]: bag radius, forearms and knees fit in between."""
 READY = (0.66, 0.76)
@@ -86,16 +93,33 @@ BELOW = 0.12
 """Height of the target above the pelvis [m]: the shoulder is then 17 cm above the target."""
 LOW, HIGH = 0.52, 0.74
 """Range of pelvis heights [m]."""
-SHIFTS = 2
+SHIFTS = 1
 """Number of moves by the palm's error before the robot goes to another side of the target."""
 CLOSER = 0.12
 """Longest such move [m]."""
 LEAN = 0.25
 """Waist pitch of a strike [rad]."""
-READY_WITHIN = (0.14, 0.25)
-"""Errors at the ready pose that do not matter [m, rad]."""
-STAND_WITHIN = (0.07, 0.14)
-"""Errors in front of the bag that the arm compensates [m, rad]."""
+BEYOND = 0.06
+"""Both poses are walked to as if they were this much farther ahead [m]: the robot still walks when it goes on."""
+COME_WITHIN = (0.22, 0.60)
+"""Errors before it goes round, seen from `BEYOND` that pose, that do not matter [m, rad]."""
+READY_WITHIN = (0.16, 0.30)
+"""Errors at the ready pose, seen from `BEYOND` it, that do not matter [m, rad]."""
+STAND_WITHIN = (0.16, 0.25)
+"""The same in front of the bag: the strike goes on walking until the palm is there."""
+FAR, CLOSE = 0.32, 0.14
+"""Distances to the stance between which crouch and turn of the waist grow with the way that is done [m]: no step of a
+strike waits for something that a picture does not show."""
+FOLLOW = 1.2
+"""Speed of a strike's steps for the palm's error [1/s]."""
+STEPS = (0.20, 0.12)
+"""Largest speed of these steps ahead and to either side [m/s]."""
+SLOWEST = 0.08
+"""Smallest speed ahead while there is room [m/s]."""
+NEAREST = 0.36
+"""Distance of pelvis and bag axis from which on no step leads nearer [m]."""
+ARM = 0.44
+"""A hand is led at most this far ahead of the pelvis [m], until the robot is near enough."""
 GAIN = 0.6
 """Integral gain on the palm's error [1/s]: trackers leave the hand 5-20 cm behind."""
 MOST = 0.15
@@ -140,9 +164,10 @@ class BoxingExpert(Expert):
         """The right hand strikes, shape [worlds]."""
         self.stand = torch.zeros(worlds, 3, device=device)
         """Pose in front of the bag: x, y [m], yaw [rad], shape [worlds, 3]."""
+        self._first = torch.zeros(worlds, 3, device=device)
         self._tries = torch.zeros(worlds, dtype=torch.long, device=device)
         self._correction = torch.zeros(worlds, 3, device=device)
-        self._flank, self._favour, self._ready, self._pace = (torch.zeros(worlds, device=device) for _ in range(4))
+        self._flank, self._ready, self._pace, self._come = (torch.zeros(worlds, device=device) for _ in range(4))
         self._aside = torch.zeros(worlds, 2, device=device)
 
     def begin(self, mask: Tensor, style: Style) -> None:
@@ -151,8 +176,8 @@ class BoxingExpert(Expert):
         self._glances = self._glances.masked_fill(mask, 0)
         self.seen = self.seen & ~mask
         self._flank = select(mask, style.uniform("flank", *BEST_FLANK), self._flank)
-        self._favour = select(mask, style.uniform("favour", -FAVOUR, FAVOUR), self._favour)
         self._ready = select(mask, style.uniform("ready", *READY), self._ready)
+        self._come = select(mask, style.uniform("come", *COME), self._come)
         self._pace = select(mask, style.uniform("pace", *PACE), self._pace)
         aside = torch.stack([style.uniform(f"aside {axis}", -ASIDE, ASIDE) for axis in "xy"], dim=1)
         self._aside = select(mask, aside, self._aside)
@@ -169,23 +194,26 @@ class BoxingExpert(Expert):
         self._try_again(mask & self._phases.at("strike") & self._phases.late)
 
         striking, waiting = self._phases.at("strike"), self._phases.at("look")
-        answer = self._walk.command(mask & ~waiting, dt)
+        answer = self._walk.command(mask & ~waiting & ~striking, dt)
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
-        command.velocity = paced(answer.velocity, self._pace) * (~striking & ~waiting)[:, None]
+        command.velocity = paced(answer.velocity, self._pace) * ~waiting[:, None]
+        command.velocity = select(striking, self._steps(), command.velocity)
         command.hands = torch.ones_like(command.hands)
-        going = self._phases.at("approach", "step up")
-        command.waist[:, 0] = self._gaze() * (going | self._phases.at(*PLACES))
+        command.waist[:, 0] = self._gaze() * ~waiting
         self._strike(command, striking, mask, dt)
         self._acting = self._phases.names()
 
         self._phases.advance(mask, dt)
-        approaching, stepping = self._phases.at("approach"), self._phases.at("step up")
-        near = torch.where(approaching, READY_WITHIN[0], STAND_WITHIN[0])
-        turn = torch.where(approaching, READY_WITHIN[1], STAND_WITHIN[1])
-        there = (answer.distance < near) & (answer.heading_error.abs() < turn)
-        onward = mask & (there | answer.arrived | self._phases.late)
-        self._step_up(onward & approaching, self.stand)
-        self._phases.enter("strike", onward & stepping)
+        going = [self._phases.at(name) for name in ("approach", "go round", "step up")]
+        onward = mask & (answer.arrived | self._phases.late)
+        for at, within in zip(going, (COME_WITHIN, READY_WITHIN, STAND_WITHIN), strict=True):
+            near = (answer.distance < within[0]) & (answer.heading_error.abs() < within[1])
+            onward = onward | (mask & at & near)
+        approaching, rounding, stepping = (onward & at for at in going)
+        self._walk.to(approaching, beyond(self._first), Floor(self._boxes, *ROOM))
+        self._phases.enter("go round", approaching)
+        self._step_up(rounding, self.stand)
+        self._phases.enter("strike", stepping)
         return command
 
     def phases(self) -> list[str]:
@@ -246,22 +274,36 @@ class BoxingExpert(Expert):
         bag, bearing = self._bag()
         flank = torch.tensor(FLANKS, device=pose.device)
         side = bearing[:, None] - flank  # [W, C]: bearing of the robot from the bag
-        out = torch.stack([torch.cos(side), torch.sin(side)], dim=2)
-        ready, stand = bag[:, None] + self._ready[:, None, None] * out, bag[:, None] + STAND * out
+
+        def before(angle: Tensor, distance: Tensor | float) -> Tensor:
+            return bag[:, None] + distance * torch.stack([torch.cos(angle), torch.sin(angle)], dim=2)
+
+        ready, stand = before(side, self._ready[:, None, None]), before(side, STAND)
         room = signed_distance(torch.cat([ready, stand], dim=1), self._boxes[:, 1::2])
         tight = (0.40 - room.view(len(pose), 2, -1).amin(dim=1)).clamp_min(0.0)
-        far = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2) + self._favour[:, None] * flank.sign()
-        price = far + 20.0 * tight + 0.5 * (flank.abs() - self._flank[:, None]).abs()
+        far = torch.linalg.vector_norm(ready - pose[:, None, :2], dim=2)
+        other = flank.sign() * torch.cos(bearing)[:, None]
+        behind = (other > 0.0) & (torch.sin(bearing)[:, None] < 0.0)
+        price = far + OTHER * other.clamp_min(0.0) + BEHIND * behind
+        price = price + 20.0 * tight + 0.5 * (flank.abs() - self._flank[:, None]).abs()
         order = price.argsort(dim=1)
         pick = torch.gather(order, 1, (self._tries // (SHIFTS + 1) % len(FLANKS))[:, None])
 
-        def chosen(points: Tensor) -> Tensor:
-            xy = torch.gather(points, 1, pick[..., None].expand(-1, 1, 2))[:, 0]
-            return torch.cat([xy, wrap_angle(torch.gather(side, 1, pick) + math.pi)], dim=1)
+        def chosen(values: Tensor) -> Tensor:
+            index = pick if values.ndim == 2 else pick[..., None].expand(-1, 1, 2)
+            return torch.gather(values, 1, index)[:, 0]
 
-        self._walk.to(mask, chosen(ready), Floor(self._boxes, *ROOM))
-        self.stand = select(mask, chosen(stand), self.stand)
+        facing = wrap_angle(chosen(side) + math.pi)[:, None]
+        self._first = select(mask, torch.cat([chosen(ready), facing], dim=1), self._first)
+        self.stand = select(mask, torch.cat([chosen(stand), facing], dim=1), self.stand)
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
+        here = torch.atan2(pose[:, 1] - bag[:, 1], pose[:, 0] - bag[:, 0])
+        sign, most = flank[pick[:, 0]].sign(), flank[pick[:, 0]].abs()
+        present = wrap_angle(bearing - here) * sign
+        come = bearing - sign * torch.minimum(torch.maximum(self._come, present), most)
+        way = torch.stack([torch.cos(come), torch.sin(come)], dim=1)
+        goal = torch.cat([bag + ROUND * way, wrap_angle(come + math.pi)[:, None]], dim=1)
+        self._walk.to(mask, beyond(goal), Floor(self._boxes, *ROOM))
         self._phases.enter("approach", mask)
 
     def _try_again(self, mask: Tensor) -> None:
@@ -280,7 +322,7 @@ class BoxingExpert(Expert):
     def _step_up(self, mask: Tensor, stand: Tensor) -> None:
         """The last steps, straight to a pose in front of the bag."""
         self.stand = select(mask, stand, self.stand)
-        self._walk.to(mask, self.stand)
+        self._walk.to(mask, beyond(self.stand))
         self._correction = self._correction.masked_fill(mask[:, None], 0.0)
         self._phases.enter("step up", mask)
 
@@ -296,8 +338,19 @@ class BoxingExpert(Expert):
         left, right = (palm() for palm in self._palms)
         return torch.where(self.right[:, None], right, left)
 
+    def _steps(self) -> Tensor:
+        """Velocity of a strike: after the palm's error, on and on until it is gone, [worlds, 3]."""
+        pose = self.sight.pose
+        error = self._local(self._wanted() - self._palm(), pose)
+        bag, _ = self._bag()
+        room = torch.linalg.vector_norm(bag - pose[:, :2], dim=1) - NEAREST
+        ahead = torch.minimum((FOLLOW * error[:, 0]).clamp(SLOWEST, STEPS[0]), FOLLOW * room).clamp_min(-STEPS[0])
+        aside = (FOLLOW * error[:, 1]).clamp(-STEPS[1], STEPS[1])
+        turn = (LIMITS.heading_gain * wrap_angle(self.stand[:, 2] - pose[:, 2])).clamp(-0.5, 0.5)
+        return torch.stack([ahead, aside, turn], dim=1)
+
     def _strike(self, command: MotionCommand, striking: Tensor, mask: Tensor, dt: float) -> None:
-        """Fill in height, waist and hand point."""
+        """Fill in height, waist and hand point of the last steps and of the strike."""
         pose, wanted = self.sight.pose, self._wanted()
         error = self._local(wanted - self._palm(), pose)
         settled = striking & mask & (self._phases.clock > 1.0)
@@ -306,16 +359,25 @@ class BoxingExpert(Expert):
 
         root = torch.cat([pose[:, :2], self.sight.height[:, None]], dim=1)
         point = self._local(wanted - root, pose) + self._correction
-        point[:, 0] += HAND_POINT - PALM_OFFSET[0]
+        point[:, 0] = (point[:, 0] + HAND_POINT - PALM_OFFSET[0]).clamp_max(ARM)
         is_right = torch.stack([~self.right, self.right], dim=1)
         command.hand_point = torch.where(is_right[..., None], point[:, None], command.hand_point)
-        command.reach = (is_right & striking[:, None]).to(command.reach.dtype)
+        leading = striking | self._phases.at("step up")
+        command.reach = (is_right & leading[:, None]).to(command.reach.dtype)
+        left = torch.linalg.vector_norm(self.stand[:, :2] - pose[:, :2], dim=1)
+        done = torch.where(striking, 1.0, ((FAR - left) / (FAR - CLOSE)).clamp(0.0, 1.0)) * leading
         height = (wanted[:, 2] - BELOW).clamp(LOW, HIGH)
-        command.height = torch.where(striking, height, command.height)
+        command.height = command.height + done * (height - command.height)
         turn = torch.where(self.right, 0.35, -0.35)
         waist = torch.stack([turn, torch.zeros_like(turn), torch.full_like(turn, LEAN)], dim=1)
-        command.waist = select(striking, waist, command.waist)
+        command.waist = command.waist + done[:, None] * (waist - command.waist)
 
     @staticmethod
     def _local(vector: Tensor, pose: Tensor) -> Tensor:
         return torch.cat([rotate_xy(-pose[:, 2], vector[:, :2]), vector[:, 2:]], dim=1)
+
+
+def beyond(pose: Tensor) -> Tensor:
+    """Poses that are `BEYOND` farther ahead than others; x, y [m], yaw [rad], shape [worlds, 3]."""
+    ahead = torch.stack([torch.cos(pose[:, 2]), torch.sin(pose[:, 2])], dim=1)
+    return torch.cat([pose[:, :2] + BEYOND * ahead, pose[:, 2:]], dim=1)
