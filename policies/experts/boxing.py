@@ -61,8 +61,16 @@ PASSED = 0.40
 TWIST = 0.9
 """Waist yaw at most [rad], by which the head turns to what it looks at: the nearer bag while it searches, then the
 target that it has seen, so that a learner without memory still sees on the way what the way is for."""
-LONGEST = {"look": 0.15, **dict.fromkeys(PLACES, 14.0), "approach": 14.0, "go round": 6.0, "step up": 6.0, "strike": 3.5}
-"""Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the last steps, after which it
+LONGEST = {
+    "look": 0.15,
+    **dict.fromkeys(PLACES, 14.0),
+    "approach": 14.0,
+    "go round": 6.0,
+    "step up": 6.0,
+    "strike": 3.5,
+}
+"""Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the way around
+the bag; the last steps, after which it
 strikes from where it is; one strike, after which the robot moves by the error of its palm."""
 
 FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
@@ -217,7 +225,7 @@ class BoxingExpert(Expert):
         return command
 
     def phases(self) -> list[str]:
-        """`look`, the places of `PLACES` while it searches, `approach`, `step up`, `strike`."""
+        """`look`, the places of `PLACES` while it searches, `approach`, `go round`, `step up`, `strike`."""
         return self._acting
 
     def _looking(self) -> Tensor:

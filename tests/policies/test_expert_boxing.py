@@ -195,7 +195,7 @@ def test_through_twist2():
     results, among = played([1102966727, 2062305377], 650)
     assert [r.outcome for r in results] == ["success", "success"]
     named = [[name for name, _ in r.phases] for r in results]
-    assert named[0] == ["look", "approach", "step up", "strike"]
-    assert named[1] == ["look", "beside 1", "behind 1", "approach", "step up", "strike"]
+    assert named[0] == ["look", "approach", "go round", "step up", "strike"]
+    assert named[1] == ["look", "beside 1", "behind 1", "approach", "go round", "step up", "strike"]
     _, alone = played([2062305377], 250)
     assert all((one[0] == two[1]).all() for one, two in zip(alone, among[: len(alone)], strict=True))
