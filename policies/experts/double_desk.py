@@ -9,6 +9,7 @@ hand is read from its distance to the palm, which the camera sees as well.
 from __future__ import annotations
 
 import math
+from dataclasses import astuple, replace
 
 import torch
 from torch import Tensor
@@ -30,9 +31,9 @@ LONGEST = {
     "look": 5.0,
     "approach": 12.0,
     "step in": 5.0,
-    "hover": 3.5,
-    "lower": 1.7,
-    "close": 1.0,
+    "hover": 2.4,
+    "lower": 1.4,
+    "close": 0.8,
     "lift": 1.3,
     "step back": 2.5,
     "turn": 7.0,
@@ -50,10 +51,12 @@ WALKS = ("look", "approach", "step in", "turn", "line up", "deliver")
 """Phases that walk to a goal."""
 LIMITS = NavigationLimits(forward=0.6, turn=0.9, arrive_position=0.045, arrive_heading=0.06)
 """Coarser stops than the navigator's own: the arm makes up for 5 cm, and each correction costs 2 s."""
-WITHIN = {"approach": (0.10, 0.15), "step in": (0.03, 0.10), "line up": (0.07, 0.08), "deliver": (0.05, 0.10)}
+SIDLING = replace(LIMITS, near=3.0, far=4.0)
+WITHIN = {"approach": (0.10, 0.15), "step in": (0.08, 0.15), "line up": (0.07, 0.08), "deliver": (0.06, 0.10)}
 """Errors at the end of a walk that do not matter [m, rad]."""
 IN_VIEW = 0.75
 """Bearing within which the head camera shows an object [rad]; half of its horizontal field of view is 0.92."""
+CLOCK, OVER_CLOCK = 0.33, 0.8
 LOOK_RIGHT, LOOK_LEFT = -0.5 * math.pi, 0.5 * math.pi
 """Headings that face the right and the left desk [rad]."""
 
@@ -78,7 +81,7 @@ HOVER = 0.12
 """Height of the hand above its grasp while it aligns [m]: fingers clear the head."""
 ALIGN = 1.5
 """Least time to align [s]."""
-ALIGNED = (0.012, 0.07)
+ALIGNED = (0.02, 0.10)
 """Errors of palm and hand that are small enough to lower [m, rad]."""
 DESCENT, ASCENT = 0.12, 0.14
 """Speeds of lowering and lifting [m/s]."""
@@ -129,9 +132,10 @@ AIM, CLOSE, ENOUGH = (0.18, 0.09), 0.01, (0.24, 0.15)
 sizes of the larger one in which it is let go when the arm does not reach farther [m]."""
 CLOSER = 0.10
 """Longest step by what the hammer lacks when it did not come over the crate [m]."""
-HURRY = 3.0
+STILL = 1.2
 """Time above the crate after which the larger rectangle counts [s]."""
-OVER_LEAN, OVER_LEAN_MORE = 0.40, 0.04
+MOST_LEAN = 0.7
+OVER_LEAN, OVER_LEAN_MORE = 0.40, 0.10
 """Waist pitch above the crate [rad], and how it grows while the hammer is not there yet [rad/s]."""
 
 STYLE = {
@@ -172,7 +176,7 @@ class DoubleDeskExpert(Expert):
         self.machine = Phases(LONGEST, worlds, device)
         """The phase of each world."""
         self.palms, self.wrists = Palms(sight), Wrists(sight)
-        self.walk = Walk(sight, LIMITS)
+        self.walk, self.sidle = Walk(sight, LIMITS), Walk(sight, SIDLING)
         self._acting: list[str] = []
         self._style = {name: torch.zeros(worlds, device=device) for name in STYLE}
         self._turns_left = torch.zeros(worlds, dtype=torch.bool, device=device)
@@ -182,6 +186,9 @@ class DoubleDeskExpert(Expert):
         self._pairs = torch.arange(3, device=device)
         self._last = torch.zeros(worlds, 3, device=device)
         self._elapsed = torch.zeros(worlds, device=device)
+        self._grasping = torch.zeros(worlds, device=device)
+        self._there = torch.zeros(worlds, dtype=torch.bool, device=device)
+        self._lean = torch.zeros(worlds, device=device)
 
     def begin(self, mask: Tensor, style: Style) -> None:
         """Draw the episode's style; look at the right desk."""
@@ -189,6 +196,7 @@ class DoubleDeskExpert(Expert):
             self._style[name] = select(mask, style.uniform(name, low, high), self._style[name])
         self._turns_left = select(mask, style.coin("turns left"), self._turns_left)
         self.walk.begin(mask)
+        self.sidle.begin(mask)
         self.machine.begin(mask)
         self._elapsed = self._elapsed.masked_fill(mask, 0.0)
         self._face(mask, LOOK_RIGHT)
@@ -200,12 +208,18 @@ class DoubleDeskExpert(Expert):
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """Move on where a phase is over, then act."""
         self._aim(mask & self.machine.at("look", "approach", "step in", "hover"))
-        answer = self.walk.command(mask & self.machine.at(*WALKS), dt)
+        aside = self.machine.at("line up", "deliver", "over")
+        answer = self.walk.command(mask & ~aside & self.machine.at(*WALKS, "hover"), dt)
+        sidling = self.sidle.command(mask & aside, dt)
+        answer = NavigationCommand(
+            *(select(aside, new, old) for new, old in zip(astuple(sidling), astuple(answer), strict=True))
+        )
         self._onward(mask, answer)
         self._acting = self.machine.names()
         command = self._act(mask, dt, answer)
         self.machine.advance(mask, dt)
         self._elapsed = self._elapsed + dt * mask
+        self._grasping = self._grasping + dt * (mask & self.machine.at("hover", "lower", "close", "lift", "over", "open"))
         return command
 
     # What it sees.
@@ -276,13 +290,17 @@ class DoubleDeskExpert(Expert):
 
     def _face(self, mask: Tensor, yaw: float) -> None:
         pose = self.sight.pose
-        self.walk.to(mask, torch.cat([pose[:, :2], torch.full_like(pose[:, 2:], yaw)], dim=1))
+        self._go(mask, pose[:, :2], yaw)
 
     def _go(self, mask: Tensor, xy: Tensor, yaw: float) -> None:
-        self.walk.to(mask, torch.cat([xy, torch.full_like(xy[:, :1], yaw)], dim=1))
+        goal = torch.cat([xy, torch.full_like(xy[:, :1], yaw)], dim=1)
+        self.walk.to(mask, goal)
+        self.sidle.to(mask, goal)
 
     def _onward(self, mask: Tensor, answer: NavigationCommand) -> None:
         """Enter the next phase where one is over."""
+        there = answer.arrived | ((answer.distance < 0.03) & (answer.heading_error.abs() < 0.10))
+        self._there = (self._there | mask & there) & self.machine.at("hover", "over")
         machine, pose, held = self.machine, self.sight.pose, self._held()
         arrived = {
             name: answer.arrived | ((answer.distance < near) & (answer.heading_error.abs() < straight))
@@ -296,7 +314,7 @@ class DoubleDeskExpert(Expert):
             "step back": back > STEP_BACK[0],
             "turn": self._in_view(self._middle()),
             "sill": self._past_sill(),
-            "over": over_crate[:, 0] | (over_crate[:, 1] & (machine.clock > HURRY)),
+            "over": over_crate[:, 1] & (machine.clock > STILL),
         }
         pace, time = self._pace()
         over["pace"] = time < COMMITTED
@@ -338,6 +356,7 @@ class DoubleDeskExpert(Expert):
         closer = torch.stack([closer[:, 0], closer[:, 1].clamp_max(self._left_edge - NEAR_EDGE)], dim=1)
         self._go(short, closer, LOOK_LEFT)
         restart = done["step in"] | done["lift"]
+        self._grasping = self._grasping.masked_fill(restart | again | done["deliver"], 0.0)
         self.palms.reset(restart)
         self.wrists.reset(restart)
 
@@ -353,8 +372,9 @@ class DoubleDeskExpert(Expert):
 
         _, short = self._stand()
         lean = torch.where(working | at("step in"), LEAN + LEAN_MORE * short, 0.0)
-        lean = torch.where(at("over"), OVER_LEAN + OVER_LEAN_MORE * clock, lean)
-        lean = torch.where(at("open"), OVER_LEAN + OVER_LEAN_MORE * LONGEST["over"], lean)
+        lean = torch.where(at("over"), (OVER_LEAN + OVER_LEAN_MORE * clock).clamp_max(MOST_LEAN), lean)
+        lean = torch.where(at("open"), self._lean, lean)
+        self._lean = select(mask, lean, self._lean)
         command.waist[:, 2] = lean
 
         crossing = at("pace", "sill")
@@ -366,6 +386,7 @@ class DoubleDeskExpert(Expert):
 
         command.reach = raised[:, None].expand(-1, 2).to(command.reach.dtype)
         self._lead_hands(command, mask, dt, raised)
+        command.arms[:, WRISTS[1][0]] = (torch.where(at("over", "open"), OVER_CLOCK, CLOCK) * self._grasping).clamp_max(1.9)
         command.hands[:, 0] = at(
             "close", "lift", "step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over"
         ).float()
@@ -375,7 +396,7 @@ class DoubleDeskExpert(Expert):
         """vx, vy [m/s] and yaw rate [rad/s] in every phase, [worlds, 3]."""
         at, pose = self.machine.at, self.sight.pose
         pace = torch.where(at("approach", "line up"), self._style["pace"], 1.0)
-        velocity = walking * pace[:, None] * at(*WALKS)[:, None]
+        velocity = walking * pace[:, None] * (at(*WALKS) | at("hover", "over") & ~self._there)[:, None]
         # A half turn may go either way.
         spin = torch.where(self._turns_left, 1.0, -1.0) * velocity[:, 2].abs()
         far = at("turn") & (wrap_angle(LOOK_LEFT - pose[:, 2]).abs() > 0.6 * math.pi)
