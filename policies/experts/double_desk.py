@@ -235,6 +235,7 @@ class DoubleDeskExpert(Expert):
         self.sidle.begin(mask)
         self.machine.begin(mask)
         self._elapsed = self._elapsed.masked_fill(mask, 0.0)
+        self._rolled = self._rolled.masked_fill(mask, 0.0)
         self._face(mask, LOOK_RIGHT)
 
     def phases(self) -> list[str]:
