@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 __all__ = [
+    "atan2",
     "gravity_in_body",
     "heading",
     "heading_np",
@@ -35,9 +36,21 @@ __all__ = [
 ]
 
 
+def atan2(y: Tensor, x: Tensor, *, out: Tensor | None = None) -> Tensor:
+    """Angle of (x, y) [rad], elementwise; the same bits whatever the number of elements.
+
+    On the CPU torch computes contiguous elements in blocks of 32, with other last bits than those that are left over,
+    so that an episode would depend on how many worlds run beside it; elements with a stride it computes one by one.
+    """
+    if y.is_cuda:
+        return torch.atan2(y, x, out=out)
+    pair = torch.stack(torch.broadcast_tensors(y, x), dim=-1)
+    return torch.atan2(pair[..., 0], pair[..., 1], out=out)
+
+
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle within -pi..pi [rad]."""
-    return torch.atan2(torch.sin(angle), torch.cos(angle))
+    return atan2(torch.sin(angle), torch.cos(angle))
 
 
 def wrap_by_remainder(angle: Tensor) -> Tensor:
@@ -105,13 +118,13 @@ def quat_from_euler(angles: Tensor) -> Tensor:
 def heading(quat: Tensor) -> Tensor:
     """Heading of unit quaternions [rad], atan2(2(wz + xy), 1 - 2(y² + z²))."""
     w, x, y, z = quat.unbind(-1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def roll_pitch(quat: Tensor) -> Tensor:
     """Roll and pitch of unit quaternions (ZYX angles) [rad], shape [..., 2]."""
     w, x, y, z = quat.unbind(-1)
-    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    roll = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
     return torch.stack([roll, pitch], dim=-1)
 
@@ -120,7 +133,7 @@ def rotation_vector(quat: Tensor) -> Tensor:
     """Axis times angle [rad] of unit quaternions along the shorter arc, shape [..., 3]."""
     quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
     sine = torch.linalg.vector_norm(quat[..., 1:], dim=-1, keepdim=True)
-    angle = 2.0 * torch.atan2(sine, quat[..., :1])
+    angle = 2.0 * atan2(sine, quat[..., :1])
     # angle / sine tends to 2 for small angles.
     tiny = torch.finfo(quat.dtype).tiny
     return quat[..., 1:] * torch.where(sine > 1e-9, angle / sine.clamp_min(tiny), torch.full_like(sine, 2.0))

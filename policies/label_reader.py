@@ -11,6 +11,7 @@ from arena_newton.canonical import ACTION_WIDTH, STATE
 from arena_newton.data.label_protocols import LABELS, V4Decoder, protocol
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
+from arena_newton.rotations import atan2
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
@@ -42,7 +43,7 @@ def read_by(policy: Policy, labels: str, late: int = 0) -> Policy:
 def measured_yaw(state: torch.Tensor) -> torch.Tensor:
     """Heading of the robot in its episode's frame (yaw, ZYX) [rad], shape [worlds], of states [worlds, 64]."""
     rot6d = state[:, STATE["root_rot6d"]].double()
-    return torch.atan2(rot6d[:, 2], rot6d[:, 0])  # R10 and R00: rows of the first two columns
+    return atan2(rot6d[:, 2], rot6d[:, 0])  # R10 and R00: rows of the first two columns
 
 
 class V4Policy(Policy):

@@ -18,6 +18,7 @@ from torch import nn
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
+from arena_newton.rotations import atan2
 from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, folded, mlp, shrink_last
@@ -149,7 +150,7 @@ class Twist2FrontEnd(FrontEnd):
     def _roll_pitch(self, quat: torch.Tensor) -> torch.Tensor:
         """Roll atan2(2(wx + yz), 1 - 2(x² + y²)) and pitch asin(clamp(2(wy - zx))); shape [worlds, 2] [rad]."""
         self._terms.copy_(self._tilt_terms(products(quat, quat)))
-        torch.atan2(self._roll_sine, self._roll_cosine, out=self._roll)
+        atan2(self._roll_sine, self._roll_cosine, out=self._roll)
         torch.asin(self._pitch_sine.clamp_(-1.0, 1.0), out=self._pitch)
         return self._angles
 

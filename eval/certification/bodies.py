@@ -22,6 +22,7 @@ from arena_newton.eval.run import Factories
 from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK, DriveGains
 from arena_newton.rotations import (
+    atan2,
     heading,
     quat_conjugate,
     quat_from_yaw,
@@ -200,7 +201,7 @@ class GlidingBase:
         yaw, counts = heading(quat), torch.from_numpy(acting).to(action.device)
         moves = action[:, ACTION["root_xy_delta"]].nan_to_num(0.0, 0.0, 0.0) * counts[:, None]
         turned = action[:, ACTION["root_rot6d"]].nan_to_num(0.0, 0.0, 0.0)
-        wanted = torch.where(counts, self._anchor + torch.atan2(turned[:, 2], turned[:, 0]), self.target[:, 2])
+        wanted = torch.where(counts, self._anchor + atan2(turned[:, 2], turned[:, 0]), self.target[:, 2])
         step = rotate_xy(wanted, moves)
         ahead = self.target[:, :2] + step - position[:, :2]
         length = torch.linalg.vector_norm(ahead, dim=1, keepdim=True).clamp_min(1e-9)

@@ -27,7 +27,7 @@ from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import Floor, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, paced
-from arena_newton.rotations import rotate_xy, wrap_angle
+from arena_newton.rotations import atan2, rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import PALMS, TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
@@ -246,7 +246,7 @@ class BoxingExpert(Expert):
         nearer = torch.linalg.vector_norm(to_bags, dim=2).argmin(dim=1)
         to_bag = torch.gather(to_bags, 1, nearer[:, None, None].expand(-1, 1, 2))[:, 0]
         way = select(self.seen, self._target()[:, :2] - pose[:, :2], to_bag)
-        return wrap_angle(torch.atan2(way[:, 1], way[:, 0]) - pose[:, 2]).clamp(-TWIST, TWIST)
+        return wrap_angle(atan2(way[:, 1], way[:, 0]) - pose[:, 2]).clamp(-TWIST, TWIST)
 
     def _search(self, mask: Tensor) -> None:
         """Go on to the next place where the last one has shown nothing."""
@@ -272,7 +272,7 @@ class BoxingExpert(Expert):
         target = self._target()[:, :2]
         gap = torch.linalg.vector_norm(target[:, None] - self._bags, dim=2)
         bag = self._bags[gap.argmin(dim=1)]
-        return bag, torch.atan2(target[:, 1] - bag[:, 1], target[:, 0] - bag[:, 0])
+        return bag, atan2(target[:, 1] - bag[:, 1], target[:, 0] - bag[:, 0])
 
     def _approach(self, mask: Tensor) -> None:
         """Plan the path to the best stance; after misses to the next best one."""
@@ -305,7 +305,7 @@ class BoxingExpert(Expert):
         self._first = select(mask, torch.cat([chosen(ready), facing], dim=1), self._first)
         self.stand = select(mask, torch.cat([chosen(stand), facing], dim=1), self.stand)
         self.right = torch.where(mask, flank[pick[:, 0]] > 0, self.right)
-        here = torch.atan2(pose[:, 1] - bag[:, 1], pose[:, 0] - bag[:, 0])
+        here = atan2(pose[:, 1] - bag[:, 1], pose[:, 0] - bag[:, 0])
         sign, most = flank[pick[:, 0]].sign(), flank[pick[:, 0]].abs()
         present = wrap_angle(bearing - here) * sign
         come = bearing - sign * torch.minimum(torch.maximum(self._come, present), most)

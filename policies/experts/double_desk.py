@@ -28,7 +28,7 @@ from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, along
-from arena_newton.rotations import heading, quat_apply, quat_from_yaw, quat_multiply, rotate_xy, turn, wrap_angle
+from arena_newton.rotations import atan2, heading, quat_apply, quat_from_yaw, quat_multiply, rotate_xy, turn, wrap_angle
 from arena_newton.tasks.double_desk import HAMMER, INSIDE, LEFT_DESK, RIGHT_DESK, SILL
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.kinematics import HAND_POINT
@@ -271,7 +271,7 @@ class DoubleDeskExpert(Expert):
         handle = torch.nn.functional.normalize((self._mass() - origin)[:, :2], dim=1)
         grasp = torch.cat([origin[:, :2] + ALONG_HANDLE * handle, origin[:, 2:]], dim=1)
         # The hand lies across the handle on the side of the robot, whichever end the head is.
-        off = wrap_angle(torch.atan2(handle[:, 1], handle[:, 0]) - 0.5 * math.pi - LOOK_RIGHT)
+        off = wrap_angle(atan2(handle[:, 1], handle[:, 0]) - 0.5 * math.pi - LOOK_RIGHT)
         off = torch.where(off.abs() > 0.5 * math.pi, wrap_angle(off + math.pi), off)
         self._grasp = select(mask, grasp, self._grasp)
         self._hand_yaw = select(mask, LOOK_RIGHT + off, self._hand_yaw)
@@ -286,7 +286,7 @@ class DoubleDeskExpert(Expert):
         """Whether the head camera shows a point that is ahead, bool, [worlds]."""
         pose = self.sight.pose
         offset = point[:, :2] - pose[:, :2]
-        return wrap_angle(torch.atan2(offset[:, 1], offset[:, 0]) - pose[:, 2]).abs() < IN_VIEW
+        return wrap_angle(atan2(offset[:, 1], offset[:, 0]) - pose[:, 2]).abs() < IN_VIEW
 
     def _stand(self) -> tuple[Tensor, Tensor]:
         """x, y [m] to grasp from, [worlds, 2], and how far the edge keeps the robot from the best distance [m]."""

@@ -19,7 +19,7 @@ from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import Floor
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, along
-from arena_newton.rotations import rotate_xy
+from arena_newton.rotations import atan2, rotate_xy
 from arena_newton.tasks.football import BALL, GOAL
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.navigate import NavigationLimits
@@ -170,7 +170,7 @@ class FootballExpert(Expert):
     def _line(self, ball: Tensor) -> Tensor:
         """The line on which the kicking foot meets the ball, as `lane`, shape [worlds, 3]."""
         offset = self._aim(ball) - ball
-        yaw = torch.atan2(offset[:, 1], offset[:, 0])
+        yaw = atan2(offset[:, 1], offset[:, 0])
         beside = torch.stack([torch.zeros_like(self._side), self._side], dim=1)
         return torch.cat([ball + rotate_xy(yaw, beside), yaw[:, None]], dim=1)
 

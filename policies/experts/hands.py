@@ -13,7 +13,7 @@ from torch import Tensor
 from arena_newton.policies.experts.base import Sight
 from arena_newton.policies.experts.phases import select
 from arena_newton.robot import ARMS, MUJOCO_JOINTS
-from arena_newton.rotations import matrix_from_quat, quat_conjugate, quat_multiply, rotate_xy
+from arena_newton.rotations import atan2, matrix_from_quat, quat_conjugate, quat_multiply, rotate_xy
 from arena_newton.trackers.motions.kinematics import HAND_POINT
 
 __all__ = ["WRISTS", "Palms", "Wrists", "wrist_angles"]
@@ -86,9 +86,9 @@ def wrist_angles(forearm: Tensor, hand: Tensor) -> Tensor:
         Angles, shape [..., 3].
     """
     m = matrix_from_quat(quat_multiply(quat_conjugate(forearm), hand))
-    roll = torch.atan2(-m[..., 1, 2], m[..., 2, 2])
+    roll = atan2(-m[..., 1, 2], m[..., 2, 2])
     pitch = torch.asin(m[..., 0, 2].clamp(-1.0, 1.0))
-    yaw = torch.atan2(-m[..., 0, 1], m[..., 0, 0])
+    yaw = atan2(-m[..., 0, 1], m[..., 0, 0])
     return torch.stack([roll, pitch, yaw], dim=-1)
 
 

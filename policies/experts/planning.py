@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from arena_newton.rotations import rotate_xy
+from arena_newton.rotations import atan2, rotate_xy
 
 __all__ = ["BLOCKED", "Floor", "Paths", "footprint", "plan", "signed_distance"]
 
@@ -60,7 +60,7 @@ def footprint(pos: Tensor, quat: Tensor, half: Tensor) -> Tensor:
     axes = torch.stack([top * half, side * half], dim=-1)  # the three half axes seen from above, [..., 3, 2]
     longest = torch.linalg.vector_norm(axes, dim=-1).argmax(dim=-1)
     along = torch.gather(axes, -2, longest[..., None, None].expand(*longest.shape, 1, 2))[..., 0, :]
-    yaw = torch.atan2(along[..., 1], along[..., 0])
+    yaw = atan2(along[..., 1], along[..., 0])
     extent = rotate_xy(-yaw[..., None].expand(*yaw.shape, 3), axes).abs().sum(dim=-2)
     return torch.cat([pos[..., :2], yaw[..., None], extent], dim=-1)
 

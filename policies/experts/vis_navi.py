@@ -19,7 +19,7 @@ from arena_newton.policies.experts.phases import select
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import paced
-from arena_newton.rotations import heading, rotate_xy
+from arena_newton.rotations import atan2, heading, rotate_xy
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.vis_navi import SIGN
 from arena_newton.trackers.motions.commands import MotionCommand
@@ -102,7 +102,7 @@ class VisNaviExpert(Expert):
         grown = torch.cat([boxes[..., :3], boxes[..., 3:] + self._wider[:, None, None]], dim=2)
         paths = plan(pose[:, :2], spot, Floor(grown, *ROOM))
         last = spot - torch.where((paths.length < BLOCKED)[:, None], _before_last(paths.points), pose[:, :2])
-        goal = torch.cat([spot, torch.atan2(last[:, 1], last[:, 0])[:, None]], dim=1)
+        goal = torch.cat([spot, atan2(last[:, 1], last[:, 0])[:, None]], dim=1)
         old = self._route if len(self._route) else paths.points
         self._route = torch.where(mask[:, None, None], paths.points, old)
         self.goal = torch.where(mask[:, None], goal, self.goal)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from arena_newton.rotations import rotate_xy, wrap_angle
+from arena_newton.rotations import atan2, rotate_xy, wrap_angle
 
 __all__ = ["NavigationCommand", "NavigationLimits", "Navigator", "steer"]
 
@@ -96,7 +96,7 @@ def steer(pose: Tensor, aim: Tensor, goal_yaw: Tensor, left: Tensor, limits: Nav
     distance = torch.linalg.vector_norm(offset, dim=1)
     direction = offset / distance.clamp_min(1e-6)[:, None]
     far = ((left - limits.near) / (limits.far - limits.near)).clamp(0.0, 1.0)
-    bearing = torch.atan2(offset[:, 1], offset[:, 0])
+    bearing = atan2(offset[:, 1], offset[:, 0])
     wanted = goal_yaw + far * wrap_angle(bearing - goal_yaw)
     error = wrap_angle(wanted - yaw)
     turn = (limits.heading_gain * error).clamp(-limits.turn, limits.turn)

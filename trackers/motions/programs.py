@@ -12,7 +12,7 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import TICK
-from arena_newton.rotations import heading, rotate_xy
+from arena_newton.rotations import atan2, heading, rotate_xy
 from arena_newton.trackers.motions import primitives as p
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
@@ -445,7 +445,7 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
         best = torch.maximum(best, clear)
     wanted = torch.tensor([plan.height for plan in plans], device=root.device)
     top = torch.minimum(best - SILL_CLEARANCE, wanted)
-    yaw = torch.atan2(ahead[:, 1], ahead[:, 0])
+    yaw = atan2(ahead[:, 1], ahead[:, 0])
     centre = start + ahead * where[:, None]
     return _box(centre, top, yaw, SILL_SIZE), top >= SILL_HEIGHTS[0]
 
@@ -481,7 +481,7 @@ def place_platform(
         where = torch.where(room > best, edge, where)
         best = torch.maximum(best, room)
     centre = start + ahead * (where + 0.5 * PLATFORM_SIZE[0])[:, None]
-    return torch.cat([centre, torch.atan2(ahead[:, 1], ahead[:, 0])[:, None]], dim=1), best
+    return torch.cat([centre, atan2(ahead[:, 1], ahead[:, 0])[:, None]], dim=1), best
 
 
 def _place_platform_box(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from arena_newton import rotations
+from arena_newton.rotations import atan2
 from arena_newton.trackers.train.references import Frame
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ class TickMeasurement:
     def tilt_error(self) -> torch.Tensor:
         """Angle between the two vertical directions as the bodies see them, shape [worlds]."""
         sine = torch.linalg.cross(self.gravity, self.reference_gravity).norm(dim=1)
-        return torch.atan2(sine, (self.gravity * self.reference_gravity).sum(1))
+        return atan2(sine, (self.gravity * self.reference_gravity).sum(1))
 
     @cached_property
     def keys(self) -> torch.Tensor:

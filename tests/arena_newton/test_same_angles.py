@@ -1,0 +1,43 @@
+"""Angles have the same bits for any number of worlds."""
+
+import ast
+from pathlib import Path
+
+import pytest
+import torch
+
+import arena_newton
+from arena_newton import rotations
+from arena_newton.rotations import atan2, heading, wrap_angle
+
+ROWS = (1, 5, 20, 31, 32, 33, 60, 128)
+"""torch computes blocks of 32 angles otherwise than what is left over."""
+PACKAGE = Path(arena_newton.__file__).parent
+
+
+@pytest.mark.parametrize("rows", ROWS)
+def test_an_angle_does_not_depend_on_its_neighbours(rows):
+    """Each of many angles has the bits that it has alone, with a result of its own and in a given tensor."""
+    generator = torch.Generator().manual_seed(rows)
+    y, x = torch.randn(2, rows, generator=generator)
+    quat = torch.nn.functional.normalize(torch.randn(rows, 4, generator=generator), dim=1)
+    for name, found, alone in (
+        ("atan2", atan2(y, x), lambda i: atan2(y[i : i + 1], x[i : i + 1])),
+        ("wrap_angle", wrap_angle(9.0 * y), lambda i: wrap_angle(9.0 * y[i : i + 1])),
+        ("heading", heading(quat), lambda i: heading(quat[i : i + 1])),
+    ):
+        assert torch.equal(found, torch.cat([alone(i) for i in range(rows)])), name
+    out = torch.empty(rows)
+    atan2(y, x, out=out)
+    assert torch.equal(out, atan2(y, x)) and torch.allclose(out, torch.atan2(y, x))
+
+
+def test_nothing_else_computes_it():
+    """No module of the product but `rotations` calls torch.atan2."""
+    found = []
+    for folder in ("", "policies", "trackers", "eval", "usd_scenes"):
+        for path in sorted((PACKAGE / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Attribute) and node.attr == "atan2" and ast.unparse(node.value) == "torch":
+                    found.append(path.name)
+    assert set(found) == {Path(rotations.__file__).name}
