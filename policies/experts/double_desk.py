@@ -236,6 +236,8 @@ class DoubleDeskExpert(Expert):
         self.machine.begin(mask)
         self._elapsed = self._elapsed.masked_fill(mask, 0.0)
         self._rolled = self._rolled.masked_fill(mask, 0.0)
+        self.palms.reset(mask)
+        self.wrists.reset(mask)
         self._face(mask, LOOK_RIGHT)
 
     def phases(self) -> list[str]:

@@ -156,12 +156,15 @@ def test_a_hammer_on_the_floor_ends_the_attempt(expert):
     assert expert.phases() == ["rest", "look"]
 
 
-def test_an_episode_begins_with_the_wrist_at_rest(expert):
-    """The roll that an episode ends with is no part of the next one in its world; other worlds keep theirs."""
+def test_an_episode_begins_as_if_it_were_the_first(expert):
+    """What an episode's hands end with is no part of the next one in its world; other worlds keep theirs."""
     everyone = torch.ones(2, dtype=torch.bool)
     expert.machine.enter("open", everyone)
     for _ in range(5):
         expert.command(everyone, 0.1)
+    expert.palms.correction[:], expert.wrists.correction[:] = 0.1, 0.2
     expert.begin(torch.tensor([True, False]), Style(2))
+    for correction in (expert.palms.correction, expert.wrists.correction):
+        assert (correction[0] == 0.0).all() and (correction[1] > 0.0).all()
     roll = expert.command(everyone, 0.1).arms[:, RIGHT_ROLL]
     assert roll[0] == 0.0 and roll[1] > 0.3
