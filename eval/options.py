@@ -368,7 +368,7 @@ class CertifyOptions:
     """Trackers, with the weights they come with; the first one alone where one is enough."""
     checks: tuple[str, ...] = ()
     """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official swap
-    visible sill; all when none is named."""
+    visible sill statistics; all when none is named."""
     episodes: int | None = None
     """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
     worlds: int = 20
