@@ -17,7 +17,7 @@ from arena_newton.intervals import wilson
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
 
-__all__ = ["CHECKS", "Tally", "mcnemar_power", "tallies"]
+__all__ = ["CHECKS", "EventTally", "mcnemar_power", "tallies"]
 
 COMPARISONS = 10_000
 """Synthetic comparisons of each case."""
@@ -39,7 +39,7 @@ SEED = 20260611
 
 
 @dataclass
-class Tally:
+class EventTally:
     """How often something happened."""
 
     case: str
@@ -82,7 +82,7 @@ def mcnemar_power(difference: float, rate: float, episodes: int = EPISODES) -> f
     return paired_power(episodes, only_last, only_other)
 
 
-def tallies(comparisons: int, episodes: int = EPISODES, seed: int = SEED) -> list[Tally]:
+def tallies(comparisons: int, episodes: int = EPISODES, seed: int = SEED) -> list[EventTally]:
     """Make synthetic comparisons of each case and count.
 
     Three policies of which the last is better by each of `DIFFERENCES` play the same episodes; two of which the second
@@ -106,13 +106,13 @@ class _Case:
     """Tallies of one case by their names, in the order of their first use."""
 
     name: str
-    found: dict[str, Tally] = field(default_factory=dict)
+    found: dict[str, EventTally] = field(default_factory=dict)
 
     def count(self, what: str, kind: str, event: bool, expected: float | None = None) -> None:
-        self.found.setdefault(what, Tally(self.name, what, kind, expected)).count(event)
+        self.found.setdefault(what, EventTally(self.name, what, kind, expected)).count(event)
 
 
-def _paired(rng: np.random.Generator, comparisons: int, episodes: int, difference: float) -> dict[str, Tally]:
+def _paired(rng: np.random.Generator, comparisons: int, episodes: int, difference: float) -> dict[str, EventTally]:
     case = _Case(f"3 policies, same episodes, the last +{100 * difference:.0f} points")
     kind = "power" if difference else "error"
     expected = mcnemar_power(difference, RATES[0], episodes)
@@ -135,7 +135,7 @@ def _paired(rng: np.random.Generator, comparisons: int, episodes: int, differenc
     return case.found
 
 
-def _unpaired(rng: np.random.Generator, comparisons: int, episodes: int, difference: float) -> dict[str, Tally]:
+def _unpaired(rng: np.random.Generator, comparisons: int, episodes: int, difference: float) -> dict[str, EventTally]:
     case = _Case(f"2 policies, different episodes, the last +{100 * difference:.0f} points")
     kind = "power" if difference else "error"
     for contenders in _contenders(rng, comparisons, episodes, (0.0, difference), shared=False):
