@@ -22,10 +22,12 @@ CONDITIONS = ("rules", "engine", "max_steps", "variant", "fast_physics")
 """What must be alike in everything that is compared, unless it is what is compared (`--differ`)."""
 NOTED = ("device", "drive", "labels", "replan", "ensemble", "latency_ticks")
 """What may differ; every value is named."""
+NOT_GIVEN = "not given"
+"""How a condition is shown that a run leaves open."""
 USUAL = {"labels": "v3.1"}
 """What a run had that does not say it."""
-MOST_CONTENDERS = 24
-"""Policies of one comparison: 276 pairs."""
+MOST_CONTENDERS = 12
+"""Policies of one comparison: 66 pairs, whose page is of some megabytes."""
 
 type Stratum = tuple[str, ...]
 
@@ -68,8 +70,8 @@ class _Gathered:
         for run in dict.fromkeys(map(id, (one.run for one in self.episodes))):
             first = next(one for one in self.episodes if id(one.run) == run)
             own: Json = getattr(first.record, name, "") if name in ("rules", "engine") else None
-            value = own or first.run.config.get(name) or USUAL.get(name)  # absent, null and false are alike
-            found.append(shown(value).strip('"'))
+            value = own or first.run.config.get(name) or USUAL.get(name) or None  # absent, null and false are alike
+            found.append(NOT_GIVEN if value is None else shown(value).strip('"'))
         return list(dict.fromkeys(found))
 
 
@@ -124,7 +126,7 @@ def read_contenders(
         played.append(found)
     alike = [(name, gathered[0].values(name)) for name in CONDITIONS]
     shared = [(name.replace("_", " "), values[0]) for name, values in alike if _all_alike(gathered, name)]
-    shared = [(name, value) for name, value in shared if value != "null"]
+    shared = [(name, value) for name, value in shared if value != NOT_GIVEN]
     if not modes:
         shared.append(("mode", gathered[0].episodes[0].record.mode))
     return ContenderSet(tuple(contenders), tuple(played), tuple(map(_facts, gathered)), tuple(shared), tuple(notes))
@@ -193,10 +195,13 @@ def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> 
 
 
 def _conditions(cell: SuiteCell) -> tuple[str, ...]:
-    """What tells cells of one policy of a suite apart, besides task, tracker and mode."""
-    trained = "+".join(cell.trained_on)
+    """What tells cells of one policy of a suite apart, besides task, tracker and mode.
+
+    Checkpoints of one policy, each executed by the tracker of its training, are one contender.
+    """
     return (
-        f"of {trained}" if trained else "",
+        f"of {'+'.join(cell.trained_on)}" if len(cell.trained_on) > 1 else "",
+        "swapped" if cell.matched is False else "",
         cell.labels,
         cell.rules,
         f"{counted(cell.latency, 'tick')} late" if cell.latency else "",

@@ -124,7 +124,10 @@ def stratified_test(strata: Sequence[Counts]) -> float:
     """
     paired = [counts for counts in strata if isinstance(counts, PairedCounts)]
     observed = sum(counts.only_first for counts in paired)
-    weights = _binomials(observed + sum(counts.only_second for counts in paired))
+    discordant = observed + sum(counts.only_second for counts in paired)
+    if len(paired) == len(strata):
+        return mcnemar(observed, discordant - observed)  # the same, without all the terms
+    weights = _binomials(discordant)
     for counts in strata:
         if isinstance(counts, UnpairedCounts):
             successes = counts.first + counts.second
@@ -139,7 +142,7 @@ def stratified_test(strata: Sequence[Counts]) -> float:
     return sum(weight for weight in weights if weight <= weights[observed]) / sum(weights)
 
 
-@functools.lru_cache(maxsize=1 << 10)
+@functools.lru_cache(maxsize=64)
 def _binomials(trials: int) -> tuple[int, ...]:
     row = [1]
     for k in range(trials):
@@ -195,7 +198,8 @@ def letters(number: int, differing: Collection[tuple[int, int]]) -> list[str]:
     """Compact letter display: two of `number` things share a letter exactly if they are no pair that differs.
 
     Things are numbered from 0, best first, so that the best has an `a`. By insertion and absorption: Piepho, H.-P.
-    (2004), An algorithm for a letter-based representation of all-pairwise comparisons, J. Comput. Graph. Stat. 13.
+    (2004), An algorithm for a letter-based representation of all-pairwise comparisons, Journal of Computational and
+    Graphical Statistics 13.
     """
     columns = [frozenset(range(number))]
     for first, second in differing:

@@ -125,21 +125,26 @@ def test_trackers_are_compared_where_each_has_one(tmp_path):
 
 
 def test_a_suite_holds_its_policies(tmp_path):
-    """Each policy of a suite is compared over the tasks that all have; what some lack is named and left out."""
+    """Each policy of a suite is compared over the tasks and trackers that all have; what some lack is left out."""
     cells = [
-        (cell_of(policy, policy, tracker, task), outcomes(won))
+        (cell_of(policy, policy, tracker, task), outcomes(won + 2 * (tracker == "sonic")))
         for policy, won in (("act", 20), ("flow", 40), ("pi05", 41))
         for tracker in ("twist2", "sonic")
         for task in ("football", "boxing")
     ]
     cells += [(cell_of("act", "act", "twist2", "vis_navi"), outcomes(60))]
+    cells += [(cell_of("act", "act", "sonic", task, trained_on=["twist2"]), outcomes(5)) for task in ("football",)]
     suite = write_suite(tmp_path / "suite", cells)
-    found = compared(tmp_path, suite, "--only", "act of twist2", "flow of twist2", "pi05 of twist2")
-    assert [one["name"] for one in found["policies"]] == ["act of twist2", "flow of twist2", "pi05 of twist2"]
-    assert [one["all"]["successes"] for one in found["policies"]] == [40, 80, 82]
+    found = compared(tmp_path, suite, "--only", "act", "flow", "pi05")
+    assert [one["name"] for one in found["policies"]] == ["act", "flow", "pi05"]
+    assert [one["all"]["successes"] for one in found["policies"]] == [84, 164, 168]
     assert [one["all"]["letters"] for one in found["policies"]] == ["b", "a", "a"]
-    assert len(found["pairs"]) == 3 and [task["task"] for task in found["pairs"][0]["tasks"]] == ["football", "boxing"]
+    strata = [["football", "twist2"], ["boxing", "twist2"], ["football", "sonic"], ["boxing", "sonic"]]
+    assert [[task["stratum"] for task in pair["tasks"]] for pair in found["pairs"]] == [strata] * 3
     assert any("Left out, because not all have it: vis_navi" in note for note in found["notes"])
+    found = compared(tmp_path, suite, "--per-tracker", "--only", "act sonic", "act swapped sonic", "act twist2")
+    assert [one["all"]["successes"] for one in found["policies"]] == [20, 22, 5]
+    assert [task["task"] for task in found["pairs"][0]["tasks"]] == ["football"]
 
 
 REFUSED = [
