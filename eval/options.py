@@ -355,7 +355,7 @@ class EngineOptions:
 class CertifyOptions:
     """Prove the benchmark: solvable tasks that need legs, clean axes, agreeing engines, the price of a swapped tracker.
 
-    Every check plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
+    Every check but `statistics` plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
     """
 
     out: str = "results/certify"
