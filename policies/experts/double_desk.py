@@ -4,12 +4,21 @@ What each decision is read from: it looks before it walks. The robot turns towar
 within the head camera's view, and only then chooses where to stand; hammer, crate, desk edges and the sill are in the
 picture whenever they are used, and true positions stand in for what the picture shows. Whether the hammer is in the
 hand is read from its distance to the palm, which the camera sees as well.
+
+A policy without memory learns from these demonstrations. It knows neither phase nor clock, so that nothing may wait for
+what it cannot see (docs/experts.md):
+
+- The hand begins to hover over the hammer while the robot still walks its last steps.
+- While the left hand grasps, and again while it lets go, the free right wrist rolls steadily: time can be seen on it.
+- The robot sidles to the sill and the crate. If it turned towards them and back, the same pictures would lie on the way
+  there and back, with opposite turns to learn from them.
+- It holds the hammer over the crate for 1.2 s (`HOLD`) before it opens the hand, also when it is there at once.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, replace
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -47,16 +56,38 @@ LONGEST = {
     "rest": math.inf,
 }
 """Phases in their usual order and their longest times [s]."""
-WALKS = ("look", "approach", "step in", "turn", "line up", "deliver")
-"""Phases that walk to a goal."""
+WALKING = ("look", "approach", "step in", "hover", "turn")
+"""Phases that walk to a goal, from farther off facing it. `hover` makes the last steps of `step in`: the hand comes
+over the hammer while the robot still moves."""
+SIDLING = ("line up", "deliver", "over")
+"""Phases that walk to a goal without turning towards it. `over` makes the last steps of `deliver`."""
+ENDING = ("hover", "over")
+"""Those of them that make the last steps, and stand once the robot was `THERE`."""
+GRASPING = ("hover", "lower", "close", "lift")
+"""Phases in which the left hand is led along the hammer."""
+ROLLING = (*GRASPING, "over", "open")
+"""Phases in which the right wrist rolls."""
+CARRYING = ("step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over")
+"""Phases with the hammer in the left hand, after the lift."""
 LIMITS = NavigationLimits(forward=0.6, turn=0.9, arrive_position=0.045, arrive_heading=0.06)
 """Coarser stops than the navigator's own: the arm makes up for 5 cm, and each correction costs 2 s."""
-SIDLING = replace(LIMITS, near=3.0, far=4.0)
+SIDE_LIMITS = replace(LIMITS, near=3.0, far=4.0)
+"""The same for a robot that keeps its goal's heading on the whole way: each way to sill and crate is below 3 m."""
 WITHIN = {"approach": (0.10, 0.15), "step in": (0.08, 0.15), "line up": (0.07, 0.08), "deliver": (0.06, 0.10)}
-"""Errors at the end of a walk that do not matter [m, rad]."""
+"""Errors at the end of a walk that do not matter [m, rad]: what comes next takes the last steps with it."""
+THERE = (0.03, 0.10)
+"""Errors with which the last steps end [m, rad]: steps for less move the hand by more than they correct."""
 IN_VIEW = 0.75
 """Bearing within which the head camera shows an object [rad]; half of its horizontal field of view is 0.92."""
-CLOCK, OVER_CLOCK = 0.33, 0.8
+ROLL = 0.33
+"""Speed of the free right wrist's roll while the left hand grasps [rad/s]: 0.13 rad from one look of a policy to the
+next, 0.4 s later, and the joint's whole range in the longest grasp."""
+OVER_ROLL = 0.8
+"""The same over the crate [rad/s]: letting go is shorter."""
+RIGHT_ROLL = int(WRISTS[1, 0])
+"""That joint among the columns of `MotionCommand.arms`."""
+MOST_ROLL = 1.9
+"""Largest angle of that roll [rad]: the joint ends at 1.97."""
 LOOK_RIGHT, LOOK_LEFT = -0.5 * math.pi, 0.5 * math.pi
 """Headings that face the right and the left desk [rad]."""
 
@@ -127,16 +158,20 @@ OVER_HEIGHT = 1.02
 """Height of the hammer's centre of mass above the crate [m]; the rim is at 0.915 m."""
 RIM = 0.93
 """Least height of the centre of mass above the crate [m]."""
-AIM, CLOSE, ENOUGH = (0.18, 0.09), 0.01, (0.24, 0.15)
-"""Half sizes of the rectangle in the crate where the centre of mass is led to, how near to it is enough, and half
-sizes of the larger one in which it is let go when the arm does not reach farther [m]."""
+AIM = (0.18, 0.09)
+"""Half sizes of the rectangle in the crate to which the centre of mass is led [m]."""
+ENOUGH = (0.24, 0.15)
+"""Half sizes of the larger one in which it may be let go [m]: the arm does not always reach as far as `AIM`."""
+HOLD = 1.2
+"""Least time above the crate before the hand opens [s]: the wrist's roll shows how much of it has passed."""
 CLOSER = 0.10
 """Longest step by what the hammer lacks when it did not come over the crate [m]."""
-STILL = 1.2
-"""Time above the crate after which the larger rectangle counts [s]."""
+OVER_LEAN = 0.40
+"""Waist pitch above the crate [rad]."""
+OVER_LEAN_MORE = 0.10
+"""How it grows while the hammer is held there [rad/s], so that the arm comes farther ..."""
 MOST_LEAN = 0.7
-OVER_LEAN, OVER_LEAN_MORE = 0.40, 0.10
-"""Waist pitch above the crate [rad], and how it grows while the hammer is not there yet [rad/s]."""
+"""... to this limit [rad]. The hand opens with the pitch at which it came to rest."""
 
 STYLE = {
     "pace": (0.92, 1.0),
@@ -176,7 +211,7 @@ class DoubleDeskExpert(Expert):
         self.machine = Phases(LONGEST, worlds, device)
         """The phase of each world."""
         self.palms, self.wrists = Palms(sight), Wrists(sight)
-        self.walk, self.sidle = Walk(sight, LIMITS), Walk(sight, SIDLING)
+        self.walk, self.sidle = Walk(sight, LIMITS), Walk(sight, SIDE_LIMITS)
         self._acting: list[str] = []
         self._style = {name: torch.zeros(worlds, device=device) for name in STYLE}
         self._turns_left = torch.zeros(worlds, dtype=torch.bool, device=device)
@@ -186,7 +221,8 @@ class DoubleDeskExpert(Expert):
         self._pairs = torch.arange(3, device=device)
         self._last = torch.zeros(worlds, 3, device=device)
         self._elapsed = torch.zeros(worlds, device=device)
-        self._grasping = torch.zeros(worlds, device=device)
+        self._rolled = torch.zeros(worlds, device=device)
+        """Time for which the right wrist has rolled [s], [worlds]."""
         self._there = torch.zeros(worlds, dtype=torch.bool, device=device)
         self._lean = torch.zeros(worlds, device=device)
 
@@ -199,6 +235,7 @@ class DoubleDeskExpert(Expert):
         self.sidle.begin(mask)
         self.machine.begin(mask)
         self._elapsed = self._elapsed.masked_fill(mask, 0.0)
+        self._rolled = self._rolled.masked_fill(mask, 0.0)
         self._face(mask, LOOK_RIGHT)
 
     def phases(self) -> list[str]:
@@ -208,18 +245,22 @@ class DoubleDeskExpert(Expert):
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """Move on where a phase is over, then act."""
         self._aim(mask & self.machine.at("look", "approach", "step in", "hover"))
-        aside = self.machine.at("line up", "deliver", "over")
-        answer = self.walk.command(mask & ~aside & self.machine.at(*WALKS, "hover"), dt)
+        at = self.machine.at
+        aside = at(*SIDLING)
+        walking = self.walk.command(mask & at(*WALKING), dt)
         sidling = self.sidle.command(mask & aside, dt)
         answer = NavigationCommand(
-            *(select(aside, new, old) for new, old in zip(astuple(sidling), astuple(answer), strict=True))
+            **{
+                field.name: select(aside, getattr(sidling, field.name), getattr(walking, field.name))
+                for field in fields(NavigationCommand)
+            }
         )
         self._onward(mask, answer)
         self._acting = self.machine.names()
         command = self._act(mask, dt, answer)
         self.machine.advance(mask, dt)
         self._elapsed = self._elapsed + dt * mask
-        self._grasping = self._grasping + dt * (mask & self.machine.at("hover", "lower", "close", "lift", "over", "open"))
+        self._rolled = self._rolled + dt * (mask & at(*ROLLING))
         return command
 
     # What it sees.
@@ -275,22 +316,19 @@ class DoubleDeskExpert(Expert):
         return torch.gather(speeds, 1, soon)[:, 0], torch.gather(times, 1, soon)[:, 0]
 
     def _over(self) -> tuple[Tensor, Tensor]:
-        """Where the centre of mass must go above the crate [m], [worlds, 3]; is it there, is it at least inside."""
+        """Where the centre of mass must go above the crate [m], [worlds, 3]; whether it may be let go, [worlds]."""
         mass, middle = self._mass(), self._middle()
         yaw = heading(self.sight.body(self._crate)[1])
         local = rotate_xy(-yaw, mass[:, :2] - middle[:, :2])
         aim, enough = (torch.tensor(half, device=mass.device) for half in (AIM, ENOUGH))
         goal = middle[:, :2] + rotate_xy(yaw, torch.minimum(torch.maximum(local, -aim), aim))
-        high = mass[:, 2] > RIM
-        deep, inside = ((local.abs() < half).all(dim=1) & high for half in (aim + CLOSE, enough))
         over = torch.cat([goal, torch.full_like(goal[:, :1], OVER_HEIGHT)], dim=1)
-        return over, torch.stack([deep, inside], dim=1)
+        return over, (local.abs() < enough).all(dim=1) & (mass[:, 2] > RIM)
 
     # What comes next.
 
     def _face(self, mask: Tensor, yaw: float) -> None:
-        pose = self.sight.pose
-        self._go(mask, pose[:, :2], yaw)
+        self._go(mask, self.sight.pose[:, :2], yaw)
 
     def _go(self, mask: Tensor, xy: Tensor, yaw: float) -> None:
         goal = torch.cat([xy, torch.full_like(xy[:, :1], yaw)], dim=1)
@@ -299,13 +337,9 @@ class DoubleDeskExpert(Expert):
 
     def _onward(self, mask: Tensor, answer: NavigationCommand) -> None:
         """Enter the next phase where one is over."""
-        there = answer.arrived | ((answer.distance < 0.03) & (answer.heading_error.abs() < 0.10))
-        self._there = (self._there | mask & there) & self.machine.at("hover", "over")
         machine, pose, held = self.machine, self.sight.pose, self._held()
-        arrived = {
-            name: answer.arrived | ((answer.distance < near) & (answer.heading_error.abs() < straight))
-            for name, (near, straight) in WITHIN.items()
-        }
+        arrived = {name: _arrived(answer, within) for name, within in WITHIN.items()}
+        self._there = (self._there | (mask & _arrived(answer, THERE))) & machine.at(*ENDING)
         back = torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1)
         wanted, over_crate = self._over()
         over = arrived | {
@@ -314,7 +348,7 @@ class DoubleDeskExpert(Expert):
             "step back": back > STEP_BACK[0],
             "turn": self._in_view(self._middle()),
             "sill": self._past_sill(),
-            "over": over_crate[:, 1] & (machine.clock > STILL),
+            "over": over_crate & (machine.clock > HOLD),
         }
         pace, time = self._pace()
         over["pace"] = time < COMMITTED
@@ -322,12 +356,12 @@ class DoubleDeskExpert(Expert):
         late = machine.late
         done = {name: mask & machine.at(name) & (late | over.get(name, torch.zeros_like(late))) for name in LONGEST}
         # A hammer that fell onto the desk is grasped again; one on the floor is out of reach.
-        lost = mask & machine.at("step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over") & ~held
+        lost = mask & machine.at(*CARRYING) & ~held
         on_desk = self._origin()[:, 2] > BENCH_HEIGHT
         missed = done["lift"] & ~held
         self._aim(missed)
         again = lost & on_desk & (pose[:, 1] < self._sill)
-        short = done["over"] & ~over_crate[:, 1]
+        short = done["over"] & ~over_crate
 
         stand, _ = self._stand()
         ready = stand + torch.stack([torch.zeros_like(stand[:, 0]), self._style["ready"]], dim=1)
@@ -356,7 +390,7 @@ class DoubleDeskExpert(Expert):
         closer = torch.stack([closer[:, 0], closer[:, 1].clamp_max(self._left_edge - NEAR_EDGE)], dim=1)
         self._go(short, closer, LOOK_LEFT)
         restart = done["step in"] | done["lift"]
-        self._grasping = self._grasping.masked_fill(restart | again | done["deliver"], 0.0)
+        self._rolled = self._rolled.masked_fill(restart | again | done["deliver"], 0.0)
         self.palms.reset(restart)
         self.wrists.reset(restart)
 
@@ -367,7 +401,7 @@ class DoubleDeskExpert(Expert):
         at, clock = self.machine.at, self.machine.clock
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         command.velocity = self._velocity(answer.velocity)
-        working = at("hover", "lower", "close", "lift")
+        working = at(*GRASPING)
         raised = ~at("look") & (~at("approach") | (answer.distance < RAISE))
 
         _, short = self._stand()
@@ -386,17 +420,17 @@ class DoubleDeskExpert(Expert):
 
         command.reach = raised[:, None].expand(-1, 2).to(command.reach.dtype)
         self._lead_hands(command, mask, dt, raised)
-        command.arms[:, WRISTS[1][0]] = (torch.where(at("over", "open"), OVER_CLOCK, CLOCK) * self._grasping).clamp_max(1.9)
-        command.hands[:, 0] = at(
-            "close", "lift", "step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over"
-        ).float()
+        roll = torch.where(at("over", "open"), OVER_ROLL, ROLL)
+        command.arms[:, RIGHT_ROLL] = (roll * self._rolled).clamp_max(MOST_ROLL)
+        command.hands[:, 0] = at("close", "lift", *CARRYING).float()
         return command
 
     def _velocity(self, walking: Tensor) -> Tensor:
         """vx, vy [m/s] and yaw rate [rad/s] in every phase, [worlds, 3]."""
         at, pose = self.machine.at, self.sight.pose
         pace = torch.where(at("approach", "line up"), self._style["pace"], 1.0)
-        velocity = walking * pace[:, None] * (at(*WALKS) | at("hover", "over") & ~self._there)[:, None]
+        walks = at(*WALKING, *SIDLING) & ~(at(*ENDING) & self._there)
+        velocity = walking * pace[:, None] * walks[:, None]
         # A half turn may go either way.
         spin = torch.where(self._turns_left, 1.0, -1.0) * velocity[:, 2].abs()
         far = at("turn") & (wrap_angle(LOOK_LEFT - pose[:, 2]).abs() > 0.6 * math.pi)
@@ -413,7 +447,7 @@ class DoubleDeskExpert(Expert):
     def _lead_hands(self, command: MotionCommand, mask: Tensor, dt: float, raised: Tensor) -> None:
         """Fill in hand points and the left wrist."""
         at, clock, yaw = self.machine.at, self.machine.clock, self.sight.pose[:, 2]
-        working = at("hover", "lower", "close", "lift")
+        working = at(*GRASPING)
         heading_of_hand = torch.where(working, self._hand_yaw, yaw)
         hand = quat_multiply(quat_from_yaw(heading_of_hand), self._grasp_quat.expand(len(yaw), 4))
         above = torch.where(at("hover"), HOVER, 0.0) + torch.where(
@@ -436,9 +470,7 @@ class DoubleDeskExpert(Expert):
         self._last = select(mask, left, self._last)
         both = torch.stack([left, posture[3].expand_as(left)], dim=1)
 
-        learn = mask & at(
-            "hover", "lower", "step back", "turn", "line up", "back off", "pace", "sill", "deliver", "over"
-        )
+        learn = mask & at("hover", "lower", *CARRYING)
         wanted = self._root()[:, None] + turn(yaw[:, None], both)
         command.hand_point = self.palms.lead(wanted, torch.stack([learn, torch.zeros_like(learn)], dim=1), dt)
         twist = mask & at("hover", "lower")
@@ -454,3 +486,9 @@ class DoubleDeskExpert(Expert):
 
     def _root(self) -> Tensor:
         return self.sight.root_position
+
+
+def _arrived(answer: NavigationCommand, within: tuple[float, float]) -> Tensor:
+    """Worlds that hold at their goal, or are off it by less than these errors [m, rad]; bool, [worlds]."""
+    near, straight = within
+    return answer.arrived | ((answer.distance < near) & (answer.heading_error.abs() < straight))

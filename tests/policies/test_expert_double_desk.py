@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from arena_newton import policies, seeding, trackers
+from arena_newton.canonical import ACTION
 from arena_newton.env import ArenaEnv
-from arena_newton.policies.experts.base import Sight
-from arena_newton.policies.experts.double_desk import LONGEST, SILL_STEP, DoubleDeskExpert
+from arena_newton.policies.experts.base import DECISION, Sight
+from arena_newton.policies.experts.double_desk import LONGEST, MOST_ROLL, RIGHT_ROLL, SILL_STEP, DoubleDeskExpert
 from arena_newton.policies.experts.style import Style
+from arena_newton.robot import CANONICAL_JOINTS
 from arena_newton.rollout import Rollout
 
 SEED, EPISODES = 904, (0, 1)
@@ -57,8 +59,9 @@ class Actions:
         del self._seed[world]
 
 
-def test_two_episodes_end_in_the_crate(env):
-    """The hammer is carried into the crate within the budget, phase by phase, and the sill is not stood on."""
+@pytest.fixture(scope="module")
+def played(env):
+    """Both episodes from beginning to end: results, actions by seed, and ticks in which the sill was touched."""
     sill = env.scene.geom_ids("/World/Sill")[0]
     touched = np.zeros(env.worlds, dtype=int)
 
@@ -67,11 +70,33 @@ def test_two_episodes_end_in_the_crate(env):
             pairs = data.contact.geom[data.contact.dist < 0.0]
             touched[world] += bool((pairs == sill).any())
 
-    results = Rollout(env, policies.get("expert"), episodes(env), on_tick=count).run()
+    actions = Actions()
+    results = Rollout(env, policies.get("expert"), episodes(env), recorder=[actions], on_tick=count).run()
+    return results, actions.of, touched
+
+
+def test_two_episodes_end_in_the_crate(played):
+    """The hammer is carried into the crate within the budget, phase by phase, and the sill is not stood on."""
+    results, _, touched = played
     assert [r.outcome for r in results] == ["success", "success"]
     for result in results:
         assert [name for name, _ in result.phases if name != "look"] == ORDER
     assert (touched < 25).all(), "a foot that lands on the sill bears on it for half a second"
+
+
+def test_the_free_wrist_shows_the_time_of_a_grasp(env, played):
+    """From hover to lift the right wrist rolls on with every decision, to its end; before that it rests."""
+    results, actions, _ = played
+    column = ACTION["joint_pos"].start + CANONICAL_JOINTS.index("right_wrist_roll_joint")
+    for episode, result in zip(episodes(env), results, strict=True):
+        roll = np.array(actions[episode.episode_seed])[:, column]
+        begins = {name: tick + len(roll) - result.steps for name, tick in result.phases}
+        assert (roll[: begins["hover"]] == 0.0).all()
+        grasp = roll[begins["hover"] : begins["step back"]]
+        assert (np.diff(grasp) >= 0.0).all() and grasp.max() <= MOST_ROLL
+        decided = grasp[DECISION::DECISION]
+        assert (np.diff(decided)[decided[1:] < MOST_ROLL - 0.02] > 0.03).all()
+        assert decided[-1] > 1.5, "the roll goes on until the hammer is lifted"
 
 
 def test_worlds_are_independent(env):
@@ -129,3 +154,14 @@ def test_a_hammer_on_the_floor_ends_the_attempt(expert):
     expert.machine.enter("turn", everyone)
     expert.command(everyone, 0.1)
     assert expert.phases() == ["rest", "look"]
+
+
+def test_an_episode_begins_with_the_wrist_at_rest(expert):
+    """The roll that an episode ends with is no part of the next one in its world; other worlds keep theirs."""
+    everyone = torch.ones(2, dtype=torch.bool)
+    expert.machine.enter("open", everyone)
+    for _ in range(5):
+        expert.command(everyone, 0.1)
+    expert.begin(torch.tensor([True, False]), Style(2))
+    roll = expert.command(everyone, 0.1).arms[:, RIGHT_ROLL]
+    assert roll[0] == 0.0 and roll[1] > 0.3
