@@ -93,7 +93,7 @@ def read_contenders(
         per_tracker: Whether each tracker of a folder makes a contender of its own.
 
     Raises:
-        InputError: A folder holds neither, no episode, recordings for training, or is damaged; a name is unknown; or
+        InputError: A folder holds neither, recordings for training, or is unfinished or damaged; a name is unknown; or
             conditions differ.
     """
     for name in differ:
@@ -106,7 +106,7 @@ def read_contenders(
         if (folder / SUITE_FILE).is_file():
             gathered += _of_suite(folder, title if len(folders) > 1 else "", per_tracker, notes)
         else:
-            gathered += _of_run(folder, title, per_tracker, notes)
+            gathered += _of_run(folder, title, per_tracker)
     gathered = _chosen(gathered, only)
     _check_alike(gathered, differ)
     notes += _notes(gathered, differ)
@@ -147,19 +147,18 @@ def _check_evaluation(run: RunRecord) -> None:
         raise InputError(f"{run.folder}: holds recordings for training; what is compared are evaluations")
 
 
-def _missing(run: RunRecord) -> list[str]:
-    planned = run.document["planned"]
-    if len(run.records) == planned or run.config.get("keep") is not None:
-        return []
-    return [f"{run.folder} is incomplete: {len(run.records)} of {planned} episodes."]
-
-
-def _of_run(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> list[_Gathered]:
+def _of_run(folder: Path, title: str, per_tracker: bool) -> list[_Gathered]:
     run = load_run(folder)
     _check_evaluation(run)
-    notes += _missing(run)
-    if not run.records:
+    played, planned = len(run.records), run.document["planned"]
+    if not played:
         raise InputError(f"{folder}: holds no finished episode")
+    if played < planned:
+        # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
+        raise InputError(
+            f"{folder}: is unfinished ({played} of {planned} episodes), and what ends first is no fair sample; "
+            f"finish it by eval resume {folder}"
+        )
     found: dict[tuple[str, str], _Gathered] = {}
     policies = {record.policy for record in run.records}
     for record in run.records:
@@ -180,7 +179,11 @@ def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> 
             waiting += 1
             continue
         _check_evaluation(run)
-        notes += _missing(run)
+        if len(run.records) < run.document["planned"]:
+            notes.append(
+                f"{run.folder} is unfinished, and left out: {len(run.records)} of {run.document['planned']} episodes."
+            )
+            continue
         alike = [words[other.id] for other in suite.cells if other.policy == cell.policy]
         said = [word for position, word in enumerate(words[cell.id]) if len({one[position] for one in alike}) > 1]
         name = " ".join(filter(None, [title, cell.policy, *said, cell.tracker if per_tracker else ""]))
@@ -190,7 +193,7 @@ def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> 
     if waiting:
         notes.append(f"{folder}: {counted(waiting, 'cell')} of {len(suite.cells)} not played yet.")
     if not found:
-        raise InputError(f"{folder}: no cell of the suite has a finished episode")
+        raise InputError(f"{folder}: no cell of the suite is finished")
     return list(found.values())
 
 

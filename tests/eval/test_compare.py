@@ -134,6 +134,7 @@ def test_a_suite_holds_its_policies(tmp_path):
     ]
     cells += [(cell_of("act", "act", "twist2", "vis_navi"), outcomes(60))]
     cells += [(cell_of("act", "act", "sonic", task, trained_on=["twist2"]), outcomes(5)) for task in ("football",)]
+    cells += [(cell_of(policy, policy, "sonic", "vis_navi"), outcomes(9)[:30]) for policy in ("act", "flow", "pi05")]
     suite = write_suite(tmp_path / "suite", cells)
     found = compared(tmp_path, suite, "--only", "act", "flow", "pi05")
     assert [one["name"] for one in found["policies"]] == ["act", "flow", "pi05"]
@@ -142,6 +143,7 @@ def test_a_suite_holds_its_policies(tmp_path):
     strata = [["football", "twist2"], ["boxing", "twist2"], ["football", "sonic"], ["boxing", "sonic"]]
     assert [[task["stratum"] for task in pair["tasks"]] for pair in found["pairs"]] == [strata] * 3
     assert any("Left out, because not all have it: vis_navi" in note for note in found["notes"])
+    assert sum("is unfinished, and left out: 30 of 60" in note for note in found["notes"]) == 3
     found = compared(tmp_path, suite, "--per-tracker", "--only", "act sonic", "act swapped sonic", "act twist2")
     assert [one["all"]["successes"] for one in found["policies"]] == [20, 22, 5]
     assert [task["task"] for task in found["pairs"][0]["tasks"]] == ["football"]
@@ -160,6 +162,7 @@ REFUSED = [
     (["a", "capped"], "--max-steps differs"),
     (["a", "recorded"], "holds recordings for training"),
     (["a", "empty"], "holds no finished episode"),
+    (["a", "half"], "half: is unfinished (30 of 60 episodes)"),
     (["a", "b", "--only", "c"], "--only c: unknown, found are a, b"),
     (["a", "b", "--differ", "policy"], "--differ policy: choose from rules engine"),
     (["a", "b", "--out", ""], "--out: is empty"),
@@ -179,6 +182,7 @@ def folders(tmp_path_factory):
     run_in(root / "warp", (4, 5, 8), engine="warp")
     run_in(root / "capped", (4, 5, 7), max_steps=1300)
     folder_with(root / "recorded", [], 60, tracker=["t"], engine="mujoco", seed_range="demonstration")
+    folder_with(root / "half", episodes("football", (4, 5))[:30], 60, tracker=["t"], engine="mujoco")
     folder_with(root / "empty", [], 60, tracker=["t"], engine="mujoco")
     return root
 
