@@ -6,6 +6,7 @@ import json
 import signal
 import sys
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,6 +40,7 @@ OVERVIEW = f"""commands:
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
   {PROG} tables <out> [<out>...] the paper's tables from suites and runs, next to the paper's numbers
+  {PROG} compare <out> <out>...  compare policies by their episodes: tests, intervals, who won which
   {PROG} tsne [flags]            map what one policy answers to the observations of two datasets
   {PROG} pack <checkpoint> [flags] make a trained policy the one that ships: half precision, a card, 32 MB
   {PROG} list [flags] [--json]   show the plan, run nothing
@@ -182,6 +184,7 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
         print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
     options = parse_flags(RunOptions, [a for a in arguments if a != "--json"], f"{PROG} list")
     from arena_newton.eval.config import resolve
+    from arena_newton.eval.detectable import detectable_text
     from arena_newton.eval.progress import simulated
     from arena_newton.text import counted
 
@@ -193,6 +196,8 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
         print("[\n" + ",\n".join(rows) + "\n]")
         return 0
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
+    cells = Counter((episode.task, episode.tracker, episode.mode) for episode in episodes)
+    print(detectable_text(list(cells.values())))
     for episode in episodes:
         print(
             f"{episode.index:>5} {episode.task:<12} {episode.tracker:<8} {episode.mode:<10} seed {episode.group_seed} "
@@ -264,6 +269,18 @@ def _tables(arguments: list[str], factories: Factories | None) -> int:
     return tables_command.run(folders, options)
 
 
+def _compare(arguments: list[str], factories: Factories | None) -> int:
+    from arena_newton.eval.table_options import CompareOptions
+
+    if _wants_help(arguments):
+        parse_flags(CompareOptions, ["--help"], f"{PROG} compare <out> [<out> ...]")
+    folders = _folders(arguments, "compare")
+    options = parse_flags(CompareOptions, arguments, f"{PROG} compare")
+    from arena_newton.eval import compare_command
+
+    return compare_command.run(folders, options)
+
+
 def _tsne(arguments: list[str], factories: Factories | None) -> int:
     from arena_newton.eval.table_options import TsneOptions
 
@@ -297,6 +314,7 @@ _COMMANDS = {
     "film": _film,
     "loop": _loop,
     "tables": _tables,
+    "compare": _compare,
     "tsne": _tsne,
     "pack": _pack,
     "matrix": _matrix,

@@ -15,7 +15,17 @@ from arena_newton import trackers
 from arena_newton.devices import resolve_engine
 from arena_newton.doctor import versions
 from arena_newton.errors import InputError
-from arena_newton.eval.certification import agreement, axes, certificate, legs, sill, solvable, swap, visible
+from arena_newton.eval.certification import (
+    agreement,
+    axes,
+    certificate,
+    error_rates,
+    legs,
+    sill,
+    solvable,
+    swap,
+    visible,
+)
 from arena_newton.eval.certification.bodies import BODIES, Body
 from arena_newton.eval.certification.context import Context, with_expert
 from arena_newton.eval.certification.finding import Check, CheckFinding
@@ -38,6 +48,7 @@ CHECKS: tuple[Check, ...] = (
     *swap.CHECKS,
     *visible.CHECKS,
     *sill.CHECKS,
+    *error_rates.CHECKS,
 )
 """All checks, in the order in which they run."""
 

@@ -355,7 +355,7 @@ class EngineOptions:
 class CertifyOptions:
     """Prove the benchmark: solvable tasks that need legs, clean axes, agreeing engines, the price of a swapped tracker.
 
-    Every check plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
+    Every check but `statistics` plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
     """
 
     out: str = "results/certify"
@@ -368,7 +368,7 @@ class CertifyOptions:
     """Trackers, with the weights they come with; the first one alone where one is enough."""
     checks: tuple[str, ...] = ()
     """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official swap
-    visible sill; all when none is named."""
+    visible sill statistics; all when none is named."""
     episodes: int | None = None
     """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
     worlds: int = 20

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["FORMATS", "TablesOptions", "TsneOptions"]
+__all__ = ["FORMATS", "CompareOptions", "TablesOptions", "TsneOptions"]
 
 FORMATS = ("md", "tex", "csv", "png")
 """Forms in which tables are written."""
@@ -22,6 +22,24 @@ class TablesOptions:
     """Rule set whose episodes count: paper or released."""
     findings: bool = False
     """Also test the paper's claims on these episodes: print them and write findings.md."""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Compare policies over the episodes that they share: exact tests, intervals, letters, and who won which episode.
+
+    Results folders are one policy each; a suite has all of its own. Episodes are paired by task, tracker, mode and
+    episode seed; runs of other seeds are compared unpaired. Where each has one tracker, trackers may differ.
+    """
+
+    out: str = "comparison"
+    """Folder to write: compare.html, compare.md, compare.json and compare.csv."""
+    only: tuple[str, ...] = ()
+    """Names of those to compare, as the command prints them; all when none is named."""
+    differ: tuple[str, ...] = ()
+    """What may differ between them, because it is what is compared: rules engine max_steps variant fast_physics."""
+    per_tracker: bool = False
+    """Each tracker of a folder is compared as one of its own, and against the others."""
 
 
 @dataclass(frozen=True)

@@ -233,7 +233,7 @@ def test_list_runs_nothing(tmp_path, monkeypatch, capsys):
     assert all(set(keys) <= set(row) for row in rows)
     assert rows[0]["episode_seed"] == 1132158683 and rows[0]["object_seed"] == 11400714786159236188
     assert main([flag for flag in flags if flag != "--json"], factories()) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 13
+    assert len(capsys.readouterr().out.splitlines()) == 14  # two lines of the plan as a whole
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,0 +1,57 @@
+"""`python -m arena_newton.eval compare`: policies against each other by their episodes, written as files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.eval.comparison import Comparison, compare
+from arena_newton.eval.comparison_page import comparison_page
+from arena_newton.eval.comparison_text import as_csv, as_json, as_markdown, rate_text, remarks, verdict
+from arena_newton.eval.contenders import read_contenders
+from arena_newton.eval.journal import StorageError, write_atomic
+from arena_newton.eval.table_options import CompareOptions
+from arena_newton.eval.wording import plain
+
+__all__ = ["run"]
+
+
+def run(folders: Sequence[Path], options: CompareOptions) -> int:
+    """Compare, print rates and verdicts, and write compare.html, compare.md, compare.json and compare.csv.
+
+    Raises:
+        InputError: A folder is unfit, a flag, or the runs cannot be compared.
+        StorageError: A file cannot be written.
+    """
+    if not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
+    out = Path(options.out).expanduser()
+    contenders = read_contenders(folders, differ=options.differ, only=options.only, per_tracker=options.per_tracker)
+    comparison = compare(contenders.contenders)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
+    write_atomic(out / "compare.html", comparison_page(out, comparison, contenders))
+    write_atomic(out / "compare.md", as_markdown(comparison, contenders))
+    write_atomic(out / "compare.json", json.dumps(as_json(comparison, contenders), indent=2) + "\n")
+    write_atomic(out / "compare.csv", as_csv(comparison))
+    for line in _said(comparison):
+        print(plain(line))
+    for note in remarks(comparison, contenders):
+        print(note)
+    print(f"comparison: {out / 'compare.html'}")
+    return 0
+
+
+def _said(comparison: Comparison) -> list[str]:
+    """Rates with letters, best first, and a sentence per pair."""
+    width = max(map(len, comparison.names))
+    ranked = sorted(zip(comparison.names, comparison.overall, strict=True), key=lambda row: -row[1].rate)
+    lines = []
+    for name, standing in ranked:
+        count, rate, interval = rate_text(standing)
+        lines.append(f"{name:<{width}}  {count:>9}  {rate:>5} % ({interval})  {standing.letters}")
+    return lines + [f"{verdict(comparison, pair)} (p {pair.p_holm:.2g})" for pair in comparison.pairs]

@@ -1,0 +1,214 @@
+"""Tests of rates against SciPy, against enumeration, and against their own promises on synthetic episodes."""
+
+import itertools
+import math
+import random
+
+import pytest
+from scipy.stats import binomtest, fisher_exact, hypergeom
+
+from arena_newton.eval.certification import error_rates
+from arena_newton.eval.comparison import Contender, compare
+from arena_newton.eval.comparison_page import beta_density
+from arena_newton.eval.detectable import POWER, STEP, detectable_difference, detectable_text, paired_power
+from arena_newton.eval.rate_tests import (
+    LARGEST_BOSCHLOO,
+    PairedCounts,
+    UnpairedCounts,
+    letters,
+    mean_difference,
+    rate_test,
+    stratified_test,
+)
+from arena_newton.eval.stats import contrast, mcnemar
+
+
+def test_paired_test_is_the_binomial_test():
+    """Within a task the p of paired episodes is SciPy's binomial test of the discordant ones."""
+    for only_first, only_second in itertools.product(range(0, 14, 2), range(13)):
+        found = rate_test(PairedCounts(7, only_first, only_second, 3))
+        expected = binomtest(only_first, only_first + only_second).pvalue if only_first + only_second else 1.0
+        assert (found.name, found.p) == ("McNemar", pytest.approx(expected, rel=1e-9))
+
+
+def test_unpaired_test_is_the_largest_over_the_common_rate():
+    """Boschloo's p is the probability of tables that Fisher's test finds no likelier, at the worst common rate."""
+    for first, n, second, m in ((7, 12, 2, 12), (1, 6, 5, 8), (0, 9, 4, 7), (10, 10, 6, 9)):
+        found = rate_test(UnpairedCounts(first, n, second, m))
+        sides = []
+        for side in ("less", "greater"):
+
+            def fisher(a, b, n=n, m=m, side=side):
+                law = hypergeom(n + m, a + b, n)
+                return law.cdf(a) if side == "less" else law.sf(a - 1)
+
+            observed = fisher(first, second)
+            extreme = [(a, b) for a in range(n + 1) for b in range(m + 1) if fisher(a, b) <= observed * (1 + 1e-9)]
+            sides.append(
+                max(
+                    sum(
+                        math.comb(n, a) * math.comb(m, b) * rate ** (a + b) * (1 - rate) ** (n + m - a - b)
+                        for a, b in extreme
+                    )
+                    for rate in (k / 400 for k in range(401))
+                )
+            )
+        assert found.name == "Boschloo"
+        assert found.p == pytest.approx(min(1.0, 2 * min(sides)), rel=2e-3)
+    assert rate_test(UnpairedCounts(0, 5, 0, 7)).p == rate_test(UnpairedCounts(5, 5, 7, 7)).p == 1.0
+
+
+def test_large_numbers_are_fishers():
+    """Beyond the size that Boschloo's test takes, the test and its name are Fisher's."""
+    n = math.isqrt(LARGEST_BOSCHLOO) + 1
+    found = rate_test(UnpairedCounts(120, n, 150, n))
+    assert (found.name, found.p) == ("Fisher", pytest.approx(fisher_exact([[120, n - 120], [150, n - 150]]).pvalue))
+    assert rate_test(UnpairedCounts(5, n - 1, 9, 60)).name == "Boschloo"
+
+
+def enumerated(strata):
+    """Probability of the stratified test by listing every outcome of every stratum."""
+    laws = []
+    for counts in strata:
+        if isinstance(counts, PairedCounts):
+            trials = counts.only_first + counts.only_second
+            coins = [sum(c) for c in itertools.product((0, 1), repeat=trials)]
+            law = {k: coins.count(k) / 2**trials for k in set(coins)}
+        else:
+            both, n = counts.first + counts.second, counts.first_episodes
+            chosen = [
+                sum(c < both for c in some) for some in itertools.combinations(range(n + counts.second_episodes), n)
+            ]
+            law = {k: chosen.count(k) / len(chosen) for k in set(chosen)}
+        laws.append(law)
+    total = {}
+    for combination in itertools.product(*laws):
+        weight = math.prod(law[k] for law, k in zip(laws, combination, strict=True))
+        total[sum(combination)] = total.get(sum(combination), 0.0) + weight
+    observed = sum(c.only_first if isinstance(c, PairedCounts) else c.first for c in strata)
+    return sum(weight for weight in total.values() if weight <= total[observed] * (1 + 1e-9))
+
+
+def test_stratified_test_is_the_enumeration():
+    """Over tasks p is what listing all outcomes gives: paired, unpaired and mixed strata."""
+    rng = random.Random(4)
+    for _ in range(40):
+        strata = []
+        for _ in range(rng.randint(1, 3)):
+            if rng.random() < 0.5:
+                strata.append(PairedCounts(rng.randint(0, 5), rng.randint(0, 4), rng.randint(0, 4), 1))
+            else:
+                n, m = rng.randint(1, 5), rng.randint(1, 5)
+                strata.append(UnpairedCounts(rng.randint(0, n), n, rng.randint(0, m), m))
+        assert stratified_test(strata) == pytest.approx(enumerated(strata), rel=1e-9)
+    assert stratified_test([]) == 1.0
+
+
+def test_stratified_test_of_one_kind():
+    """One unpaired stratum is Fisher's test; paired ones are McNemar's test of all their episodes."""
+    for table in ([[8, 2], [1, 5]], [[30, 30], [22, 38]], [[0, 9], [3, 4]]):
+        (a, b), (c, d) = table
+        p = stratified_test([UnpairedCounts(a, a + b, c, c + d)])
+        assert p == pytest.approx(fisher_exact(table).pvalue, rel=1e-9)
+    strata = [PairedCounts(3, 9, 2, 1), PairedCounts(0, 4, 4, 0), PairedCounts(9, 1, 0, 7)]
+    assert stratified_test(strata) == pytest.approx(mcnemar(14, 6))
+
+
+def test_letters_say_exactly_what_differs():
+    """For every set of differing pairs of up to five, two share a letter exactly if they do not differ."""
+    for number in (2, 3, 4, 5):
+        pairs = list(itertools.combinations(range(number), 2))
+        for chosen in itertools.product((False, True), repeat=len(pairs)):
+            differing = [pair for pair, taken in zip(pairs, chosen, strict=True) if taken]
+            signs = letters(number, differing)
+            for pair in pairs:
+                assert bool(set(signs[pair[0]]) & set(signs[pair[1]])) == (pair not in differing), (differing, signs)
+            assert signs[0].startswith("a")
+    # The example of Piepho (2004), section 2, has the form: first two against the last two, the middle with both.
+    assert letters(3, [(0, 2)]) == ["a", "ab", "b"]
+
+
+def test_the_difference_is_the_contrast_of_the_tables():
+    """The paired interval is that of `stats.contrast`, and both kinds shrink as episodes grow."""
+    rng = random.Random(8)
+    strata, counts = [], []
+    for _ in range(3):
+        first, second = ({n: rng.random() < rate for n in range(30)} for rate in (0.7, 0.5))
+        strata.append([(1 / 3, first), (-1 / 3, second)])
+        cells = [sum((first[n], second[n]) == ends for n in range(30)) for ends in itertools.product((1, 0), repeat=2)]
+        counts.append(PairedCounts(*cells))
+    found, expected = mean_difference(counts), contrast(strata)
+    assert (found.value, found.low, found.high) == pytest.approx((expected.value, expected.low, expected.high))
+    few, many = (mean_difference([UnpairedCounts(6 * k, 10 * k, 3 * k, 10 * k)]) for k in (1, 50))
+    assert few.value == many.value == pytest.approx(0.3)
+    assert few.low < 0 < many.low and many.high - many.low < 0.2 * (few.high - few.low)
+    # Agresti and Caffo: p1' = 7/12, p2' = 4/12.
+    half = 1.959963984540054 * math.sqrt((7 / 12 * 5 / 12 + 4 / 12 * 8 / 12) / 12)
+    assert few.high - few.low == pytest.approx(2 * half)
+    assert mean_difference([]) is None
+
+
+def test_posterior_is_a_density():
+    """The violin's density integrates to 1 and has its mean at (s + 1)/(n + 2)."""
+    for successes, episodes in ((0, 5), (3, 20), (20, 20), (41, 60)):
+        grid = [(k + 0.5) / 20_000 for k in range(20_000)]
+        values = [beta_density(successes, episodes, rate) for rate in grid]
+        assert sum(values) / 20_000 == pytest.approx(1.0, abs=1e-4)
+        mean = sum(v * r for v, r in zip(values, grid, strict=True)) / 20_000
+        assert mean == pytest.approx((successes + 1) / (episodes + 2), abs=1e-4)
+    assert beta_density(0, 5, 0.0) == 6.0 and beta_density(5, 5, 1.0) == 6.0 and beta_density(2, 5, 1.0) == 0.0
+
+
+def test_the_power_is_the_enumeration():
+    """McNemar's power is the sum over all outcomes of the pairs; the difference found is the smallest that has it."""
+    n, first, second = 14, 0.4, 0.1
+    total = 0.0
+    for a in range(n + 1):
+        for b in range(n + 1 - a):
+            ways = math.comb(n, a) * math.comb(n - a, b)
+            total += ways * first**a * second**b * (1 - first - second) ** (n - a - b) * (mcnemar(a, b) <= 0.05)
+    assert paired_power(n, first, second) == pytest.approx(total, rel=1e-9)
+    gain = detectable_difference(60)
+    assert paired_power(60, (0.5 + gain) / 2, (0.5 - gain) / 2) >= POWER
+    assert paired_power(60, (0.5 + gain - STEP) / 2, (0.5 - gain + STEP) / 2) < POWER
+    assert detectable_difference(5, nested=True) is None  # five coins alone never reach 5 %
+    assert detectable_difference(60, nested=True) < gain
+    text = detectable_text([60] * 7)
+    assert f"60 episodes of a cell 13 to {100 * gain:g} points" in text and "all 420" in text
+    assert "3 episodes of a cell at no difference" in detectable_text([3]) and detectable_text([]) == ""
+
+
+def test_comparisons_keep_their_level_and_find_what_is_there():
+    """On 150 synthetic comparisons of each case no test errs more than its level allows, and power is as computed."""
+    found = error_rates.tallies(150, episodes=20)
+    assert [tally for tally in found if not tally.holds] == []
+    by_name = {(tally.case, tally.what): tally for tally in found}
+    none, much = (
+        by_name[f"3 policies, same episodes, the last +{points} points", "Cochran-Mantel-Haenszel, all tasks"]
+        for points in (0, 20)
+    )
+    assert none.kind == "error" and much.kind == "power" and much.rate > 0.4 > none.rate
+
+
+def test_a_test_that_errs_is_found_out(monkeypatch):
+    """A test that quarters its p breaks its level in the same simulation."""
+    monkeypatch.setattr("arena_newton.eval.comparison.stratified_test", lambda strata: stratified_test(strata) / 4)
+    assert any(not tally.holds for tally in error_rates.tallies(150, episodes=20))
+
+
+def test_family_is_adjusted_over_all_pairs():
+    """Adjusted p follow Holm: over pairs for all tasks together, over pairs and tasks within tasks."""
+    rng = random.Random(2)
+    contenders = [
+        Contender(f"p{k}", {(t,): {n: rng.random() < 0.3 + 0.2 * k for n in range(40)} for t in ("a", "b")})
+        for k in range(3)
+    ]
+    result = compare(contenders)
+    ranked = sorted(pair.p for pair in result.pairs)
+    highest = 0.0
+    for rank, p in enumerate(ranked):
+        highest = max(highest, min(1.0, (3 - rank) * p))
+        assert any(pair.p == p and pair.p_holm == pytest.approx(highest) for pair in result.pairs)
+    parts = [part for pair in result.pairs for part in pair.strata]
+    smallest = min(parts, key=lambda part: part.p)
+    assert len(parts) == 6 and smallest.p_holm == pytest.approx(min(1.0, 6 * smallest.p))
