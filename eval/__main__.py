@@ -18,9 +18,9 @@ from arena_newton.eval.options import (
     EngineOptions,
     FilmOptions,
     LoopOptions,
-    MergeOptions,
     RecordOptions,
     ReportOptions,
+    RunMergeOptions,
     RunOptions,
 )
 from arena_newton.eval.pack_options import PackOptions
@@ -167,11 +167,11 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
 
 def _merge(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
-        parse_flags(MergeOptions, ["--help"], f"{PROG} merge <out> [<out> ...]")
+        parse_flags(RunMergeOptions, ["--help"], f"{PROG} merge <out> [<out> ...]")
     folders = folders_named(
         arguments, "merge", PROG, noun="the folders of the shards", shown="<out> <out>... --out <new>"
     )
-    options = parse_flags(MergeOptions, arguments, f"{PROG} merge")
+    options = parse_flags(RunMergeOptions, arguments, f"{PROG} merge")
     from arena_newton.eval import shard_merge
 
     return shard_merge.run(folders, options)

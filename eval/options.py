@@ -16,9 +16,9 @@ __all__ = [
     "EngineOptions",
     "FilmOptions",
     "LoopOptions",
-    "MergeOptions",
     "RecordOptions",
     "ReportOptions",
+    "RunMergeOptions",
     "RunOptions",
     "is_quick",
 ]
@@ -271,7 +271,7 @@ class ReportOptions:
 
 
 @dataclass(frozen=True)
-class MergeOptions:
+class RunMergeOptions:
     """Join the folders of shards into one results folder, as if one machine had played the plan.
 
     Recordings are copied, tables and report are written from the joined journal. Nothing in the shards changes.

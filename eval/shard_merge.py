@@ -19,7 +19,7 @@ from arena_newton.eval.document import CONFIG_FILE, Document, Status, plan_numbe
 from arena_newton.eval.folder import RECORDING_FLAGS, comparable, setting
 from arena_newton.eval.identity import differing_key, moving_versions
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
-from arena_newton.eval.options import MergeOptions, RunOptions
+from arena_newton.eval.options import RunMergeOptions, RunOptions
 from arena_newton.eval.records import Json, JsonObject, shown
 from arena_newton.eval.results import Results, RunRecord, due_episodes, load_run
 from arena_newton.eval.sharding import Shard, dealt, read_shard
@@ -57,7 +57,7 @@ class _Kept:
     folder: Path
 
 
-def run(folders: Sequence[Path], options: MergeOptions) -> int:
+def run(folders: Sequence[Path], options: RunMergeOptions) -> int:
     """Merge as the command line asks for, and print the table.
 
     Returns:
@@ -112,11 +112,11 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
         notes.append(f"Joined with {said}.")
     document = _document(runs, out, whole=not missing)
     temporary = out.with_name(out.name + PARTIAL)
+    if temporary.exists() or temporary.is_symlink():
+        raise InputError(f"{temporary}: was left by a merge that was killed, or one is writing it; remove it")
     try:
         temporary.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
-    except FileExistsError:
-        raise InputError(f"{temporary}: was left by a merge that was killed, or one is writing it; remove it") from None
     except OSError as error:
         raise InputError(f"--out {out}: cannot be created ({error.strerror})") from None
     try:
