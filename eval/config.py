@@ -374,7 +374,7 @@ def _check_shard(options: RunOptions) -> None:
     if options.shard is None:
         return
     parse_shard(options.shard)
-    if is_quick(options):
+    if is_quick(options) or options.seeing:
         raise InputError(
             "--shard: splits a plan, which --task, --seeds or --repeats name; --task all is the benchmark's"
         )

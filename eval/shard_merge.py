@@ -24,7 +24,7 @@ from arena_newton.eval.records import Json, JsonObject, shown
 from arena_newton.eval.results import Results, RunRecord, due_episodes, load_run
 from arena_newton.eval.sharding import Shard, dealt, read_shard
 from arena_newton.files import PARTIAL, file_label, replace_atomically
-from arena_newton.text import counted, plain_text
+from arena_newton.text import counted, is_printable, plain_text
 
 __all__ = ["MergedRun", "merge", "run"]
 
@@ -69,6 +69,8 @@ def run(folders: Sequence[Path], options: RunMergeOptions) -> int:
     """
     if options.out is None or not options.out.strip():
         raise InputError("merge: name a new folder with --out")
+    if not is_printable(options.out):
+        raise InputError(f"--out {plain_text(options.out)}: has control characters in it")
     out = Path(options.out).expanduser()
     merged = merge(folders, out, partial=options.partial, accept_versions=options.accept_versions)
     print(report.table(merged.results))
@@ -111,7 +113,7 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
             raise InputError(f"merge: {said}; finish them, or join what there is with --partial")
         notes.append(f"Joined with {said}.")
     document = _document(runs, out, whole=not missing)
-    temporary = out.with_name(out.name + PARTIAL)
+    temporary = Path(os.path.abspath(out) + PARTIAL)
     if temporary.exists() or temporary.is_symlink():
         raise InputError(f"{temporary}: was left by a merge that was killed, or one is writing it; remove it")
     try:
@@ -274,7 +276,7 @@ def _document(runs: Sequence[RunRecord], out: Path, *, whole: bool) -> Document:
     """config.json of all: the first folder's, with the environments and versions of the others."""
     document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
     document.pop("shard", None)
-    document["options"] = runs[0].document["options"] | {"shard": None, "out": str(out)}
+    document["options"] = runs[0].document["options"] | {"shard": None, "seeing": False, "out": str(out)}
     environments: dict[str, JsonObject] = {}
     for run in runs:
         environments = run.document.get("environments", {}) | environments

@@ -226,6 +226,8 @@ def test_bad_calls(copied, capsys, monkeypatch):
         ("s1", "s2", "s3", "--out", "file"): "is a file",
         ("s1", "s2", "s3", "--out", "file/m"): "cannot be created",
         ("s1", "s2", "s3", "--out", ""): "--out",
+        ("s1", "s2", "s3", "--out", "."): "is not empty",
+        ("s1", "s2", "s3", "--out", "a\nb"): "control characters",
         ("s1", "s2", "s3", "--out", "busy"): "busy.part: was left",
         ("s1", "--out", "m", "--shard", "1/2"): "--shard: unknown argument",
     }
@@ -304,3 +306,19 @@ def test_a_real_run(tmp_path, monkeypatch):
     }
     assert sorted(one["episodes.jsonl"].splitlines()) == sorted(merged["episodes.jsonl"].splitlines())
     assert configuration(tmp_path / "m") == configuration(tmp_path / "one")
+
+
+@pytest.mark.timeout(300)
+def test_recorded_shards(tmp_path):
+    """Two shards of a recording give the files of one machine's, which the merged folder counts as recorded."""
+    flags = "--task boxing --episodes 3 --engine mujoco --size 64x64 --max-steps 4".split()
+    for name, more in (("one", ["--worlds", "3"]), ("s1", ["--shard", "1/2"]), ("s2", ["--shard", "2/2"])):
+        assert main(["record", *flags, *more, "--out", str(tmp_path / name)]) == 0
+    merge([tmp_path / "s1", tmp_path / "s2"], tmp_path / "m")
+    names = sorted(str(path.relative_to(tmp_path / "one")) for path in (tmp_path / "one" / "episodes").rglob("*.*"))
+    assert len(names) == 6
+    for name in names:
+        assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "one" / name).read_bytes(), name
+    journal = (tmp_path / "m" / "episodes.jsonl").read_bytes()
+    assert main(["resume", str(tmp_path / "m")]) == 0
+    assert (tmp_path / "m" / "episodes.jsonl").read_bytes() == journal, "played again"

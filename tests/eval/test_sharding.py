@@ -15,6 +15,8 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.config import resolve
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.sharding import Shard, dealt, parse_shard
+from arena_newton.eval.suite_call import plan_call
+from arena_newton.eval.suite_options import MatrixOptions
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "visual", "--repeats", "4"]
@@ -132,6 +134,14 @@ def test_other_arrays_are_refused(text, environ, expected):
     with pytest.raises(InputError, match="^--shard ") as caught:
         parse_shard(text, environ)
     assert expected in str(caught.value)
+
+
+def test_suites_take_arrays_too(monkeypatch):
+    """`matrix --shard slurm` plays the part of the array's task, and the command that continues names it."""
+    monkeypatch.setattr(os, "environ", os.environ | slurm(1, 2, 0, 1))
+    call = plan_call("tiny", MatrixOptions(shard="slurm"))
+    assert call.shard == (2, 2) and "--shard 2/2" in call.again
+    assert call.chosen == plan_call("tiny", MatrixOptions(shard="2/2")).chosen
 
 
 def test_list_shows_a_shard(capsys):
