@@ -133,9 +133,11 @@ def _of_suite(folder: Path, notes: list[str]) -> list[tuple[str, EvaluatedCell, 
         run = load_cell(suite, cell)
         if cell.status == "failed":
             notes.append(f"{run.folder}: failed ({plain_text(cell.error or 'no reason', 200)}).")
-        if len(run.records) < run.document["planned"]:
-            notes.append(f"{run.folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
-        if run.records:
+        played, planned = len(run.records), run.document["planned"]
+        if played < planned:
+            # Successes end before timeouts do: the first episodes of a cell are no fair sample of it.
+            notes.append(f"{run.folder} is incomplete, and left out: {played} of {planned} episodes.")
+        elif run.records:
             found.append((cell.rules, _suite_cell(cell, run), run))
     return found
 

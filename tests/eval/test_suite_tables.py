@@ -214,15 +214,26 @@ def test_what_is_missing_is_said(cells, suite):
     ]
 
 
-def test_unequal_seeds_are_never_compared_as_pairs(tmp_path):
-    """Of two cells of which one is incomplete only common episodes are compared, and the others are counted."""
+def test_an_unfinished_cell_is_no_sample(tmp_path):
+    """Successes end before timeouts do, so that a cell's first episodes are left out and named, not tabulated."""
     matched, swapped = (
         cell_of("act", "act", tracker, "football", trained_on=("twist2",)) for tracker in ("twist2", "sonic")
     )
     write_suite(tmp_path / "suite", [(matched, outcomes(30)), (swapped, None)])
     write_cell(tmp_path / "suite" / swapped.folder, swapped, outcomes(10), played=20)
     found = read_cells([tmp_path / "suite"])
-    assert f"{tmp_path / 'suite' / swapped.folder} is incomplete: 20 of 60 episodes." in found.notes
+    folder = tmp_path / "suite" / swapped.folder
+    assert f"{folder} is incomplete, and left out: 20 of 60 episodes." in found.notes
+    assert [(cell.tracker, len(cell.records)) for cell in found.cells] == [("twist2", 60)]
+
+
+def test_unequal_seeds_are_never_compared_as_pairs(tmp_path):
+    """Of two folders of which one holds fewer episodes only common ones are compared, and the others are counted."""
+    for tracker, won, played in (("twist2", 30, 60), ("sonic", 10, 20)):
+        facts = {"family": "act", "facts": {"trackers": ["twist2"], "tasks": ["football"]}}
+        cell = cell_of("x", "x", tracker, "football")
+        write_cell(tmp_path / tracker, cell, outcomes(won), played=played, policy_facts=facts)
+    found = read_cells([tmp_path / "twist2", tmp_path / "sonic"])
     (table,) = [t for t in suite_tables(found.cells, paper_numbers()) if t.name == "cross_gmt"]
     mine = entry(table, source="ours")
     assert (mine.pairs, mine.unpaired, mine.matched_sr, mine.drop) == (20, 40, 1.0, 0.5)
