@@ -1,4 +1,4 @@
-"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|report|bench|engines|certify|list] ...``."""
+"""Command line of the benchmark: ``python -m arena_newton.eval [run|resume|merge|report|bench|certify|list] ...``."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from arena_newton.eval.options import (
     LoopOptions,
     RecordOptions,
     ReportOptions,
+    RunMergeOptions,
     RunOptions,
 )
 from arena_newton.eval.pack_options import PackOptions
@@ -36,6 +37,7 @@ PROG = "python -m arena_newton.eval"
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
+  {PROG} merge <out> <out>... --out <new>  join the folders of run --shard 1/16 ... 16/16
   {PROG} record [flags]          record demonstrations for datasets, or more cameras with --from <out>
   {PROG} report <out> [<out>...] write tables and report again from the journal; one table of several runs
   {PROG} film <out> [<out>...]   one success per task as a film or a picture
@@ -102,7 +104,7 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
     from arena_newton.eval.learned_row import row_options
 
     config = resolve(options)
-    folder = ResultsFolder(results_folder(options.out), config, versions())
+    folder = ResultsFolder(results_folder(options.out, config.shard), config, versions())
     folder.check()
     row = row_options(config.flags, folder.path)
     beside = None
@@ -163,6 +165,18 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
         print(note)
     print(f"report: {folder / 'report.html'}")
     return 0
+
+
+def _merge(arguments: list[str], factories: Factories | None) -> int:
+    if _wants_help(arguments):
+        parse_flags(RunMergeOptions, ["--help"], f"{PROG} merge <out> [<out> ...]")
+    folders = folders_named(
+        arguments, "merge", PROG, noun="the folders of the shards", shown="<out> <out>... --out <new>"
+    )
+    options = parse_flags(RunMergeOptions, arguments, f"{PROG} merge")
+    from arena_newton.eval import shard_merge
+
+    return shard_merge.run(folders, options)
 
 
 def _film(arguments: list[str], factories: Factories | None) -> int:
@@ -310,6 +324,7 @@ _COMMANDS = {
     "run": _run,
     "record": _record,
     "resume": _resume,
+    "merge": _merge,
     "report": _report,
     "film": _film,
     "loop": _loop,

@@ -23,13 +23,14 @@ from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RecordOptions, RunOptions, is_quick
 from arena_newton.eval.records import JsonObject
+from arena_newton.eval.sharding import Shard, dealt, parse_shard
 from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
-from arena_newton.text import is_printable, plain_text
+from arena_newton.text import counted, is_printable, plain_text
 
 if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
@@ -65,7 +66,9 @@ class RunConfig:
     flags: RunOptions
     """The flags with every default filled in and every path absolute."""
     episodes: tuple[plan.Episode, ...]
-    """The plan."""
+    """What is to be played: the plan, or its part that the shard has."""
+    planned: int
+    """Episodes of the whole plan."""
     repeats: int
     """As in the flags, like the device, but never left open."""
     device: str
@@ -89,6 +92,8 @@ class RunConfig:
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str
     """The package's own code that moves and judges, by content."""
+    shard: Shard | None = None
+    """Part of the plan; None: all of it. It is no part of the identity."""
     recording: Mapping[str, CameraConfig] | None = None
     """Recorded cameras by name; None where nothing is recorded."""
     labels: str = "v3.1"
@@ -105,9 +110,9 @@ class RunConfig:
     def identity(self) -> Identity:
         """What the results depend on, by flag name; two runs with equal identity may share a results folder.
 
-        Videos, viewers and the folder are absent: they do not change an episode. So is the number of worlds, except for
-        a policy that depends on it. Files count by content. What each environment was built with and the libraries'
-        versions are stored next to it in config.json.
+        Videos, viewers, the folder and shards are absent: they do not change an episode. So is the number of worlds,
+        except for a policy that depends on it. Files count by content. What each environment was built with and the
+        libraries' versions are stored next to it in config.json.
         """
         flags = self.flags
         return {
@@ -284,14 +289,21 @@ def resolve(options: RunOptions) -> RunConfig:
         max_steps=flags.max_steps,
         seed_range=seeding.EVALUATION if flags.series is None else seeding.DEMONSTRATION,
     )
+    shard = None if options.shard is None else parse_shard(options.shard)
+    if shard is not None and shard.count > len(episodes):
+        raise InputError(f"--shard {shard}: the plan has {counted(len(episodes), 'episode')}, expected no more shards")
+    keys = [(e.task, e.tracker, e.mode, e.group_seed, e.repeat) for e in episodes]
+    played = episodes if shard is None else [episodes[index] for index in dealt(keys, shard)]
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
     engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     return RunConfig(
-        flags=dataclasses.replace(flags, engine=engine, device=device),
-        episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in episodes),
+        flags=dataclasses.replace(flags, engine=engine, device=device, shard=None if shard is None else str(shard)),
+        episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in played),
+        planned=len(episodes),
+        shard=shard,
         repeats=repeats,
         device=device,
         policy=options.policy,
@@ -339,6 +351,7 @@ def _check_flags(options: RunOptions) -> None:
     if options.labels not in (None, *LABELS):
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     _check_chunks(options)
+    _check_shard(options)
     if options.video_episodes is not None and options.video_episodes < 1:
         raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
     for name in ("video_episodes", "video_size", "follow"):
@@ -354,6 +367,19 @@ def _check_flags(options: RunOptions) -> None:
         raise InputError(f"--seeds {min(options.seeds)}: expected numbers of at least 0")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
+
+
+def _check_shard(options: RunOptions) -> None:
+    """Refuse a shard that is none, and one of a run that has no plan to split."""
+    if options.shard is None:
+        return
+    parse_shard(options.shard)
+    if is_quick(options) or options.seeing:
+        raise InputError(
+            "--shard: splits a plan, which --task, --seeds or --repeats name; --task all is the benchmark's"
+        )
+    if options.keep is not None:
+        raise InputError("--shard: does not go with --only-success, whose attempts follow from the earlier ones")
 
 
 def _check_chunks(options: RunOptions) -> None:

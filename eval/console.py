@@ -42,6 +42,7 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, s
         print(f"  {planned}, all finished -> {folder}", flush=True)
         return
     finished = len(config.episodes) - remain
+    planned = planned if config.shard is None else f"shard {config.shard}: {planned} of {config.planned:,}"
     size = f"{planned}, {finished} finished, {remain} remain" if finished else planned
     size = size if flags.keep is None else f"{planned}, {remain} due"
     worlds = min(flags.worlds, max(map(len, waiting.values())))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, TypedDict
 
@@ -29,8 +29,19 @@ from arena_newton.eval.records import (
     read_regular,
     shown,
 )
+from arena_newton.eval.sharding import dealt, read_shard
 
-__all__ = ["CONFIG_FILE", "Document", "Identity", "Status", "check_plan", "read_document", "trackers_of"]
+__all__ = [
+    "CONFIG_FILE",
+    "Document",
+    "Identity",
+    "PlanKey",
+    "Status",
+    "check_plan",
+    "plan_numbers",
+    "read_document",
+    "trackers_of",
+]
 
 CONFIG_FILE = "config.json"
 
@@ -99,8 +110,9 @@ class Identity(_Identity, total=False):
 class Status(TypedDict):
     """How the last `run` or `resume` in its folder ended."""
 
-    state: Literal["started", "success", "cancelled", "error"]
-    """`started`: is running, or was killed; `success`: every planned episode is in the journal."""
+    state: Literal["started", "success", "cancelled", "error", "partial"]
+    """`started`: is running, or was killed; `success`: every planned episode is in the journal; `partial`: was joined
+    from shards of which some were missing or unfinished."""
     started_at: str
     """ISO 8601, UTC."""
     finished_at: str | None
@@ -126,6 +138,8 @@ class Document(_Document, total=False):
     variant_changes: Annotated[list[str], Fit("sentences")]
     later_versions: Annotated[list[Versions], Fit("versions by library")]
     """Of the libraries that a later `resume --accept-versions` ran with."""
+    shard: Annotated[str, Fit("a shard such as 3/16", lambda value: read_shard(value) is not None)]
+    """Part of the plan that the folder is of; absent where it is of all."""
     status: Annotated[Status, Fit("state, times and error of the run")]
 
 
@@ -157,7 +171,7 @@ def read_document(folder: Path) -> Document:
     return document  # type: ignore[return-value]  # what `fit` has tested
 
 
-_Key = tuple[str, str, str, int, int]
+PlanKey = tuple[str, str, str, int, int]
 """Task, tracker, mode, group seed, repeat."""
 _PARTS: tuple[Literal["policy", "rules", "engine"], ...] = ("policy", "rules", "engine")
 
@@ -179,12 +193,13 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
     """
     config = document["config"]
     by_hand = "the journal was changed by hand"
-    numbers: dict[_Key, int] = {}
+    numbers: dict[PlanKey, int] = {}
     ended: dict[int, EpisodeRecord] = {}
-    budgets, plan = _budgets(config), _plan_numbers(folder / CONFIG_FILE, config)
+    budgets, plan = _budgets(config), plan_numbers(folder / CONFIG_FILE, config)
     if plan and document["planned"] != len(plan):
         count = f"planned is {document['planned']}, the plan has {len(plan)}"
         raise InputError(f"{folder / CONFIG_FILE}: {count}; it was changed by hand")
+    ours = _dealt_numbers(folder / CONFIG_FILE, document, plan)
     run: JsonObject = {key: config[key] for key in _PARTS if key in config}
     named = trackers_of(config)
     kind = config.get("seed_range") or seeding.EVALUATION
@@ -200,6 +215,8 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
             or ("mode" in config and record.mode not in config["mode"])
         ):
             raise InputError(f"{name}: is not in the plan of {CONFIG_FILE}; {by_hand}")
+        if ours is not None and record.index not in ours:
+            raise InputError(f"{name}: is not in shard {document['shard']}; {by_hand}")
         if numbers.setdefault(key, record.index) != record.index:
             raise InputError(f"{name}: is in the journal as episode {numbers[key]} too")
         seed = seeding.planned_seed(document["gym_ids"][record.task], kind, record.group_seed, record.repeat)
@@ -243,8 +260,22 @@ def _budgets(config: Identity) -> dict[str, int]:
     return {name: budget if cap is None else min(budget, cap) for name, budget in budgets.items()}
 
 
-def _plan_numbers(path: Path, config: Identity) -> dict[_Key, int]:
-    """Numbers of the plan's episodes by task, tracker, mode, group seed and repeat; empty where they are not known."""
+def _dealt_numbers(path: Path, document: Document, plan: Mapping[PlanKey, int]) -> frozenset[int] | None:
+    """Numbers of the episodes of a folder's shard; None where it is of the whole plan."""
+    shard = read_shard(document.get("shard", ""))
+    if shard is None:
+        return None
+    if shard.count > len(plan):
+        raise InputError(f"{path}: shard {shard} of a plan of {len(plan):,} episodes; it was changed by hand")
+    return frozenset(dealt(list(plan), shard))
+
+
+def plan_numbers(path: Path, config: Identity) -> dict[PlanKey, int]:
+    """Numbers of the plan's episodes by task, tracker, mode, group seed and repeat; empty where they are not known.
+
+    Raises:
+        InputError: There are more than a run may have; the message begins with `path`.
+    """
     named = trackers_of(config)
     if "task" not in config or "mode" not in config or named is None:
         return {}

@@ -20,14 +20,17 @@ from arena_newton.eval.identity import config_hash, differing_key, moving_versio
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.records import JsonObject, check_types
+from arena_newton.eval.sharding import Shard
 from arena_newton.files import PARTIAL
 from arena_newton.text import plain_text
 
 __all__ = [
     "BREAK_FILE",
     "EPISODES",
+    "RECORDING_FLAGS",
     "SUBFOLDERS",
     "ResultsFolder",
+    "comparable",
     "iso",
     "results_folder",
     "setting",
@@ -44,14 +47,15 @@ BREAK_FILE = "break.txt"
 """Where the trace of a break is kept for who looks into it."""
 
 
-def results_folder(out: str | None) -> Path:
-    """Folder of --out; a new one, named by the time of day, where none is named.
+def results_folder(out: str | None, shard: Shard | None = None) -> Path:
+    """Folder of --out; a new one, named by the time of day and the shard, where none is named.
 
     Raises:
         InputError: --out names nothing.
     """
     if out is None:
-        return Path("results") / datetime.datetime.now().strftime("%Y%m%d_%H%M%S")
+        part = "" if shard is None else f"_shard_{shard.number}_of_{shard.count}"
+        return Path("results") / (datetime.datetime.now().strftime("%Y%m%d_%H%M%S") + part)
     if not out.strip():
         raise InputError("--out: is empty, name a folder")
     return Path(out).expanduser()
@@ -122,6 +126,11 @@ class ResultsFolder:
                 f"{folder}: holds results of another configuration: {key} was {setting(was)}, now {setting(now)}; "
                 "choose another --out"
             )
+        was_shard, shard = stored.get("shard"), self.config.flags.shard
+        if was_shard != shard:
+            was = "the whole plan" if was_shard is None else f"shard {was_shard}"
+            now_shard = "without a shard" if shard is None else f"--shard {shard}"
+            raise InputError(f"{folder}: was begun with {was}, now {now_shard}; choose another --out")
         for name in RECORDING_FLAGS:
             default = getattr(RunOptions, name)
             kept, given = stored["options"].get(name, default), getattr(self.config.flags, name)
@@ -177,9 +186,11 @@ class ResultsFolder:
             "gym_ids": {name: tasks.get(name).gym_id for name in config.flags.task},
             "options": config.stored_flags(),
             "versions": self.installed,
-            "planned": len(config.episodes),
+            "planned": config.planned,
             "environments": {},
         }
+        if config.shard is not None:
+            document["shard"] = str(config.shard)
         if config.variant is not None:
             from arena_newton.usd_scenes import validate
 
@@ -238,7 +249,7 @@ class ResultsFolder:
         if group not in known:
             known[group] = plain
             self._save()
-        difference = differing_key(_comparable(known[group]), _comparable(plain))
+        difference = differing_key(comparable(known[group]), comparable(plain))
         if difference is not None:
             key, was, now = difference
             change = f"was run with {key} {setting(was)}, now it is {setting(now)}"
@@ -255,7 +266,7 @@ class ResultsFolder:
             "policy": config.policy_hash,
             "variant": config.variant_hash,
             "versions": config_hash(moving_versions(self.installed)),
-            "environment": config_hash(_comparable(environment)),
+            "environment": config_hash(comparable(environment)),
         }
 
     def keep_trace(self) -> None:
@@ -280,6 +291,6 @@ def _versions(document: Document) -> list[dict[str, str | None]]:
     return [document.get("versions", {}), *document.get("later_versions", ())]
 
 
-def _comparable(facts: JsonObject) -> JsonObject:
+def comparable(facts: JsonObject) -> JsonObject:
     """Facts of an environment without the number of its device: `cuda:0` and `cuda:1` are alike."""
     return {key: str(value).split(":")[0] if key == "device" else value for key, value in facts.items()}

@@ -18,6 +18,7 @@ __all__ = [
     "LoopOptions",
     "RecordOptions",
     "ReportOptions",
+    "RunMergeOptions",
     "RunOptions",
     "is_quick",
 ]
@@ -114,6 +115,9 @@ class RunOptions:
     actions: bool = False
     """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
     tracker in a run."""
+    shard: str | None = None
+    """Play part n of N of the plan, such as 3/16, into a folder of its own; `merge` joins them. slurm: the part of this
+    task of a Slurm array; slurm/16 where the array has not all 16."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
@@ -201,6 +205,8 @@ class RecordOptions:
     """Run a 1 ms tracker at 5 ms x 4 substeps."""
     max_steps: int | None = None
     """Cap on the step budget of the rule set [ticks of 0.02 s]."""
+    shard: str | None = None
+    """Record part n of N of the plan, such as 3/16 or slurm, into a folder of its own; not with --only-success."""
     out: str | None = None
     """Folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
@@ -262,6 +268,21 @@ class ReportOptions:
     """Print a table of successes per task, tracker and mode as Markdown, and write nothing."""
     json: bool = False
     """Print results.json instead of the table."""
+
+
+@dataclass(frozen=True)
+class RunMergeOptions:
+    """Join the folders of shards into one results folder, as if one machine had played the plan.
+
+    Recordings are copied, tables and report are written from the joined journal. Nothing in the shards changes.
+    """
+
+    out: str | None = None
+    """Folder to write; it must be new."""
+    partial: bool = False
+    """Join what there is although shards are missing or unfinished; `resume <out>` plays the rest."""
+    accept_versions: bool = False
+    """Join shards that were played with other versions of the libraries; the folder then names all."""
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ _STATES = {
     "started": "The run has not ended: it is going on, or it was killed.",
     "cancelled": "The run was cancelled.",
     "error": "The run ended with an error",
+    "partial": "Joined from shards of which some were missing or unfinished.",
 }
 
 
@@ -109,6 +110,9 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     found = []
     if run.status is not None and run.status["state"] != "success":
         found.append(_STATES[run.status["state"]] + (f": {run.status['error']}" if run.status["error"] else ""))
+    if "shard" in results:
+        plan = counted(run.document["planned"], "episode")
+        found.append(f"Shard {results['shard']} of a plan of {plan}: no result before all are merged.")
     if not results["complete"]:
         found.append(f"Incomplete: {results['finished']} of {results['planned']} episodes are finished.")
     errors = sum(cell["errors"] for cell in results["cells"])

@@ -117,6 +117,7 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
         "seed_series": 0,
         "max_steps": None,
         "drive": "auto",
+        "shard": None,
     }
     for name, default in given.items():
         if getattr(options, name) != default:

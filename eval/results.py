@@ -10,9 +10,10 @@ from typing import NotRequired
 from arena_newton.eval import rounds
 from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
+from arena_newton.eval.sharding import read_shard
 from arena_newton.eval.stats import Aggregate, aggregate
 
-__all__ = ["Results", "RunRecord", "in_plan_order", "load_run", "results_json"]
+__all__ = ["Results", "RunRecord", "due_episodes", "in_plan_order", "load_run", "results_json"]
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,11 @@ class Results(Aggregate):
     config_hash: str
     config: Identity
     planned: int
+    """Episodes of the plan, or of its part that the folder is of."""
     finished: int
     complete: bool
+    shard: NotRequired[str]
+    """Part of the plan, such as `3/16`; absent where the folder is of all."""
     status: NotRequired[str]
     """State of `document.Status`; absent in a folder of a version without status."""
 
@@ -66,11 +70,17 @@ def load_run(folder: Path) -> RunRecord:
     return RunRecord(folder, document, in_plan_order(records))
 
 
+def due_episodes(document: Document) -> int:
+    """Episodes that a folder is to have: those of its plan, or of its shard."""
+    shard = read_shard(document.get("shard", ""))
+    return document["planned"] if shard is None else shard.size(document["planned"])
+
+
 def _complete(run: RunRecord) -> bool:
     """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
     planned, keep = run.document["planned"], run.config.get("keep")
     if keep is None:
-        return len(run.records) == planned
+        return len(run.records) == due_episodes(run.document)
     groups = planned // run.config["repeats"]
     return rounds.complete(planned, groups, {record.index: record.outcome for record in run.records}, keep)
 
@@ -81,12 +91,14 @@ def results_json(run: RunRecord) -> Results:
     results: Results = {
         "config_hash": run.document["config_hash"],
         "config": run.config,
-        "planned": run.document["planned"],
+        "planned": due_episodes(run.document),
         "finished": len(run.records),
         "complete": _complete(run),
         "cells": figures["cells"],
         "suites": figures["suites"],
     }
+    if "shard" in run.document:
+        results["shard"] = run.document["shard"]
     if run.status is not None:
         results["status"] = run.status["state"]
     return results

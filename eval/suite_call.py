@@ -6,17 +6,16 @@ No library of physics or pictures is loaded: a wrong file, a dry run and an abse
 from __future__ import annotations
 
 import dataclasses
-import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton.errors import InputError
 from arena_newton.eval.matrix_cells import check_policies, dealt, expand_cells, matrix_table, parse_only, selected
+from arena_newton.eval.sharding import parse_shard
 from arena_newton.eval.suite_file import SuiteFile, read_suite_file, suite_path
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, read_suite
-from arena_newton.text import plain_text
 
 __all__ = ["SuiteCall", "plan_call"]
 
@@ -55,11 +54,12 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
         InputError: One is wrong, or a checkpoint is absent.
     """
     suite = read_suite_file(suite_path(given))
-    only, (shard, shards) = parse_only(options.only), _shard(options.shard)
+    only, shard = parse_only(options.only), parse_shard(options.shard)
+    options = dataclasses.replace(options, shard=str(shard))
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit {options.limit}: expected at least 1")
     cells = expand_cells(suite)
-    chosen = {cell.id for cell in dealt(cells, shard, shards)}
+    chosen = {cell.id for cell in dealt(cells, shard.number, shard.count)}
     chosen &= {cell.id for cell in (selected(cells, only) if only else cells)}
     checked, problem = {}, None
     try:
@@ -74,7 +74,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
         cells=tuple(checked.get(cell.id, cell) for cell in cells),
         chosen=tuple(cell.id for cell in cells if cell.id in chosen),
         out=_out(options, suite),
-        shard=(shard, shards),
+        shard=(shard.number, shard.count),
         again=_again(given, options),
         problem=problem,
     )
@@ -86,15 +86,6 @@ def _out(options: MatrixOptions, suite: SuiteFile) -> Path:
     if not options.out.strip():
         raise InputError("--out: is empty, name a folder")
     return Path(options.out).expanduser()
-
-
-def _shard(text: str) -> tuple[int, int]:
-    """Number and count of --shard."""
-    found = re.fullmatch(r"([0-9]{1,4})/([0-9]{1,4})", text)
-    shard, shards = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not 1 <= shard <= shards:
-        raise InputError(f"--shard {plain_text(text, 60)}: expected n/N with n from 1 to N, such as 1/4")
-    return shard, shards
 
 
 def _again(given: str, options: MatrixOptions) -> str:

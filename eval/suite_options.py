@@ -25,7 +25,8 @@ class MatrixOptions:
     limit: int | None = None
     """Play at most so many cells in this call."""
     shard: str = "1/1"
-    """Play part n of N, such as 1/4: each part has cells of every task, together they are the suite."""
+    """Play part n of N, such as 1/4: each part has cells of every task, together they are the suite. slurm: the part of
+    this task of a Slurm array; slurm/4 where the array has not all 4."""
     dry_run: bool = False
     """Print the matrix and its size, and play nothing."""
     keep_going: bool = False

@@ -405,12 +405,59 @@ def safetensors(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], 
     return lambda path: void(weights_file.load(path)), made
 
 
+def shards(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+    """Results folders of two shards of one plan, of which journal or configuration of one is damaged."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "eval"))
+    import contextlib
+    import shutil
+
+    from eval_fakes import factories
+
+    from arena_newton.eval.__main__ import main
+    from arena_newton.eval.shard_merge import merge
+
+    folders = [folder / name for name in ("a", "b")]
+    for number, out in enumerate(folders, start=1):
+        flags = "--task football boxing --engine mujoco --seeds 0 3 --repeats 2 --policy stand".split()
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert main([*flags, "--shard", f"{number}/2", "--out", str(out)], factories()) == 0
+    names = ("episodes.jsonl", "episodes.jsonl", "config.json")
+    sound = {path: path.read_bytes() for out in folders for name in names if (path := out / name)}
+
+    def read(path: Path) -> None:
+        joined = folder / "joined"
+        try:
+            merged = merge(folders, joined, partial=rng.random() < 0.5)
+            assert (joined / "report.html").is_file() and len(merged.run.records) <= 8
+        finally:
+            shutil.rmtree(joined, ignore_errors=True)
+        assert not list(folder.glob("*.part")), "a refused merge leaves something"
+
+    def made() -> tuple[str, bytes]:
+        for path, data in sound.items():
+            path.write_bytes(data)
+        path = rng.choice(list(sound))
+        # Faults in one line of a journal, or anywhere, and journals that lost or doubled lines.
+        lines = sound[path].splitlines(keepends=True)
+        at, kind = rng.randrange(len(lines)), rng.random()
+        if path.suffix == ".jsonl" and kind < 0.2:
+            lines[at : at + 1] = rng.choice(([], [lines[at]] * 2, lines[at : at + 1] + [b"\n"]))
+            return str(path.relative_to(folder)), b"".join(lines)
+        if path.suffix == ".jsonl" and kind < 0.5:
+            lines[at] = damaged(lines[at], rng, text=True)
+            return str(path.relative_to(folder)), b"".join(lines)
+        return str(path.relative_to(folder)), damaged(sound[path], rng, text=rng.random() < 0.8)
+
+    return read, made
+
+
 def void(_: object) -> None:
     """Nothing is made of what was read."""
 
 
 READERS = {
-    f.__name__: f for f in (usda, usdc, usdz, images, motions, recordings, datasets, pickles, tables, onnx, safetensors)
+    f.__name__: f
+    for f in (usda, usdc, usdz, images, motions, recordings, datasets, pickles, tables, onnx, safetensors, shards)
 }
 
 

@@ -1,0 +1,324 @@
+"""Merged shards are what one machine would have written; what does not fit together is refused in one line."""
+
+import json
+import os
+import re
+import shutil
+
+import pytest
+from eval_fakes import factories
+
+from arena_newton import doctor
+from arena_newton.errors import InputError
+from arena_newton.eval import shard_merge
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.results import load_run
+from arena_newton.eval.shard_merge import merge
+
+FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
+TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
+TIMES = re.compile(rb'"(wall_s|started_at|finished_at|duration_sec)": ?("[^"]*"|[0-9.e+-]+)')
+
+
+def contents(folder):
+    """Every file of a results folder but its configuration, without the times at which episodes were played."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "config.json"]
+    found = {}
+    for path in files:
+        data, name = path.read_bytes(), str(path.relative_to(folder))
+        timed = path.name == "episodes.jsonl" or path.parent.name == "episodes"
+        found[name] = TIMES.sub(rb"\1", data) if timed else data
+    return found
+
+
+def configuration(folder):
+    """What of a config.json says what was played."""
+    document = json.loads((folder / "config.json").read_text())
+    return {key: value for key, value in document.items() if key not in ("status", "options")}
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """Folders of one machine, `one`, and of three shards with other numbers of worlds, `s1` to `s3`."""
+    folder = tmp_path_factory.mktemp("shards")
+    assert main(["run", *FLAGS, "--actions", "--worlds", "3", "--out", str(folder / "one")], factories()) == 0
+    for n, worlds in ((1, "1"), (2, "7"), (3, "4")):
+        flags = [*FLAGS, "--actions", "--worlds", worlds, "--shard", f"{n}/3", "--out", str(folder / f"s{n}")]
+        assert main(["run", *flags], factories()) == 0
+    return folder
+
+
+@pytest.fixture
+def copied(played, tmp_path):
+    """The folders of the shards, to be changed."""
+    for name in ("s1", "s2", "s3"):
+        shutil.copytree(played / name, tmp_path / name)
+    return tmp_path
+
+
+def shards(folder):
+    """The three folders."""
+    return [folder / name for name in ("s1", "s2", "s3")]
+
+
+def edited(folder, change, number=0):
+    """Change a line of a journal."""
+    path = folder / "episodes.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    change(lines[number])
+    path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
+    return lines[number]
+
+
+def test_merged_shards_are_one_machine(played, tmp_path):
+    """Journal, tables, reports and actions are one machine's byte for byte, times apart, in any order of folders."""
+    merge(shards(played), tmp_path / "m")
+    merge(shards(played)[::-1], tmp_path / "backwards")
+    merge([played / "one"], tmp_path / "alone")
+    for name in TABLES:
+        assert (tmp_path / "m" / name).read_bytes() == (played / "one" / name).read_bytes(), name
+    assert contents(tmp_path / "m") == contents(tmp_path / "alone")
+    assert configuration(tmp_path / "m") == configuration(played / "one")
+    assert (tmp_path / "m/episodes.jsonl").read_bytes() == (tmp_path / "backwards/episodes.jsonl").read_bytes()
+    assert contents(tmp_path / "m") == contents(tmp_path / "backwards")
+    actions = {path.name: path.read_bytes() for path in (played / "one" / "actions").iterdir()}
+    assert actions and {path.name: path.read_bytes() for path in (tmp_path / "m" / "actions").iterdir()} == actions
+    lines = {line for folder in shards(played) for line in (folder / "episodes.jsonl").read_bytes().splitlines()}
+    merged = (tmp_path / "m" / "episodes.jsonl").read_bytes().splitlines()
+    assert set(merged) == lines and [json.loads(line)["index"] for line in merged] == list(range(48))
+    assert load_run(tmp_path / "m").status["state"] == "success"
+
+
+def test_a_merged_folder_merges_and_resumes(played, tmp_path, capsys):
+    """A partial merge says what is missing, `resume` plays it, and it can be merged with the rest instead."""
+    flags = ["merge", str(played / "s1"), str(played / "s3"), "--out", str(tmp_path / "m")]
+    assert main(flags) == 2
+    error = capsys.readouterr().err
+    assert "16 episodes of 48 missing: shard 2/3 is not named" in error and error.count("\n") == 1
+    assert not (tmp_path / "m").exists()
+    assert main([*flags, "--partial"]) == 1
+    assert "Incomplete: 32 of 48 episodes" in capsys.readouterr().out
+    results = json.loads((tmp_path / "m" / "results.json").read_text())
+    assert (results["status"], results["complete"], results["planned"]) == ("partial", False, 48)
+    merge([played / "s2", tmp_path / "m"], tmp_path / "whole")
+    assert main(["resume", str(tmp_path / "m")], factories()) == 0
+    for name in TABLES:
+        one = (played / "one" / name).read_bytes()
+        assert (tmp_path / "whole" / name).read_bytes() == one == (tmp_path / "m" / name).read_bytes(), name
+
+
+def test_unfinished_shards_are_named(copied):
+    """Of an unfinished shard, torn last line included, folder and numbers are named, of a missing one its number."""
+    journal = copied / "s2" / "episodes.jsonl"
+    journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-3]) + b'{"index": 4')
+    with pytest.raises(InputError) as caught:
+        merge([copied / "s1", copied / "s2"], copied / "m")
+    assert f"{copied / 's2'} (shard 2/3) has 13 of 16 episodes, shard 3/3 is not named" in str(caught.value)
+    assert "19 episodes of 48 missing" in str(caught.value)
+    assert main(["resume", str(copied / "s2")], factories()) == 0
+    assert merge(shards(copied), copied / "m").results["complete"]
+
+
+def test_other_counts_of_shards_join(played, tmp_path):
+    """Whole plans and shards of other counts join where they have every episode, alike in several."""
+    half = tmp_path / "half"
+    assert main(["run", *FLAGS, "--actions", "--shard", "1/2", "--out", str(half)], factories()) == 0
+    merged = merge([*shards(played), half], tmp_path / "m")
+    assert "24 episodes in several folders, each alike." in merged.notes
+    assert (tmp_path / "m" / "report.html").read_bytes() == (played / "one" / "report.html").read_bytes()
+    with pytest.raises(InputError, match="shard 2/2 is not named"):
+        merge([half], tmp_path / "n")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("outcome", None), ("steps", 0), ("margin", 0.123), ("overflow", True), ("phases", [["a", 0]])]
+)
+def test_overlaps_that_differ_are_refused(copied, played, key, value):
+    """Two folders with one episode and another value of it are refused: episode, value and both folders are named."""
+    shutil.copytree(copied / "s1", copied / "again")
+
+    def change(line):
+        line[key] = {"fall": "timeout"}.get(line["outcome"], "fall") if value is None else value
+
+    line = edited(copied / "again", change, 2)
+    with pytest.raises(InputError) as caught:
+        merge([*shards(copied), copied / "again"], copied / "m")
+    words = f"episode {line['index']} ({line['task']} twist2 {line['mode']} seed {line['group_seed']} "
+    words += f"repeat {line['repeat']}): {key} is"
+    text = str(caught.value)
+    assert text.startswith(words) and f"in {copied / 's1'}" in text and f"in {copied / 'again'}" in text
+    assert not (copied / "m").exists() and not list(copied.glob("*.part"))
+
+
+def test_overlaps_of_other_times_join(copied):
+    """Times and recordings of an episode that two folders have may differ: the first folder's line is kept."""
+    shutil.copytree(copied / "s1", copied / "twin")
+    edited(copied / "twin", lambda line: line.update(started_at="later", durations=line["durations"] | {"wall_s": 9.0}))
+    merged = merge([*shards(copied), copied / "twin"], copied / "m")
+    assert "16 episodes in several folders, each alike." in merged.notes
+    assert b"later" not in (copied / "m" / "episodes.jsonl").read_bytes()
+
+
+def test_an_error_gives_way(copied, played):
+    """Where an episode ended as an error in one folder, the other folder's counts, as after --retry-errors."""
+    shutil.copytree(copied / "s1", copied / "again")
+    broken = {"outcome": "error", "reason": "environment", "error": "out of memory", "steps": 0}
+    edited(copied / "s1", lambda line: line.update(broken))
+    merged = merge([*shards(copied), copied / "again"], copied / "m")
+    assert any(note.startswith("1 episode ended as an error in one folder") for note in merged.notes)
+    assert (copied / "m" / "table.md").read_bytes() == (played / "one" / "table.md").read_bytes()
+    assert main(["merge", *map(str, shards(copied)), "--out", str(copied / "n")]) == 1, "an error is not 0"
+
+
+def rewritten(folder, change):
+    """Change a config.json, and its hash as a run of that configuration has it."""
+    path = folder / "config.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda d: d["config"].update(code="0" * 12), "code is 000000000000, in"),
+        (lambda d: d["config"]["policy_facts"].update(name="other"), "policy_facts.name is other, in"),
+        (lambda d: d["rule_set"].update({next(iter(d["rule_set"])): "x"}), "rule_set."),
+        (lambda d: d["environments"]["boxing twist2 base"].update(physics_dt=1), "boxing twist2 base: physics_dt is 1"),
+        (lambda d: d["versions"].update(mujoco="0.1"), "mujoco is 0.1, in"),
+        (lambda d: d["options"].update(record=True), "--record is True, in"),
+        (lambda d: d.update(shard="3/49"), "shard 3/49 of a plan of 48"),
+        (lambda d: d.update(shard="1/3"), "is not in shard 1/3"),
+        (lambda d: d.update(shard="4/3"), "shard is"),
+    ],
+)
+def test_folders_that_differ_are_refused(copied, change, expected):
+    """Another configuration, rule set, environment, library or split is refused with the key and both folders."""
+    rewritten(copied / "s2", change)
+    with pytest.raises(InputError) as caught:
+        merge(shards(copied), copied / "m")
+    assert expected in str(caught.value) and str(copied / "s2") in str(caught.value)
+    assert not (copied / "m").exists()
+
+
+def test_versions_can_be_accepted(copied):
+    """With --accept-versions the merged folder names the libraries of all shards."""
+    rewritten(copied / "s2", lambda document: document["versions"].update(mujoco="0.1"))
+    assert main(["merge", *map(str, shards(copied)), "--out", str(copied / "m"), "--accept-versions"]) == 0
+    later = json.loads((copied / "m" / "config.json").read_text())["later_versions"]
+    assert [versions["mujoco"] for versions in later] == ["0.1"]
+
+
+def test_bad_calls(copied, capsys, monkeypatch):
+    """A missing or unfit --out, a folder twice or without results: one line, exit code 2, nothing is written."""
+    monkeypatch.chdir(copied)
+    (copied / "link").symlink_to("s1")
+    (copied / "file").write_text("x")
+    (copied / "busy.part").mkdir()
+    before = sorted(str(path) for path in copied.rglob("*"))
+    cases = {
+        (): "name the folders of the shards",
+        ("s1", "s2", "s3"): "--out",
+        ("s1", "s1", "--out", "m"): "named twice",
+        ("s1", "nowhere", "--out", "m"): "nowhere: no results folder",
+        ("s1", "s2", "s3", "--out", "s1"): "--out s1: is not empty",
+        ("s1", "s2", "s3", "--out", "link"): "is a link",
+        ("s1", "s2", "s3", "--out", "file"): "is a file",
+        ("s1", "s2", "s3", "--out", "file/m"): "cannot be created",
+        ("s1", "s2", "s3", "--out", ""): "--out",
+        ("s1", "s2", "s3", "--out", "."): "is not empty",
+        ("s1", "s2", "s3", "--out", "a\nb"): "control characters",
+        ("s1", "s2", "s3", "--out", "busy"): "busy.part: was left",
+        ("s1", "--out", "m", "--shard", "1/2"): "--shard: unknown argument",
+    }
+    for arguments, expected in cases.items():
+        capsys.readouterr()
+        assert main(["merge", *arguments]) == 2, arguments
+        error = capsys.readouterr().err
+        assert expected in error and error.count("\n") == 1, error
+    assert sorted(str(path) for path in copied.rglob("*")) == before
+
+
+@pytest.mark.parametrize("path", ["../s2/config.json", "/etc/hostname", "strips/../../x", "config.json", "strips/.x"])
+def test_recordings_outside_are_refused(copied, path):
+    """A journal that names a file which no run writes cannot have it copied."""
+    edited(copied / "s1", lambda line: line.update(media={"world strip": path}))
+    with pytest.raises(InputError, match="expected a recording of the folder"):
+        merge(shards(copied), copied / "m")
+    assert not (copied / "m").exists()
+
+
+def test_linked_recordings_are_refused(copied):
+    """Neither a link nor a linked folder is followed, and a pipe does not block."""
+    edited(copied / "s1", lambda line: line.update(media={"world strip": "strips/a.jpg"}))
+    (copied / "secret").mkdir()
+    (copied / "secret" / "a.jpg").write_text("mine")
+    (copied / "s1" / "strips").symlink_to("../secret")
+    with pytest.raises(InputError, match="strips: is a link"):
+        merge(shards(copied), copied / "m")
+    (copied / "s1" / "strips").unlink()
+    (copied / "s1" / "strips").mkdir()
+    (copied / "s1" / "strips" / "a.jpg").symlink_to("../../secret/a.jpg")
+    with pytest.raises(InputError, match=r"a\.jpg: is a link"):
+        merge(shards(copied), copied / "m")
+    (copied / "s1" / "strips" / "a.jpg").unlink()
+    os.mkfifo(copied / "s1" / "strips" / "a.jpg")
+    with pytest.raises(InputError, match=r"a\.jpg: is not a regular file"):
+        merge(shards(copied), copied / "m")
+    (copied / "s1" / "strips" / "a.jpg").unlink()
+    merged = merge(shards(copied), copied / "m")
+    assert any("no folder has: strips/a.jpg" in note for note in merged.notes)
+
+
+def test_a_full_disk_leaves_nothing(copied, monkeypatch, capsys):
+    """When the disk is full while recordings are copied: one line, exit code 2, no half folder."""
+
+    def full(source, target, length):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shard_merge.shutil, "copyfileobj", full)
+    assert main(["merge", *map(str, shards(copied)), "--out", str(copied / "m")]) == 2
+    error = capsys.readouterr().err
+    assert "disk full; the shards are as they were" in error and error.count("\n") == 1
+    assert not list(copied.glob("m*"))
+
+
+@pytest.mark.timeout(600)
+def test_a_real_run(tmp_path, monkeypatch):
+    """On engine mujoco three shards with other numbers of worlds give one machine's bytes, with strips and films."""
+    installed = doctor.versions()
+    monkeypatch.setattr(doctor, "versions", lambda: installed)
+    flags = ["--task", "boxing", "vis_navi", "--engine", "mujoco", "--seeds", "0", "--repeats", "3", "--max-steps", "6"]
+    flags += ["--policy", "expert", "--tracker", "twist2", "--strip", "--video", "--video-episodes", "1"]
+    flags += ["--video-size", "64x48"]
+    assert main(["run", *flags, "--worlds", "3", "--out", str(tmp_path / "one")]) == 0
+    for n, worlds in ((1, "1"), (2, "2"), (3, "1")):
+        out = ["--worlds", worlds, "--shard", f"{n}/3", "--out", str(tmp_path / f"s{n}")]
+        assert main(["run", *flags, *out]) == 0
+    merge(shards(tmp_path), tmp_path / "m")
+    merge([tmp_path / "one"], tmp_path / "alone")
+    merged, alone = contents(tmp_path / "m"), contents(tmp_path / "alone")
+    assert merged == alone
+    assert sum(name.endswith(".jpg") for name in merged) == 12 and sum(name.endswith(".mp4") for name in merged) == 4
+    one = contents(tmp_path / "one")
+    assert {name: data for name, data in one.items() if name != "episodes.jsonl"} == {
+        name: data for name, data in merged.items() if name != "episodes.jsonl"
+    }
+    assert sorted(one["episodes.jsonl"].splitlines()) == sorted(merged["episodes.jsonl"].splitlines())
+    assert configuration(tmp_path / "m") == configuration(tmp_path / "one")
+
+
+@pytest.mark.timeout(300)
+def test_recorded_shards(tmp_path):
+    """Two shards of a recording give the files of one machine's, which the merged folder counts as recorded."""
+    flags = "--task boxing --episodes 3 --engine mujoco --size 64x64 --max-steps 4".split()
+    for name, more in (("one", ["--worlds", "3"]), ("s1", ["--shard", "1/2"]), ("s2", ["--shard", "2/2"])):
+        assert main(["record", *flags, *more, "--out", str(tmp_path / name)]) == 0
+    merge([tmp_path / "s1", tmp_path / "s2"], tmp_path / "m")
+    names = sorted(str(path.relative_to(tmp_path / "one")) for path in (tmp_path / "one" / "episodes").rglob("*.*"))
+    assert len(names) == 6
+    for name in names:
+        assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "one" / name).read_bytes(), name
+    journal = (tmp_path / "m" / "episodes.jsonl").read_bytes()
+    assert main(["resume", str(tmp_path / "m")]) == 0
+    assert (tmp_path / "m" / "episodes.jsonl").read_bytes() == journal, "played again"
