@@ -255,7 +255,11 @@ class ExpertPolicy(Policy):
         mask = torch.from_numpy(deciding).to(self.sight.device)
         command = self.expert.command(mask, DECISION * TICK)
         self._commands = torch.where(mask[:, None], command.pack(), self._commands)
-        self._phases = self.expert.phases()
+        phases = self.expert.phases()
+        if phases is not None and self._phases is not None:
+            # Of a world that does not decide now the expert may name the phase that its next decision begins.
+            phases = [new if now else old for now, new, old in zip(deciding, phases, self._phases, strict=True)]
+        self._phases = phases
 
     def describe(self) -> Json:
         """Name, the tasks that have an expert and the ticks between two decisions."""

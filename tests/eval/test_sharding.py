@@ -148,8 +148,8 @@ def test_list_shows_a_shard(capsys):
     """`list` prints the episodes of a shard with their numbers in the plan."""
     assert main(["list", *FLAGS, "--shard", "2/3"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("16 episodes, ")
-    assert [int(line.split()[0]) for line in lines[1:]] == [e.index for e in plan("2/3")]
+    assert lines[0].startswith("16 episodes, ") and "tell a policy" in lines[1]
+    assert [int(line.split()[0]) for line in lines[2:]] == [e.index for e in plan("2/3")]
 
 
 def test_a_folder_belongs_to_one_shard(tmp_path, capsys):
