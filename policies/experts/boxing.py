@@ -26,7 +26,7 @@ from arena_newton.policies.experts.eyes import Eyes, silhouette
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import Floor, signed_distance
 from arena_newton.policies.experts.style import Style
-from arena_newton.policies.experts.walking import Walk, paced
+from arena_newton.policies.experts.walking import Walk, beyond, paced, passing
 from arena_newton.rotations import atan2, rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import PALMS, TARGET
@@ -69,9 +69,8 @@ LONGEST = {
     "step up": 6.0,
     "strike": 3.5,
 }
-"""Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the way around
-the bag; the last steps, after which it
-strikes from where it is; one strike, after which the robot moves by the error of its palm."""
+"""Phase → longest time in it [s]: the first glance; 6 m of way; 4 m of way and a turn; the way around the bag; the last
+steps, after which it strikes from where it is; one strike, after which the robot moves by the error of its palm."""
 
 FLANKS = tuple(math.radians(a) for a in (60, -60, 75, -75, 45, -45, 90, -90))
 """Bearing of the target from the bag's axis minus that of the robot [rad]: positive is on the robot's right."""
@@ -107,8 +106,6 @@ CLOSER = 0.12
 """Longest such move [m]."""
 LEAN = 0.25
 """Waist pitch of a strike [rad]."""
-BEYOND = 0.06
-"""Both poses are walked to as if they were this much farther ahead [m]: the robot still walks when it goes on."""
 COME_WITHIN = (0.22, 0.60)
 """Errors before it goes round, seen from `BEYOND` that pose, that do not matter [m, rad]."""
 READY_WITHIN = (0.16, 0.30)
@@ -213,11 +210,10 @@ class BoxingExpert(Expert):
 
         self._phases.advance(mask, dt)
         going = [self._phases.at(name) for name in ("approach", "go round", "step up")]
-        onward = mask & (answer.arrived | self._phases.late)
-        for at, within in zip(going, (COME_WITHIN, READY_WITHIN, STAND_WITHIN), strict=True):
-            near = (answer.distance < within[0]) & (answer.heading_error.abs() < within[1])
-            onward = onward | (mask & at & near)
-        approaching, rounding, stepping = (onward & at for at in going)
+        approaching, rounding, stepping = (
+            mask & at & (passing(answer, within) | self._phases.late)
+            for at, within in zip(going, (COME_WITHIN, READY_WITHIN, STAND_WITHIN), strict=True)
+        )
         self._walk.to(approaching, beyond(self._first), Floor(self._boxes, *ROOM))
         self._phases.enter("go round", approaching)
         self._step_up(rounding, self.stand)
@@ -383,9 +379,3 @@ class BoxingExpert(Expert):
     @staticmethod
     def _local(vector: Tensor, pose: Tensor) -> Tensor:
         return torch.cat([rotate_xy(-pose[:, 2], vector[:, :2]), vector[:, 2:]], dim=1)
-
-
-def beyond(pose: Tensor) -> Tensor:
-    """Poses that are `BEYOND` farther ahead than others; x, y [m], yaw [rad], shape [worlds, 3]."""
-    ahead = torch.stack([torch.cos(pose[:, 2]), torch.sin(pose[:, 2])], dim=1)
-    return torch.cat([pose[:, :2] + BEYOND * ahead, pose[:, 2:]], dim=1)

@@ -27,7 +27,7 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
-from arena_newton.policies.experts.walking import Walk, along
+from arena_newton.policies.experts.walking import Walk, along, passing
 from arena_newton.rotations import atan2, heading, quat_apply, quat_from_yaw, quat_multiply, rotate_xy, turn, wrap_angle
 from arena_newton.tasks.double_desk import HAMMER, INSIDE, LEFT_DESK, RIGHT_DESK, SILL
 from arena_newton.trackers.motions.commands import MotionCommand
@@ -340,8 +340,8 @@ class DoubleDeskExpert(Expert):
     def _onward(self, mask: Tensor, answer: NavigationCommand) -> None:
         """Enter the next phase where one is over."""
         machine, pose, held = self.machine, self.sight.pose, self._held()
-        arrived = {name: _arrived(answer, within) for name, within in WITHIN.items()}
-        self._there = (self._there | (mask & _arrived(answer, THERE))) & machine.at(*ENDING)
+        arrived = {name: passing(answer, within) for name, within in WITHIN.items()}
+        self._there = (self._there | (mask & passing(answer, THERE))) & machine.at(*ENDING)
         back = torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1)
         wanted, over_crate = self._over()
         over = arrived | {
@@ -488,9 +488,3 @@ class DoubleDeskExpert(Expert):
 
     def _root(self) -> Tensor:
         return self.sight.root_position
-
-
-def _arrived(answer: NavigationCommand, within: tuple[float, float]) -> Tensor:
-    """Worlds that hold at their goal, or are off it by less than these errors [m, rad]; bool, [worlds]."""
-    near, straight = within
-    return answer.arrived | ((answer.distance < near) & (answer.heading_error.abs() < straight))

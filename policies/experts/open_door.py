@@ -20,8 +20,8 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.hands import Palms
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
-from arena_newton.policies.experts.walking import Walk, along
-from arena_newton.rotations import heading, rotate_xy, wrap_angle
+from arena_newton.policies.experts.walking import BEYOND, Walk, along, passing
+from arena_newton.rotations import heading, rotate_xy, turn, wrap_angle
 from arena_newton.tasks.open_door import DOORWAY, HANDLE, LEAF
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.navigate import NavigationLimits
@@ -77,9 +77,6 @@ INSIDE, FAR_INSIDE = 0.45, 1.1
 """Pelvis past the door's plane [m] at which the robot stops when the leaf is open, and in any case."""
 PASSING = (0.10, 0.12)
 """Errors at the two places before the door at which the robot goes on [m, rad]: the arm makes up for them."""
-BEYOND = 0.06
-"""How much farther than to the lever it is led [m], so that it goes on while it still walks: who learns from these
-demonstrations knows no phase and no clock, and would wait for the last centimetres for ever (docs/experts.md)."""
 BACK = 0.25
 """Way back after a missed lever [m]."""
 LEARN, MOST_LEARNED = 0.6, 0.06
@@ -134,8 +131,7 @@ class OpenDoorExpert(Expert):
         self._onward(mask)
         walking = states.at("approach", "step in", "retreat")
         answer = self.walk.command(mask & walking, dt)
-        there = (answer.distance < PASSING[0]) & (answer.heading_error.abs() < PASSING[1])
-        arrived = mask & (there | answer.arrived | states.late)
+        arrived = mask & (passing(answer, PASSING) | states.late)
         self._arrive(arrived & walking)
 
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
@@ -218,7 +214,7 @@ class OpenDoorExpert(Expert):
         pressed = ABOVE - TOUCHING + (PRESSING * states.clock).clamp_max(TOUCHING + BELOW)
         wanted = self._lever()
         wanted[:, 2] += ABOVE - down - pressed * states.at("press") - (ABOVE + BELOW) * opening
-        wanted = select(holding | opening, wanted, self._over(self._raised))
+        wanted = select(holding | opening, wanted, self.sight.root_position + turn(self.sight.pose[:, 2], self._raised))
         both = torch.stack([self.palms.measured()[:, 0], wanted], dim=1)
         learn = torch.zeros(len(wanted), 2, dtype=torch.bool, device=wanted.device)
         learn[:, 1] = mask & (states.at("lower") | states.at("step in") & (states.clock > UP))
@@ -229,11 +225,6 @@ class OpenDoorExpert(Expert):
         command.reach[:, 0] = states.at("push").to(command.reach.dtype)
         command.reach[:, 1] = (raised | holding | states.at("push")).to(command.reach.dtype)
         command.waist[:, 2] = LEAN * holding
-
-    def _over(self, local: Tensor) -> Tensor:
-        """A point of the pelvis' heading frame [m] in the world, shape [worlds, 3]."""
-        turned = torch.cat([rotate_xy(self.sight.pose[:, 2], local[:, :2]), local[:, 2:]], dim=1)
-        return self.sight.root_position + turned
 
     def _push(self, command: MotionCommand) -> None:
         """Feet behind, straight through the doorway."""

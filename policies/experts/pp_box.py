@@ -21,7 +21,7 @@ from arena_newton.policies.experts.base import Expert, Sight
 from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
-from arena_newton.policies.experts.walking import Walk, along, paced
+from arena_newton.policies.experts.walking import Walk, along, beyond, paced, passing
 from arena_newton.rotations import heading, matrix_from_quat, quat_from_yaw, rotate_xy, wrap_angle
 from arena_newton.tasks.pp_box import BOX, DECKS, TABLE
 from arena_newton.trackers.motions.commands import MotionCommand
@@ -53,10 +53,6 @@ READY = 0.28
 """Distance of the palms ahead of the pelvis before that [m]."""
 PASSING = (0.10, 0.12)
 """Errors at the places on the way, and in front of box and shelf, that do not matter [m, rad]: the arms compensate."""
-BEYOND = 0.06
-"""How much farther than to box and shelf it is led [m], so that it goes on while it still walks. Whoever learns from
-these demonstrations knows no phase and no clock: where they wait for the last centimetres, or for a time, it waits
-for ever (docs/experts.md)."""
 ALIGN_GAIN = 1.5
 """Integral gain on palms and wrists while they align [1/s]."""
 LEARNING = 0.4
@@ -339,10 +335,6 @@ class PPBoxExpert(Expert):
             state.enter(following, entering)
             return entering
 
-        def near(answer: NavigationCommand, within: tuple[float, float]) -> Tensor:
-            close = (answer.distance < within[0]) & (answer.heading_error.abs() < within[1])
-            return close | answer.arrived
-
         away = torch.linalg.vector_norm(pose[:, :2] - self._stand[:, :2], dim=1)
         off = torch.linalg.vector_norm(pose[:, :2] - self._spot[:, :2], dim=1)
         self._approach(done("retreat", away > BACK))
@@ -352,8 +344,8 @@ class PPBoxExpert(Expert):
         sunk = self.underside < self._deck_top() - SUNK + self._down
         enter("lower", "open", (self._centre()[:, 2] < flat) | sunk)
         enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - SHORT) | (self.grip[:, 0] >= FARTHEST)))
-        enter("step in", "reach", near(haul, PASSING))
-        self.haul.to(enter("carry", "step in", near(haul, PASSING)), beyond(self._spot))
+        enter("step in", "reach", passing(haul, PASSING))
+        self.haul.to(enter("carry", "step in", passing(haul, PASSING)), beyond(self._spot))
         self._choose_spot(enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING))
         enter("back", "turn", away > BACK)
         lifted = done("lift", self._underside() > self._table + LIFTED)
@@ -362,8 +354,8 @@ class PPBoxExpert(Expert):
         state.enter("retreat", lifted & ~held)
         enter("close", "lift", (self._overlap() > self._deep - SHORT) & (clock > SQUEEZED))
         enter("align", "close", (clock > SOONEST) & (self._missing() < ALIGNED))
-        enter("step up", "align", near(walk, PASSING))
-        self.walk.to(enter("approach", "step up", near(walk, PASSING) & (state.clock > 0)), beyond(self._stand))
+        enter("step up", "align", passing(walk, PASSING))
+        self.walk.to(enter("approach", "step up", passing(walk, PASSING) & (state.clock > 0)), beyond(self._stand))
 
     def _watch(self, mask: Tensor) -> None:
         """Leave the usual order where the box rests somewhere else than between the hands."""
@@ -482,8 +474,3 @@ def pose_before(point: Tensor, yaw: Tensor, distance: Tensor) -> Tensor:
     """
     ahead = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
     return torch.cat([point - distance[:, None] * ahead, yaw[:, None]], dim=1)
-
-
-def beyond(pose: Tensor) -> Tensor:
-    """Poses that are `BEYOND` farther ahead than others; x, y [m], yaw [rad], shape [worlds, 3]."""
-    return pose_before(pose[:, :2], pose[:, 2], torch.full_like(pose[:, 2], -BEYOND))

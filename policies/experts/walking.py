@@ -11,7 +11,11 @@ from arena_newton.policies.experts.planning import Floor, plan
 from arena_newton.rotations import rotate_xy, wrap_angle
 from arena_newton.trackers.motions.navigate import NavigationCommand, NavigationLimits, Navigator
 
-__all__ = ["Walk", "along", "paced"]
+__all__ = ["BEYOND", "Walk", "along", "beyond", "paced", "passing"]
+
+BEYOND = 0.06
+"""How much farther than to a place a robot is led that goes on there while it still walks [m]: whoever learns from
+demonstrations knows no phase and no clock, and would wait for the last centimetres for ever (docs/experts.md)."""
 
 HEADING_GAIN = 1.5
 """Yaw rate for a heading error on a line [1/s]."""
@@ -58,6 +62,18 @@ class Walk:
 def paced(velocity: Tensor, pace: Tensor) -> Tensor:
     """A velocity [worlds, 3] whose two speeds, not its yaw rate, are multiplied by a pace, shape [worlds]."""
     return velocity * torch.stack([pace, pace, torch.ones_like(pace)], dim=1)
+
+
+def passing(answer: NavigationCommand, within: tuple[float, float]) -> Tensor:
+    """Worlds that hold at their goal, or are off it by less than these errors [m, rad]; bool, shape [worlds]."""
+    close = (answer.distance < within[0]) & (answer.heading_error.abs() < within[1])
+    return close | answer.arrived
+
+
+def beyond(pose: Tensor) -> Tensor:
+    """Poses that are `BEYOND` farther ahead than others; x, y [m], yaw [rad], shape [worlds, 3]."""
+    ahead = torch.stack([torch.cos(pose[:, 2]), torch.sin(pose[:, 2])], dim=1)
+    return torch.cat([pose[:, :2] + BEYOND * ahead, pose[:, 2:]], dim=1)
 
 
 def _padded(points: Tensor, length: int) -> Tensor:
