@@ -13,7 +13,7 @@ from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.sharding import read_shard
 from arena_newton.eval.stats import Aggregate, aggregate
 
-__all__ = ["Results", "RunRecord", "due_episodes", "in_plan_order", "load_run", "results_json"]
+__all__ = ["Results", "RunRecord", "due_episodes", "in_plan_order", "is_complete", "load_run", "results_json"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def due_episodes(document: Document) -> int:
     return document["planned"] if shard is None else shard.size(document["planned"])
 
 
-def _complete(run: RunRecord) -> bool:
+def is_complete(run: RunRecord) -> bool:
     """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
     planned, keep = run.document["planned"], run.config.get("keep")
     if keep is None:
@@ -93,7 +93,7 @@ def results_json(run: RunRecord) -> Results:
         "config": run.config,
         "planned": due_episodes(run.document),
         "finished": len(run.records),
-        "complete": _complete(run),
+        "complete": is_complete(run),
         "cells": figures["cells"],
         "suites": figures["suites"],
     }
