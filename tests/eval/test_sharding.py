@@ -178,6 +178,23 @@ def test_a_folder_belongs_to_one_shard(tmp_path, capsys):
     assert "was begun with the whole plan" in capsys.readouterr().err
 
 
+def test_shards_are_no_results(tmp_path, capsys):
+    """Tables and comparisons refuse a finished shard and name merge; a joint table of all shards says what they are."""
+    flags = ["run", "--task", "boxing", "--repeats", "2", "--engine", "mujoco", "--shard"]
+    folders = [str(tmp_path / name) for name in ("a", "b")]
+    for number, folder in enumerate(folders, start=1):
+        assert main([*flags, f"{number}/2", "--out", folder], factories()) == 0
+    for command in (["tables", *folders], ["compare", *folders], ["tables", folders[1]]):
+        capsys.readouterr()
+        assert main([*command, "--out", str(tmp_path / "out")]) == 2
+        error = capsys.readouterr().err
+        assert "of a run; name the folder into which eval merge joins all" in error and error.count("\n") == 1
+    assert main(["report", *folders]) == 0
+    printed = capsys.readouterr().out
+    assert f"{folders[0]} is shard 1/2 of a plan of 6 episodes: 3 of 3 episodes." in printed
+    assert "incomplete" not in printed
+
+
 def test_shards_without_out_have_folders_of_their_own(tmp_path, monkeypatch):
     """Tasks of an array that start in the same second do not meet in one folder."""
     monkeypatch.chdir(tmp_path)
