@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +11,13 @@ from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.evaluated_cells import EvaluatedCell, read_cells
 from arena_newton.eval.pack_options import ENOUGH, PackOptions
+from arena_newton.eval.results import RunRecord, is_complete, load_run
 from arena_newton.policies.learned.checkpoint_packing import pack, packed_digest, training_command
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, CellResult, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
 from arena_newton.rules import MODES
+from arena_newton.text import counted
 
 __all__ = ["run"]
 
@@ -39,7 +42,7 @@ def run(given: Path, options: PackOptions) -> int:
         why = f"none is solved at {100 * ENOUGH:.0f} %" if options.results else "the checkpoint names none"
         raise InputError(f"--tasks: {why}; name those that it is offered for")
     out = SHIPPED if options.out is None else Path(options.out).expanduser()
-    words = ["python", "-m", "arena_newton.eval", "pack", given.name]
+    words = ["python", "-m", "arena_newton.eval", "pack", given.name or given.resolve().name]
     for flag, values in (("--tasks", options.tasks), ("--results", [Path(name).name for name in options.results])):
         words += [flag, *values] if values else []
     card = PolicyCard(
@@ -62,18 +65,28 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
     """What a checkpoint reached: its cells, chunks executed as it says itself, without latency.
 
     Raises:
-        InputError: A folder is unfit, or holds no cell of this checkpoint.
+        InputError: A folder is unfit or unfinished, was played under conditions of its own, or holds no cell of this
+            checkpoint.
     """
     if not folders:
         return ()
-    cells = [cell for cell in read_cells(folders).cells if cell.weights in digests]
+    read = read_cells(folders)
+    cells = [cell for cell in read.cells if cell.weights in digests]
     plain = [cell for cell in cells if not cell.latency and cell.replan is None and not cell.ensemble]
     if not plain:
         where = " ".join(map(str, folders))
         raise InputError(
             f"--results {where}: no cell of this checkpoint (weights {' or '.join(digests)}), its chunks executed whole"
         )
+    for folder in dict.fromkeys(cell.folder for cell in plain):
+        _check_usual(load_run(folder))
     plain.sort(key=_order)
+    for cell, other in itertools.pairwise(plain):
+        if _order(cell) == _order(other):
+            names = f"{cell.task} {cell.tracker} {cell.mode}"
+            raise InputError(f"--results {other.folder}: {names} is in {cell.folder} too; leave one of them out")
+    for note in read.notes:
+        print(note)
     return tuple(
         CellResult(
             task=cell.task,
@@ -87,6 +100,22 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
     )
 
 
+def _check_usual(run: RunRecord) -> None:
+    """Refuse a run that is no result of the benchmark: cut budgets, another scene, or unfinished.
+
+    Raises:
+        InputError: It is one of these.
+    """
+    where = f"--results {run.folder}"
+    if not is_complete(run):
+        # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
+        played = f"{len(run.records):,} of {counted(run.document['planned'], 'episode')}"
+        raise InputError(f"{where}: is unfinished ({played}), and what ends first is no fair sample; eval resume it")
+    for name, said in (("max_steps", "--max-steps"), ("variant", "--variant")):
+        if run.config.get(name) is not None:
+            raise InputError(f"{where}: was played with {said}, which makes it no result of the benchmark")
+
+
 def _order(cell: EvaluatedCell) -> tuple[int, str, int]:
     names = tasks.names()
     return names.index(cell.task) if cell.task in names else len(names), cell.tracker, MODES.index(cell.mode)
@@ -98,5 +127,6 @@ def _solved(found: Sequence[CellResult], trained: Sequence[str], trackers: Seque
     for one in found:
         if one.mode == "base" and one.tracker in (trackers or (one.tracker,)):
             rates.setdefault(one.task, []).append(one.rate)
-    solved = [task for task in trained if min(rates.get(task, [0.0])) >= ENOUGH]
+    solved = [task for task in trained if len(rates.get(task, ())) >= max(len(trackers), 1)]
+    solved = [task for task in solved if min(rates[task]) >= ENOUGH]
     return tuple(sorted(solved, key=lambda task: -min(rates[task])))

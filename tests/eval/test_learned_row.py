@@ -131,7 +131,9 @@ def test_without_weights_the_default_run_goes_on(absent, tmp_path, capsys):
 
 def test_it_plays_the_tasks_of_its_card(shipped, folder, tmp_path, capsys):
     """Without --task these are all of its card; another task is one error that names them; a folder may be named."""
-    assert {episode.task for episode in resolve(RunOptions(policy="learned")).episodes} == {"vis_navi", "boxing"}
+    for more in ({}, {"repeats": 1}, {"mode": ("visual",)}, {"seeds": (1,), "shard": "1/3"}):
+        played = {episode.task for episode in resolve(RunOptions(policy="learned", **more)).episodes}
+        assert played == {"vis_navi", "boxing"}
     assert main(["list", "--policy", "learned", "--task", "boxing", "football"]) == 2
     assert "--policy learned: does vis_navi, boxing (card.md says how well), not football" in capsys.readouterr().err
     short = ["--task", "boxing", "--repeats", "1", "--seeds", "0", "--device", "cpu", "--engine", "mujoco"]
@@ -179,6 +181,58 @@ def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
     (other / "model.safetensors").write_bytes(weights[:-4] + b"\x00\x00\x00\x00")
     assert main(["pack", str(other), "--out", str(tmp_path / "p"), "--results", str(tmp_path / "played")]) == 2
     assert "no cell of this checkpoint" in capsys.readouterr().err and not (tmp_path / "p").exists()
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """A checkpoint of two trackers, `made`, and runs of its packed form through one of them."""
+    root = tmp_path_factory.mktemp("evaluated")
+    made = checkpoint(root / "made", trackers=("twist2", "sonic"))
+    assert main(["pack", str(made), "--out", str(root / "packed")]) == 0
+    flags = ["--policy", f"learned:{root / 'packed'}", "--device", "cpu", "--engine", "mujoco"]
+    flags += ["--seeds", "0", "--repeats", "4", "--task", "boxing"]
+    for name, more in {"whole": [], "shard": ["--shard", "1/2"], "capped": ["--max-steps", "50"]}.items():
+        assert main([*flags, *more, "--out", str(root / name)], stand_ins()) == 0
+    lines = (root / "whole" / "episodes.jsonl").read_text().splitlines(keepends=True)
+    for name, kept in {
+        "half": [line for line in lines if '"success"' in line],
+        "won": [line.replace('"fall"', '"success"').replace('"timeout"', '"success"') for line in lines],
+    }.items():
+        (root / name).mkdir()
+        (root / name / "config.json").write_bytes((root / "whole" / "config.json").read_bytes())
+        (root / name / "episodes.jsonl").write_text("".join(kept))
+    assert main([*flags, "--rules", "released", "--out", str(root / "released")], stand_ins()) == 0
+    return root
+
+
+@pytest.mark.parametrize(
+    ("results", "said"),
+    [
+        (["half"], "half: is unfinished (2 of 4 episodes), and what ends first is no fair sample"),
+        (["shard"], "shard: is shard 1/2 of a run; name the folder into which eval merge joins all"),
+        (["capped"], "capped: was played with --max-steps, which makes it no result of the benchmark"),
+        (["won"], "--tasks: none is solved at 75 %"),  # its demonstrations are of two trackers
+    ],
+)
+def test_pack_takes_results_alone(evaluated, results, said, tmp_path, capsys):
+    """A part of a run or one under conditions of its own is none, and one tracker of two is not every tracker."""
+    folders = [str(evaluated / name) for name in results]
+    assert main(["pack", str(evaluated / "made"), "--out", str(tmp_path / "p"), "--results", *folders]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1, error
+    assert not (tmp_path / "p").exists()
+
+
+def test_pack_says_what_it_leaves_out(evaluated, tmp_path, capsys, monkeypatch):
+    """Episodes under other rules do not count, and are named; the card names a checkpoint given as `.`."""
+    monkeypatch.chdir(evaluated / "made")
+    folders = [str(evaluated / name) for name in ("whole", "released")]
+    command = ["pack", ".", "--out", str(tmp_path / "p"), "--results", *folders, "--tasks", "boxing"]
+    assert main(command) == 0
+    assert "4 episodes under the rules released left out." in capsys.readouterr().out
+    card = read_card(tmp_path / "p")
+    assert card.packed_by == "python -m arena_newton.eval pack made --tasks boxing --results whole released"
+    assert [(one.task, one.episodes) for one in card.results] == [("boxing", 4)]
 
 
 @pytest.mark.parametrize(
