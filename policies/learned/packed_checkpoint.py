@@ -97,8 +97,9 @@ class ActCheckpoint:
             InputError: They do not fit.
         """
         path = self.folder / WEIGHTS_NAME
-        network = ActNetwork(self.sizes)
         weights = read_weights(path)
+        with torch.device("meta"):  # no memory for sizes that the file does not have
+            network = ActNetwork(self.sizes)
         kept = {name: value for name, value in weights.items() if not name.startswith("model.vae_encoder")}
         try:
             network.load(kept if self.trains_latent else weights)
@@ -219,6 +220,9 @@ def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str
             options = _object(path, f"steps[{index}].config", step.get("config") or {})
             if options.get("rename_map"):
                 raise InputError(f"{path}: steps[{index}] renames observations, which a packed policy does not")
+            if options.get("float_dtype") not in (None, "float32"):
+                given = f"{options['float_dtype']!r:.40}"
+                raise InputError(f"{path}: steps[{index}] computes in {given}, a packed policy in float32")
             if step["registry_name"] in NORMALISES:
                 state, part = _statistics(path, index, step, options, sizes)
                 files.append(state)
@@ -241,6 +245,11 @@ def _statistics(
     if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):
         raise InputError(f"{path}: {where}.state_file is {state!r:.60}, expected a name of a safetensors file")
     modes = _object(path, f"{where}.config.norm_map", options.get("norm_map"))
+    chosen = options.get("normalize_observation_keys")
+    if chosen is not None:
+        raise InputError(f"{path}: {where} normalises only {str(chosen)[:80]}, a packed policy whatever has statistics")
+    features = options.get("features")  # LeRobot normalises what is named here, by the kind that is named
+    named = None if features is None else _object(path, f"{where}.config.features", features)
     eps = options.get("eps", 1e-8)
     if not isinstance(eps, int | float) or not 0.0 <= eps < 1.0:
         raise InputError(f"{path}: {where}.config.eps is {eps!r:.40}, expected 0 to 1")
@@ -257,6 +266,10 @@ def _statistics(
                 f"{path}: {where} normalises {KINDS[feature]} by {mode!r:.40}, expected MEAN_STD or IDENTITY"
             )
         mean, std = tensors.get(f"{feature}.mean"), tensors.get(f"{feature}.std")
+        if named is not None and feature != "action" and path.name == PROCESSOR_FILES[0]:
+            kind = _object(path, f"{where}.config.features.{feature}", named.get(feature, {})).get("type")
+            if kind != KINDS[feature]:
+                raise InputError(f"{path}: {where} takes {feature} for {kind!r:.40}, expected {KINDS[feature]}")
         if mean is None or std is None or mean.shape != shape or std.shape != shape:
             raise InputError(f"{path.parent / state}: {feature} has no mean and std of shape {list(shape)}")
         found[feature] = Spread(mean.float(), std.float(), float(eps))
