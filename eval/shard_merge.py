@@ -24,6 +24,7 @@ from arena_newton.eval.options import RunMergeOptions, RunOptions
 from arena_newton.eval.records import Json, JsonObject, shown
 from arena_newton.eval.results import Results, RunRecord, due_episodes, is_complete, load_run
 from arena_newton.eval.sharding import Shard, dealt, read_shard
+from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.files import PARTIAL, file_label, replace_atomically
 from arena_newton.text import counted, is_printable, plain_text
 
@@ -106,6 +107,9 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
         StorageError: `out` cannot be written.
     """
     _check_out(out, folders)
+    for folder in folders:
+        if (folder / SUITE_FILE).is_file():
+            raise InputError(f"merge {folder}: is a suite, whose parts are joined by copying one folder over the other")
     runs = sorted((load_run(folder) for folder in folders), key=_order)
     for other in runs[1:]:
         _check_alike(runs[0], other, accept_versions)

@@ -302,12 +302,15 @@ def test_bad_calls(copied, capsys, monkeypatch):
     (copied / "link").symlink_to("s1")
     (copied / "file").write_text("x")
     (copied / "busy.part").mkdir()
+    (copied / "suite").mkdir()
+    (copied / "suite" / "suite.json").write_text("{}")
     before = sorted(str(path) for path in copied.rglob("*"))
     cases = {
         (): "name the folders of the shards",
         ("s1", "s2", "s3"): "--out",
         ("s1", "s1", "--out", "m"): "named twice",
         ("s1", "nowhere", "--out", "m"): "nowhere: no results folder",
+        ("s1", "suite", "--out", "m"): "suite: is a suite, whose parts are joined by copying",
         ("s1", "s2", "s3", "--out", "s1"): "--out s1: is not empty",
         ("s1", "s2", "s3", "--out", "link"): "is a link",
         ("s1", "s2", "s3", "--out", "file"): "is a file",

@@ -144,6 +144,14 @@ def test_suites_take_arrays_too(monkeypatch):
     assert call.chosen == plan_call("tiny", MatrixOptions(shard="2/2")).chosen
 
 
+def test_suites_have_a_cell_for_each_shard(tmp_path):
+    """More shards than cells are refused, as a run refuses more shards than episodes."""
+    cells = len(plan_call("tiny", MatrixOptions()).cells)
+    assert len(plan_call("tiny", MatrixOptions(shard=f"{cells}/{cells}")).chosen) == 1
+    with pytest.raises(InputError, match=f"^--shard 1/{cells + 1}: the suite has {cells} cells, expected no more"):
+        plan_call("tiny", MatrixOptions(shard=f"1/{cells + 1}"))
+
+
 def test_list_shows_a_shard(capsys):
     """`list` prints the episodes of a shard with their numbers in the plan."""
     assert main(["list", *FLAGS, "--shard", "2/3"]) == 0
