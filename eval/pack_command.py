@@ -28,6 +28,8 @@ def run(given: Path, options: PackOptions) -> int:
     Raises:
         InputError: The checkpoint or a flag is unfit, or the results are of another policy.
     """
+    if options.out is not None and not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
     folder = checkpoint_folder(given, "pack")
     checkpoint = read_act_checkpoint(folder)
     facts = checkpoint.facts

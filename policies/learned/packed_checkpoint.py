@@ -120,7 +120,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         with safe_open(path, framework="pt") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: not readable as safetensors ({error})") from None
+        said = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: not readable as safetensors ({said})") from None
     for name, value in found.items():
         if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
             raise InputError(f"{path}: {name} holds something else than finite floating-point numbers")

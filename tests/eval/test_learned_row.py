@@ -241,6 +241,7 @@ def test_pack_says_what_it_leaves_out(evaluated, tmp_path, capsys, monkeypatch):
         (["pack"], "pack: name the checkpoint"),
         (["pack", "nowhere"], "pack:nowhere: no such folder"),
         (["pack", "."], "holds no checkpoint"),
+        (["pack", ".", "--out", ""], "--out: is empty, name a folder"),
     ],
 )
 def test_pack_refuses_what_is_no_checkpoint(arguments, said, tmp_path, monkeypatch, capsys):
