@@ -36,12 +36,15 @@ def run(given: Path, options: PackOptions) -> int:
     before = read_card(folder) if (folder / CARD_FILE).is_file() else None  # of one that is packed again
     digests = (checkpoint.digest, packed_digest(folder))
     found = _results([Path(name).expanduser() for name in options.results], digests)
-    trained = facts.task_vector or facts.tasks
-    chosen = options.tasks or (_solved(found, trained, facts.trackers) if options.results else trained)
+    kept = _kept(before, digests, found)
+    found = (*found, *kept)
+    # Of equally good tasks the first stays the first.
+    trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.task_vector or facts.tasks))))
+    chosen = options.tasks or (_solved(found, trained, facts.trackers) if found else trained)
     for task in chosen:
         tasks.get(task)
     if not chosen:
-        why = f"none is solved at {100 * ENOUGH:.0f} %" if options.results else "the checkpoint names none"
+        why = f"none is solved at {100 * ENOUGH:.0f} %" if found else "the checkpoint names none"
         raise InputError(f"--tasks: {why}; name those that it is offered for")
     out = SHIPPED if options.out is None else Path(options.out).expanduser()
     words = ["python", "-m", "arena_newton.eval", "pack", given.name or given.resolve().name]
@@ -50,9 +53,9 @@ def run(given: Path, options: PackOptions) -> int:
     card = PolicyCard(
         tasks=tuple(dict.fromkeys(chosen)),
         command=options.command or training_command(facts.options) or (before.command if before is not None else ""),
-        packed_by=" ".join(map(shlex.quote, words)),
+        packed_by="; then ".join([*([before.packed_by] if before and kept else []), " ".join(map(shlex.quote, words))]),
         note=options.note or (before.note if before is not None else ""),
-        results=found,
+        results=_in_order(found, chosen, facts.trackers),
     )
     card = pack(folder, out, card)
     print(f"{out}: {card.bytes / 1e6:.2f} MB, weights {card.weights}, tasks {', '.join(card.tasks)}")
@@ -82,9 +85,9 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
         )
     for folder in dict.fromkeys(cell.folder for cell in plain):
         _check_usual(load_run(folder))
-    plain.sort(key=_order)
+    plain.sort(key=_names)
     for cell, other in itertools.pairwise(plain):
-        if _order(cell) == _order(other):
+        if _names(cell) == _names(other):
             names = f"{cell.task} {cell.tracker} {cell.mode}"
             raise InputError(f"--results {other.folder}: {names} is in {cell.folder} too; leave one of them out")
     for note in read.notes:
@@ -100,6 +103,13 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
         )
         for cell in plain
     )
+
+
+def _kept(before: PolicyCard | None, digests: Sequence[str], found: Sequence[CellResult]) -> list[CellResult]:
+    """Cells of the card of a policy that is packed again, whose weights stay; those that were found anew are not."""
+    if before is None or before.weights not in digests:
+        return []
+    return [cell for cell in before.results if _names(cell) not in {_names(one) for one in found}]
 
 
 def _check_usual(run: RunRecord) -> None:
@@ -118,9 +128,18 @@ def _check_usual(run: RunRecord) -> None:
             raise InputError(f"{where}: was played with {said}, which makes it no result of the benchmark")
 
 
-def _order(cell: EvaluatedCell) -> tuple[int, str, int]:
-    names = tasks.names()
-    return names.index(cell.task) if cell.task in names else len(names), cell.tracker, MODES.index(cell.mode)
+def _names(cell: EvaluatedCell | CellResult) -> tuple[str, str, str]:
+    return cell.task, cell.tracker, cell.mode
+
+
+def _in_order(cells: Sequence[CellResult], offered: Sequence[str], trackers: Sequence[str]) -> tuple[CellResult, ...]:
+    """Cells as a card lists them: tasks that it is offered for and trackers of its training come first."""
+
+    def place(name: str, known: Sequence[str]) -> tuple[int, str]:
+        return (known.index(name) if name in known else len(known)), name
+
+    first = (*offered, *tasks.names())
+    return tuple(sorted(cells, key=lambda c: (place(c.task, first), place(c.tracker, trackers), place(c.mode, MODES))))
 
 
 def _solved(found: Sequence[CellResult], trained: Sequence[str], trackers: Sequence[str]) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The policy that ships: its row in the default run, its flags, and its card with results."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -174,7 +175,10 @@ def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
     page = (out / "card.md").read_text()
     assert "Made for a test." in page and page.count("| boxing | twist2 |") == 2
     assert main(["pack", str(out), "--out", str(out), "--tasks", "boxing"]) == 0
-    assert read_card(out).note == "Made for a test."
+    again = read_card(out)
+    assert (again.note, set(again.results), again.tasks) == ("Made for a test.", set(card.results), ("boxing",))
+    assert [(one.task, one.mode) for one in again.results][:2] == [("boxing", "base"), ("boxing", "visual")]
+    assert again.packed_by.startswith(card.packed_by + "; then python -m arena_newton.eval pack packed --tasks")
     other = checkpoint(tmp_path / "other", seed=9, tasks=("vis_navi", "boxing"))
     capsys.readouterr()
     weights = (other / "model.safetensors").read_bytes()
@@ -235,6 +239,29 @@ def test_pack_says_what_it_leaves_out(evaluated, tmp_path, capsys, monkeypatch):
     assert [(one.task, one.episodes) for one in card.results] == [("boxing", 4)]
 
 
+def test_a_policy_is_packed_again_with_more_results(evaluated, tmp_path, capsys):
+    """Cells of its card stay beside those that come anew, and tasks follow from all of them."""
+    won, out = evaluated / "won", tmp_path / "again"
+    assert main(["pack", str(evaluated / "made"), "--out", str(out), "--results", str(won), "--tasks", "boxing"]) == 0
+    card = json.loads((out / "card.json").read_text())
+    other = {"task": "vis_navi", "mode": "base", "episodes": 4, "successes": 1, "falls": 0}
+    card["results"] += [other | {"tracker": tracker} for tracker in ("sonic", "twist2")]
+    card["results"] += [
+        card["results"][0] | {"tracker": "sonic", "successes": 3},
+        other | {"tracker": "x", "mode": "?"},
+    ]
+    (out / "card.json").write_text(json.dumps(card))
+    assert main(["pack", str(out), "--out", str(out), "--results", str(evaluated / "whole")]) == 2
+    assert "none is solved" in capsys.readouterr().err
+    assert main(["pack", str(out), "--out", str(out)]) == 0
+    cells = [(one.task, one.tracker, one.mode, one.successes) for one in read_card(out).results]
+    boxing = [("boxing", "sonic", "base", 3), ("boxing", "twist2", "base", 4)]
+    assert sorted(cells) == boxing + sorted(
+        ("vis_navi", name, mode, 1) for name, mode in (("sonic", "base"), ("twist2", "base"), ("x", "?"))
+    )
+    assert read_card(out).tasks == ("boxing",)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -271,6 +298,19 @@ def test_a_damaged_card_is_one_error(folder, tmp_path, field, value):
     with pytest.raises(InputError, match=rf"card\.json: .*{field}") as error:
         read_card(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_what_ships_can_be_packed_again(tmp_path):
+    """Packing the policy in the package gives the same files, and a card that says no less."""
+    card = learned_card.shipped_card()
+    if card is None:
+        pytest.skip("no policy comes with this build")
+    assert main(["pack", str(learned_card.SHIPPED), "--out", str(tmp_path / "p")]) == 0
+    again = read_card(tmp_path / "p")
+    assert dataclasses.replace(again, packed_by="", bytes=0) == dataclasses.replace(card, packed_by="", bytes=0)
+    for name in ("model.safetensors", "config.json", "arena_policy.json"):
+        assert (tmp_path / "p" / name).read_bytes() == (learned_card.SHIPPED / name).read_bytes(), name
+    assert card.bytes == sum(p.stat().st_size for p in learned_card.SHIPPED.iterdir() if p.stem != "card")
 
 
 def test_what_ships_fits(capsys):
