@@ -227,7 +227,7 @@ class ActNetwork(nn.Module):
         unknown = sorted(set(weights) - {f"model.{name}" for name in own})
         if unknown:
             raise KeyError(unknown[0])
-        self.load_state_dict({name: value.float() for name, value in own.items()}, assign=True)
+        self.load_state_dict({name: value.float() for name, value in own.items()})
         self.requires_grad_(False).eval()
         self.backbone.fold()
 

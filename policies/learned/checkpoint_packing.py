@@ -21,12 +21,12 @@ from safetensors.torch import save
 from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
 from arena_newton.foreign import create
-from arena_newton.policies.learned.act_network import ActNetwork
 from arena_newton.policies.learned.learned_card import CARD_FILE, CARD_PAGE, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import (
     PROCESSOR_FILES,
     WEIGHTS_NAME,
     ActCheckpoint,
+    loaded_network,
     read_act_checkpoint,
     read_weights,
 )
@@ -133,15 +133,7 @@ def pack(folder: Path, out: Path, card: PolicyCard) -> PolicyCard:
 
 def _try(checkpoint: ActCheckpoint, weights: dict[str, torch.Tensor]) -> None:
     """Refuse weights that do not fit the network, or whose answer in half precision is not finite."""
-    with torch.device("meta"):  # no memory for sizes that the file does not have
-        network = ActNetwork(checkpoint.sizes)
-    try:
-        network.load(weights)
-    except (KeyError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(
-            f"{checkpoint.folder / WEIGHTS_NAME}: does not hold the weights of this network: {said}"
-        ) from None
+    network = loaded_network(checkpoint.folder / WEIGHTS_NAME, checkpoint.sizes, weights)
     facts, sizes = checkpoint.facts, checkpoint.sizes
     task = torch.zeros(1, sizes.tasks) if sizes.tasks else None
     with torch.inference_mode():

@@ -21,7 +21,15 @@ from arena_newton.foreign import check_size, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
 
-__all__ = ["PROCESSOR_FILES", "WEIGHTS_NAME", "ActCheckpoint", "Spread", "read_act_checkpoint", "read_weights"]
+__all__ = [
+    "PROCESSOR_FILES",
+    "WEIGHTS_NAME",
+    "ActCheckpoint",
+    "Spread",
+    "loaded_network",
+    "read_act_checkpoint",
+    "read_weights",
+]
 
 WEIGHTS_NAME = "model.safetensors"
 """File of the weights."""
@@ -98,15 +106,33 @@ class ActCheckpoint:
         """
         path = self.folder / WEIGHTS_NAME
         weights = read_weights(path)
-        with torch.device("meta"):  # no memory for sizes that the file does not have
-            network = ActNetwork(self.sizes)
         kept = {name: value for name, value in weights.items() if not name.startswith("model.vae_encoder")}
-        try:
-            network.load(kept if self.trains_latent else weights)
-        except (KeyError, RuntimeError) as error:
-            said = " ".join(str(error).split())[:300]
-            raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
-        return network
+        return loaded_network(path, self.sizes, kept if self.trains_latent else weights)
+
+
+def loaded_network(path: Path, sizes: ActSizes, weights: dict[str, torch.Tensor]) -> ActNetwork:
+    """A network of these sizes with the weights of a file, on the CPU, in float32.
+
+    Raises:
+        InputError: They do not fit.
+    """
+    largest = {
+        "model.decoder_pos_embed.weight": (sizes.chunk_size, sizes.dim_model),
+        "model.encoder_latent_input_proj.weight": (sizes.dim_model, sizes.latent_dim),
+    }
+    for stack, layers in (("encoder", sizes.n_encoder_layers), ("decoder", sizes.n_decoder_layers)):
+        shape = (sizes.dim_feedforward, sizes.dim_model)
+        largest |= {f"model.{stack}.layers.{layer}.linear1.weight": shape for layer in range(layers)}
+    try:
+        for name, wanted in largest.items():  # before memory is taken for sizes that the file does not have
+            if tuple(weights[name].shape) != wanted:
+                raise RuntimeError(f"{name} has shape {list(weights[name].shape)}, expected {list(wanted)}")
+        network = ActNetwork(sizes)
+        network.load(weights)
+    except (KeyError, RuntimeError) as error:
+        said = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
+    return network
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
