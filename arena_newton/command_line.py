@@ -1,6 +1,7 @@
 """What a command line answers when its work fails."""
 
 import atexit
+import errno
 import gc
 import os
 import sys
@@ -40,3 +41,8 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a path of the user's that cannot even be looked for; pathlib passes these on
+        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES) or error.filename is None:
+            raise
+        print(f"error: {plain_text(error.filename, 100)}: {error.strerror}", file=sys.stderr)
+        return 2

@@ -12,7 +12,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.comparison import Contender
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, load_run
+from arena_newton.eval.results import RunRecord, check_whole_plan, load_run
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
@@ -150,6 +150,7 @@ def _check_evaluation(run: RunRecord) -> None:
 def _of_run(folder: Path, title: str, per_tracker: bool) -> list[_Gathered]:
     run = load_run(folder)
     _check_evaluation(run)
+    check_whole_plan(run)
     played, planned = len(run.records), run.document["planned"]
     if not played:
         raise InputError(f"{folder}: holds no finished episode")
