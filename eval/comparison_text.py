@@ -32,6 +32,8 @@ OVER_ALL = "all"
 """Name of the rows over all tasks."""
 CELLS = ("both", "only_first", "only_second", "neither")
 """How a pair of episodes can end."""
+LEAST = 1e-300
+"""Probabilities below this are said to be so: they may be too small for a number."""
 METHOD = (
     "Within a task: McNemar's exact test of the episodes that both played; where two runs share no episode, "
     f"Boschloo's exact test (Fisher's where the product of their numbers is above {LARGEST_BOSCHLOO:,}). Over all "
@@ -53,6 +55,8 @@ def stratum_title(stratum: tuple[str, ...]) -> str:
 
 def p_text(p: float) -> str:
     """A probability, such as `0.034` and `3e-05`."""
+    if p < LEAST:
+        return f"<{LEAST:.0e}"
     return f"{p:.2g}" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -63,8 +67,9 @@ def rate_text(standing: Standing) -> tuple[str, str, str]:
 
 
 def difference_text(difference: RateDifference) -> str:
-    """A difference in points with its interval, such as `+12 (3 to 21)`."""
-    return f"{100 * difference.value:+.1f} ({100 * difference.low:.0f} to {100 * difference.high:.0f})"
+    """A difference in points with its interval, such as `+12.0 (3 to 21)`."""
+    value, low, high = (100 * part for part in (difference.value, difference.low, difference.high))
+    return f"{round(value, 1) + 0.0:+.1f} ({round(low)} to {round(high)})"  # + 0.0: no -0
 
 
 def verdict(comparison: Comparison, pair: PairComparison) -> str:
@@ -72,9 +77,11 @@ def verdict(comparison: Comparison, pair: PairComparison) -> str:
     first, second = comparison.names[pair.first], comparison.names[pair.second]
     if not pair.differs:
         return f"{first} and {second} are not told apart"
+    better, worse = (first, second) if pair.excess > 0 else (second, first)
     if pair.difference.value == 0.0:
-        return f"{first} and {second} differ, with equal mean rates"
-    better, worse = (first, second) if pair.difference.value > 0 else (second, first)
+        return f"{better} succeeds in more episodes than {worse}, with equal mean rates"
+    if (pair.difference.value > 0) != (pair.excess > 0):
+        return f"{better} succeeds in more episodes than {worse}, which has the higher mean rate"
     return f"{better} succeeds more often than {worse}"
 
 

@@ -13,6 +13,9 @@ from rows import episodes
 from test_report import folder_with
 
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.comparison import Contender, compare
+from arena_newton.eval.comparison_text import difference_text, p_text, verdict
+from arena_newton.eval.rate_tests import RateDifference
 from arena_newton.eval.stats import mcnemar, wilson
 
 
@@ -209,3 +212,30 @@ def test_a_plan_says_what_it_can_tell(capsys):
     assert main(["list", "--task", "boxing", "football"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("120 episodes") and "60 episodes of a cell 13 to 26.5 points, all 120" in said[1]
+
+
+def test_the_sentence_has_the_direction_of_the_test():
+    """Where few episodes of one task outweigh the mean, the better one is who won more episodes, and it is said."""
+    outcomes = [
+        {("big",): dict(enumerate([won] * 15 + [False] * 45)), ("small",): dict(enumerate([not won] * 4))}
+        for won in (True, False)
+    ]
+    comparison = compare([Contender("a", outcomes[0]), Contender("b", outcomes[1])])
+    (pair,) = comparison.pairs
+    assert pair.differs and pair.difference.value < 0
+    assert verdict(comparison, pair) == "a succeeds in more episodes than b, which has the higher mean rate"
+    outcomes = [
+        {("big",): dict(enumerate([won] * 15 + [False] * 45)), ("small",): dict(enumerate([not won] + [False] * 3))}
+        for won in (True, False)
+    ]
+    comparison = compare([Contender("a", outcomes[0]), Contender("b", outcomes[1])])
+    (pair,) = comparison.pairs
+    assert pair.differs and pair.difference.value == 0
+    assert verdict(comparison, pair) == "a succeeds in more episodes than b, with equal mean rates"
+
+
+def test_figures_have_no_minus_zero():
+    """A difference and its bounds that are shown as 0 have no minus, and what is too small for a number is said so."""
+    assert difference_text(RateDifference(-0.0001, -0.004, 0.02)) == "+0.0 (0 to 2)"
+    assert difference_text(RateDifference(0.12, 0.034, 0.206)) == "+12.0 (3 to 21)"
+    assert (p_text(mcnemar(1680, 0)), p_text(3e-5), p_text(0.034), p_text(1.0)) == ("<1e-300", "3e-05", "0.034", "1.00")
