@@ -3,7 +3,9 @@
 import csv
 import html
 import json
+import os
 import re
+import shutil
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -16,7 +18,9 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.comparison import Contender, compare
 from arena_newton.eval.comparison_text import difference_text, p_text, verdict
 from arena_newton.eval.rate_tests import RateDifference
+from arena_newton.eval.sharding import Shard, dealt
 from arena_newton.eval.stats import mcnemar, wilson
+from arena_newton.eval.suite_records import CellEvent, event_line
 
 
 def run_in(folder, per_seed, *, task="football", tracker="t", policy="p", strips=False, rules="paper", **config):
@@ -27,6 +31,8 @@ def run_in(folder, per_seed, *, task="football", tracker="t", policy="p", strips
         if strips:
             name = f"{task}__base__seed{row['group_seed']}__repeat{row['repeat']}__world.jpg"
             row["media"] = {"world strip": f"strips/{name}"}
+            (folder / "strips").mkdir(parents=True, exist_ok=True)
+            (folder / "strips" / name).touch()
     config = {"tracker": [tracker], "task": [task], "policy": policy, "rules": rules, "engine": "mujoco"} | config
     return folder_with(folder, rows, len(rows), **config)
 
@@ -66,12 +72,33 @@ def test_the_page_links_what_differs(tmp_path):
     assert len(links) == 11
     for link in links:
         target = (tmp_path / "out" / unquote(html.unescape(link))).resolve()
-        assert target.parent == a / "strips"
+        assert target.parent == a / "strips" and target.is_file()
     names = {Path(unquote(link)).name for link in links}
     assert "football__base__seed0__repeat4__world.jpg" in names and not any("seed1" in name for name in names)
     assert page.count("play it again") == 11 and "--seeds 0 --repeats 5" in page  # those of b have no strip
     assert 'href="../a%20b/report.html"' in page
     assert "<script" not in page and "script-src" not in page and "default-src &#39;none&#39;" in page
+    shutil.rmtree(a / "strips")  # results that came without their recordings
+    compared(tmp_path, a, b)
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert ".jpg" not in page and page.count("play it again") == 22
+
+
+def test_folders_may_have_any_name(tmp_path):
+    """Long names that differ at their end, and names that are no text, are compared and linked."""
+    odd = os.fsdecode(b"b\xff")
+    a, b = run_in(tmp_path / ("a" * 250 + "1"), (4, 5, 7), strips=True), run_in(tmp_path / ("a" * 250 + "2"), (4, 6, 7))
+    found = compared(tmp_path, a, b)
+    assert [one["name"] for one in found["policies"]] == [a.name, b.name]
+    try:
+        c = run_in(tmp_path / odd, (10, 5, 12), strips=True)
+    except OSError:
+        return  # a file system of text alone
+    (a / "report.html").touch(), (c / "report.html").touch()
+    compared(tmp_path, a, c)
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert page.count('href="../b%FF/strips/') == 11 and 'href="../b%FF/report.html"' in page
+    assert f'href="../{a.name}/report.html"' in page  # its path is too long for a table, not for a link
 
 
 def test_the_same_runs_give_the_same_bytes(tmp_path):
@@ -147,6 +174,16 @@ def test_a_suite_holds_its_policies(tmp_path):
     assert [[task["stratum"] for task in pair["tasks"]] for pair in found["pairs"]] == [strata] * 3
     assert any("Left out, because not all have it: vis_navi" in note for note in found["notes"])
     assert sum("is unfinished, and left out: 30 of 60" in note for note in found["notes"]) == 3
+    beginning = cell_of("act", "act", "twist2", "sit_sofa")
+    broken = cell_of("act", "act", "sonic", "sit_sofa")
+    suite = write_suite(tmp_path / "more", [*cells, (beginning, None), (broken, None)])
+    (suite / beginning.folder).mkdir(parents=True)
+    with (suite / "suite.1-of-1.jsonl").open("ab") as journal:
+        journal.write(event_line(CellEvent(cell=broken.id, event="failed", at="2026-01-02", error="no weights")))
+    notes = compared(tmp_path, suite, "--only", "act", "flow")["notes"]
+    assert any(note.endswith("more: 1 cell of 19 not played yet.") for note in notes)
+    assert any(note.endswith(f"{broken.folder}: failed (no weights).") for note in notes)
+    suite = tmp_path / "suite"
     found = compared(tmp_path, suite, "--per-tracker", "--only", "act sonic", "act swapped sonic", "act twist2")
     assert [one["all"]["successes"] for one in found["policies"]] == [20, 22, 5]
     assert [task["task"] for task in found["pairs"][0]["tasks"]] == ["football"]
@@ -165,6 +202,9 @@ REFUSED = [
     (["a", "capped"], "--max-steps differs"),
     (["a", "recorded"], "holds recordings for training"),
     (["a", "empty"], "holds no finished episode"),
+    (["a", "shard"], "shard: is shard 1/2 of a plan; join its shards by eval merge"),
+    (["a", "~nosuchuser/b"], "~nosuchuser/b: no home folder of that user"),
+    (["a", "b", "--out", "~nosuchuser/b"], "~nosuchuser/b: no home folder of that user"),
     (["a", "half"], "half: is unfinished (30 of 60 episodes)"),
     (["a", "b", "--only", "c"], "--only c: unknown, found are a, b"),
     (["a", "b", "--differ", "policy"], "--differ policy: choose from rules engine"),
@@ -186,6 +226,11 @@ def folders(tmp_path_factory):
     run_in(root / "capped", (4, 5, 7), max_steps=1300)
     folder_with(root / "recorded", [], 60, tracker=["t"], engine="mujoco", seed_range="demonstration")
     folder_with(root / "half", episodes("football", (4, 5))[:30], 60, tracker=["t"], engine="mujoco")
+    every_other = dealt([("football", "t", "base", n // 20, n % 20) for n in range(60)], Shard(1, 2))
+    rows = [row for row in episodes("football", (4, 5, 7)) if row["index"] in every_other]
+    folder_with(root / "shard", rows, 60, tracker=["t"], task=["football"], mode=["base"], engine="mujoco")
+    document = json.loads((root / "shard" / "config.json").read_text()) | {"shard": "1/2"}
+    (root / "shard" / "config.json").write_text(json.dumps(document))
     folder_with(root / "empty", [], 60, tracker=["t"], engine="mujoco")
     return root
 
