@@ -257,6 +257,8 @@ def test_a_plan_says_what_it_can_tell(capsys):
     assert main(["list", "--task", "boxing", "football"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("120 episodes") and "60 episodes of a cell 13 to 26.5 points, all 120" in said[1]
+    assert main(["list", "--task", "boxing", "--seeds", "0", "--repeats", "2001"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("    0 boxing")  # too many to compute: no empty line
 
 
 def test_the_sentence_has_the_direction_of_the_test():

@@ -11,7 +11,7 @@ from scipy.stats import binomtest, fisher_exact, hypergeom
 from arena_newton.eval.certification import error_rates
 from arena_newton.eval.comparison import Contender, compare
 from arena_newton.eval.comparison_page import beta_density
-from arena_newton.eval.detectable import POWER, STEP, detectable_difference, detectable_text, paired_power
+from arena_newton.eval.detectable import MOST_PAIRS, POWER, STEP, detectable_difference, detectable_text, paired_power
 from arena_newton.eval.rate_tests import (
     LARGEST_BOSCHLOO,
     PairedCounts,
@@ -275,6 +275,16 @@ def test_the_power_is_the_enumeration():
     text = detectable_text([60] * 7)
     assert f"60 episodes of a cell 13 to {100 * gain:g} points" in text and "all 420" in text
     assert "3 episodes of a cell at no difference" in detectable_text([3]) and detectable_text([]) == ""
+
+
+def test_every_plan_that_is_said_to_be_computed_is():
+    """Up to the largest plan whose difference is computed there is one, and the largest tells smaller ones apart."""
+    few, many = (detectable_difference(n) for n in (420, MOST_PAIRS))
+    assert many < few == 0.1
+    # In the normal limit: 0.84 + 1.96 standard deviations of half the discordant pairs.
+    assert many == pytest.approx(2.8 * math.sqrt(0.5 / MOST_PAIRS), abs=STEP)
+    assert f"all {MOST_PAIRS:,}" in detectable_text([MOST_PAIRS // 2] * 2)
+    assert detectable_text([MOST_PAIRS + 1]) == ""
 
 
 def test_comparisons_keep_their_level_and_find_what_is_there():
