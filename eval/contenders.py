@@ -23,6 +23,8 @@ CONDITIONS = ("rules", "engine", "max_steps", "variant", "fast_physics")
 """What must be alike in everything that is compared, unless it is what is compared (`--differ`)."""
 NOTED = ("device", "drive", "labels", "replan", "ensemble", "latency_ticks")
 """What may differ; every value is named."""
+HASHED = {"rules_hash": "The rules", "scenes": "The scenes"}
+"""What is known by its content, of the tasks of a run; that it differs is named."""
 NOT_GIVEN = "not given"
 """How a condition is shown that a run leaves open."""
 USUAL = {"labels": "v3.1"}
@@ -295,6 +297,11 @@ def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
     found += [f"Weights of {tracker} differ: {' '.join(kept)}." for tracker, kept in weights.items() if len(kept) > 1]
     codes = {played.run.config.get("code") for one in gathered for played in one.episodes}
     found += [f"The runs were made with {len(codes)} versions of the code."] if len(codes) > 1 else []
+    found += [
+        f"{what} have changed between the runs: {' '.join(sorted(versions))}, of the same tasks."
+        for key, what in HASHED.items()
+        for versions in _versions(gathered, key)
+    ]
     for one in gathered:
         errors = sum(played.record.outcome == "error" for played in one.episodes)
         if errors:
@@ -303,6 +310,16 @@ def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
                 "no success."
             )
     return [plain_text(text) for text in found]
+
+
+def _versions(gathered: Sequence[_Gathered], key: str) -> list[set[str]]:
+    """Hashes of something that depends on a run's tasks, where runs of the same tasks have several."""
+    by_tasks: dict[tuple[str, ...], set[str]] = {}
+    for run in {id(played.run): played.run for one in gathered for played in one.episodes}.values():
+        tasks, value = run.config.get("task"), run.config.get(key)
+        if tasks is not None and isinstance(value, str):
+            by_tasks.setdefault((run.config["rules"], *sorted(tasks)), set()).add(value)
+    return [versions for versions in by_tasks.values() if len(versions) > 1]
 
 
 def _by_episode(

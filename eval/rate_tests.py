@@ -185,12 +185,13 @@ def mean_difference(strata: Sequence[Counts]) -> RateDifference | None:
     """Mean over strata, each counting the same, of the difference of the rates; None without episodes.
 
     The interval is normal, from counts to which made episodes are added, as many successes as failures. Of one stratum
-    it is that of Agresti and Min (2005), which `stats.contrast` explains, where episodes are paired, and otherwise that
-    of Agresti, A. and Caffo, B. (2000), Simple and effective confidence intervals for proportions, The American
-    Statistician 54: two made episodes of each condition move its middle and widen it. Of several strata each has these
-    two in its variance, while the two that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004),
-    An improved confidence interval for a linear function of binomial proportions, Computational Statistics & Data
-    Analysis 45; two in each stratum would draw the middle of many small ones to 0.
+    it is that of Agresti, A. and Min, Y. (2005), Simple improved confidence intervals for comparing matched
+    proportions, Statistics in Medicine 24, where episodes are paired, and otherwise that of Agresti, A. and Caffo, B.
+    (2000), Simple and effective confidence intervals for proportions, The American Statistician 54: two made episodes
+    of each condition move its middle and widen it. Of several strata each has these two in its variance, while the two
+    that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004), An improved confidence interval
+    for a linear function of binomial proportions, Computational Statistics & Data Analysis 45; two in each stratum
+    would draw the middle of many small ones to 0.
     """
     if not strata or any(not counts.first_episodes or not counts.second_episodes for counts in strata):
         return None

@@ -252,6 +252,16 @@ def test_what_is_compared_may_differ(folders, tmp_path):
     assert any(note.startswith("Engine differs: a: mujoco; warp: warp") for note in found["notes"])
 
 
+def test_rules_and_scenes_that_have_changed_are_named(tmp_path):
+    """Runs under rules of the same name but other content, or in other scenes, are compared, and it is said."""
+    a, b = (run_in(tmp_path / name, (4, 5, 7), rules_hash=name * 12, scenes=f"{name}1") for name in ("a", "b"))
+    notes = compared(tmp_path, a, b)["notes"]
+    assert f"The rules have changed between the runs: {'a' * 12} {'b' * 12}, of the same tasks." in notes
+    assert "The scenes have changed between the runs: a1 b1, of the same tasks." in notes
+    c = run_in(tmp_path / "c", (4, 5, 7), rules_hash="a" * 12, scenes="a1")
+    assert not any("changed" in note for note in compared(tmp_path, a, c)["notes"])
+
+
 def test_a_plan_says_what_it_can_tell(capsys):
     """`eval list` prints the smallest difference of the plan's episodes below their number."""
     assert main(["list", "--task", "boxing", "football"]) == 0

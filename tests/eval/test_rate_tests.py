@@ -131,7 +131,7 @@ def test_letters_say_exactly_what_differs():
 
 
 def test_the_difference_is_the_contrast_of_the_tables():
-    """The paired interval is that of `stats.contrast`, and both kinds shrink as episodes grow."""
+    """Of paired episodes value and width are those of `stats.contrast`, and both kinds shrink as episodes grow."""
     rng = random.Random(8)
     strata, counts = [], []
     for _ in range(3):
@@ -140,7 +140,8 @@ def test_the_difference_is_the_contrast_of_the_tables():
         cells = [sum((first[n], second[n]) == ends for n in range(30)) for ends in itertools.product((1, 0), repeat=2)]
         counts.append(PairedCounts(*cells))
     found, expected = mean_difference(counts), contrast(strata)
-    assert (found.value, found.low, found.high) == pytest.approx((expected.value, expected.low, expected.high))
+    assert (found.value, found.high - found.low) == pytest.approx((expected.value, expected.high - expected.low))
+    assert found.low < expected.low < found.high < expected.high  # the middle is moved towards 0
     few, many = (mean_difference([UnpairedCounts(6 * k, 10 * k, 3 * k, 10 * k)]) for k in (1, 50))
     assert few.value == many.value == pytest.approx(0.3)
     assert few.low < 0 < many.low and many.high - many.low < 0.2 * (few.high - few.low)
