@@ -35,10 +35,14 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
-    write_atomic(out / "compare.html", comparison_page(out, comparison, contenders))
-    write_atomic(out / "compare.md", as_markdown(comparison, contenders))
-    write_atomic(out / "compare.json", json.dumps(as_json(comparison, contenders), indent=2) + "\n")
-    write_atomic(out / "compare.csv", as_csv(comparison))
+    files = {
+        "compare.html": comparison_page(out, comparison, contenders),
+        "compare.md": as_markdown(comparison, contenders),
+        "compare.json": json.dumps(as_json(comparison, contenders), indent=2) + "\n",
+        "compare.csv": as_csv(comparison),
+    }
+    for name, text in files.items():
+        write_atomic(out / name, text, "what was compared is as it was")
     for line in _said(comparison):
         print(plain(line))
     for note in remarks(comparison, contenders):

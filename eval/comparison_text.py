@@ -107,11 +107,13 @@ def _title(part: StratumPair) -> str:
     return stratum_title(part.stratum)
 
 
-def _cells(part: StratumPair) -> tuple[str, str, str, str]:
+def _cells(part: StratumPair) -> tuple[str, str, str, str, str]:
+    """How many pairs of episodes ended in each way, where there are pairs; then the successes of both."""
     counts = part.counts
-    if isinstance(counts, PairedCounts):
-        return str(counts.both), str(counts.only_first), str(counts.only_second), str(counts.neither)
-    return "", f"{counts.first}/{counts.first_episodes}", f"{counts.second}/{counts.second_episodes}", ""
+    each = [str(getattr(counts, name)) if isinstance(counts, PairedCounts) else "" for name in CELLS]
+    rates = f"{counts.first}/{counts.first_episodes}, {counts.second}/{counts.second_episodes}"
+    both, only_first, only_second, neither = each
+    return both, only_first, only_second, neither, rates
 
 
 def _standings(comparison: Comparison, standings: Sequence[Standing], title: str) -> list[list[str]]:
@@ -141,7 +143,8 @@ def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
     lines += [markdown_table(["first", "second", "Δ", "p", "p (Holm)"], table, 2)]
     lines += [f"- {escaped(verdict(comparison, pair))}." for pair in comparison.pairs] + [""]
     lines += ["## Within tasks", ""]
-    head = ["task", "first", "second", "both", "only first", "only second", "neither", "Δ", "test", "p", "p (Holm)"]
+    head = ["task", "first", "second", "both", "only first", "only second", "neither", "successes"]
+    head += ["Δ", "test", "p", "p (Holm)"]
     table = []
     for position in range(len(comparison.strata)):
         for pair in comparison.pairs:

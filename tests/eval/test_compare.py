@@ -132,6 +132,8 @@ def test_other_seeds_are_compared_unpaired(tmp_path):
     assert (task["test"], task["first"], task["second"]) == ("Boschloo", 16, 46) and not task["paired"]
     assert any("share no episode seed" in note for note in found["notes"])
     assert "compared unpaired" in (tmp_path / "out" / "compare.html").read_text()
+    row = (tmp_path / "out" / "compare.md").read_text().split("## Within tasks")[1].splitlines()[4]
+    assert [cell.strip() for cell in row.split("|")][4:9] == ["", "", "", "", "16/60, 46/60"]
     shared = [row | {"index": 20 + number} for number, row in enumerate(episodes("football", (9,)))]
     few = folder_with(tmp_path / "few", rows[:20] + shared, 40, tracker=["t"], seeds=[3, 0], engine="mujoco")
     found = compared(tmp_path, a, few)
@@ -243,6 +245,14 @@ def test_what_cannot_be_compared_is_refused(folders, monkeypatch, capsys, argume
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
     assert not (folders / "comparison").exists()
+
+
+def test_a_file_that_cannot_be_written_is_named(folders, tmp_path, capsys):
+    """Where a file of the comparison cannot be written its path is said, with exit code 2 and no talk of journals."""
+    (tmp_path / "compare.html").mkdir()
+    assert main(["compare", str(folders / "a"), str(folders / "b"), "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "compare.html: cannot be written" in error and "journal" not in error and error.count("\n") == 1
 
 
 def test_what_is_compared_may_differ(folders, tmp_path):
