@@ -14,6 +14,8 @@ __all__ = ["INTERRUPTED", "exit_code"]
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
+NO_HOME = "Could not determine home directory."
+"""What `pathlib` says of a path such as `~nobody/x`."""
 
 
 def exit_code(work: Callable[[], int | None]) -> int:
@@ -35,6 +37,11 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except ArenaError as error:
         print(f"error: {plain_text(error)}", file=sys.stderr)
         return error.exit_code
+    except RuntimeError as error:
+        if str(error) != NO_HOME:
+            raise
+        print("error: a path begins with ~ and the name of a user that is not known here", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
         return INTERRUPTED
