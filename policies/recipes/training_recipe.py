@@ -14,7 +14,7 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 
-__all__ = ["FAMILIES", "REALIGN", "RECIPES", "TrainingRecipe", "paper_file", "recipe"]
+__all__ = ["FAMILIES", "REALIGN", "RECIPES", "TrainingRecipe", "paper_file", "recipe", "with_pretrained"]
 
 FAMILIES: dict[str, str] = {
     "act": "act",
@@ -181,6 +181,19 @@ def recipe(family: str, name: str = "fast", **overrides: object) -> TrainingReci
     for layer in (_CHANGES.get(("*", name), {}), _CHANGES.get((family, name), {}), {"name": name}, overrides):
         paper = _changed(paper, layer)
     return paper
+
+
+def with_pretrained(recipe: TrainingRecipe) -> TrainingRecipe:
+    """The recipe for a vision encoder that begins with `--weights`.
+
+    Where the paper's recipe tunes a pretrained encoder more slowly than the rest (flow matching: LeRobot's
+    `vision_encoder_lr_multiplier` 0.1 of 2e-5), the encoder has that learning rate, whatever the recipe gives new
+    weights: the rest's would wash out what CLIP knows.
+    """
+    paper = _read_paper(recipe.family)
+    if paper.lr_backbone >= paper.lr:
+        return recipe
+    return replace(recipe, lr_backbone=min(recipe.lr_backbone, paper.lr_backbone))
 
 
 def _changed(recipe: TrainingRecipe, changes: Mapping[str, object]) -> TrainingRecipe:
