@@ -11,6 +11,7 @@ import functools
 import http.client
 import importlib
 import json
+import secrets
 import select
 import socket
 import ssl
@@ -29,6 +30,7 @@ from arena_newton.policies.base import Json, Observation
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, read_address
 from arena_newton.policies.remote_client import MAX_CHUNK, MAX_FAILURES, MAX_REPLY, RemoteClient
 from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink, episode_lost
+from arena_newton.policies.serve.arena_codec import CLIENT_HEADER
 from arena_newton.policies.serve.handshake import ServedFacts, read_facts
 from arena_newton.policies.serve.wire_error import WireError
 
@@ -161,6 +163,16 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
     reset_kind, infer_kind = "/reset", "/infer"
     camera = CameraConfig(width=640, height=480, fit="native")
     """The original's client sends the head camera as it is, 640×480; resizing is the server's work."""
+
+    def __init__(self, url: str, **options: Any):
+        """As of `RemoteClient`."""
+        super().__init__(url, **options)
+        self._name = secrets.token_hex(8)
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """With a name, by which a server tells the worlds of this client from those of others on this machine."""
+        return {**super().headers, CLIENT_HEADER: self._name}
 
     def check(self) -> None:
         """Reach the server, begin an episode there, and read what it declares.
