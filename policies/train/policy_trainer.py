@@ -155,7 +155,10 @@ class PolicyTrainer:
 
     def _descend(self) -> None:
         """Batch, loss and gradient."""
-        batch = self.batches(self._rows, shift=self.recipe.shift_px, colour=self.recipe.colour)
+        recipe = self.recipe
+        batch = self.batches(
+            self._rows, shift=recipe.shift_px, colour=recipe.colour, transforms=recipe.image_transforms
+        )
         # LeRobot makes some constants on the host and copies them, which no graph can hold; here they are made on the
         # device.
         with self.device if self.graphed else contextlib.nullcontext(), self._precision():
