@@ -153,7 +153,7 @@ def test_a_process_that_dies_is_an_error(rows):
 
 
 def test_how_a_process_ended(monkeypatch):
-    """The signal of a process that takes long to end is waited for; one that only closed its output has no exit code."""
+    """The signal of a process that ends slowly is waited for; one that only closed its output has no exit code."""
     monkeypatch.setattr(decoder_pool, "DEATH_PATIENCE", 0.05)
     code = "import os, time; os.close(1); time.sleep(600)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
