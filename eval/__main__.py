@@ -223,9 +223,9 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
 def _loop(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(LoopOptions, arguments, f"{PROG} loop")
-    from arena_newton.extras import require
+    from arena_newton.eval.loop_requirements import check_libraries
 
-    require("data", "eval loop")
+    check_libraries(options.policy)  # before the libraries are loaded
     from arena_newton.eval import learning_loop
 
     return learning_loop.run(options, factories)
