@@ -1,7 +1,9 @@
 """What a command line answers when its work fails."""
 
 import atexit
+import contextlib
 import errno
+import faulthandler
 import gc
 import os
 import sys
@@ -32,6 +34,10 @@ def exit_code(work: Callable[[], int | None]) -> int:
     # which takes seconds after the last line is printed; what is frozen is not looked at. Once, however often called.
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)
+    # Kernels and drivers are native code: a crash in it names the Python lines of all threads, or nobody can mend it.
+    if not faulthandler.is_enabled():
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # there may be no error stream
+            faulthandler.enable(sys.__stderr__)
     try:
         return work() or 0
     except ArenaError as error:

@@ -109,6 +109,19 @@ def test_a_command_ends_without_a_search_for_garbage():
     assert (done.stdout, done.returncode) == ("True\n", 0), done.stderr
 
 
+def test_a_crash_of_native_code_names_the_line():
+    """A program that dies in a kernel or a driver leaves the Python lines of its threads on the error stream."""
+    crash = (
+        "import ctypes\n"
+        "from arena_newton.command_line import exit_code\n"
+        "def work():\n    ctypes.string_at(0)\n"
+        "exit_code(work)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", crash], capture_output=True, text=True, check=False)
+    assert done.returncode < 0
+    assert "Fatal Python error: Segmentation fault" in done.stderr and "in work" in done.stderr
+
+
 def test_a_home_that_is_nobodys_is_bad_input(capsys):
     """A path with the name of an unknown user is one line and exit code 2, in whichever command."""
     assert exit_code(lambda: int(Path("~nosuchuser/x").expanduser().exists())) == 2
