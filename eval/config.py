@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 from arena_newton import __version__, policies, rule_sets, seeding, trackers
 from arena_newton import tasks as task_specs
 from arena_newton.data.episode import CAMERAS
-from arena_newton.devices import resolve_engine
+from arena_newton.devices import cluster_engine, resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.eval import plan, rounds
 from arena_newton.eval.document import Identity
@@ -36,7 +37,16 @@ if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
     from arena_newton.trackers.base import Tracker
 
-__all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "recorded_cameras", "recording_run", "resolve"]
+__all__ = [
+    "DEFAULT_TRACKER",
+    "DRIVES",
+    "RAY_FLAGS",
+    "RunConfig",
+    "plain_facts",
+    "recorded_cameras",
+    "recording_run",
+    "resolve",
+]
 
 DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
@@ -54,8 +64,11 @@ MOST_DISTURBANCE = 10.0
 """Largest factor of the noise; no robot stands far less."""
 LABELS = ("v3.1", "v4")
 """Label protocols, `data.label_protocols.LABELS`, which loads torch."""
+RAY_FLAGS = ("ray_actors", "ray_cpus", "ray_gpus", "ray_minutes", "ray_attempts")
+"""Flags that belong to --ray."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
 ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
+ONE_CALL |= {"ray", *RAY_FLAGS}
 """Flags that a resumed run does not take over."""
 
 
@@ -298,7 +311,10 @@ def resolve(options: RunOptions) -> RunConfig:
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
-    engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
+    if options.ray is None:
+        engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
+    else:
+        engine, device = cluster_engine(options.engine, options.device, options.ray_gpus)
     return RunConfig(
         flags=dataclasses.replace(flags, engine=engine, device=device, shard=None if shard is None else str(shard)),
         episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in played),
@@ -361,6 +377,7 @@ def _check_flags(options: RunOptions) -> None:
         if getattr(options, name) != getattr(RunOptions, name) and not options.record:
             raise InputError(f"{_flag(name)}: belongs to --record, which is not given")
     _check_viewer(options)
+    _check_ray(options)
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: must be alone, name either all or single tasks")
     if options.seeds and min(options.seeds) < 0:
@@ -380,6 +397,29 @@ def _check_shard(options: RunOptions) -> None:
         )
     if options.keep is not None:
         raise InputError("--shard: does not go with --only-success, whose attempts follow from the earlier ones")
+
+
+def _check_ray(options: RunOptions) -> None:
+    """Refuse a cluster that cannot be asked for, before one is looked for."""
+    if options.ray is None:
+        for name in RAY_FLAGS:
+            if getattr(options, name) != getattr(RunOptions, name):
+                raise InputError(f"{_flag(name)}: belongs to --ray, which is not given")
+        return
+    if len(options.ray) > 1 or not all(text.strip() for text in options.ray):
+        raise InputError(f"--ray {' '.join(options.ray)}: expected one address, such as 10.0.0.1:6379, or none")
+    for name in ("ray_actors", "ray_cpus", "ray_attempts"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InputError(f"{_flag(name)} {value}: expected at least 1")
+    gpus, minutes = options.ray_gpus, options.ray_minutes
+    if gpus is not None and not 0 < gpus <= 1:
+        raise InputError(f"--ray-gpus {gpus:g}: expected more than 0 and at most 1; an environment is on one GPU")
+    if not 0 < minutes < math.inf:
+        raise InputError(f"--ray-minutes {minutes:g}: expected more than 0")
+    if options.viewer is not None:
+        raise InputError("--viewer: shows worlds of this process, and with --ray none are; drop one of both")
+    require("ray", "--ray")
 
 
 def _check_chunks(options: RunOptions) -> None:

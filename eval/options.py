@@ -118,6 +118,19 @@ class RunOptions:
     shard: str | None = None
     """Play part n of N of the plan, such as 3/16, into a folder of its own; `merge` joins them. slurm: the part of this
     task of a Slurm array; slurm/16 where the array has not all 16."""
+    ray: tuple[str, ...] | None = None
+    """Let processes of a Ray cluster play, and keep the journal here: its address, such as 10.0.0.1:6379, or auto; with
+    no address, a Ray of its own on this machine."""
+    ray_actors: int | None = None
+    """With --ray: processes that play at once; as many as the cluster has room for when not given."""
+    ray_cpus: int | None = None
+    """With --ray: cores of each of them; 4, or all of the smallest node where it has fewer, when not given."""
+    ray_gpus: float | None = None
+    """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
+    ray_minutes: float = 60.0
+    """With --ray: a slice of the plan, at most two batches of worlds, that takes longer is stopped and played again."""
+    ray_attempts: int = 3
+    """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
@@ -207,6 +220,19 @@ class RecordOptions:
     """Cap on the step budget of the rule set [ticks of 0.02 s]."""
     shard: str | None = None
     """Record part n of N of the plan, such as 3/16 or slurm, into a folder of its own; not with --only-success."""
+    ray: tuple[str, ...] | None = None
+    """Let processes of a Ray cluster play, and keep the journal here: its address, such as 10.0.0.1:6379, or auto; with
+    no address, a Ray of its own on this machine."""
+    ray_actors: int | None = None
+    """With --ray: processes that play at once; as many as the cluster has room for when not given."""
+    ray_cpus: int | None = None
+    """With --ray: cores of each of them; 4, or all of the smallest node where it has fewer, when not given."""
+    ray_gpus: float | None = None
+    """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
+    ray_minutes: float = 60.0
+    """With --ray: a slice of the plan, at most two batches of worlds, that takes longer is stopped and played again."""
+    ray_attempts: int = 3
+    """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
     out: str | None = None
     """Folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False

@@ -25,7 +25,7 @@ from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, camera
 from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import recording
-from arena_newton.eval.config import DRIVES, RunConfig, plain_facts, recorded_cameras, resolve
+from arena_newton.eval.config import DRIVES, RAY_FLAGS, RunConfig, plain_facts, recorded_cameras, resolve
 from arena_newton.eval.folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.identity import differing_key
 from arena_newton.eval.journal import StorageError
@@ -119,9 +119,11 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
         "drive": "auto",
         "shard": None,
     }
+    given |= {name: getattr(RecordOptions, name) for name in ("ray", *RAY_FLAGS)}
     for name, default in given.items():
         if getattr(options, name) != default:
-            raise InputError(f"--{name.replace('_', '-')}: is in the recording; drop it beside --from")
+            why = "plays a plan" if name.startswith("ray") else "is in the recording"
+            raise InputError(f"--{name.replace('_', '-')}: {why}; drop it beside --from")
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")
     pictures = RunOptions(record_cameras=options.cameras, record_size=options.size, record_depth=options.depth)
