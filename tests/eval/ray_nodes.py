@@ -24,7 +24,7 @@ class Nodes:
     """A cluster whose machines are processes."""
 
     def __init__(self, log, environment=None):
-        """Start the head, which plays nothing where `cores` of `add` are to."""
+        """Start the head, which has a core."""
         self.log, self.environment = (
             open(log, "ab"),
             os.environ | (environment or {}) | {"RAY_USAGE_STATS_ENABLED": "0"},
@@ -43,15 +43,7 @@ class Nodes:
 
     def actors(self):
         """Process ids of what plays."""
-        found = []
-        for machine in (self.head, *self.others):
-            for process in descendants(machine.pid):
-                try:
-                    if process.name().startswith("ray::Episode"):
-                        found.append(process.pid)
-                except psutil.Error:
-                    continue
-        return found
+        return [pid for machine in (self.head, *self.others) for pid in actors(machine.pid)]
 
     def kill_machine(self, number):
         """All processes of a machine that is not the head, at once."""
@@ -70,6 +62,18 @@ def descendants(pid):
         return psutil.Process(pid).children(recursive=True)
     except psutil.Error:
         return []
+
+
+def actors(pid):
+    """Process ids of what plays, below a process."""
+    found = []
+    for process in descendants(pid):
+        try:
+            if process.name().startswith("ray::Episode"):
+                found.append(process.pid)
+        except psutil.Error:
+            continue
+    return found
 
 
 def kill_all(machine):
