@@ -31,11 +31,12 @@ def main():
     parser.add_argument("--pause", type=float, default=20.0, help="mean time between two [s]")
     parser.add_argument("--seed", type=int, default=0)
     options, flags = parser.parse_known_args()
-    options.out.mkdir(parents=True)
+    options.out.mkdir(parents=True, exist_ok=True)
     plan = ["run", *flags, "--engine", "mujoco", "--out"]
-    began = time.perf_counter()
-    subprocess.run([*EVAL, *plan, str(options.out / "alone")], check=True, stdout=subprocess.DEVNULL)
-    print(f"one process: {time.perf_counter() - began:.0f} s", flush=True)
+    if not (options.out / "alone").exists():
+        began = time.perf_counter()
+        subprocess.run([*EVAL, *plan, str(options.out / "alone")], check=True, stdout=subprocess.DEVNULL)
+        print(f"one process: {time.perf_counter() - began:.0f} s", flush=True)
     nodes, draw = Nodes(options.out / "ray.log"), random.Random(options.seed)
     try:
         nodes.add()
