@@ -10,6 +10,7 @@ import dataclasses
 import logging
 import math
 import os
+import secrets
 import signal
 import sys
 import threading
@@ -128,10 +129,16 @@ class Member:
 def in_cluster(address: tuple[str, ...]) -> Iterator[None]:
     """Be in the cluster of an address, or in one of our own on this machine where there is none.
 
+    A cluster of our own asks for a token that only its processes have; Ray would leave one in the home folder. That of
+    another cluster is the user's business (`RAY_AUTH_MODE`, `RAY_AUTH_TOKEN`).
+
     Raises:
         InputError: No cluster answers, or one of another version of Ray or Python.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it would report to Ray's makers
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")  # its warnings would go to the terminal
+    if not address and not {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
+        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # our processes hide GPUs themselves
     own = {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "object_store_memory": STORE_BYTES}
     terminate = signal.getsignal(signal.SIGTERM)
@@ -146,7 +153,8 @@ def in_cluster(address: tuple[str, ...]) -> Iterator[None]:
         where = f"--ray {address[0]}" if address else "--ray"
         lines = str(error).strip().splitlines()
         cause = plain_text(lines[0] if lines else type(error).__name__, 200)
-        raise InputError(f"{where}: no Ray cluster to be used: {cause}") from None
+        hint = " (one that asks for a token: RAY_AUTH_MODE=token)" if address else ""
+        raise InputError(f"{where}: no Ray cluster to be used: {cause}{hint}") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminate)  # Ray's own one leaves without a word
     try:
