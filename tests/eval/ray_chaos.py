@@ -43,7 +43,10 @@ def main():
         began = time.perf_counter()
         said = open(options.out / "said.txt", "wb")
         run = subprocess.Popen(
-            [*EVAL, *plan, str(options.out / "ray"), "--ray", nodes.address, "--worlds", "4"], stdout=said, stderr=said
+            [*EVAL, *plan, str(options.out / "ray"), "--ray", nodes.address, "--worlds", "4"],
+            env=os.environ | nodes.token,
+            stdout=said,
+            stderr=said,
         )
         killed = {"process": 0, "machine": 0}
         journal = options.out / "ray" / "episodes.jsonl"

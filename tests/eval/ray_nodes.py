@@ -1,6 +1,7 @@
 """Machines of a Ray cluster, all on this one, for tests; and what ends their processes with `kill -9`."""
 
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -25,12 +26,13 @@ class Nodes:
 
     def __init__(self, log, environment=None):
         """Start the head, which has a core."""
-        self.log, self.environment = (
-            open(log, "ab"),
-            os.environ | (environment or {}) | {"RAY_USAGE_STATS_ENABLED": "0"},
-        )
+        self.log = open(log, "ab")
+        self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        """Environment of who may use the cluster."""
+        self.environment = os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | self.token | (environment or {})
         self.address = f"127.0.0.1:{free_port()}"
-        self.head, self.others = self._start("--head", "--port", self.address.split(":")[1], cores=1), []
+        port = self.address.split(":")[1]
+        self.head, self.others = self._start("--head", "--port", port, "--include-dashboard=false", cores=1), []
 
     def add(self, cores=1):
         """One more machine."""
@@ -38,7 +40,7 @@ class Nodes:
 
     def _start(self, *flags, cores):
         command = [RAY, "start", *flags, "--block", "--node-ip-address", "127.0.0.1", "--num-cpus", str(cores)]
-        command += ["--object-store-memory", str(80 << 20), "--disable-usage-stats", "--include-dashboard=false"]
+        command += ["--object-store-memory", str(80 << 20), "--disable-usage-stats"]
         return subprocess.Popen(command, env=self.environment, stdout=self.log, stderr=self.log, start_new_session=True)
 
     def actors(self):

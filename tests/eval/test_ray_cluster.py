@@ -52,7 +52,8 @@ def alone(tmp_path_factory):
 def start(nodes, folder, *flags):
     """A run by the cluster, in a process of its own."""
     command = [sys.executable, str(FAKES), "run", *PLAN, "--ray", nodes.address, *flags, "--out", str(folder)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    environment = os.environ | nodes.token
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def lines(folder):
