@@ -35,10 +35,10 @@ QUICK_TRACKERS = ("twist2", "sonic")
 class RunOptions:
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
-    Without --task, --mode, --seeds, --repeats and --max-steps the experts solve all seven tasks through both trackers,
-    a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where one comes with
-    the package, and the report opens with film strips. As soon as one of
-    them is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
+    Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
+    both trackers, a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where
+    one comes with the package, and the report opens with film strips. As soon as one of them is given, the rest follows
+    the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
     task: tuple[str, ...] = ()
@@ -72,6 +72,11 @@ class RunOptions:
     """Group seeds; the protocol's are 0 1 2."""
     repeats: int | None = None
     """Episodes per group seed; the protocol's are 20."""
+    until_width: float | None = None
+    """Instead of --repeats: play each task, tracker and mode until the 95 % interval of its success rate is as narrow,
+    such as 0.14; looked at every 20 episodes, group seeds in turn."""
+    max: int | None = None
+    """With --until-width: episodes of each task, tracker and mode at most, 200 when not given."""
     worlds: int = 20
     """Episodes simulated at once."""
     engine: str = "auto"
@@ -165,7 +170,7 @@ class RunOptions:
 def is_quick(options: RunOptions) -> bool:
     """Whether the flags leave the plan open: the default run over all tasks."""
     named = options.task or options.mode or options.seeds or options.series is not None
-    return not named and (options.repeats, options.max_steps) == (None, None)
+    return not named and (options.repeats, options.max_steps, options.until_width) == (None, None, None)
 
 
 @dataclass(frozen=True)

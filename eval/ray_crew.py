@@ -23,12 +23,13 @@ import ray
 from ray.exceptions import RayError
 
 from arena_newton.errors import InputError
-from arena_newton.eval.config import RAY_FLAGS, RunConfig
+from arena_newton.eval.config import RunConfig
 from arena_newton.eval.folder import ResultsFolder
 from arena_newton.eval.identity import differing_key, moving_versions
 from arena_newton.eval.journal import StorageError
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
+from arena_newton.eval.play_flags import RAY_FLAGS
 from arena_newton.eval.progress import Progress
 from arena_newton.eval.ray_actor import EpisodeActor
 from arena_newton.eval.slice_events import Broke, Event, Node, Opened, Slice

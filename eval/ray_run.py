@@ -190,7 +190,7 @@ class _Driver:
     def _append(self, episode: Episode, record: EpisodeRecord) -> None:
         self.journal.append(record)
         self.ended[record.index] = record
-        if self.config.flags.keep is not None:
+        if self.config.flags.keep is not None or self.config.width_rule is not None:
             self._next_round((episode.task, episode.tracker, episode.mode))
 
     def _next_round(self, group: Group) -> None:

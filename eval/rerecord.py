@@ -25,11 +25,12 @@ from arena_newton.data.episode import CAMERAS, VIDEO_FOLDER, EpisodeFile, camera
 from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import recording
-from arena_newton.eval.config import DRIVES, RAY_FLAGS, RunConfig, plain_facts, recorded_cameras, resolve
+from arena_newton.eval.config import DRIVES, RunConfig, plain_facts, recorded_cameras, resolve
 from arena_newton.eval.folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.identity import differing_key
 from arena_newton.eval.journal import StorageError
 from arena_newton.eval.options import RecordOptions, RunOptions
+from arena_newton.eval.play_flags import RAY_FLAGS
 from arena_newton.eval.progress import Progress
 from arena_newton.eval.run import Factories
 from arena_newton.files import PARTIAL, replace_atomically

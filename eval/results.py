@@ -13,7 +13,16 @@ from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.sharding import read_shard
 from arena_newton.eval.stats import Aggregate, aggregate
 
-__all__ = ["Results", "RunRecord", "due_episodes", "in_plan_order", "load_run", "results_json"]
+__all__ = [
+    "Results",
+    "RunRecord",
+    "due_episodes",
+    "in_plan_order",
+    "is_complete",
+    "load_run",
+    "results_json",
+    "width_rule",
+]
 
 
 @dataclass(frozen=True)
@@ -76,13 +85,21 @@ def due_episodes(document: Document) -> int:
     return document["planned"] if shard is None else shard.size(document["planned"])
 
 
-def _complete(run: RunRecord) -> bool:
+def is_complete(run: RunRecord) -> bool:
     """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
     planned, keep = run.document["planned"], run.config.get("keep")
-    if keep is None:
+    rule = width_rule(run.config)
+    if keep is None and rule is None:
         return len(run.records) == due_episodes(run.document)
-    groups = planned // run.config["repeats"]
-    return rounds.complete(planned, groups, {record.index: record.outcome for record in run.records}, keep)
+    groups = planned // (run.config["repeats"] * len(run.config["seeds"]))
+    return rounds.complete(planned, groups, {record.index: record.outcome for record in run.records}, keep, rule)
+
+
+def width_rule(config: Identity) -> rounds.WidthRule | None:
+    """The rule by which a task, tracker and mode of a stored run had enough episodes; None where it had all."""
+    if "until_width" not in config:
+        return None
+    return rounds.WidthRule(config["until_width"], config["max"], len(config["seeds"]))
 
 
 def results_json(run: RunRecord) -> Results:
@@ -93,7 +110,7 @@ def results_json(run: RunRecord) -> Results:
         "config": run.config,
         "planned": due_episodes(run.document),
         "finished": len(run.records),
-        "complete": _complete(run),
+        "complete": is_complete(run),
         "cells": figures["cells"],
         "suites": figures["suites"],
     }

@@ -333,7 +333,7 @@ class RunPlayer:
         self, task: str, tracker: str, mode: str, order: list[Episode], left: dict[int, Episode]
     ) -> list[Episode]:
         """More attempts where successes are missing; they are added to what is left."""
-        if self.config.flags.keep is None:
+        if self.config.flags.keep is None and self.config.width_rule is None:
             return []
         more = due(self.config, self.ended).get((task, tracker, mode), [])
         order += more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -21,7 +22,7 @@ from arena_newton.eval.identity import differing_key, moving_versions
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
 from arena_newton.eval.options import RunMergeOptions, RunOptions
 from arena_newton.eval.records import Json, JsonObject, shown
-from arena_newton.eval.results import Results, RunRecord, due_episodes, load_run
+from arena_newton.eval.results import Results, RunRecord, due_episodes, is_complete, load_run, width_rule
 from arena_newton.eval.sharding import Shard, dealt, read_shard
 from arena_newton.files import PARTIAL, file_label, replace_atomically
 from arena_newton.text import counted, is_printable, plain_text
@@ -107,6 +108,9 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
         _check_alike(runs[0], other, accept_versions)
     kept, notes = _joined(runs)
     missing = runs[0].document["planned"] - len(kept)
+    if missing and width_rule(runs[0].config) is not None:
+        whole = dataclasses.replace(runs[0], records=[part.record for part in kept])
+        missing = 0 if is_complete(whole) else missing
     if missing:
         said = f"{counted(missing, 'episode')} of {runs[0].document['planned']:,} missing: {_missing(runs, kept)}"
         if not partial:

@@ -140,7 +140,7 @@ def due(config: RunConfig, ended: Mapping[int, EpisodeRecord]) -> dict[Group, li
     outcomes = {index: record.outcome for index, record in ended.items()}
     found = {}
     for names, group in groups(config.episodes).items():
-        wanted = set(rounds.due([e.index for e in group], outcomes, config.flags.keep))
+        wanted = set(rounds.due([e.index for e in group], outcomes, config.flags.keep, config.width_rule))
         if wanted:
             found[names] = [episode for episode in group if episode.index in wanted]
     return found

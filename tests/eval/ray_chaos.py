@@ -1,9 +1,9 @@
-"""Ten times `kill -9` in one run by a Ray cluster of two machines on this one; then: is it what one process writes?
+"""Ten times `kill -9` in runs by a Ray cluster of two machines on this one; then: is it what one process writes?
 
     python tests/eval/ray_chaos.py results/chaos --task boxing vis_navi --seeds 0 --repeats 12
 
-Plays the plan once without Ray and once with it, while actors and the second machine are killed at random moments, one
-of three times the machine, which comes back a little later. Prints what was killed when, and compares every file.
+Plays the plan once without Ray, then with it as often as it takes, while actors and the second machine are killed at
+random moments; the machine, one of three times, comes back. Prints what was killed when, and compares every file.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import random
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 from ray_nodes import Nodes
@@ -24,7 +25,7 @@ EVAL = [sys.executable, "-m", "arena_newton.eval"]
 
 
 def main():
-    """Run; exit code 0 where both folders are alike and every kill found something to kill."""
+    """Run; exit code 0 where every run has all episodes once, and the files of one process."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--kills", type=int, default=10)
@@ -37,47 +38,56 @@ def main():
         began = time.perf_counter()
         subprocess.run([*EVAL, *plan, str(options.out / "alone")], check=True, stdout=subprocess.DEVNULL)
         print(f"one process: {time.perf_counter() - began:.0f} s", flush=True)
-    nodes, draw = Nodes(options.out / "ray.log"), random.Random(options.seed)
+    merge([options.out / "alone"], options.out / "merged_alone")
+    draw, killed, good = random.Random(options.seed), Counter(), True
+    while sum(killed.values()) < options.kills:
+        number = len(list(options.out.glob("ray_*")))
+        good &= one_run(options, plan, options.out / f"ray_{number}", draw, killed)
+    print(f"killed: {dict(killed)}; {'all alike' if good else 'NOT ALIKE'}")
+    return int(not good)
+
+
+def one_run(options, plan, folder, draw, killed):
+    """One run in which actors and a machine are killed; whether it is what one process writes."""
+    nodes, journal = Nodes(options.out / "ray.log"), folder / "episodes.jsonl"
+
+    def ended():
+        return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+    began = time.perf_counter()
     try:
         nodes.add()
-        began = time.perf_counter()
-        said = open(options.out / "said.txt", "wb")
-        run = subprocess.Popen(
-            [*EVAL, *plan, str(options.out / "ray"), "--ray", nodes.address, "--worlds", "4"],
-            env=os.environ | nodes.token,
-            stdout=said,
-            stderr=said,
-        )
-        killed = {"process": 0, "machine": 0}
-        journal = options.out / "ray" / "episodes.jsonl"
+        said = open(options.out / f"{folder.name}.txt", "wb")
+        command = [*EVAL, *plan, str(folder), "--ray", nodes.address, "--worlds", "4"]
+        run = subprocess.Popen(command, env=os.environ | nodes.token, stdout=said, stderr=said)
+        while run.poll() is None and ended() == 0:
+            time.sleep(0.5)
         while run.poll() is None and sum(killed.values()) < options.kills:
             time.sleep(draw.expovariate(1 / options.pause) + 1.0)
-            actors = nodes.actors()
+            actors, what = nodes.actors(), "machine" if draw.random() < 1 / 3 else "actor"
             if run.poll() is not None or not actors:
                 continue
-            what = "machine" if nodes.others and draw.random() < 1 / 3 else "process"
-            ended = journal.read_bytes().count(b"\n") if journal.exists() else 0
+            lines = ended()
             if what == "machine":
                 nodes.kill_machine(0)
+                nodes.add()
             else:
                 os.kill(draw.choice(actors), 9)
             killed[what] += 1
-            print(f"{time.perf_counter() - began:5.0f} s: kill -9 of a {what}, {ended} episodes had ended", flush=True)
-            if what == "machine":
-                time.sleep(draw.uniform(0.0, 10.0))
-                nodes.add()
+            print(f"{folder.name}, {time.perf_counter() - began:3.0f} s: kill -9 of {what}, {lines} ended", flush=True)
         code = run.wait()
-        print(f"by Ray: {time.perf_counter() - began:.0f} s, exit code {code}, killed {killed}", flush=True)
     finally:
         nodes.stop()
     found = [json.loads(line)["index"] for line in journal.read_text().splitlines()]
-    print(f"{len(found)} journal lines of {len(set(found))} episodes")
-    for name in ("alone", "ray"):
-        merge([options.out / name], options.out / f"merged_{name}")
-    one, other = (contents(options.out / f"merged_{name}") for name in ("alone", "ray"))
+    merge([folder], options.out / f"merged_{folder.name}")
+    one, other = contents(options.out / "merged_alone"), contents(options.out / f"merged_{folder.name}")
     different = sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
-    print(f"{len(one)} files, different: {' '.join(different) or 'none'}")
-    return int(bool(different) or code != 0 or sum(killed.values()) < options.kills or len(found) != len(set(found)))
+    lines = f"{len(found)} journal lines of {len(set(found))} episodes, {len(one)} files, different:"
+    print(
+        f"{folder.name}, {time.perf_counter() - began:.0f} s, exit code {code}: {lines} {different or 'none'}",
+        flush=True,
+    )
+    return code == 0 and not different and len(found) == len(set(found))
 
 
 if __name__ == "__main__":
