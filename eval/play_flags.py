@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from arena_newton.errors import InputError
 from arena_newton.eval.options import RunOptions
@@ -44,8 +45,9 @@ def check_ray(options: RunOptions) -> None:
             if getattr(options, name) != getattr(RunOptions, name):
                 raise InputError(f"{_flag(name)}: belongs to --ray, which is not given")
         return
-    if len(options.ray) > 1 or not all(text.strip() for text in options.ray):
-        raise InputError(f"--ray {' '.join(options.ray)}: expected one address, such as 10.0.0.1:6379, or none")
+    addresses = [text for text in options.ray if text == "auto" or re.fullmatch(r"[^/\s]+:[0-9]{1,5}", text)]
+    if len(options.ray) > 1 or len(addresses) < len(options.ray):
+        raise InputError(f"--ray {' '.join(options.ray)}: expected one address, such as 10.0.0.1:6379, auto, or none")
     for name in ("ray_actors", "ray_cpus", "ray_attempts"):
         value = getattr(options, name)
         if value is not None and value < 1:

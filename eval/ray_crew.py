@@ -12,12 +12,13 @@ import math
 import os
 import secrets
 import signal
+import socket
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import ray
 from ray.exceptions import RayError
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from arena_newton.eval.run import Factories
 
+
 __all__ = ["Crew", "Done", "Lease", "Lost", "Member", "in_cluster"]
 
 OWN = "local"
@@ -50,6 +52,8 @@ STORE_BYTES = 80 << 20
 """Object store of such a cluster, near the least that Ray takes: only numbers and lines pass through it."""
 USUAL_CPUS = 4
 """Cores of a process where --ray-cpus does not say."""
+CONNECTION = 10.0
+"""An address answers within this time [s]."""
 BEGINNING = 600.0
 """A process has at least this time to build tracker and policy, whatever --ray-minutes says [s]."""
 STARTS = 5
@@ -141,15 +145,22 @@ def in_cluster(address: tuple[str, ...]) -> Iterator[None]:
     if not address and not {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # our processes hide GPUs themselves
-    own = {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "object_store_memory": STORE_BYTES}
+    if address and address[0] != "auto":
+        _knock(address[0])
     terminate = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(
-            address=address[0] if address else OWN,
-            log_to_driver=False,
-            logging_level=logging.CRITICAL,
-            **({} if address else own),
-        )
+        with _native_silence():
+            if address:
+                ray.init(address=address[0], log_to_driver=False, logging_level=logging.CRITICAL)
+            else:
+                ray.init(
+                    address=OWN,
+                    log_to_driver=False,
+                    logging_level=logging.CRITICAL,
+                    include_dashboard=False,
+                    object_store_memory=STORE_BYTES,
+                    _node_ip_address="127.0.0.1",
+                )
     except Exception as error:  # Ray raises whatever is at hand
         where = f"--ray {address[0]}" if address else "--ray"
         lines = str(error).strip().splitlines()
@@ -162,6 +173,30 @@ def in_cluster(address: tuple[str, ...]) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where nobody listens; Ray would try for minutes."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), CONNECTION).close()
+    except (OSError, OverflowError) as error:
+        cause = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"--ray {address}: no Ray cluster answers ({plain_text(cause, 80)})") from None
+
+
+@contextlib.contextmanager
+def _native_silence() -> Iterator[None]:
+    """What native code complains of goes nowhere: each attempt to reach a cluster that is not there is a line."""
+    sys.stderr.flush()
+    kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
 
 
 class Crew:
@@ -250,7 +285,9 @@ class Crew:
         for pending in answered:
             member = asked[pending]
             try:
-                said = ray.get(next(pending) if member.lease is not None else pending)
+                said = ray.get(
+                    next(cast("ObjectRefGenerator[Event]", pending)) if member.lease is not None else pending
+                )
             except StopIteration:
                 lease, member.lease, member.pending, member.until = member.lease, None, None, math.inf
                 assert lease is not None
@@ -287,7 +324,8 @@ class Crew:
     def _hire(self, member: Member) -> None:
         """Ask for a process; where there is no room the cluster answers when there is."""
         resources = {"num_cpus": self._cpus, "num_gpus": self._gpus}
-        member.actor = ray.remote(EpisodeActor).options(**resources, max_restarts=0).remote(self._gpus > 0)
+        made = ray.remote(EpisodeActor).options(**resources, max_restarts=0).remote(self._gpus > 0)
+        member.actor = cast("ActorHandle[EpisodeActor]", made)
         member.pending = member.actor.node.remote()
 
     def _open(self, member: Member, node: Node) -> None:

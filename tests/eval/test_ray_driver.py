@@ -177,7 +177,10 @@ FLAGS = ["run", "--task", "boxing", "--engine", "mujoco"]
     ("flags", "said"),
     [
         (["--ray-actors", "2"], "--ray-actors: belongs to --ray, which is not given"),
-        (["--ray", "a", "b"], "--ray a b: expected one address"),
+        (["--ray", "a:1", "b:1"], "--ray a:1 b:1: expected one address"),
+        (["--ray", "ray://a:1"], "--ray ray://a:1: expected one address"),
+        (["--ray", "127.0.0.1:1"], "--ray 127.0.0.1:1: no Ray cluster answers (Connection refused)"),
+        (["--ray", "127.0.0.1:99999"], "--ray 127.0.0.1:99999: no Ray cluster answers"),
         (["--ray", "--ray-actors", "0"], "--ray-actors 0: expected at least 1"),
         (["--ray", "--ray-attempts", "0"], "--ray-attempts 0: expected at least 1"),
         (["--ray", "--ray-minutes", "-1"], "--ray-minutes -1: expected more than 0"),
