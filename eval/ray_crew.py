@@ -141,7 +141,6 @@ def in_cluster(address: tuple[str, ...]) -> Iterator[None]:
         InputError: No cluster answers, or one of another version of Ray or Python.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it would report to Ray's makers
-    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")  # its warnings would go to the terminal
     if not address and not {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # our processes hide GPUs themselves
