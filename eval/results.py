@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NotRequired
 
+from arena_newton.errors import InputError
 from arena_newton.eval import rounds
 from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
@@ -16,6 +17,7 @@ from arena_newton.eval.stats import Aggregate, aggregate
 __all__ = [
     "Results",
     "RunRecord",
+    "check_whole_plan",
     "due_episodes",
     "in_plan_order",
     "is_complete",
@@ -83,6 +85,17 @@ def due_episodes(document: Document) -> int:
     """Episodes that a folder is to have: those of its plan, or of its shard."""
     shard = read_shard(document.get("shard", ""))
     return document["planned"] if shard is None else shard.size(document["planned"])
+
+
+def check_whole_plan(run: RunRecord) -> None:
+    """Refuse a shard, whose episodes are a part of a result.
+
+    Raises:
+        InputError: The folder is one.
+    """
+    shard = run.document.get("shard")
+    if shard is not None:
+        raise InputError(f"{run.folder}: is shard {shard} of a run; name the folder into which eval merge joins all")
 
 
 def is_complete(run: RunRecord) -> bool:
