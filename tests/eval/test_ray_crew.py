@@ -2,6 +2,8 @@
 
 import dataclasses
 import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -229,3 +231,10 @@ def test_other_code_or_versions_are_refused(crew_of):
     fake.opened = Broke("input", "--policy x: no such file", "")
     with pytest.raises(InputError, match="^--policy x: no such file$"):
         crew.opened()
+
+
+def test_the_driver_loads_no_physics():
+    """What deals episodes out runs on a machine without GPU or simulator: neither torch nor Warp is imported."""
+    program = "import sys, arena_newton.eval.ray_run\nprint(*{'torch', 'warp', 'newton', 'mujoco'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.split() == []
