@@ -54,6 +54,7 @@ _EXTRA_PURPOSES = {
     "gr00t": "`--policy remote:gr00t://`",
     "plots": "charts, and maps of predicted actions",
     "policies": "policies of the families diffusion, flow and pi05",
+    "ray": "`eval run --ray`: processes of a cluster",
     "rerun": "`--viewer rerun`",
     "serve": "a policy server; `--policy remote:` of a websocket",
     "teleop": "a person drives the robot; viewers of a run",

@@ -13,6 +13,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "gr00t": ("zmq", "msgpack"),
     "plots": ("matplotlib", "sklearn"),
     "policies": ("diffusers", "transformers", "scipy"),
+    "ray": ("ray",),
     "rerun": ("rerun",),
     "serve": ("websockets", "msgpack"),
     "teleop": ("viser", "websockets", "redis"),

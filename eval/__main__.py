@@ -111,6 +111,10 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
     if row is not None:
         beside = ResultsFolder(results_folder(row.out), resolve(row), versions())
         beside.check()
+    if config.flags.ray is not None:
+        from arena_newton.eval import ray_run
+
+        return ray_run.execute(folder, factories, beside)
     from arena_newton.eval.run import execute
 
     return execute(folder, factories, beside)

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING
 from arena_newton import __version__, policies, rule_sets, seeding, trackers
 from arena_newton import tasks as task_specs
 from arena_newton.data.episode import CAMERAS
-from arena_newton.devices import resolve_engine
+from arena_newton.devices import cluster_engine, resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.eval import plan, rounds
 from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
 from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RecordOptions, RunOptions, is_quick
+from arena_newton.eval.play_flags import RAY_FLAGS, check_ray, check_width
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.sharding import Shard, dealt, parse_shard
 from arena_newton.extras import require
@@ -36,7 +37,16 @@ if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
     from arena_newton.trackers.base import Tracker
 
-__all__ = ["DEFAULT_TRACKER", "DRIVES", "RunConfig", "plain_facts", "recorded_cameras", "recording_run", "resolve"]
+__all__ = [
+    "DEFAULT_TRACKER",
+    "DRIVES",
+    "RAY_FLAGS",
+    "RunConfig",
+    "plain_facts",
+    "recorded_cameras",
+    "recording_run",
+    "resolve",
+]
 
 DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
@@ -50,12 +60,15 @@ DRIVES: Mapping[str, DriveGains | None] = {
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
 CHUNK_FLAGS = ("replan", "ensemble", "latency_ticks")
 """Flags that say how a policy's chunks are executed."""
+MOST_EPISODES = 200
+"""Episodes of a task, tracker and mode under --until-width; the widest interval is then 14 points wide."""
 MOST_DISTURBANCE = 10.0
 """Largest factor of the noise; no robot stands far less."""
 LABELS = ("v3.1", "v4")
 """Label protocols, `data.label_protocols.LABELS`, which loads torch."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
 ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
+ONE_CALL |= {"ray", *RAY_FLAGS}
 """Flags that a resumed run does not take over."""
 
 
@@ -140,6 +153,7 @@ class RunConfig:
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
             **self._chunks(),
+            **self._budget(),
             **self._demonstrations(),
         }
 
@@ -147,6 +161,19 @@ class RunConfig:
         """How chunks are executed, as far as it is not the usual: whole, at once, one after the other."""
         given = {name: getattr(self.flags, name) for name in CHUNK_FLAGS}
         return {name: value for name, value in given.items() if value}  # type: ignore[return-value]  # a part of one
+
+    @property
+    def width_rule(self) -> rounds.WidthRule | None:
+        """When a task, tracker and mode has enough episodes; None: when all are played."""
+        flags = self.flags
+        if flags.until_width is None:
+            return None
+        return rounds.WidthRule(flags.until_width, flags.max or MOST_EPISODES, len(flags.seeds))
+
+    def _budget(self) -> Identity:
+        """The rule that is said before the first episode; nothing where the plan is played as a whole."""
+        rule = self.width_rule
+        return {} if rule is None else {"until_width": rule.width, "max": rule.most}  # type: ignore[typeddict-item]
 
     def _demonstrations(self) -> Identity:
         """What tells a run of `eval record` from an evaluation; nothing for one."""
@@ -264,13 +291,20 @@ def resolve(options: RunOptions) -> RunConfig:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
     default_repeats = QUICK_REPEATS if quick else plan.PROTOCOL_REPEATS
     repeats = default_repeats if options.repeats is None else options.repeats
+    used_seeds = tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS)
+    if options.until_width is not None:
+        needed = -(-(options.max or MOST_EPISODES) // len(used_seeds))
+        if options.repeats not in (None, needed):
+            raise InputError(f"--repeats {options.repeats}: --until-width decides it, up to --max; drop one of both")
+        repeats = needed
     flags = dataclasses.replace(
         options,
         task=tasks,
         tracker=used,
         mode=tuple(options.mode) or ("base",),
-        seeds=tuple(options.seeds) or (QUICK_SEEDS if quick else plan.PROTOCOL_SEEDS),
+        seeds=used_seeds,
         repeats=repeats,
+        max=(options.max or MOST_EPISODES) if options.until_width is not None else None,
         strip=options.strip or quick,
         seeing=options.seeing or (quick and options.policy == "expert" and not options.record),
         follow=options.follow or quick,
@@ -298,7 +332,10 @@ def resolve(options: RunOptions) -> RunConfig:
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
     variant_hash = _variant_hash(variant) if variant else None
-    engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
+    if options.ray is None:
+        engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
+    else:
+        engine, device = cluster_engine(options.engine, options.device, options.ray_gpus)
     return RunConfig(
         flags=dataclasses.replace(flags, engine=engine, device=device, shard=None if shard is None else str(shard)),
         episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in played),
@@ -361,6 +398,8 @@ def _check_flags(options: RunOptions) -> None:
         if getattr(options, name) != getattr(RunOptions, name) and not options.record:
             raise InputError(f"{_flag(name)}: belongs to --record, which is not given")
     _check_viewer(options)
+    check_ray(options)
+    check_width(options)
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: must be alone, name either all or single tasks")
     if options.seeds and min(options.seeds) < 0:

@@ -38,13 +38,17 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, s
     if flags.keep is not None:
         planned = f"{flags.keep:,} successes to record of each task, tracker and mode"
         planned += f" in at most {len(config.episodes):,} attempts"
+    rule = config.width_rule
+    if rule is not None:
+        planned = f"of each task, tracker and mode at most {counted(rule.most, 'episode')}, until the 95 % interval of "
+        planned += f"its success rate is at most {100 * rule.width:g} points wide"
     if not remain:
         print(f"  {planned}, all finished -> {folder}", flush=True)
         return
     finished = len(config.episodes) - remain
     planned = planned if config.shard is None else f"shard {config.shard}: {planned} of {config.planned:,}"
     size = f"{planned}, {finished} finished, {remain} remain" if finished else planned
-    size = size if flags.keep is None else f"{planned}, {remain} due"
+    size = size if flags.keep is None and rule is None else f"{planned}, {remain} due"
     worlds = min(flags.worlds, max(map(len, waiting.values())))
     most = simulated(sum(episode.max_steps for group in waiting.values() for episode in group))
     print(f"  {size}, {counted(worlds, 'world')} at once, {most} -> {folder}", flush=True)

@@ -88,6 +88,9 @@ class Identity(_Identity, total=False):
     """Absent, as the next two, where chunks are executed as usual."""
     ensemble: bool
     latency_ticks: Positive
+    until_width: Annotated[float, Fit("a number from 0 to 1", lambda value: 0 < value < 1)]
+    """With `max`: width of the interval at which a task, tracker and mode has enough episodes. Absent without rule."""
+    max: Positive
     worlds: Annotated[float | None, Fit("a number or null")]
     rules_hash: Name
     engine: Name

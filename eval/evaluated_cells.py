@@ -11,7 +11,7 @@ from arena_newton import seeding
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, check_whole_plan, load_run
+from arena_newton.eval.results import RunRecord, check_whole_plan, is_complete, load_run
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
@@ -107,7 +107,7 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
                 raise InputError(f"{folder}: holds recordings for training; tables are of evaluations")
             check_whole_plan(run)
             found += [(run.config["rules"], cell, run) for cell in _of_run(run)]
-            if len(run.records) < run.document["planned"] and run.config.get("keep") is None:
+            if run.config.get("keep") is None and len(run.records) < run.document["planned"] and not is_complete(run):
                 notes.append(f"{folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
     others = sorted({plain_text(other, 60) for other, _, _ in found if other != rules})
     if others:

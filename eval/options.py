@@ -35,10 +35,10 @@ QUICK_TRACKERS = ("twist2", "sonic")
 class RunOptions:
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
-    Without --task, --mode, --seeds, --repeats and --max-steps the experts solve all seven tasks through both trackers,
-    a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where one comes with
-    the package, and the report opens with film strips. As soon as one of
-    them is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
+    Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
+    both trackers, a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where
+    one comes with the package, and the report opens with film strips. As soon as one of them is given, the rest follows
+    the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
     task: tuple[str, ...] = ()
@@ -72,6 +72,11 @@ class RunOptions:
     """Group seeds; the protocol's are 0 1 2."""
     repeats: int | None = None
     """Episodes per group seed; the protocol's are 20."""
+    until_width: float | None = None
+    """Instead of --repeats: play each task, tracker and mode until the 95 % interval of its success rate is as narrow,
+    such as 0.14; looked at every 20 episodes, group seeds in turn."""
+    max: int | None = None
+    """With --until-width: episodes of each task, tracker and mode at most, 200 when not given."""
     worlds: int = 20
     """Episodes simulated at once."""
     engine: str = "auto"
@@ -118,6 +123,19 @@ class RunOptions:
     shard: str | None = None
     """Play part n of N of the plan, such as 3/16, into a folder of its own; `merge` joins them. slurm: the part of this
     task of a Slurm array; slurm/16 where the array has not all 16."""
+    ray: tuple[str, ...] | None = None
+    """Let processes of a Ray cluster play, and keep the journal here: its address, such as 10.0.0.1:6379, or auto; with
+    no address, a Ray of its own on this machine."""
+    ray_actors: int | None = None
+    """With --ray: processes that play at once; as many as the cluster has room for when not given."""
+    ray_cpus: int | None = None
+    """With --ray: cores of each of them; 4, or all of the smallest node where it has fewer, when not given."""
+    ray_gpus: float | None = None
+    """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
+    ray_minutes: float = 60.0
+    """With --ray: a slice of the plan, at most two batches of worlds, that takes longer is stopped and played again."""
+    ray_attempts: int = 3
+    """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
@@ -152,7 +170,7 @@ class RunOptions:
 def is_quick(options: RunOptions) -> bool:
     """Whether the flags leave the plan open: the default run over all tasks."""
     named = options.task or options.mode or options.seeds or options.series is not None
-    return not named and (options.repeats, options.max_steps) == (None, None)
+    return not named and (options.repeats, options.max_steps, options.until_width) == (None, None, None)
 
 
 @dataclass(frozen=True)
@@ -207,6 +225,19 @@ class RecordOptions:
     """Cap on the step budget of the rule set [ticks of 0.02 s]."""
     shard: str | None = None
     """Record part n of N of the plan, such as 3/16 or slurm, into a folder of its own; not with --only-success."""
+    ray: tuple[str, ...] | None = None
+    """Let processes of a Ray cluster play, and keep the journal here: its address, such as 10.0.0.1:6379, or auto; with
+    no address, a Ray of its own on this machine."""
+    ray_actors: int | None = None
+    """With --ray: processes that play at once; as many as the cluster has room for when not given."""
+    ray_cpus: int | None = None
+    """With --ray: cores of each of them; 4, or all of the smallest node where it has fewer, when not given."""
+    ray_gpus: float | None = None
+    """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
+    ray_minutes: float = 60.0
+    """With --ray: a slice of the plan, at most two batches of worlds, that takes longer is stopped and played again."""
+    ray_attempts: int = 3
+    """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
     out: str | None = None
     """Folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False

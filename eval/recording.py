@@ -25,12 +25,10 @@ from arena_newton.eval.identity import PACKAGE, hash_paths, moving_versions, sce
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.records import JsonObject
-from arena_newton.interfaces import EpisodeResult
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.text import counted
 
 __all__ = [
-    "agrees",
     "demonstration_recorder",
     "disturbance_of",
     "encoding_processes",
@@ -129,11 +127,6 @@ def _whole(file: EpisodeFile, cameras: Iterable[str]) -> bool:
         except (av.error.FFmpegError, OSError, IndexError):
             return False
     return True
-
-
-def agrees(record: EpisodeRecord, result: EpisodeResult) -> bool:
-    """Whether an episode that was played again ended as the journal says."""
-    return (record.outcome, record.reason, record.steps) == (result.outcome, result.reason, result.steps)
 
 
 def outcome_lines(config: RunConfig, folder: Path, records: Sequence[EpisodeRecord]) -> list[str]:

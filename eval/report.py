@@ -10,7 +10,8 @@ from arena_newton.eval import html_report
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.learned_row import ROW_FOLDER, row_results
 from arena_newton.eval.original_format import write_original
-from arena_newton.eval.results import Results, RunRecord, results_json
+from arena_newton.eval.results import Results, RunRecord, results_json, width_rule
+from arena_newton.eval.rounds import LOOK_EVERY
 from arena_newton.eval.stats import ResultCell, Suite, error_reasons, outside_suites
 from arena_newton.eval.wording import (
     environment_facts,
@@ -132,6 +133,12 @@ def notes(run: RunRecord, results: Results) -> list[str]:
         more = "" if beside["complete"] else f", of which {beside['finished']} of {beside['planned']} are finished"
         found.append(
             f"The episodes of policy learned{more}, their strips and a report of their own are in {ROW_FOLDER}/."
+        )
+    rule = width_rule(results["config"])
+    if rule is not None:
+        found.append(
+            f"Said before the first episode: a row ends when its interval is at most {100 * rule.width:g} points "
+            f"wide, looked at every {LOOK_EVERY} episodes, or after {rule.most}."
         )
     late, replan = results["config"].get("latency_ticks", 0), results["config"].get("replan")
     if late:

@@ -30,6 +30,7 @@ from arena_newton.eval.folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.identity import differing_key
 from arena_newton.eval.journal import StorageError
 from arena_newton.eval.options import RecordOptions, RunOptions
+from arena_newton.eval.play_flags import RAY_FLAGS
 from arena_newton.eval.progress import Progress
 from arena_newton.eval.run import Factories
 from arena_newton.files import PARTIAL, replace_atomically
@@ -119,9 +120,11 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
         "drive": "auto",
         "shard": None,
     }
+    given |= {name: getattr(RecordOptions, name) for name in ("ray", *RAY_FLAGS)}
     for name, default in given.items():
         if getattr(options, name) != default:
-            raise InputError(f"--{name.replace('_', '-')}: is in the recording; drop it beside --from")
+            why = "plays a plan" if name.startswith("ray") else "is in the recording"
+            raise InputError(f"--{name.replace('_', '-')}: {why}; drop it beside --from")
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")
     pictures = RunOptions(record_cameras=options.cameras, record_size=options.size, record_depth=options.depth)

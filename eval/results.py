@@ -23,6 +23,7 @@ __all__ = [
     "is_complete",
     "load_run",
     "results_json",
+    "width_rule",
 ]
 
 
@@ -100,10 +101,18 @@ def check_whole_plan(run: RunRecord) -> None:
 def is_complete(run: RunRecord) -> bool:
     """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
     planned, keep = run.document["planned"], run.config.get("keep")
-    if keep is None:
+    rule = width_rule(run.config)
+    if keep is None and rule is None:
         return len(run.records) == due_episodes(run.document)
-    groups = planned // run.config["repeats"]
-    return rounds.complete(planned, groups, {record.index: record.outcome for record in run.records}, keep)
+    groups = planned // (run.config["repeats"] * len(run.config["seeds"]))
+    return rounds.complete(planned, groups, {record.index: record.outcome for record in run.records}, keep, rule)
+
+
+def width_rule(config: Identity) -> rounds.WidthRule | None:
+    """The rule by which a task, tracker and mode of a stored run had enough episodes; None where it had all."""
+    if "until_width" not in config:
+        return None
+    return rounds.WidthRule(config["until_width"], config["max"], len(config["seeds"]))
 
 
 def results_json(run: RunRecord) -> Results:

@@ -7,29 +7,39 @@ import dataclasses
 import errno
 import gc
 import math
-import shlex
-import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import warp as wp
 
 from arena_newton import policies, trackers
-from arena_newton.command_line import INTERRUPTED
 from arena_newton.data.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
-from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import console, recording, report, rounds
+from arena_newton.errors import InputError
+from arena_newton.eval import console, recording
 from arena_newton.eval.config import DRIVES, RunConfig
 from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
-from arena_newton.eval.progress import Progress, kernels_to_compile
+from arena_newton.eval.progress import kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
-from arena_newton.eval.results import Results, RunRecord, load_run
+from arena_newton.eval.whole_run import (
+    Group,
+    RunStopped,
+    begun,
+    check_again,
+    command,
+    due,
+    groups,
+    kept,
+    progress_of,
+    run_and_report,
+    told_how_to_go_on,
+)
 from arena_newton.files import file_label
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.recorder import EpisodeRecorder
@@ -43,13 +53,7 @@ from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
 from arena_newton.viewing import FailureRecorder, WorldViewer
 
-__all__ = ["Factories", "RunStopped", "execute"]
-
-
-class RunStopped(ArenaError):
-    """Something other than an episode failed; what was played is kept, what was running stays unplayed."""
-
-    exit_code = 2
+__all__ = ["EpisodeLines", "Factories", "RunPlayer", "RunStopped", "ProgressSink", "check_parts", "execute"]
 
 
 @dataclass(frozen=True)
@@ -75,34 +79,15 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
         RunStopped: Simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
     quiet_warp()
-    factories = factories or Factories()
-    began = time.perf_counter()
-    if not _played(folder, factories):
-        return INTERRUPTED
-    whole, code = True, 0
-    try:
-        if beside is not None:
-            whole = _played(beside, factories)
-            if whole:
-                code = _exit_code(beside, *_reported(beside))
-    finally:  # whatever happened to the other, this one is told
-        loaded, results = _reported(folder)
-        console.result(loaded, results, _command(folder, "resume"), time.perf_counter() - began)
-        for line in recording.outcome_lines(folder.config, folder.path, loaded.records):
-            print(line)
-    return max(code, _exit_code(folder, loaded, results)) if whole else INTERRUPTED
-
-
-def _command(folder: ResultsFolder, name: str) -> str:
-    """The command line that does something to a folder."""
-    return f"python -m arena_newton.eval {name} {shlex.quote(str(folder.path))}"
+    made_of = factories or Factories()
+    return run_and_report(folder, beside, lambda one: _played(one, made_of))
 
 
 def _played(folder: ResultsFolder, factories: Factories) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
     config = folder.config
     try:
-        config, policy = _check_parts(config, factories)
+        config, policy = check_parts(config, factories)
     except SystemExit as stop:
         parts = f"--tracker {' '.join(config.flags.tracker)} or --policy {config.policy_label}"
         raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
@@ -111,28 +96,10 @@ def _played(folder: ResultsFolder, factories: Factories) -> bool:
         viewer = _viewer(config, folder.path)
         if viewer is not None:
             ended.callback(viewer.close)
-        return _play(config, folder, factories, policy, viewer, _command(folder, "resume"))
+        return _play(config, folder, factories, policy, viewer, command(folder, "resume"))
 
 
-def _reported(folder: ResultsFolder) -> tuple[RunRecord, Results]:
-    """Write the reports of a folder."""
-    try:
-        loaded = load_run(folder.path)
-        return loaded, report.write_reports(loaded)
-    except StorageError as error:
-        raise StorageError(f"{error}; free space, then: {_command(folder, 'report')}") from None
-
-
-def _exit_code(folder: ResultsFolder, loaded: RunRecord, results: Results) -> int:
-    """0 when the run has all that was asked for, 1 otherwise."""
-    config = folder.config
-    if config.flags.keep is not None:
-        kept = sum(record.outcome == "success" for record in loaded.records)
-        return 0 if kept >= config.flags.keep * len(_groups(config.episodes)) else 1
-    return 0 if results["complete"] and not any(record.outcome == "error" for record in loaded.records) else 1
-
-
-def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
+def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
     """Build trackers and policy and check plan and variant, so that wrong input shows before the first episode.
 
     Returns:
@@ -141,7 +108,7 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
     made = {name: factories.tracker(name, config.checkpoint) for name in config.flags.tracker}
     policy = factories.policy(config.policy, **config.policy_options)
     policy.check()
-    for (task, _, mode), group in _groups(config.episodes).items():
+    for (task, _, mode), group in groups(config.episodes).items():
         policy.check_task(task, mode, [episode.episode_seed for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
@@ -165,43 +132,61 @@ def _play(
     with Journal(folder.journal) as journal:
         folder.settle(config, journal.records)
         folder.sweep()
-        run = _Run(config, folder, journal, factories, policy, viewer)
+        run = RunPlayer(config, folder, journal, factories, policy, viewer)
         try:
-            run.play()
+            with told_how_to_go_on(resume, run.kept):
+                ended, waiting = begun(config, folder, journal)
+                if waiting:
+                    run.play(ended, waiting)
         except KeyboardInterrupt:
             print(f"\ninterrupted: {run.kept()}; continue with: {resume}")
             return False
-        except StorageError as error:
-            raise StorageError(f"{error}; free space, then: {resume}") from None
         except PolicyUnavailable as error:
             raise RunStopped(f"{error}; {run.kept()}; when it is back: {resume}") from None
-        except RunStopped as error:
-            raise RunStopped(f"{error}; {run.kept()}; continue with: {resume}") from None
         finally:
             folder.sweep()
     return True
 
 
-def _groups(episodes: Iterable[Episode]) -> dict[tuple[str, str, str], list[Episode]]:
-    """Episodes by task, tracker and mode: a group runs in one environment."""
-    groups: dict[tuple[str, str, str], list[Episode]] = {}
-    for episode in episodes:
-        groups.setdefault((episode.task, episode.tracker, episode.mode), []).append(episode)
-    return groups
+class EpisodeLines(Protocol):
+    """Where finished episodes go: the journal, or what passes them on to it."""
+
+    records: list[EpisodeRecord]
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Take the record of an episode that ended."""
+
+
+class ProgressSink(Protocol):
+    """What is told of episodes while they run (`progress.Progress`)."""
+
+    def tick(self, active: int) -> None:
+        """One tick of so many worlds is over."""
+
+    def episode(self, budget: int, used: int) -> None:
+        """An episode is over, with its planned ticks and those that it took."""
+
+    def more(self, budgets: Sequence[int]) -> None:
+        """Episodes with these budgets are planned besides."""
+
+    def say(self, text: str) -> None:
+        """A line for who looks on."""
 
 
 @dataclass
-class _Run:
-    """What all groups of a run share."""
+class RunPlayer:
+    """Plays episodes of a run in this process, one environment after the other."""
 
     config: RunConfig
     folder: ResultsFolder
-    journal: Journal
+    journal: EpisodeLines
     factories: Factories
     policy: Policy
     viewer: WorldViewer | None = None
     """What shows the worlds, if anything does."""
-    progress: Progress = field(init=False)
+    batch: int | None = None
+    """Worlds of every environment; None: as --worlds says, no more than there are episodes."""
+    progress: ProgressSink = field(init=False)
     hashes: dict[str, str | None] = field(default_factory=dict)
     """What the present environment's episodes name their run by; empty before it is built."""
     ended: dict[int, EpisodeRecord] = field(default_factory=dict)
@@ -209,56 +194,26 @@ class _Run:
 
     def kept(self) -> str:
         """How many of the planned episodes are in the journal, in words."""
-        kept = len({record.index for record in self.journal.records})
-        return f"{kept} of {counted(len(self.config.episodes), 'episode')} kept"
+        return kept(self.config, self.journal.records)
 
-    def play(self) -> None:
-        """Run what is missing, environment by environment."""
-        if self.journal.torn_bytes:
-            torn = counted(self.journal.torn_bytes, "byte")
-            print(f"  cut a torn last line of {torn} off the journal", file=sys.stderr)
-        done = self.ended = self._done()
-        waiting = self._waiting()
-        console.announce(self.config, self.folder.path, waiting)
-        if not waiting:
-            self.folder.finished()
-            return
-        budget = {episode.index: episode.max_steps for episode in self.config.episodes}
-        finished = sum(budget[index] for index in done)
-        coming = [episode.max_steps for group in waiting.values() for episode in group]
-        self.progress = Progress(
-            finished + sum(coming), planned=len(done) + len(coming), finished=len(done), done=finished
-        )
+    def play(self, ended: dict[int, EpisodeRecord], waiting: Mapping[Group, list[Episode]]) -> None:
+        """Run what is missing, environment by environment.
+
+        Args:
+            ended: Finished episodes by number.
+            waiting: Those to play, by task, tracker and mode.
+        """
+        self.ended = ended
+        shown = self.progress = progress_of(self.config, ended, waiting)
         try:
             with self.folder.running():
                 for names, group in waiting.items():
-                    self.progress.group(" ".join(names))
-                    self._play_group(" ".join(names), group)
+                    shown.group(" ".join(names))
+                    self.play_group(" ".join(names), group)
         finally:
-            self.progress.close()
+            shown.close()
 
-    def _done(self) -> dict[int, EpisodeRecord]:
-        """The finished episodes; one whose recording is missing is none."""
-        ended = {record.index: record for record in self.journal.records}
-        again, planned = self.config.flags.retry_errors, {e.index: e for e in self.config.episodes}
-        done = {index: record for index, record in ended.items() if not (again and record.outcome == "error")}
-        where = self.folder.path
-        lost = [i for i, r in done.items() if not recording.is_recorded(self.config, where, r, planned[i])]
-        if lost:
-            print(f"  of {counted(len(lost), 'episode')} the recording is missing: played again", file=sys.stderr)
-        return {index: record for index, record in done.items() if index not in lost}
-
-    def _waiting(self) -> dict[tuple[str, str, str], list[Episode]]:
-        """Episodes to play next, by task, tracker and mode."""
-        outcomes = {index: record.outcome for index, record in self.ended.items()}
-        found = {}
-        for names, group in _groups(self.config.episodes).items():
-            wanted = set(rounds.due([e.index for e in group], outcomes, self.config.flags.keep))
-            if wanted:
-                found[names] = [episode for episode in group if episode.index in wanted]
-        return found
-
-    def _play_group(self, group: str, episodes: list[Episode]) -> None:
+    def play_group(self, group: str, episodes: list[Episode]) -> None:
         """Run the episodes of one task, tracker and mode, which name the group.
 
         What breaks an environment as a whole says nothing about its episodes: it stops the run and leaves them
@@ -304,7 +259,7 @@ class _Run:
             env = self.factories.env(
                 task,
                 tracker=self.factories.tracker(tracker, config.checkpoint),
-                worlds=min(flags.worlds, len(episodes)),
+                worlds=self.batch or min(flags.worlds, len(episodes)),
                 engine=flags.engine,
                 device=config.device,
                 rules=flags.rules,
@@ -378,9 +333,9 @@ class _Run:
         self, task: str, tracker: str, mode: str, order: list[Episode], left: dict[int, Episode]
     ) -> list[Episode]:
         """More attempts where successes are missing; they are added to what is left."""
-        if self.config.flags.keep is None:
+        if self.config.flags.keep is None and self.config.width_rule is None:
             return []
-        more = self._waiting().get((task, tracker, mode), [])
+        more = due(self.config, self.ended).get((task, tracker, mode), [])
         order += more
         left |= {episode.index: episode for episode in more}
         self.progress.more([episode.max_steps for episode in more])
@@ -400,15 +355,8 @@ class _Run:
         Raises:
             RunStopped: It was played again for its recording, and ended in another way.
         """
-        before = next((r for r in reversed(self.journal.records) if r.index == result.episode.index), None)
-        if before is not None and before.outcome != "error" and not recording.agrees(before, result):
-            for path in media.values():
-                (self.folder.path / path).unlink(missing_ok=True)
-            raise RunStopped(
-                f"{result.episode.key}: was played again for its recording and ended as {result.outcome} after "
-                f"{result.steps} steps, the journal has {before.outcome} after {before.steps}: engine "
-                f"{self.config.flags.engine} does not repeat an episode bit for bit; record into another --out"
-            )
+        where, records = self.folder.path, self.journal.records
+        check_again(self.config, where, records, result, result.episode, media.values())
         record = _record(result, media, self.hashes)
         self.journal.append(record)
         self.ended[record.index] = record

@@ -1,0 +1,222 @@
+"""What the driver of `run --ray` does with what processes tell: nothing is lost, nothing counts twice."""
+
+import pytest
+from eval_fakes import FakePolicy, factories
+
+from arena_newton import devices, doctor, extras
+from arena_newton.eval import ray_run
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.config import resolve
+from arena_newton.eval.folder import ResultsFolder
+from arena_newton.eval.journal import Journal, read_journal
+from arena_newton.eval.options import RunOptions
+from arena_newton.eval.ray_crew import Done, Lost, Member
+from arena_newton.eval.run import RunStopped, check_parts
+from arena_newton.eval.slice_events import Ended, Slice
+from arena_newton.eval.slice_player import play
+from arena_newton.eval.whole_run import begun
+
+ray = pytest.importorskip("ray", reason="needs the extra [ray]")
+
+PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine": "mujoco", "worlds": 4, "ray": ()}
+
+
+class StubCrew:
+    """Processes that play in this one, and are lost where a test says so."""
+
+    def __init__(self, folder, size, lost=lambda lease, told: None, made_of=None):
+        self.folder, self.members, self.lost = folder, [Member(ready=True) for _ in range(size)], lost
+        self.made_of, self.shown = made_of or factories(), None
+        self.policy = FakePolicy("expert")
+        self.sizes = []
+
+    def idle(self):
+        return [member for member in self.members if member.lease is None]
+
+    def lend(self, member, lease):
+        member.lease, member.last = lease, lease.group
+        self.sizes.append((lease.size, lease.worlds, tuple(lease.left)))
+
+    def heard(self):
+        for member in self.members:
+            lease = member.lease
+            if lease is None:
+                continue
+            told = []
+            part = Slice(" ".join(lease.group), tuple(lease.left), lease.worlds, self.folder.document["config_hash"])
+            play(part, self.folder.config, self.folder.path, self.made_of, self.policy, told.append)
+            loss = self.lost(lease, told)
+            for event in told if loss is None else told[: loss[0]]:
+                yield lease, event
+            member.lease = None
+            yield lease, Done() if loss is None else loss[1]
+
+
+@pytest.fixture
+def driven(tmp_path):
+    """Plays a plan with a stub crew; gives the records, the crew and the folder."""
+
+    def drive(lost=lambda lease, told: None, size=2, made_of=None, out="r", **changes):
+        options = RunOptions(**(PLAN | {"out": str(tmp_path / out)} | changes))
+        config, _ = check_parts(resolve(options), factories())
+        folder = ResultsFolder(tmp_path / out, config, doctor.versions())
+        folder.check()
+        folder.make()
+        crew = StubCrew(folder, size, lost, made_of)
+        with Journal(folder.journal) as journal:
+            folder.settle(config, journal.records)
+            done, waiting = begun(config, folder, journal)
+            ray_run._Driver(folder, journal, crew, done, waiting).play()
+        return read_journal(folder.journal)[0], crew, folder
+
+    return drive
+
+
+def outcomes(records):
+    """What came of each episode, by number; each is there once."""
+    assert len({record.index for record in records}) == len(records)
+    return {record.index: (record.outcome, record.steps, record.margin) for record in records}
+
+
+def test_slices_cover_the_plan_once(driven, tmp_path):
+    """All episodes are played once in slices of at most two batches, with a run's outcomes."""
+    records, crew, _ = driven()
+    assert main(["run", "--task", "football", "boxing", "--seeds", "0", "1", "--repeats", "4", "--engine", "mujoco",
+                 "--out", str(tmp_path / "one")], factories()) == 0  # fmt: skip
+    assert outcomes(records) == outcomes(read_journal(tmp_path / "one" / "episodes.jsonl")[0])
+    played = [index for _, _, indices in crew.sizes for index in indices]
+    assert sorted(played) == list(range(16)) and max(size for size, _, _ in crew.sizes) <= 8
+
+
+def test_losses_lose_nothing(driven):
+    """Whatever is told before a process is lost counts once; the rest is played again, with the same outcomes."""
+    undisturbed, _, _ = driven(out="u")
+    count = iter(range(100))
+
+    def lost(lease, told):
+        number = next(count)
+        return (number % (len(told) + 1), Lost("killed", with_node=number % 2 == 0)) if number < 9 else None
+
+    records, crew, _ = driven(lost)
+    assert outcomes(records) == outcomes(undisturbed)
+    assert len(crew.sizes) > 9
+
+
+def test_what_ended_before_a_loss_is_not_played_again(driven):
+    """An episode that was told of is in the journal, and in no later slice."""
+    known = set()
+
+    def lost(lease, told):
+        assert not known & set(lease.left)
+        after = next(i for i, event in enumerate(told) if isinstance(event, Ended)) + 1
+        known.add(told[after - 1].line["index"])
+        return (after, Lost("killed", with_node=True)) if len(known) < 5 else None
+
+    driven(lost)
+    assert len(known) >= 5
+
+
+def test_a_poison_episode_ends_as_an_error_and_the_rest_goes_on(driven):
+    """Who is running at a loss comes into a smaller slice, then alone; after the attempts alone it is an error."""
+    undisturbed, _, _ = driven(out="u")
+
+    def lost(lease, told):
+        return (1, Lost("it died")) if 5 in lease.left else None
+
+    records, crew, _ = driven(lost, worlds=16)
+    expected = {index: ending for index, ending in outcomes(undisturbed).items() if index != 5}
+    assert {index: ending for index, ending in outcomes(records).items() if index != 5} == expected
+    error = next(record for record in records if record.index == 5)
+    assert (error.outcome, error.reason) == ("error", "environment")
+    assert error.error == "played alone 3 times, each time its process was lost: it died"
+    assert error.hashes == records[0].hashes
+    with_it = [size for size, _, indices in crew.sizes if 5 in indices]
+    assert with_it[-3:] == [1, 1, 1] and with_it[0] > with_it[1] > 1 and len(with_it) == 5
+
+
+def test_where_every_episode_breaks_the_run_stops(driven):
+    """A bug of policy or simulator does not end the whole plan as errors."""
+    with pytest.raises(RunStopped, match="boxing twist2 base: 5 episodes and no other: device lost"):
+        driven(lambda lease, told: (1, Lost("device lost", "a trace")), worlds=1, ray_attempts=1, task=("boxing",))
+
+
+def test_a_loss_before_the_environment_is_built_blames_no_episode(driven):
+    """A process that dies while it builds costs no episode an attempt, and slices stay as large."""
+    count = iter(range(100))
+    records, crew, _ = driven(lambda lease, told: (0, Lost("it died")) if next(count) < 6 else None, ray_attempts=1)
+    assert len(outcomes(records)) == 16 and all(record.outcome != "error" for record in records)
+    assert crew.sizes[0][0] == crew.sizes[6][0]
+
+
+def test_a_lost_machine_blames_no_episode(driven):
+    """When a machine leaves the cluster, what ran there is not suspected."""
+    count = iter(range(100))
+    records, crew, _ = driven(
+        lambda lease, told: (1, Lost("gone", with_node=True)) if next(count) < 12 else None, worlds=1, ray_attempts=1
+    )
+    assert all(record.outcome != "error" for record in records)
+
+
+def test_only_so_many_successes_are_played(driven):
+    """With --only-success the rounds are those of one process, whatever is lost."""
+    count = iter(range(100))
+
+    def lost(lease, told):
+        return (len(told) // 2, Lost("killed", with_node=True)) if next(count) % 3 == 0 else None
+
+    plain, _, _ = driven(out="a", keep=2, worlds=20, size=1)
+    records, _, _ = driven(lost, keep=2, size=3)
+    assert outcomes(records) == outcomes(plain)
+    assert len(records) < 16
+
+
+FLAGS = ["run", "--task", "boxing", "--engine", "mujoco"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--ray-actors", "2"], "--ray-actors: belongs to --ray, which is not given"),
+        (["--ray", "a:1", "b:1"], "--ray a:1 b:1: expected one address"),
+        (["--ray", "ray://a:1"], "--ray ray://a:1: expected one address"),
+        (["--ray", "127.0.0.1:1"], "--ray 127.0.0.1:1: no Ray cluster answers (Connection refused)"),
+        (["--ray", "127.0.0.1:99999"], "--ray 127.0.0.1:99999: no Ray cluster answers"),
+        (["--ray", "--ray-actors", "0"], "--ray-actors 0: expected at least 1"),
+        (["--ray", "--ray-attempts", "0"], "--ray-attempts 0: expected at least 1"),
+        (["--ray", "--ray-minutes", "-1"], "--ray-minutes -1: expected more than 0"),
+        (["--ray", "--ray-minutes", "nan"], "--ray-minutes nan: expected more than 0"),
+        (["--ray", "--ray-gpus", "2"], "--ray-gpus 2: expected more than 0 and at most 1"),
+        (["--ray", "--ray-gpus", "0.5"], "--ray-gpus 0.5: engine mujoco runs on the CPU"),
+        (["--ray", "--device", "cuda"], "--device cuda: engine mujoco runs on the CPU"),
+        (["--ray", "--device", "tpu"], "--device tpu: unknown"),
+        (["--ray", "--viewer", "usd"], "--viewer: shows worlds of this process"),
+    ],
+)
+def test_wrong_flags_are_refused_before_ray_starts(flags, said, tmp_path, capsys):
+    """Each is one line with exit code 2, and no folder is made."""
+    assert main([*FLAGS, *flags, "--out", str(tmp_path / "r")], factories()) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {said}") and error.count("\n") == 1
+    assert not (tmp_path / "r").exists() and not ray.is_initialized()
+
+
+def test_a_missing_extra_is_one_line(tmp_path, capsys, monkeypatch):
+    """Without Ray the extra and its command are named."""
+    find = extras.importlib.util.find_spec
+    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
+    assert main([*FLAGS, "--ray", "--out", str(tmp_path / "r")], factories()) == 2
+    assert "--ray: needs the extra [ray]" in capsys.readouterr().err
+
+
+def test_engine_of_a_cluster(monkeypatch, tmp_path):
+    """Processes on GPUs are asked for by engine, device or fraction; nothing is looked for on this machine."""
+    gpus = tmp_path / "gpus"
+    monkeypatch.setattr(devices, "NVIDIA_DEVICES", gpus)
+    assert devices.cluster_engine("auto", None, None) == ("mujoco", "cpu")
+    assert devices.cluster_engine("auto", None, 0.5) == ("warp", "cuda:0")
+    assert devices.cluster_engine("auto", "cuda:3", None) == ("warp", "cuda:0")
+    assert devices.cluster_engine("warp", None, None) == ("warp", "cuda:0")
+    assert devices.cluster_engine("warp", "cpu", None) == ("warp", "cpu")
+    (gpus / "0000:01:00.0").mkdir(parents=True)
+    assert devices.cluster_engine("auto", None, None) == ("warp", "cuda:0")
+    assert devices.cluster_engine("mujoco", None, None) == ("mujoco", "cpu")
