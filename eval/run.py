@@ -43,7 +43,7 @@ from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
 from arena_newton.viewing import FailureRecorder, WorldViewer
 
-__all__ = ["Factories", "RunStopped", "execute"]
+__all__ = ["Factories", "RunStopped", "check_parts", "execute", "make_env"]
 
 
 class RunStopped(ArenaError):
@@ -102,7 +102,7 @@ def _played(folder: ResultsFolder, factories: Factories) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
     config = folder.config
     try:
-        config, policy = _check_parts(config, factories)
+        config, policy = check_parts(config, factories)
     except SystemExit as stop:
         parts = f"--tracker {' '.join(config.flags.tracker)} or --policy {config.policy_label}"
         raise RunStopped(f"{parts}: left with SystemExit: {stop.code} before the first episode") from None
@@ -132,7 +132,7 @@ def _exit_code(folder: ResultsFolder, loaded: RunRecord, results: Results) -> in
     return 0 if results["complete"] and not any(record.outcome == "error" for record in loaded.records) else 1
 
 
-def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
+def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
     """Build trackers and policy and check plan and variant, so that wrong input shows before the first episode.
 
     Returns:
@@ -150,6 +150,31 @@ def _check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Po
     if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than the policy's chunk of {chunk} has")
     return config, read_by(policy, config.labels, late)
+
+
+def make_env(config: RunConfig, factories: Factories, episode: Episode, worlds: int) -> World:
+    """The environment of an episode's task, tracker and mode, as the run's flags say.
+
+    Args:
+        config: The run, with the parts of `check_parts`.
+        factories: What it is built with.
+        episode: One of its episodes.
+        worlds: Worlds in the batch.
+    """
+    flags = config.flags
+    return factories.env(
+        episode.task,
+        tracker=factories.tracker(episode.tracker, config.checkpoint),
+        worlds=worlds,
+        engine=flags.engine,
+        device=config.device,
+        rules=flags.rules,
+        mode=episode.mode,
+        variant_file=str(config.variant) if config.variant else None,
+        fast_physics=flags.fast_physics,
+        camera=config.camera,
+        drive=DRIVES[flags.drive],
+    )
 
 
 def _play(
@@ -301,19 +326,7 @@ class _Run:
         if kernels_to_compile(Path(wp.config.kernel_cache_dir or "."), flags.engine or "", config.device):
             self.progress.say("  compiling kernels, once; this takes a minute or some")
         try:
-            env = self.factories.env(
-                task,
-                tracker=self.factories.tracker(tracker, config.checkpoint),
-                worlds=min(flags.worlds, len(episodes)),
-                engine=flags.engine,
-                device=config.device,
-                rules=flags.rules,
-                mode=mode,
-                variant_file=str(config.variant) if config.variant else None,
-                fast_physics=flags.fast_physics,
-                camera=config.camera,
-                drive=DRIVES[flags.drive],
-            )
+            env = make_env(config, self.factories, episodes[0], min(flags.worlds, len(episodes)))
             facts = self.folder.register(group, env.describe())
             if flags.verbose:
                 self.progress.say(console.environment(group, facts))
