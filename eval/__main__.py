@@ -25,7 +25,7 @@ from arena_newton.eval.options import (
     RunOptions,
 )
 from arena_newton.eval.pack_options import PackOptions
-from arena_newton.eval.placement_options import SensitivityOptions
+from arena_newton.eval.placement_options import AdversaryOptions, SensitivityOptions
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.flags import folders_named, parse_flags
 
@@ -50,6 +50,7 @@ OVERVIEW = f"""commands:
   {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
   {PROG} sensitivity [flags]     map success and margin over the placements of a task
+  {PROG} adversary [flags]       search the placement at which a policy does worst
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
@@ -262,6 +263,13 @@ def _sensitivity(arguments: list[str], factories: Factories | None) -> int:
     return sensitivity.run(options, factories)
 
 
+def _adversary(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(AdversaryOptions, arguments, f"{PROG} adversary")
+    from arena_newton.eval import adversary
+
+    return adversary.run(options, factories)
+
+
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
@@ -346,6 +354,7 @@ _COMMANDS = {
     "pack": _pack,
     "matrix": _matrix,
     "sensitivity": _sensitivity,
+    "adversary": _adversary,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,

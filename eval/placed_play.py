@@ -112,17 +112,20 @@ class PlacedWorlds:
         if self._env is not None:
             self._env.close()
 
-    def placed(self, points: Sequence[tuple[float, ...]], first: int = 0) -> list[PlacedEpisode]:
+    def placed(
+        self, points: Sequence[tuple[float, ...]], first: int = 0, episodes: Sequence[Episode] | None = None
+    ) -> list[PlacedEpisode]:
         """Every episode seed of the study at every placement.
 
         Args:
             points: Placements, one value per axis each.
             first: Number of the first of them.
+            episodes: Other episodes than the study's own.
         """
         return [
             PlacedEpisode(point, number, episode)
             for number, point in enumerate(points, start=first)
-            for episode in self.config.episodes
+            for episode in (self.config.episodes if episodes is None else episodes)
         ]
 
     def play(

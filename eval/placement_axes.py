@@ -61,10 +61,18 @@ class Axis:
         steps = points if self.turns else points - 1
         return tuple(self.low + (self.high - self.low) * k / steps for k in range(points))
 
-    def nearest(self, value: float) -> float:
-        """The value of the range that is nearest to one."""
-        value = min(max(value, self.low), self.high)
-        return float(math.floor(value + 0.5)) if self.counts else value
+    def at(self, part: float) -> float:
+        """The value at a part of the range, from 0 to 1; each number has an equal part of it."""
+        if self.counts:
+            numbers = int(self.high - self.low) + 1
+            return self.low + min(int(part * numbers), numbers - 1)
+        return self.low + part * (self.high - self.low)
+
+    def part(self, value: float) -> float:
+        """Where a value lies in the range, from 0 to 1; of a number the middle of its part."""
+        if self.counts:
+            return (value - self.low + 0.5) / (self.high - self.low + 1.0)
+        return (value - self.low) / (self.high - self.low)
 
 
 def axes_of(rules: TaskRules, mode: str) -> tuple[Axis, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["PlacementOptions", "SensitivityOptions"]
+__all__ = ["AdversaryOptions", "PlacementOptions", "SensitivityOptions"]
 
 
 @dataclass(frozen=True)
@@ -61,3 +61,22 @@ class SensitivityOptions(PlacementOptions):
     """Points along each axis, the ends of its range among them."""
     out: str | None = None
     """Folder to write, which must not exist; results/sensitivity_<task>_<tracker>_<mode> when none is named."""
+
+
+@dataclass(frozen=True)
+class AdversaryOptions(PlacementOptions):
+    """Search the placement of a task at which a policy does worst, and report it beside the mean over the range.
+
+    The cross-entropy method on margins: batches of placements, all played at once; on CUDA thousands of worlds.
+    """
+
+    batch: int = 60
+    """Placements of a batch; the first is drawn from the whole range and gives the mean."""
+    batches: int = 5
+    """Batches, each drawn where the ones before did worst."""
+    confirm: int = 10
+    """Episodes with new seeds at the placement that was found worst."""
+    search_seed: int = 0
+    """Seed of the search itself."""
+    out: str | None = None
+    """Folder to write, which must not exist; results/adversary_<task>_<tracker>_<mode> when none is named."""

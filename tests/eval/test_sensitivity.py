@@ -85,7 +85,7 @@ def test_a_sample_on_a_cylinder_stays_on_it():
     (target,) = moved(before, axes, (2.0, 0.0), rules, "base").values()
     assert (target["x"], target["y"]) == pytest.approx((-3.0 + 0.15, -3.7)) and target["bag"] == 2
     assert before == kept
-    assert axes[0].grid(9) == (1.0, 2.0) and axes[0].nearest(1.6) == 2.0
+    assert axes[0].grid(9) == (1.0, 2.0) and [axes[0].at(k) for k in (0.0, 0.49, 0.51, 1.0)] == [1, 1, 2, 2]
     circle = axes[1].grid(4)
     assert len(circle) == 4 and circle[-1] < np.pi - 1.0  # a full circle's end is its beginning
 
