@@ -242,7 +242,7 @@ def resolve(options: RunOptions) -> RunConfig:
     scheme, _, target = options.policy.partition(":")
     if scheme == "learned":
         card = _card(target)
-        tasks = card.tasks if quick else tasks
+        tasks = tasks if options.task else card.tasks
         card.check_tasks(tasks)
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
