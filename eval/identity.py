@@ -38,7 +38,7 @@ _REPORTING = """__main__ action_map bench bench_figure bench_learned bench_polic
     shard_merge sharding stats success_film suite_call suite_figures suite_file suite_folder suite_options
     suite_records suite_run suite_tables table_entries table_options table_text tables tables_command
     tsne_command wording
-    adversary placed_play placement_axes placement_files placement_map placement_options sensitivity
+    adversary loop_requirements placed_play placement_axes placement_files placement_map placement_options sensitivity
     worst_placement"""
 _CHECKS = "agreement axes certificate context error_rates finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
