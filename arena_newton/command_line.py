@@ -35,8 +35,8 @@ def exit_code(work: Callable[[], int | None]) -> int:
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)
     # Kernels and drivers are native code: a crash in it names the Python lines of all threads, or nobody can mend it.
-    if not faulthandler.is_enabled():
-        with contextlib.suppress(AttributeError, OSError, ValueError):  # there may be no error stream
+    if not faulthandler.is_enabled() and sys.__stderr__ is not None:
+        with contextlib.suppress(OSError, ValueError):  # the error stream may be closed
             faulthandler.enable(sys.__stderr__)
     try:
         return work() or 0

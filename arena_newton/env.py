@@ -8,7 +8,7 @@ Episodes of a plan, budgets and endings are `arena_newton.rollout`'s work.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from arena_newton.interfaces import Tracker
     from arena_newton.robot import DriveGains
     from arena_newton.rules import RuleSet
-    from arena_newton.tasks.base import Draws
+    from arena_newton.tasks.base import Draws, Sample
 
 __all__ = ["STAND_ACTION", "ArenaEnv"]
 
@@ -208,7 +208,12 @@ class ArenaEnv:
         return self._lights
 
     def reset(
-        self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, *, spawn: Spawn | None = None
+        self,
+        seeds: Sequence[int],
+        worlds: Sequence[int] | np.ndarray | None = None,
+        *,
+        spawn: Spawn | None = None,
+        samples: Sequence[Mapping[str, Sample]] | None = None,
     ) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone.
 
@@ -218,13 +223,17 @@ class ArenaEnv:
             seeds: Episode seeds, one per world.
             worlds: World indices; all worlds by default.
             spawn: The robot's pose at the reset instead of the task's spawn pose.
+            samples: Samples of the objects' poses instead of those that the seeds draw, one mapping per world.
 
         Raises:
-            InputError: Another number of seeds than of worlds, or a world that is not in the batch or named twice.
+            InputError: Another number of seeds or samples than of worlds, or a world that is not in the batch or named
+                twice.
         """
         rows = self._rows(worlds)
         if len(seeds) != len(rows):
             raise InputError(f"{len(seeds)} seeds for {len(rows)} worlds")
+        if samples is not None and len(samples) != len(rows):
+            raise InputError(f"{len(samples)} samples for {len(rows)} worlds")
         p, h = self.physics, self.scene.robot
         qpos = p.qpos0[rows].copy()
         mocap_pos = np.tile(p.mocap_pos0, (len(rows), 1, 1))
@@ -234,7 +243,9 @@ class ArenaEnv:
         for k, (seed, world) in enumerate(zip(map(int, seeds), rows.tolist(), strict=True)):
             pose = (self.spec.spawn_position, self.spec.spawn_quat) if spawn is None else spawn(seed)
             qpos[k, h.root_qpos : h.root_qpos + 7] = np.concatenate(pose)
-            draws = self.draws[world] = self.spec.draw(seed, self.mode, self.rules)
+            draws = self.draws[world] = self.spec.draw(
+                seed, self.mode, self.rules, None if samples is None else samples[k]
+            )
             for prim, placed in draws.placed.items():
                 if self.scene.has_body(f"{prim}/Frame"):
                     mocap = self.scene.mocap_id(prim)

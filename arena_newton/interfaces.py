@@ -348,7 +348,12 @@ class World(Protocol):
         """Light of each world, for cameras."""
 
     def reset(
-        self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, *, spawn: Spawn | None = None
+        self,
+        seeds: Sequence[int],
+        worlds: Sequence[int] | np.ndarray | None = None,
+        *,
+        spawn: Spawn | None = None,
+        samples: Sequence[Mapping[str, dict[str, float]]] | None = None,
     ) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone."""
 

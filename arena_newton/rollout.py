@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -84,6 +84,7 @@ class Rollout:
         max_steps: int | None = None,
         latency: int = 0,
         spawn: Spawn | None = None,
+        samples: Callable[[Planned], Mapping[str, dict[str, float]]] | None = None,
         on_finish: Callable[[EpisodeResult], None] | None = None,
         on_tick: Callable[[int], None] | None = None,
     ):
@@ -100,12 +101,13 @@ class Rollout:
                 that the policy looks again when so many actions of it are left; in an episode's first ticks the robot
                 stands.
             spawn: The robot's pose at a reset instead of the task's spawn pose.
+            samples: Samples of the objects' poses of an episode instead of those that its seed draws.
             on_finish: Called with each result, in the order of ending.
             on_tick: Called each tick with the number of active worlds.
         """
         self.env, self.policy = env, policy
         self.recorders: Sequence[Recorder] = [recorder] if isinstance(recorder, Recorder) else recorder
-        self.disturbance, self.spawn = disturbance, spawn
+        self.disturbance, self.spawn, self.samples = disturbance, spawn, samples
         self.budget = max_steps or env.budget
         self.on_finish, self.on_tick = on_finish, on_tick
         self.latency = latency
@@ -155,7 +157,12 @@ class Rollout:
         env.release(free)
         if not taken:
             return
-        env.reset([episode.episode_seed for _, episode in taken.values()], list(taken), spawn=self.spawn)
+        episodes = [episode for _, episode in taken.values()]
+        seeds_of = [episode.episode_seed for episode in episodes]
+        if self.samples is None:
+            env.reset(seeds_of, list(taken), spawn=self.spawn)
+        else:
+            env.reset(seeds_of, list(taken), spawn=self.spawn, samples=[self.samples(one) for one in episodes])
         mask, seeds = np.zeros(env.worlds, dtype=bool), [0] * env.worlds
         for world, (index, episode) in taken.items():
             self._running[world] = _Running(index, episode, time.perf_counter())

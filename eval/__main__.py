@@ -25,6 +25,7 @@ from arena_newton.eval.options import (
     RunOptions,
 )
 from arena_newton.eval.pack_options import PackOptions
+from arena_newton.eval.placement_options import AdversaryOptions, SensitivityOptions
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.flags import folders_named, parse_flags, user_path
 
@@ -48,6 +49,8 @@ OVERVIEW = f"""commands:
   {PROG} list [flags] [--json]   show the plan, run nothing
   {PROG} loop [flags]            record, build, train, evaluate, report: the whole loop
   {PROG} matrix <suite> [flags]  play policies x trackers x tasks x modes as one plan that can be continued
+  {PROG} sensitivity [flags]     map success and margin over the placements of a task
+  {PROG} adversary [flags]       search the placement at which a policy does worst
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
@@ -255,6 +258,23 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
     return suite_run.run(call, factories)
 
 
+def _sensitivity(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(SensitivityOptions, arguments, f"{PROG} sensitivity")
+    from arena_newton.extras import require
+
+    require("plots", "eval sensitivity", ("matplotlib",))
+    from arena_newton.eval import sensitivity
+
+    return sensitivity.run(options, factories)
+
+
+def _adversary(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(AdversaryOptions, arguments, f"{PROG} adversary")
+    from arena_newton.eval import adversary
+
+    return adversary.run(options, factories)
+
+
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
     from arena_newton.eval import bench
@@ -338,6 +358,8 @@ _COMMANDS = {
     "tsne": _tsne,
     "pack": _pack,
     "matrix": _matrix,
+    "sensitivity": _sensitivity,
+    "adversary": _adversary,
     "bench": _bench,
     "engines": _engines,
     "certify": _certify,

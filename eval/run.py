@@ -53,7 +53,16 @@ from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
 from arena_newton.viewing import FailureRecorder, WorldViewer
 
-__all__ = ["EpisodeLines", "Factories", "RunPlayer", "RunStopped", "ProgressSink", "check_parts", "execute"]
+__all__ = [
+    "EpisodeLines",
+    "Factories",
+    "ProgressSink",
+    "RunPlayer",
+    "RunStopped",
+    "check_parts",
+    "execute",
+    "make_env",
+]
 
 
 @dataclass(frozen=True)
@@ -117,6 +126,31 @@ def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Pol
     if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than the policy's chunk of {chunk} has")
     return config, read_by(policy, config.labels, late)
+
+
+def make_env(config: RunConfig, factories: Factories, episode: Episode, worlds: int) -> World:
+    """The environment of an episode's task, tracker and mode, as the run's flags say.
+
+    Args:
+        config: The run, with the parts of `check_parts`.
+        factories: What it is built with.
+        episode: One of its episodes.
+        worlds: Worlds in the batch.
+    """
+    flags = config.flags
+    return factories.env(
+        episode.task,
+        tracker=factories.tracker(episode.tracker, config.checkpoint),
+        worlds=worlds,
+        engine=flags.engine,
+        device=config.device,
+        rules=flags.rules,
+        mode=episode.mode,
+        variant_file=str(config.variant) if config.variant else None,
+        fast_physics=flags.fast_physics,
+        camera=config.camera,
+        drive=DRIVES[flags.drive],
+    )
 
 
 def _play(
@@ -256,19 +290,7 @@ class RunPlayer:
         if kernels_to_compile(Path(wp.config.kernel_cache_dir or "."), flags.engine or "", config.device):
             self.progress.say("  compiling kernels, once; this takes a minute or some")
         try:
-            env = self.factories.env(
-                task,
-                tracker=self.factories.tracker(tracker, config.checkpoint),
-                worlds=self.batch or min(flags.worlds, len(episodes)),
-                engine=flags.engine,
-                device=config.device,
-                rules=flags.rules,
-                mode=mode,
-                variant_file=str(config.variant) if config.variant else None,
-                fast_physics=flags.fast_physics,
-                camera=config.camera,
-                drive=DRIVES[flags.drive],
-            )
+            env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
             facts = self.folder.register(group, env.describe())
             if flags.verbose:
                 self.progress.say(console.environment(group, facts))

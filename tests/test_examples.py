@@ -15,23 +15,27 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MOST_LINES = 60
 SHORT: dict[str, list[str]] = {
+    "aim_a_kick": ["--kick", "3.3", "2.24", "--max-steps", "60"],
     "compare_runs": ["--max-steps", "4", "--out", "OUT"],
     "drive_by_code": ["--max-steps", "60"],
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
     "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
+    "refine_reference": ["--max-steps", "4", "--rounds", "2"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
     "usd_variant": ["--max-steps", "4", "--out", "OUT"],
 }
 """Example → flags with which it takes seconds; OUT is a folder of the test's own."""
 SAYS = {
+    "aim_a_kick": r"0  kick \+3.30 \+2.24 m/s  margin -0.\d+ m\n(.*\n)+in the engine: margin \+0.\d+ m, .* cm apart",
     "compare_runs": r"expert: 0 of 4, 0 that the other loses\n.*stand: 0 of 4.*\nprobability .* by luck: 1\n",
     "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
     "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
+    "refine_reference": r"played 0: a palm comes within -\d.\d+ m after 0.\d s\nplayed 1: a palm",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }

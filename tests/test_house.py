@@ -45,7 +45,7 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 """Libraries that may be absent."""
 MOST_ANY = 30
 ANY = {
-    "arena_newton/differentiable.py": "a context of autograd keeps whatever it is given",
+    "arena_newton/differentiable/kernel_gradients.py": "a context of autograd keeps whatever it is given",
     "arena_newton/foreign.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/registry.py": "what a maker takes is its own business",

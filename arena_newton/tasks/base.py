@@ -370,20 +370,21 @@ class TaskSpec:
         _check_mode(mode)
         return rules.task(self.name).semantic_variant if mode == "semantic" else "base"
 
-    def draw(self, seed: int, mode: str, rules: RuleSet) -> Draws:
+    def draw(self, seed: int, mode: str, rules: RuleSet, samples: Mapping[str, Sample] | None = None) -> Draws:
         """Everything random about the episode with this seed.
 
         Args:
             seed: Episode seed.
             mode: base, execution, semantic or visual.
             rules: Rule set; it decides where a sample is put.
+            samples: Record name → sample, instead of those that the seed draws.
 
         Raises:
             InputError: Unknown mode.
         """
         _check_mode(mode)
         own = rules.task(self.name)
-        sampled = self.sample(seed, mode, own)
+        sampled = self.sample(seed, mode, own) if samples is None else dict(samples)
         placed = {o.prim: world_pose(o, own.object(o.record), sampled[o.record]) for o in self.objects}
         light = None
         if mode == "visual":

@@ -35,6 +35,7 @@ from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
+    from arena_newton.tasks.base import Sample
 
 __all__ = ["BODIES", "Body", "FrozenLegsEnv", "GlidingBase", "GlidingEnv", "HeldLegs", "freeze_legs"]
 
@@ -230,10 +231,15 @@ class GlidingEnv(ArenaEnv):
         return GlidingBase(self)
 
     def reset(
-        self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, *, spawn: Spawn | None = None
+        self,
+        seeds: Sequence[int],
+        worlds: Sequence[int] | np.ndarray | None = None,
+        *,
+        spawn: Spawn | None = None,
+        samples: Sequence[Mapping[str, Sample]] | None = None,
     ) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, spawn=spawn)
+        super().reset(seeds, worlds, spawn=spawn, samples=samples)
         mask = np.zeros(self.worlds, dtype=bool)
         mask[slice(None) if worlds is None else worlds] = True
         self.base.begin(torch.from_numpy(mask).to(self.torch_device))

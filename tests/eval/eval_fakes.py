@@ -44,7 +44,7 @@ class FakeEnv:
         self.ended = 0
         """Episodes whose world got the next one."""
 
-    def reset(self, seeds, worlds=None, *, spawn=None):
+    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
         worlds = range(self.worlds) if worlds is None else worlds
         for world, seed in zip(worlds, seeds, strict=True):
             self.ended += bool(self.tick[world])

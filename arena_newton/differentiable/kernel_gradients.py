@@ -19,7 +19,7 @@ from arena_newton.quiet import quiet_warp
 from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
 from arena_newton.streams import on_torch_stream
 
-__all__ = ["ReferenceState", "reference_step", "success_margin"]
+__all__ = ["Recording", "ReferenceState", "recorded", "reference_step", "success_margin"]
 
 quiet_warp()  # a tensor handed over may be the first that the process asks of Warp
 
@@ -91,6 +91,17 @@ class _Recorded(torch.autograd.Function):
             return None, *_backpropagate(ctx.tape, ctx.arrays, ctx.outputs, grads)
 
 
+def recorded(record: Recording, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Outputs of launches on a tape as torch tensors, differentiable in the tensors that they read.
+
+    Args:
+        record: Launches; it gets the tensors as float32 arrays and returns its tape and the arrays that are outputs.
+        *tensors: What it reads, float32.
+    """
+    outputs: tuple[torch.Tensor, ...] = _Recorded.apply(record, *tensors)
+    return outputs
+
+
 def reference_step(
     action: torch.Tensor, state: ReferenceState, *, max_root_delta_deg: float = 0.0
 ) -> tuple[torch.Tensor, ReferenceState]:
@@ -125,7 +136,7 @@ def reference_step(
         steps.copy_(wp.to_torch(after.steps))
         return tape, [after.mimic, *(getattr(after, name) for name in _FLOAT_STATE), after.joint_vel]
 
-    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = _Recorded.apply(
+    mimic, position, quat, joints, prev_yaw, prev_z, joint_vel = recorded(
         record, action, *(getattr(state, name) for name in _FLOAT_STATE)
     )
     return mimic, ReferenceState(position, quat, joints, prev_yaw, prev_z, state.heading, steps, joint_vel)
@@ -165,5 +176,4 @@ def success_margin(launch: Callable[..., None], **arguments: object) -> torch.Te
             launch(**dict(zip(floats, arrays, strict=True)), **fixed, **made, margin=margin)
         return tape, [margin]
 
-    margin: torch.Tensor = _Recorded.apply(record, *floats.values())[0]
-    return margin
+    return recorded(record, *floats.values())[0]

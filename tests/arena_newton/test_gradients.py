@@ -1,0 +1,235 @@
+"""Gradients beyond the kernels: of a ball's flight by Newton's solver, of the closed loop by central differences."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from arena_newton import ArenaEnv, canonical, trackers
+from arena_newton.ball import BALL
+from arena_newton.differentiable import (
+    ReferenceState,
+    RollingBall,
+    ball_flight,
+    central_differences,
+    play,
+    reference_step,
+)
+from arena_newton.errors import InputError
+from arena_newton.robot import TICK
+
+FOOTBALL = RollingBall(radius=0.11, mass=0.43, friction=0.7, restitution=0.1)
+ON_GROUND = [0.0, 0.0, 0.11]
+
+
+def flown(velocity, ticks, start=ON_GROUND, ball=FOOTBALL):
+    """Path of one ball, shape [ticks + 1, 3]."""
+    return ball_flight(torch.tensor([start]), torch.as_tensor(velocity).float()[None], ball, ticks=ticks)[:, 0]
+
+
+def slopes(velocity, ticks, axis, step):
+    """Central differences of where a ball ends on one axis, for each component of its velocity."""
+    shift = step * torch.cat([torch.eye(3), -torch.eye(3)])
+    moved = torch.as_tensor(velocity).float() + shift
+    with torch.no_grad():
+        end = ball_flight(torch.tensor([ON_GROUND] * 6), moved, FOOTBALL, ticks=ticks)[-1, :, axis]
+    return (end[:3] - end[3:]) / (2 * step)
+
+
+@pytest.fixture(scope="module")
+def pitch():
+    """One world of football, whose engine steps at 5 ms as TWIST2's does; nobody touches the ball."""
+    env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", fast_physics=True)
+    yield env
+    env.close()
+
+
+def kicked(env, velocity, ticks):
+    """Path of the engine's ball, shape [ticks + 1, 3], from a start on the ground."""
+    env.reset([7], spawn=lambda seed: ((0.0, -5.0, 0.8), (1.0, 0.0, 0.0, 0.0)))
+    data, body = env.physics.data[0], env.judge.ball
+    address, speed = env.scene.joint_qpos(BALL), env.scene.joint_qvel(BALL)
+    data.qvel[speed : speed + 3] = velocity
+    path = [data.qpos[address : address + 3].copy()]
+    for _ in range(ticks):
+        env.physics.step()
+        path.append(env.physics.xpos.numpy()[0, body].copy())
+    return np.array(path)
+
+
+def test_a_free_ball_falls_as_the_formula_says():
+    """In the air the path is x + v·t − g·t²/2 up to the integrator's half step, and its gradient to v is t."""
+    velocity = torch.tensor([1.0, -2.0, 3.0], requires_grad=True)
+    path = flown(velocity, 25, start=[0.0, 0.0, 2.0])
+    t = 25 * TICK
+    expected = torch.tensor([1.0 * t, -2.0 * t, 2.0 + 3.0 * t - 0.5 * 9.81 * t * (t + 0.001)])
+    torch.testing.assert_close(path[-1].detach(), expected, atol=1e-4, rtol=0.0)
+    for axis in range(3):
+        (grad,) = torch.autograd.grad(path[-1, axis], velocity, retain_graph=True)
+        torch.testing.assert_close(grad, t * torch.eye(3)[axis], atol=1e-5, rtol=0.0)
+
+
+@pytest.mark.parametrize("speed", [2.0, 5.0])
+def test_a_rolling_ball_has_the_gradient_of_differences(speed):
+    """Through sliding and rolling, place and velocity at the start have the gradients of central differences."""
+    velocity = torch.tensor([0.3 * speed, speed, 0.0], requires_grad=True)
+    last = flown(velocity, 40)[-1]
+    for axis in range(2):
+        (grad,) = torch.autograd.grad(last[axis], velocity, retain_graph=True)
+        torch.testing.assert_close(grad[:2], slopes(velocity.detach(), 40, axis, 0.05)[:2], atol=5e-3, rtol=0.0)
+    assert 5 / 7 * 40 * TICK * 0.98 < float(torch.autograd.grad(last[1], velocity)[0][1]) < 40 * TICK
+
+
+def test_balls_of_a_batch_do_not_meet():
+    """Each ball of a batch flies as it flies alone, even from the same place."""
+    velocity = torch.tensor([[1.0, 0.0, 2.0], [0.0, 3.0, 0.0], [-1.0, 0.0, 2.0]])
+    together = ball_flight(torch.tensor([ON_GROUND] * 3), velocity, FOOTBALL, ticks=20)
+    for ball in range(3):
+        assert torch.equal(together[:, ball], flown(velocity[ball], 20))
+
+
+@pytest.mark.parametrize("restitution", [0.1, 0.4, 0.75])
+def test_a_dropped_ball_bounces_as_its_restitution_says(restitution):
+    """Dropped from 1 m it rises to e² of it: the root of the ratio is e ± 0.03."""
+    ball = RollingBall(radius=0.11, mass=0.43, friction=0.7, restitution=restitution)
+    height = flown([0.0, 0.0, 0.0], 60, start=[0.0, 0.0, 1.11], ball=ball)[:, 2] - 0.11
+    landed = int(height.argmin())
+    assert float(height[landed + 1 :].max().clamp(min=0.0).sqrt()) == pytest.approx(restitution, abs=0.03)
+
+
+@pytest.mark.parametrize(("velocity", "apart"), [((0, 2, 0), 0.02), ((0, 4, 0), 0.04), ((3, 3, 0), 0.09)])
+def test_a_rolled_ball_goes_where_the_engines_goes(pitch, velocity, apart):
+    """After 1.5 s the flight is within a few centimetres of the path of the engine that judges episodes."""
+    real = kicked(pitch, velocity, 75)
+    ball = RollingBall.of(pitch.scene)
+    assert (ball.radius, ball.restitution) == (pytest.approx(0.11), 0.1)
+    path = flown(velocity, 75, start=real[0].tolist(), ball=ball).numpy()
+    assert np.linalg.norm(path - real, axis=1).max() < apart
+
+
+def test_a_landing_does_not_move_with_the_vertical_speed():
+    """What the documentation warns of: behind a bounce the gradient to the vertical speed is not the path's slope."""
+    velocity = torch.tensor([0.0, 5.0, 2.0], requires_grad=True)
+    end = flown(velocity, 50)[-1, 1]
+    (grad,) = torch.autograd.grad(end, velocity)
+    found = slopes(velocity.detach(), 50, 1, 0.1)
+    assert float(grad[1]) == pytest.approx(float(found[1]), abs=0.01)
+    assert abs(float(grad[2]) - float(found[2])) > 0.1
+
+
+def test_shapes_that_do_not_fit_are_named():
+    """Another shape than [n, 3] is one error that shows the shapes."""
+    with pytest.raises(InputError, match=r"ball_flight: .*\[2, 3\], \[1, 3\]"):
+        ball_flight(torch.zeros(2, 3), torch.zeros(1, 3), FOOTBALL, ticks=2)
+    with pytest.raises(InputError, match="expected"):
+        ball_flight(torch.zeros(0, 3), torch.zeros(0, 3), FOOTBALL, ticks=2)
+
+
+def test_differences_of_a_known_function():
+    """A quadratic's gradient is exact whatever the batch; points are as many as twice the parameters and one."""
+    matrix = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    asked = []
+
+    def function(points):
+        asked.append(len(points))
+        return ((points @ matrix) * points).sum(1)
+
+    at = torch.tensor([1.0, -2.0], dtype=torch.float64)
+    for rows in (1, 3, 8):
+        asked.clear()
+        found = central_differences(function, at, torch.tensor([0.1, 0.2]), rows=rows)
+        torch.testing.assert_close(found.gradient, 2 * matrix @ at)
+        torch.testing.assert_close(found.bend, torch.tensor([0.2, 0.2], dtype=torch.float64))
+        assert asked == [rows] * -(-5 // rows)
+        assert found.value == pytest.approx(4.0)
+
+
+def test_a_kink_tells_itself():
+    """Where the slope changes within the step, `bend` is as large as the gradient's error; elsewhere it is zero."""
+    found = central_differences(lambda points: points.abs().sum(1), torch.tensor([0.0, 1.0]), 0.1, rows=5)
+    torch.testing.assert_close(found.gradient, torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(found.bend, torch.tensor([1.0, 0.0]), atol=1e-6, rtol=0.0)
+    with pytest.raises(InputError, match=r"shape \[5, 2\] for 5 rows"):
+        central_differences(lambda points: points, torch.tensor([0.0, 1.0]), 0.1, rows=5)
+
+
+def test_the_estimate_is_the_exact_gradient_where_both_exist():
+    """Where the reference ends after some ticks of the closed loop: differences agree with the kernels' gradient."""
+    env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=5, engine="mujoco", device="cpu", fast_physics=True)
+    stand = torch.tensor(canonical.STAND_ACTION)
+    names = torch.tensor([0, 1, 5, 7])  # both displacements, and where the rotation's first column points
+    weight = torch.tensor([1.0, -0.7, 0.3])
+    at = stand[names] + torch.tensor([0.01, -0.02, 0.05, 0.1])
+    states = []
+
+    def ended(points):
+        env.reset([11] * 5)
+        for _ in range(env.startup_ticks):
+            env.step(stand.repeat(5, 1))
+        env.observe()
+        states.append(ReferenceState.of(env.loop.reference))
+        actions = stand.repeat(5, 1)
+        actions[:, names] = points
+        for _ in range(4):
+            env.step(actions)
+        return wp.to_torch(env.loop.reference.position) @ weight
+
+    estimated = central_differences(ended, at, 2e-3, rows=5)
+    leaf, state = at.clone().requires_grad_(), ReferenceState(*(field[:1] for field in states[0]))
+    action = stand.index_put((names,), leaf)[None]
+    for _ in range(4):
+        _, state = reference_step(action, state)
+    (exact,) = torch.autograd.grad((state.position @ weight).sum(), leaf)
+    assert exact.abs().min() > 1e-3
+    torch.testing.assert_close(estimated.gradient, exact, atol=2e-3, rtol=2e-3)
+    env.close()
+
+
+def test_a_fallen_world_reaches_nothing_more():
+    """From the tick of a fall or an error on, a world's margin is −inf, whatever its bodies do."""
+    env = ArenaEnv("vis_navi", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", rules="released")
+    actions = torch.tensor(canonical.STAND_ACTION).repeat(2, 6, 1)
+    actions[1, 3] = torch.nan
+    margin = play(env, actions, seed=5).margin
+    assert margin[:, 0].isfinite().all() and margin[:3, 1].isfinite().all()
+    assert margin[3:, 1].eq(-torch.inf).all()
+    env.close()
+
+
+def test_the_engines_solver_has_no_adjoints():
+    """mujoco_warp's modules are compiled without adjoints: when that changes, the documentation must."""
+    import mujoco_warp._src.constraint
+    import mujoco_warp._src.forward
+    import mujoco_warp._src.smooth
+    import mujoco_warp._src.solver  # noqa: F401
+
+    for name in ("constraint", "forward", "smooth", "solver"):
+        assert wp.get_module(f"mujoco_warp._src.{name}").options["enable_backward"] is False
+
+
+def test_worlds_differ_by_their_actions_alone():
+    """Played from one seed, equal actions reach equal bits and others another margin; what does not fit is named."""
+    env = ArenaEnv("vis_navi", tracker=trackers.get("pd"), worlds=3, engine="mujoco", device="cpu", rules="released")
+    actions = torch.tensor(canonical.STAND_ACTION).repeat(3, 12, 1)
+    actions[1, :, canonical.ACTION["joint_pos"]] += 0.3
+    played = play(env, actions, seed=5)
+    assert torch.equal(played.xpos[:, 0], played.xpos[:, 2]) and played.xpos.shape[:2] == (12, 3)
+    assert played.best[0] == played.best[2] != played.best[1] and played.margin.isfinite().all()
+    assert not env.active.any()
+    with pytest.raises(InputError, match=r"shape \[2, 12, 40\] for 3 worlds"):
+        play(env, actions[:2], seed=5)
+    env.close()
+
+
+def test_the_documented_estimate_runs():
+    """The block of docs/gradients.md gives two finite slopes: a step ahead and a lower stance change the margin."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "gradients.md").read_text()
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
+    world: dict = {"__name__": "docs_gradients"}
+    exec(compile(block, "docs/gradients.md", "exec"), world)
+    found = world["found"]
+    assert found.gradient.shape == found.bend.shape == (2,) and found.gradient.isfinite().all()
+    assert found.gradient[0] != 0.0

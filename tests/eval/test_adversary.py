@@ -1,0 +1,140 @@
+"""The search of a policy's worst placement: it finds a known one, its numbers are what was played, nothing is lost."""
+
+import csv
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEnv, factories
+
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.placement_axes import Axis
+from arena_newton.eval.worst_placement import score_of, search
+from arena_newton.interfaces import EpisodeResult, Verdict
+from arena_newton.kernels import tick as codes
+
+AXES = (Axis("football", "x", -1.2, 1.2), Axis("football", "y", -1.2, 1.2), Axis("target", "bag", 1.0, 3.0))
+HOLE = (0.9, -0.7)
+"""Where the stand-in's robot fails."""
+
+
+def result(outcome, steps=10, margin=0.0):
+    """An episode's result."""
+    return EpisodeResult(SimpleNamespace(), outcome, outcome, steps, margin)
+
+
+class HoleEnv(FakeEnv):
+    """Football that fails within 0.3 m of a hole, the nearer the worse, and succeeds everywhere else."""
+
+    played: list = []
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.samples = [(0.0, 0.0)] * self.worlds
+
+    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
+        """Keep the samples."""
+        super().reset(seeds, worlds, spawn=spawn)
+        for world, seed, sample in zip(worlds, seeds, samples, strict=True):
+            self.samples[world] = (sample["football"]["x"], sample["football"]["y"])
+            self.played.append((seed, self.samples[world]))
+
+    def step(self, action, worlds=None):
+        """End on the second tick with a success, or never."""
+        self.tick[self.active] += 1
+        far = np.linalg.norm(np.array(self.samples) - HOLE, axis=1) > 0.3
+        return np.where(self.active & (self.tick > 1) & far, codes.SUCCESS, codes.RUNNING).astype(np.int32)
+
+    def verdict(self, world):
+        """How far from the hole's rim."""
+        return Verdict(margin=float(np.linalg.norm(np.array(self.samples[world]) - HOLE)) - 0.3)
+
+
+def call(out, *flags):
+    """Exit code of the command over the stand-ins."""
+    HoleEnv.played.clear()
+    common = ["--task", "football", "--out", str(out), "--max-steps", "4"]
+    return main(["adversary", *common, *flags], factories(env=HoleEnv))
+
+
+def test_scores_order_failures_and_successes():
+    """Far failures are below near ones, these below slow successes, and those below fast ones; errors say nothing."""
+    order = [
+        [result("fall", margin=-2.0)],
+        [result("timeout", margin=-0.1)],
+        [result("fall", margin=0.4), result("timeout", margin=0.2)],
+        [result("success", steps=90)],
+        [result("success", steps=20), result("error", margin=math.nan)],
+    ]
+    scores = [score_of(one, 100) for one in order]
+    assert scores == sorted(scores) and scores == pytest.approx([-2.0, -0.1, 0.0, 0.1, 0.8])
+    assert math.isnan(score_of([result("error", margin=math.nan)], 100))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_search_finds_a_known_minimum(seed):
+    """On a bowl whose lowest point is one of three numbers, the worst of five batches is near it."""
+
+    def bowl(points):
+        return [math.hypot(x - HOLE[0], y - HOLE[1]) + (bag != 2.0) for x, y, bag in points]
+
+    points, scores = search(AXES, bowl, batches=5, size=40, seed=seed)
+    assert len(points) == len(scores) == 200
+    assert min(scores) < 0.06
+    assert min(scores[160:]) < min(scores[:40])
+    for x, y, bag in points:
+        assert abs(x) <= 1.2 and abs(y) <= 1.2 and bag in (1.0, 2.0, 3.0)
+
+
+def test_placements_without_a_score_are_left_out():
+    """A batch of errors moves nothing, and the search goes on."""
+    points, scores = search(AXES, lambda points: [math.nan] * len(points), batches=3, size=10, seed=1)
+    assert len(points) == 30 and all(math.isnan(score) for score in scores)
+
+
+def test_the_command_finds_the_hole(tmp_path, capsys):
+    """The worst placement is in the hole, fails with new seeds too, and stands beside the mean of the whole range."""
+    assert call(tmp_path / "out", "--batch", "40", "--batches", "4", "--confirm", "6", "--worlds", "8") == 0
+    told = json.loads((tmp_path / "out" / "adversary.json").read_text())
+    assert np.linalg.norm(np.array(told["worst"]["values"]) - HOLE) < 0.15
+    assert (told["worst"]["success_rate"], told["confirmed"]["successes"], told["confirmed"]["episodes"]) == (0, 0, 6)
+    inside = [np.linalg.norm(np.array(where) - HOLE) <= 0.3 for _, where in HoleEnv.played[:40]]
+    assert told["mean"]["successes"] == 40 - sum(inside) and told["mean"]["judged"] == 40
+    assert len({seed for seed, _ in HoleEnv.played[:160]}) == 1
+    assert len({seed for seed, _ in HoleEnv.played[160:]}) == 6
+    assert {where for _, where in HoleEnv.played[160:]} == {tuple(told["worst"]["values"])}
+    said = capsys.readouterr().out
+    assert "mean over the range: " in said and "with new seeds: 0/6" in said
+    with (tmp_path / "out" / "episodes.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == 166
+    with (tmp_path / "out" / "placements.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == 160
+
+
+def test_the_search_does_not_depend_on_the_number_of_worlds(tmp_path):
+    """The same bytes for one world and for many."""
+    for worlds in ("1", "9"):
+        assert call(tmp_path / worlds, "--batch", "12", "--batches", "2", "--confirm", "2", "--worlds", worlds) == 0
+    for name in ("episodes.csv", "placements.csv", "adversary.json"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "9" / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--batch", "5"], "--batch 5: expected at least 10"),
+        (["--batches", "0"], "--batches 0: expected at least 1"),
+        (["--confirm", "0"], "--confirm 0: expected at least 1"),
+        (["--search-seed", "-1"], "--search-seed -1"),
+        (["--batch", "100000", "--batches", "3"], "make 300,010 episodes, at most 200,000"),
+        (["--axes", "ball.x"], "--axes ball.x: task football draws football.x, football.y"),
+    ],
+)
+def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):
+    """What does not fit is named before anything is played or written."""
+    assert call(tmp_path / "out", *flags) == 2
+    told = capsys.readouterr().err
+    assert message in told and told.count("\n") == 1
+    assert not (tmp_path / "out").exists() and not HoleEnv.played

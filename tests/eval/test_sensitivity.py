@@ -1,0 +1,186 @@
+"""A grid of placements: its axes, what is played at each point, and the files and pictures that come of it."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEnv, factories
+
+from arena_newton import rule_sets, tasks
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.placement_axes import axes_of, chosen, moved
+from arena_newton.interfaces import Verdict
+from arena_newton.kernels import tick as codes
+
+PAPER = rule_sets.get("paper")
+
+
+class PlacedEnv(FakeEnv):
+    """Football that succeeds where the ball's x is positive, falls where its y is above 1 and otherwise times out."""
+
+    played: list = []
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.samples = [{} for _ in range(self.worlds)]
+
+    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
+        """Keep the samples."""
+        super().reset(seeds, worlds, spawn=spawn)
+        for world, seed, sample in zip(worlds, seeds, samples, strict=True):
+            self.samples[world] = sample["football"]
+            self.played.append((seed, dict(sample["football"])))
+
+    def step(self, action, worlds=None):
+        """End on the second tick, by the placement."""
+        self.tick[self.active] += 1
+        where = np.array([(sample.get("x", 0.0), sample.get("y", 0.0)) for sample in self.samples])
+        ends = np.where(where[:, 0] > 0, codes.SUCCESS, np.where(where[:, 1] > 1, codes.FALL, codes.RUNNING))
+        return np.where(self.active & (self.tick > 1), ends, codes.RUNNING).astype(np.int32)
+
+    def verdict(self, world):
+        """The margin is x."""
+        return Verdict(margin=self.samples[world]["x"])
+
+
+def call(out, *flags):
+    """Exit code of the command over the stand-ins."""
+    PlacedEnv.played.clear()
+    return main(["sensitivity", "--task", "football", "--out", str(out), *flags], factories(env=PlacedEnv))
+
+
+def rows(path):
+    """Rows of a CSV."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("task", tasks.names())
+@pytest.mark.parametrize("mode", ["base", "execution"])
+def test_every_task_has_axes_and_its_draws_lie_on_them(task, mode):
+    """What the seeds draw is within the axes' ranges, and everything that differs between seeds is an axis."""
+    spec, rules = tasks.get(task), PAPER.task(task)
+    axes = axes_of(rules, mode)
+    drawn = [spec.sample(seed, mode, rules) for seed in range(20)]
+    for axis in axes:
+        values = [sample[axis.record][axis.key] for sample in drawn]
+        assert axis.low <= min(values) < max(values) <= axis.high, axis.name
+        assert axis.grid(5)[0] == axis.low and len(set(axis.grid(5))) == (2 if axis.counts else 5)
+    for sample in drawn:
+        values = [sample[axis.record][axis.key] for axis in axes]
+        again = moved(drawn[0], axes, values, rules, mode)
+        assert again.keys() == sample.keys()
+        for record in sample:
+            assert again[record] == pytest.approx(sample[record])
+
+
+def test_a_sample_on_a_cylinder_stays_on_it():
+    """Boxing's target moves with bag and azimuth; the sample it was made from is left alone."""
+    rules = PAPER.task("boxing")
+    before = tasks.get("boxing").sample(3, "base", rules)
+    kept = {record: dict(sample) for record, sample in before.items()}
+    axes = chosen(axes_of(rules, "base"), ["boxing_target.bag", "boxing_target.azimuth"], "boxing")
+    (target,) = moved(before, axes, (2.0, 0.0), rules, "base").values()
+    assert (target["x"], target["y"]) == pytest.approx((-3.0 + 0.15, -3.7)) and target["bag"] == 2
+    assert before == kept
+    assert axes[0].grid(9) == (1.0, 2.0) and [axes[0].at(k) for k in (0.0, 0.49, 0.51, 1.0)] == [1, 1, 2, 2]
+    circle = axes[1].grid(4)
+    assert len(circle) == 4 and circle[-1] < np.pi - 1.0  # a full circle's end is its beginning
+
+
+def test_the_grid_is_played_with_the_same_seeds_everywhere(tmp_path):
+    """Every point gets each seed once; rates, falls and margins are those of its placement."""
+    assert call(tmp_path / "out", "--grid", "3", "5", "--repeats", "2", "--worlds", "4", "--max-steps", "4") == 0
+    seeds = {seed for seed, _ in PlacedEnv.played}
+    assert len(seeds) == 2 and len(PlacedEnv.played) == 30
+    points = rows(tmp_path / "out" / "sensitivity.csv")
+    assert len(points) == 15
+    for point in points:
+        x, y = float(point["football.x"]), float(point["football.y"])
+        assert (float(point["success_rate"]), int(point["falls"])) == (x > 0, 2 * (x <= 0 and y > 1))
+        assert float(point["mean_margin"]) == float(point["least_margin"]) == pytest.approx(x)
+        here = [seed for seed, sample in PlacedEnv.played if (sample["x"], sample["y"]) == pytest.approx((x, y))]
+        assert sorted(here) == sorted(seeds)
+    told = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
+    assert (told["successes"], told["judged"]) == (10, 30) and told["points"][0]["success_s"] is None
+    assert (tmp_path / "out" / "sensitivity.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_files_do_not_depend_on_the_number_of_worlds(tmp_path):
+    """Rows are in the plan's order whatever order the episodes end in: the same bytes."""
+    for worlds in ("1", "7"):
+        assert call(tmp_path / worlds, "--grid", "3", "--repeats", "2", "--worlds", worlds, "--max-steps", "4") == 0
+    for name in ("episodes.csv", "sensitivity.csv", "sensitivity.json", "sensitivity.png"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "7" / name).read_bytes(), name
+
+
+def test_what_was_played_is_kept(tmp_path, monkeypatch):
+    """An interruption leaves the rows of all episodes that had ended."""
+    plain, ended = PlacedEnv.step, []
+
+    def stopped(self, action, worlds=None):
+        if len(self.played) > 6:
+            raise KeyboardInterrupt
+        ended.append(1)
+        return plain(self, action, worlds)
+
+    monkeypatch.setattr(PlacedEnv, "step", stopped)
+    assert call(tmp_path / "out", "--grid", "3", "--worlds", "2", "--max-steps", "4") == 130
+    assert len(rows(tmp_path / "out" / "episodes.csv")) in (5, 6)
+
+
+def test_one_axis_is_a_map_of_one_row(tmp_path):
+    """With one axis the seeds draw the other number, the same at every point."""
+    assert call(tmp_path / "out", "--axes", "football.x", "--grid", "4", "--max-steps", "4") == 0
+    assert [float(row["football.x"]) for row in rows(tmp_path / "out" / "sensitivity.csv")] == pytest.approx(
+        [-1.2, -0.4, 0.4, 1.2]
+    )
+    assert len({sample["y"] for _, sample in PlacedEnv.played}) == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--axes", "ball.x"], "--axes ball.x: task football draws football.x, football.y"),
+        (["--axes", "football.x", "football.x"], "--axes football.x football.x: each only once"),
+        (["--grid", "3", "3", "3"], "--grid 3 3 3: expected one number, or one for each of the 2 axes"),
+        (["--grid", "0"], "--grid 0: expected at least 1"),
+        (["--grid", "1000", "--repeats", "1"], "make 1,000,000 episodes, at most 200,000"),
+        (["--repeats", "0"], "--repeats 0: expected at least 1"),
+        (["--worlds", "0"], "--worlds 0: expected 1 to"),
+        (["--mode", "wild"], "wild"),
+        (["--task", "chess"], "chess"),
+    ],
+)
+def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):
+    """What does not fit is named before anything is played or written."""
+    assert call(tmp_path / "out", *flags) == 2
+    told = capsys.readouterr().err
+    assert message in told and told.count("\n") == 1
+    assert not (tmp_path / "out").exists() and not PlacedEnv.played
+
+
+def test_a_folder_is_never_written_twice(tmp_path, capsys):
+    """An existing folder is refused, whatever is in it."""
+    (tmp_path / "out").mkdir()
+    assert call(tmp_path / "out", "--grid", "2") == 2
+    assert "exists; remove it or name another folder" in capsys.readouterr().err
+
+
+def test_samples_place_what_the_seed_would(tmp_path):
+    """The real environment puts the ball where a sample says, and the other world's where its seed says."""
+    from arena_newton import ArenaEnv, trackers
+
+    env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", fast_physics=True)
+    drawn = env.spec.draw(5, "base", env.rules).sampled
+    env.reset([5, 5], samples=[{"football": {"x": 0.25, "y": -0.5, "z": 0.11}}, drawn])
+    address = env.scene.joint_qpos("/World/Ball")
+    ball = env.physics.qpos.numpy()[:, address : address + 3].copy()
+    assert ball[0] == pytest.approx((0.25, -0.5, 0.11))
+    env.reset([5, 5])
+    assert np.array_equal(env.physics.qpos.numpy()[1, address : address + 3], ball[1])
+    with pytest.raises(InputError, match="1 samples for 2 worlds"):
+        env.reset([5, 5], samples=[drawn])
+    env.close()
