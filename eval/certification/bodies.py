@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -272,7 +272,7 @@ def _gliding(factories: Factories) -> Factories:
     return dataclasses.replace(factories, env=GlidingEnv, tracker=tracker)
 
 
-BODIES: Mapping[str, Body] = {
+BODIES: dict[str, Body] = {
     body.name: body
     for body in (
         Body("robot", "the whole robot", lambda factories: factories),
