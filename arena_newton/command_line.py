@@ -1,6 +1,9 @@
 """What a command line answers when its work fails."""
 
 import atexit
+import contextlib
+import errno
+import faulthandler
 import gc
 import os
 import sys
@@ -13,6 +16,8 @@ __all__ = ["INTERRUPTED", "exit_code"]
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
+NO_HOME = "Could not determine home directory."
+"""What `pathlib` says of a path such as `~nobody/x`."""
 
 
 def exit_code(work: Callable[[], int | None]) -> int:
@@ -29,14 +34,28 @@ def exit_code(work: Callable[[], int | None]) -> int:
     # which takes seconds after the last line is printed; what is frozen is not looked at. Once, however often called.
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)
+    # Kernels and drivers are native code: a crash in it names the Python lines of all threads, or nobody can mend it.
+    if not faulthandler.is_enabled():
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # there may be no error stream
+            faulthandler.enable(sys.__stderr__)
     try:
         return work() or 0
     except ArenaError as error:
         print(f"error: {plain_text(error)}", file=sys.stderr)
         return error.exit_code
+    except RuntimeError as error:
+        if str(error) != NO_HOME:
+            raise
+        print("error: a path begins with ~ and the name of a user that is not known here", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a path of the user's that cannot even be looked for; pathlib passes these on
+        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES) or error.filename is None:
+            raise
+        print(f"error: {plain_text(error.filename, 100)}: {error.strerror}", file=sys.stderr)
+        return 2

@@ -13,7 +13,7 @@ import tyro
 
 from arena_newton.errors import InputError
 
-__all__ = ["folders_named", "parse_flags"]
+__all__ = ["folders_named", "parse_flags", "user_path"]
 
 
 def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | None = None) -> T:
@@ -65,6 +65,18 @@ def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
     return f"these arguments cannot be read together: {' '.join(arguments)}; see {prog} --help"
 
 
+def user_path(given: str) -> Path:
+    """A path as it was typed, whose leading `~` or `~name` is a home folder.
+
+    Raises:
+        InputError: There is no user of that name.
+    """
+    try:
+        return Path(given).expanduser()
+    except RuntimeError:
+        raise InputError(f"{given}: no home folder of that user is known here") from None
+
+
 def folders_named(
     arguments: list[str], command: str, prog: str, *, noun: str = "a folder", shown: str = "<folder>"
 ) -> list[Path]:
@@ -82,7 +94,7 @@ def folders_named(
     """
     found: list[Path] = []
     while arguments and not arguments[0].startswith("-"):
-        found.append(Path(arguments.pop(0)).expanduser())
+        found.append(user_path(arguments.pop(0)))
     if not found:
         raise InputError(f"{command}: name {noun}: {prog} {command} {shown}")
     for number, folder in enumerate(found):

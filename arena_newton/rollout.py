@@ -198,10 +198,15 @@ class Rollout:
         self._next[asks], self._length[asks] = 0, actions.shape[1]
 
     def _left(self, length: int) -> torch.Tensor:
-        """What every world plays until a chunk of a length begins, shape [worlds, latency, 40]."""
-        if length <= self.latency:
+        """What every world plays until a chunk of a length begins, shape [worlds, latency, 40].
+
+        Whoever is asked again before its answer has begun would have to decide twice at once; only one that gives a
+        longer chunk in pieces does not.
+        """
+        whole = getattr(self.policy, "chunk_size", 1) if getattr(self.policy, "in_pieces", False) else length
+        if whole <= self.latency:
             late = f"--latency-ticks {self.latency}: policy {self.policy.name} gives chunks of"
-            raise InputError(f"{late} {counted(length, 'action')}; expected fewer ticks than that")
+            raise InputError(f"{late} {counted(whole, 'action')}; expected fewer ticks than that")
         ticks = np.clip(self._next[:, None] + np.arange(self.latency), 0, self._chunk.shape[1] - 1)
         left = self._chunk[self._rows[:, None], torch.from_numpy(ticks).to(self.env.torch_device)]
         first = torch.from_numpy(self._length == 0).to(self.env.torch_device)

@@ -26,7 +26,7 @@ from arena_newton.eval.options import (
 )
 from arena_newton.eval.pack_options import PackOptions
 from arena_newton.eval.suite_options import MatrixOptions
-from arena_newton.flags import folders_named, parse_flags
+from arena_newton.flags import folders_named, parse_flags, user_path
 
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
 def _folder(arguments: list[str], command: str) -> Path:
     if not arguments or arguments[0].startswith("-"):
         raise InputError(f"{command}: name the results folder: {PROG} {command} <out>")
-    return Path(arguments.pop(0)).expanduser()
+    return user_path(arguments.pop(0))
 
 
 def _folders(arguments: list[str], command: str) -> list[Path]:
@@ -211,7 +211,8 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
         return 0
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
     cells = Counter((episode.task, episode.tracker, episode.mode) for episode in episodes)
-    print(detectable_text(list(cells.values())))
+    if told := detectable_text(list(cells.values())):
+        print(told)
     for episode in episodes:
         print(
             f"{episode.index:>5} {episode.task:<12} {episode.tracker:<8} {episode.mode:<10} seed {episode.group_seed} "
@@ -222,9 +223,9 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
 def _loop(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(LoopOptions, arguments, f"{PROG} loop")
-    from arena_newton.extras import require
+    from arena_newton.eval.loop_requirements import check_libraries
 
-    require("data", "eval loop")
+    check_libraries(options.policy)  # before the libraries are loaded
     from arena_newton.eval import learning_loop
 
     return learning_loop.run(options, factories)
@@ -313,7 +314,7 @@ def _pack(arguments: list[str], factories: Factories | None) -> int:
         parse_flags(PackOptions, ["--help"], f"{PROG} pack <checkpoint>")
     if not arguments or arguments[0].startswith("-"):
         raise InputError(f"pack: name the checkpoint, or the folder of a training: {PROG} pack <checkpoint>")
-    given = Path(arguments.pop(0)).expanduser()
+    given = user_path(arguments.pop(0))
     options = parse_flags(PackOptions, arguments, f"{PROG} pack")
     from arena_newton.eval import pack_command
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from arena_newton import trackers
 from arena_newton.devices import resolve_engine
@@ -37,6 +36,7 @@ from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.plan import MAX_EPISODES
 from arena_newton.eval.progress import duration
 from arena_newton.eval.run import Factories
+from arena_newton.flags import user_path
 from arena_newton.quiet import quiet_warp
 
 __all__ = ["CHECKS", "run"]
@@ -131,12 +131,12 @@ def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str,
         raise InputError(f"--jobs {options.jobs}: expected 0 or more")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
-    if options.twist2_checkpoint is not None and not Path(options.twist2_checkpoint).expanduser().is_file():
+    if options.twist2_checkpoint is not None and not user_path(options.twist2_checkpoint).is_file():
         raise InputError(f"--twist2-checkpoint {options.twist2_checkpoint}: no such file")
     if not options.out.strip():
         raise InputError("--out: is empty, name a folder")
     resolve_engine(options.engine, options.device)
-    folder = Path(options.out).expanduser()
+    folder = user_path(options.out)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: is a file")
     if folder.exists() and any(folder.iterdir()):

@@ -9,11 +9,12 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.comparison import Comparison, compare
 from arena_newton.eval.comparison_page import comparison_page
-from arena_newton.eval.comparison_text import as_csv, as_json, as_markdown, rate_text, remarks, verdict
+from arena_newton.eval.comparison_text import as_csv, as_json, as_markdown, p_text, rate_text, remarks, verdict
 from arena_newton.eval.contenders import read_contenders
 from arena_newton.eval.journal import StorageError, write_atomic
 from arena_newton.eval.table_options import CompareOptions
 from arena_newton.eval.wording import plain
+from arena_newton.flags import user_path
 
 __all__ = ["run"]
 
@@ -27,17 +28,21 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
     """
     if not options.out.strip():
         raise InputError("--out: is empty, name a folder")
-    out = Path(options.out).expanduser()
+    out = user_path(options.out)
     contenders = read_contenders(folders, differ=options.differ, only=options.only, per_tracker=options.per_tracker)
     comparison = compare(contenders.contenders)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
-    write_atomic(out / "compare.html", comparison_page(out, comparison, contenders))
-    write_atomic(out / "compare.md", as_markdown(comparison, contenders))
-    write_atomic(out / "compare.json", json.dumps(as_json(comparison, contenders), indent=2) + "\n")
-    write_atomic(out / "compare.csv", as_csv(comparison))
+    files = {
+        "compare.html": comparison_page(out, comparison, contenders),
+        "compare.md": as_markdown(comparison, contenders),
+        "compare.json": json.dumps(as_json(comparison, contenders), indent=2) + "\n",
+        "compare.csv": as_csv(comparison),
+    }
+    for name, text in files.items():
+        write_atomic(out / name, text, "what was compared is as it was")
     for line in _said(comparison):
         print(plain(line))
     for note in remarks(comparison, contenders):
@@ -54,4 +59,5 @@ def _said(comparison: Comparison) -> list[str]:
     for name, standing in ranked:
         count, rate, interval = rate_text(standing)
         lines.append(f"{name:<{width}}  {count:>9}  {rate:>5} % ({interval})  {standing.letters}")
-    return lines + [f"{verdict(comparison, pair)} (p {pair.p_holm:.2g})" for pair in comparison.pairs]
+    p = "p" if len(comparison.pairs) == 1 else "adjusted p"
+    return lines + [f"{verdict(comparison, pair)} ({p} {p_text(pair.p_holm)})" for pair in comparison.pairs]

@@ -14,6 +14,7 @@ from arena_newton.eval.rate_tests import (
     PairedCounts,
     RateDifference,
     UnpairedCounts,
+    excess,
     letters,
     mean_difference,
     rate_test,
@@ -21,7 +22,6 @@ from arena_newton.eval.rate_tests import (
 )
 from arena_newton.eval.stats import holm
 from arena_newton.intervals import wilson
-from arena_newton.text import counted
 
 __all__ = ["LEVEL", "Comparison", "Contender", "PairComparison", "Standing", "StratumPair", "compare", "counts_of"]
 
@@ -68,6 +68,8 @@ class PairComparison:
     """Of the stratified exact test."""
     p_holm: float
     """Adjusted for the number of pairs."""
+    excess: float
+    """Successes of the first beyond what the test expects of equal rates: where it differs, whether it is better."""
     difference: RateDifference
 
     @property
@@ -131,7 +133,7 @@ def compare(contenders: Sequence[Contender]) -> Comparison:
         InputError: There are fewer than two, or they have no stratum in common.
     """
     if len(contenders) < 2:
-        raise InputError(f"compare: needs two policies or more, found {counted(len(contenders), 'policy')}")
+        raise InputError(f"compare: needs two policies or more, found {len(contenders)}")
     strata = tuple(s for s in contenders[0].outcomes if all(one.outcomes.get(s) for one in contenders))
     if not strata:
         raise InputError(_nothing_common(contenders))
@@ -157,7 +159,8 @@ def compare(contenders: Sequence[Contender]) -> Comparison:
             )
             for stratum in strata
         )
-        pairs.append(PairComparison(*pair, parts, p, p_holm, _difference([part.counts for part in parts])))
+        counts = [part.counts for part in parts]
+        pairs.append(PairComparison(*pair, parts, p, p_holm, excess(counts), _difference(counts)))
     within = {}
     for position, stratum in enumerate(strata):
         differing = [(pair.first, pair.second) for pair in pairs if pair.strata[position].p_holm <= LEVEL]

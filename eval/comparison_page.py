@@ -76,7 +76,7 @@ def comparison_page(out: Path, comparison: Comparison, contenders: ContenderSet)
         ticks=TICKS,
         size=VIOLIN,
         policies=[(name, dict(facts)) for name, facts in zip(comparison.names, contenders.facts, strict=True)],
-        reports=[_report(out, Path(dict(facts)["folder"])) for facts in contenders.facts],
+        reports=[_report(out, folder) for folder in contenders.folders],
         overall=_rows(comparison, comparison.overall),
         verdicts=[verdict(comparison, pair) for pair in comparison.pairs],
         pairs=[_pair(comparison, pair) for pair in comparison.pairs],
@@ -105,7 +105,7 @@ def _report(out: Path, folder: Path) -> str | None:
 def _address(out: Path, folder: Path, name: str) -> str:
     """Path from the page to a file of a results folder, as an address."""
     relative = os.path.relpath(folder.resolve() / name, out.resolve())
-    return urllib.parse.quote(Path(relative).as_posix())
+    return urllib.parse.quote(os.fsencode(Path(relative).as_posix()))  # names of folders need not be text
 
 
 def _rows(comparison: Comparison, standings: Sequence[Standing]) -> list[dict[str, object]]:
@@ -200,6 +200,7 @@ def _side(out: Path, played: PlayedEpisode) -> _Side:
     links = tuple(
         (f"{'strip' if name.endswith('strip') else 'video'}, {MEDIA[name]}", _address(out, run.folder, path))
         for name, path in media_of(record).items()
+        if (run.folder / path).is_file()  # results may have come without their recordings
     )
     why = plain(record.reason) if record.reason and record.reason != record.outcome else ""
     command = "" if links else replay_command(run.document["options"], record, worlds=run.config.get("worlds"))

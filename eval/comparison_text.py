@@ -32,6 +32,8 @@ OVER_ALL = "all"
 """Name of the rows over all tasks."""
 CELLS = ("both", "only_first", "only_second", "neither")
 """How a pair of episodes can end."""
+LEAST = 1e-300
+"""Probabilities below this are said to be so: they may be too small for a number."""
 METHOD = (
     "Within a task: McNemar's exact test of the episodes that both played; where two runs share no episode, "
     f"Boschloo's exact test (Fisher's where the product of their numbers is above {LARGEST_BOSCHLOO:,}). Over all "
@@ -40,7 +42,8 @@ METHOD = (
     f"Those that share a letter are not told apart (adjusted p above {LEVEL:g}), which does not say that they are "
     "alike. The first letters are of the best.",
     "Rates have 95 % Wilson intervals. Δ is the first rate minus the second in points, over all tasks the mean of the "
-    "tasks' differences, with its 95 % interval (Agresti and Min where paired, Agresti and Caffo where not).",
+    "tasks' differences, with its 95 % interval (Agresti and Min where paired, Agresti and Caffo where not; of several "
+    "tasks the made episodes that move its middle are shared out, after Price and Bonett).",
     "An episode that ended with an error counts as no success.",
 )
 """How the figures are made, in paragraphs."""
@@ -53,6 +56,8 @@ def stratum_title(stratum: tuple[str, ...]) -> str:
 
 def p_text(p: float) -> str:
     """A probability, such as `0.034` and `3e-05`."""
+    if p < LEAST:
+        return f"<{LEAST:.0e}"
     return f"{p:.2g}" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -63,8 +68,9 @@ def rate_text(standing: Standing) -> tuple[str, str, str]:
 
 
 def difference_text(difference: RateDifference) -> str:
-    """A difference in points with its interval, such as `+12 (3 to 21)`."""
-    return f"{100 * difference.value:+.1f} ({100 * difference.low:.0f} to {100 * difference.high:.0f})"
+    """A difference in points with its interval, such as `+12.0 (3 to 21)`."""
+    value, low, high = (100 * part for part in (difference.value, difference.low, difference.high))
+    return f"{round(value, 1) + 0.0:+.1f} ({round(low)} to {round(high)})"  # + 0.0: no -0
 
 
 def verdict(comparison: Comparison, pair: PairComparison) -> str:
@@ -72,9 +78,11 @@ def verdict(comparison: Comparison, pair: PairComparison) -> str:
     first, second = comparison.names[pair.first], comparison.names[pair.second]
     if not pair.differs:
         return f"{first} and {second} are not told apart"
+    better, worse = (first, second) if pair.excess > 0 else (second, first)
     if pair.difference.value == 0.0:
-        return f"{first} and {second} differ, with equal mean rates"
-    better, worse = (first, second) if pair.difference.value > 0 else (second, first)
+        return f"{better} succeeds in more episodes than {worse}, with equal mean rates"
+    if (pair.difference.value > 0) != (pair.excess > 0):
+        return f"{better} succeeds in more episodes than {worse}, which has the higher mean rate"
     return f"{better} succeeds more often than {worse}"
 
 
@@ -99,11 +107,13 @@ def _title(part: StratumPair) -> str:
     return stratum_title(part.stratum)
 
 
-def _cells(part: StratumPair) -> tuple[str, str, str, str]:
+def _cells(part: StratumPair) -> tuple[str, str, str, str, str]:
+    """How many pairs of episodes ended in each way, where there are pairs; then the successes of both."""
     counts = part.counts
-    if isinstance(counts, PairedCounts):
-        return str(counts.both), str(counts.only_first), str(counts.only_second), str(counts.neither)
-    return "", f"{counts.first}/{counts.first_episodes}", f"{counts.second}/{counts.second_episodes}", ""
+    each = [str(getattr(counts, name)) if isinstance(counts, PairedCounts) else "" for name in CELLS]
+    rates = f"{counts.first}/{counts.first_episodes}, {counts.second}/{counts.second_episodes}"
+    both, only_first, only_second, neither = each
+    return both, only_first, only_second, neither, rates
 
 
 def _standings(comparison: Comparison, standings: Sequence[Standing], title: str) -> list[list[str]]:
@@ -133,7 +143,8 @@ def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
     lines += [markdown_table(["first", "second", "Δ", "p", "p (Holm)"], table, 2)]
     lines += [f"- {escaped(verdict(comparison, pair))}." for pair in comparison.pairs] + [""]
     lines += ["## Within tasks", ""]
-    head = ["task", "first", "second", "both", "only first", "only second", "neither", "Δ", "test", "p", "p (Holm)"]
+    head = ["task", "first", "second", "both", "only first", "only second", "neither", "successes"]
+    head += ["Δ", "test", "p", "p (Holm)"]
     table = []
     for position in range(len(comparison.strata)):
         for pair in comparison.pairs:

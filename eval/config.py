@@ -243,7 +243,7 @@ def resolve(options: RunOptions) -> RunConfig:
     scheme, _, target = options.policy.partition(":")
     if scheme == "learned":
         card = _card(target)
-        tasks = card.tasks if quick else tasks
+        tasks = tasks if options.task else card.tasks
         card.check_tasks(tasks)
     if options.failures:
         check_interactions(tasks)

@@ -10,9 +10,10 @@ from pathlib import Path
 from arena_newton import seeding
 from arena_newton.errors import InputError
 from arena_newton.eval.comparison import Contender
+from arena_newton.eval.document import CONFIG_FILE
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, load_run
+from arena_newton.eval.results import RunRecord, check_whole_plan, load_run
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
@@ -22,6 +23,8 @@ CONDITIONS = ("rules", "engine", "max_steps", "variant", "fast_physics")
 """What must be alike in everything that is compared, unless it is what is compared (`--differ`)."""
 NOTED = ("device", "drive", "labels", "replan", "ensemble", "latency_ticks")
 """What may differ; every value is named."""
+HASHED = {"rules_hash": "The rules", "scenes": "The scenes"}
+"""What is known by its content, of the tasks of a run; that it differs is named."""
 NOT_GIVEN = "not given"
 """How a condition is shown that a run leaves open."""
 USUAL = {"labels": "v3.1"}
@@ -49,6 +52,8 @@ class ContenderSet:
     """Of each contender its episodes, by stratum and what names the episode in it."""
     facts: tuple[tuple[tuple[str, str], ...], ...]
     """Of each contender what it is, by name: policy, tracker, folder."""
+    folders: tuple[Path, ...]
+    """Of each contender the folder that was named on the command line."""
     alike: tuple[tuple[str, str], ...]
     """Conditions that all share, by name."""
     notes: tuple[str, ...]
@@ -129,17 +134,24 @@ def read_contenders(
     shared = [(name, value) for name, value in shared if value != NOT_GIVEN]
     if not modes:
         shared.append(("mode", gathered[0].episodes[0].record.mode))
-    return ContenderSet(tuple(contenders), tuple(played), tuple(map(_facts, gathered)), tuple(shared), tuple(notes))
+    return ContenderSet(
+        contenders=tuple(contenders),
+        played=tuple(played),
+        facts=tuple(map(_facts, gathered)),
+        folders=tuple(one.where for one in gathered),
+        alike=tuple(shared),
+        notes=tuple(notes),
+    )
 
 
 def _titles(folders: Sequence[Path]) -> list[str]:
     """The shortest ends of the folders' paths by which they can be told apart."""
     paths = [folder.resolve() for folder in folders]
     for number in range(1, max(len(path.parts) for path in paths) + 1):
-        names = ["/".join(path.parts[-number:]) for path in paths]
+        names = [plain_text("/".join(path.parts[-number:]), None) for path in paths]
         if len(set(names)) == len(names):
-            return [plain_text(name, 80) for name in names]
-    return [plain_text(path, 80) for path in paths]
+            return names
+    return [plain_text(path, None) for path in paths]
 
 
 def _check_evaluation(run: RunRecord) -> None:
@@ -150,6 +162,7 @@ def _check_evaluation(run: RunRecord) -> None:
 def _of_run(folder: Path, title: str, per_tracker: bool) -> list[_Gathered]:
     run = load_run(folder)
     _check_evaluation(run)
+    check_whole_plan(run)
     played, planned = len(run.records), run.document["planned"]
     if not played:
         raise InputError(f"{folder}: holds no finished episode")
@@ -163,7 +176,7 @@ def _of_run(folder: Path, title: str, per_tracker: bool) -> list[_Gathered]:
     policies = {record.policy for record in run.records}
     for record in run.records:
         key = (record.policy if len(policies) > 1 else "", record.tracker if per_tracker else "")
-        name = " ".join([title, *(plain_text(word, 60) for word in key if word)])
+        name = " ".join([title, *(plain_text(word, None) for word in key if word)])
         found.setdefault(key, _Gathered(name, folder)).episodes.append(PlayedEpisode(record, run))
     return list(found.values())
 
@@ -174,9 +187,12 @@ def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> 
     found: dict[tuple[str, ...], _Gathered] = {}
     waiting = 0
     for cell in suite.cells:
-        run = load_cell(suite, cell) if (folder / cell.folder).is_dir() else None
+        if cell.status == "failed":
+            notes.append(f"{folder / cell.folder}: failed ({plain_text(cell.error or 'no reason', 200)}).")
+        # A cell that is beginning has a folder before it has a configuration.
+        run = load_cell(suite, cell) if (folder / cell.folder / CONFIG_FILE).exists() else None
         if run is None or not run.records:
-            waiting += 1
+            waiting += cell.status != "failed"
             continue
         _check_evaluation(run)
         if len(run.records) < run.document["planned"]:
@@ -188,7 +204,7 @@ def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> 
         said = [word for position, word in enumerate(words[cell.id]) if len({one[position] for one in alike}) > 1]
         name = " ".join(filter(None, [title, cell.policy, *said, cell.tracker if per_tracker else ""]))
         key = (cell.policy, *words[cell.id], cell.tracker if per_tracker else "")
-        one = found.setdefault(key, _Gathered(plain_text(name, 120), folder))
+        one = found.setdefault(key, _Gathered(plain_text(name, None), folder))
         one.episodes += [PlayedEpisode(record, run) for record in run.records]
     if waiting:
         notes.append(f"{folder}: {counted(waiting, 'cell')} of {len(suite.cells)} not played yet.")
@@ -262,7 +278,7 @@ def _trackers(one: _Gathered) -> list[str]:
 def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
     """What differs although it need not, and what went wrong."""
     found = []
-    for name in (*differ, *NOTED):
+    for name in dict.fromkeys((*differ, *NOTED)):
         if not _all_alike(gathered, name):
             said = "; ".join(f"{one.name}: {' and '.join(one.values(name))}" for one in gathered)
             found.append(f"{name.replace('_', ' ').capitalize()} differs: {said}.")
@@ -278,6 +294,11 @@ def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
     found += [f"Weights of {tracker} differ: {' '.join(kept)}." for tracker, kept in weights.items() if len(kept) > 1]
     codes = {played.run.config.get("code") for one in gathered for played in one.episodes}
     found += [f"The runs were made with {len(codes)} versions of the code."] if len(codes) > 1 else []
+    found += [
+        f"{what} have changed between the runs: {' '.join(sorted(versions))}, of the same tasks."
+        for key, what in HASHED.items()
+        for versions in _versions(gathered, key)
+    ]
     for one in gathered:
         errors = sum(played.record.outcome == "error" for played in one.episodes)
         if errors:
@@ -286,6 +307,16 @@ def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
                 "no success."
             )
     return [plain_text(text) for text in found]
+
+
+def _versions(gathered: Sequence[_Gathered], key: str) -> list[set[str]]:
+    """Hashes of something that depends on a run's tasks, where runs of the same tasks have several."""
+    by_tasks: dict[tuple[str, ...], set[str]] = {}
+    for run in {id(played.run): played.run for one in gathered for played in one.episodes}.values():
+        tasks, value = run.config.get("task"), run.config.get(key)
+        if tasks is not None and isinstance(value, str):
+            by_tasks.setdefault((run.config["rules"], *sorted(tasks)), set()).add(value)
+    return [versions for versions in by_tasks.values() if len(versions) > 1]
 
 
 def _by_episode(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 
 from arena_newton.text import counted
 
@@ -125,9 +126,10 @@ def _below(trials: int, most: int, p: float) -> float:
 @functools.cache
 def _critical(discordant: int, level: float) -> int:
     """Most successes of the rarer side with which the test of so many discordant pairs rejects; -1: it never does."""
-    total, tail, k = 1 << discordant, 0, 0
-    weight = 1
-    while 2 * (tail + weight) <= level * total:
+    # Whole numbers: a float ends at 2 to the power of 1024.
+    limit = math.floor(Fraction(str(level)) / 2 * (1 << discordant))
+    weight, tail, k = 1, 0, 0
+    while tail + weight <= limit:
         tail += weight
         weight = weight * (discordant - k) // (k + 1)
         k += 1

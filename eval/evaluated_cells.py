@@ -11,7 +11,7 @@ from arena_newton import seeding
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, load_run
+from arena_newton.eval.results import RunRecord, check_whole_plan, load_run
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
@@ -93,8 +93,8 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
 
     Raises:
         InputError: A folder holds neither or is damaged, two hold the same cell, none holds an episode under the
-            rules, one holds recordings for training, or they differ in step budgets, scene variant or a tracker's
-            weights.
+            rules, one holds recordings for training or a shard, or they differ in step budgets, scene variant or a
+            tracker's weights.
     """
     found: list[tuple[str, EvaluatedCell, RunRecord]] = []
     notes: list[str] = []
@@ -105,6 +105,7 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
             run = load_run(folder)
             if run.config.get("seed_range", seeding.EVALUATION) != seeding.EVALUATION:
                 raise InputError(f"{folder}: holds recordings for training; tables are of evaluations")
+            check_whole_plan(run)
             found += [(run.config["rules"], cell, run) for cell in _of_run(run)]
             if len(run.records) < run.document["planned"] and run.config.get("keep") is None:
                 notes.append(f"{folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")

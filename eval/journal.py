@@ -295,8 +295,10 @@ class Journal(LockedLines):
         self.records.append(record)
 
 
-def write_atomic(path: Path, text: str) -> None:
+def write_atomic(path: Path, text: str, kept: str = "the journal is kept") -> None:
     """Write a text file so that a reader sees the old content or the new, never a part; links are not followed.
+
+    The message of an error ends with what is `kept`.
 
     Raises:
         StorageError: It cannot be written.
@@ -305,4 +307,4 @@ def write_atomic(path: Path, text: str) -> None:
         with replace_atomically(path, sync=True) as file:
             file.write(text.encode("utf-8"))
     except OSError as error:
-        raise _explain(error, path, "the journal is kept") from None
+        raise _explain(error, path, kept) from None

@@ -28,6 +28,7 @@ from arena_newton.eval.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.folder import ResultsFolder
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING, LoopRecord, StageRecord
+from arena_newton.eval.loop_requirements import check_disk, check_folder, check_libraries, recorded_bytes
 from arena_newton.eval.options import LoopOptions, RecordOptions, RunOptions
 from arena_newton.eval.plan import PROTOCOL_SEEDS
 from arena_newton.eval.progress import duration
@@ -67,10 +68,19 @@ def _train(options: PolicyTrainOptions) -> Path:
     return train(options)
 
 
+def _check_training(options: PolicyTrainOptions) -> int:
+    """See `check_training`."""
+    from arena_newton.policies.train.training_check import check_training
+
+    return check_training(options)
+
+
 @dataclass(frozen=True)
 class LoopParts:
     """What the stages call; tests put their own in."""
 
+    check: Callable[[PolicyTrainOptions], int] = _check_training
+    """Refuses a training that cannot begin, and gives the bytes of its checkpoints."""
     train: Callable[[PolicyTrainOptions], Path] = _train
     """Trains, and gives the folder of the last checkpoint."""
     clock: Callable[[], float] = time.perf_counter
@@ -84,12 +94,18 @@ def run(options: LoopOptions, factories: Factories | None = None, parts: LoopPar
         was recorded, 130 interrupted.
 
     Raises:
-        InputError: A flag or the folder is wrong; said before anything is played.
+        InputError: A flag or the folder is wrong, or something is missing that a later stage needs; said before
+            anything is played.
     """
     options = resolved(options)
     out = Path(str(options.out)).expanduser()
+    loop = _Loop(options, out, factories, parts or LoopParts())
+    new = not (out / LOOP_FILE).exists()
+    if new:  # one that cannot end leaves no folder
+        _check_out(out)
+        loop.check()
     with held(out):
-        return _Loop(options, out, factories, parts or LoopParts()).play()
+        return loop.play(checked=new)
 
 
 def resolved(options: LoopOptions) -> LoopOptions:
@@ -179,6 +195,13 @@ def _evaluation(options: LoopOptions, out: Path) -> RunOptions:
     )
 
 
+def _check_out(out: Path) -> None:
+    check_folder(out)
+    known = {LOOP_FILE, LOCK_FILE}
+    if out.is_dir() and not (out / LOOP_FILE).is_file() and any(path.name not in known for path in out.iterdir()):
+        raise InputError(f"--out {out}: is not empty and holds no loop; choose another folder")
+
+
 @contextlib.contextmanager
 def held(out: Path) -> Iterator[None]:
     """Make the folder and hold it, so that no two processes work in it.
@@ -186,11 +209,7 @@ def held(out: Path) -> Iterator[None]:
     Raises:
         InputError: It is another process's, holds something else, or cannot be made.
     """
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out {out}: is a file")
-    known = {LOOP_FILE, LOCK_FILE}
-    if out.is_dir() and not (out / LOOP_FILE).is_file() and any(path.name not in known for path in out.iterdir()):
-        raise InputError(f"--out {out}: is not empty and holds no loop; choose another folder")
+    _check_out(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
         lock = os.fdopen(os.open(out / LOCK_FILE, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o644), "w")
@@ -215,9 +234,28 @@ class _Loop:
     stages: dict[str, StageRecord] = field(default_factory=dict)
     """Stages that have begun, in their order."""
 
-    def play(self) -> int:
-        """Play what is left."""
+    def check(self) -> None:
+        """Refuse a loop whose later stages lack something; stages that are finished need nothing."""
+
+        def unfinished(name: str) -> bool:
+            return not self.stages.get(name, StageRecord()).finished
+
+        needed = 0
+        if unfinished("record") or unfinished("build"):
+            config = resolve(recording_run(_recording(self.options, self.out)))
+            budgets = {episode.task: episode.max_steps for episode in config.episodes}
+            needed += recorded_bytes(budgets, self.options.episodes or 0, str(self.options.size))
+        if unfinished("train"):
+            check_libraries(self.options.policy)
+            needed += self.parts.check(_training(self.options, self.out))
+        if needed:
+            check_disk(self.out, needed)
+
+    def play(self, *, checked: bool = True) -> int:
+        """Play what is left, after a check of what it needs."""
         self._read()
+        if not checked:
+            self.check()
         stages: Mapping[str, Callable[[], int]] = {
             "record": self._record,
             "build": self._build,

@@ -21,10 +21,11 @@ class PackOptions:
     out: str | None = None
     """Folder to write; that of the policy that comes with the package when none is named."""
     tasks: tuple[str, ...] = ()
-    """Tasks that it is offered for, the one first that the default run shows; with --results those that it solves at
-    75 % in mode base through a tracker of its training, otherwise those of its training."""
+    """Tasks that it is offered for, the one first that the default run shows; with results those that it solves at
+    75 % in mode base through every tracker of its training, otherwise those of its training."""
     results: tuple[str, ...] = ()
-    """Results folders or suites of eval whose cells of this checkpoint go into the card."""
+    """Results folders or suites of eval whose cells of this checkpoint go into the card; a packed policy that is
+    packed again keeps its other cells."""
     command: str = ""
     """Command of the training, if not as the checkpoint remembers it."""
     note: str = ""

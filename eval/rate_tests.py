@@ -10,7 +10,10 @@ import math
 import string
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
+import numpy as np
+import numpy.typing as npt
 from scipy.stats import boschloo_exact
 
 from arena_newton.eval.stats import mcnemar
@@ -22,6 +25,7 @@ __all__ = [
     "RateDifference",
     "TestOfRates",
     "UnpairedCounts",
+    "excess",
     "letters",
     "mean_difference",
     "rate_test",
@@ -30,6 +34,8 @@ __all__ = [
 
 LARGEST_BOSCHLOO = 60_000
 """Product of both numbers of episodes up to which Boschloo's test is computed (half a second); above it Fisher's."""
+TIE = 1e-9
+"""Relative difference up to which two probabilities count as equal: they are rounded."""
 
 
 @dataclass(frozen=True)
@@ -117,45 +123,53 @@ def stratified_test(strata: Sequence[Counts]) -> float:
 
     The statistic is the first's number of successes, given in each stratum what does not depend on who succeeded: of
     paired episodes how many had one success (each is a fair coin then), of others all successes (hypergeometric then).
-    Strata are independent, so the sum's distribution is the convolution of theirs, in whole numbers without rounding.
-    Outcomes at most as probable as the observed one count, as in Fisher's test. This is the exact conditional form of
-    the test of Cochran (1954), Biometrics 10, and Mantel and Haenszel (1959), J. Nat. Cancer Inst. 22; of paired
-    episodes, each a stratum of its own, it is McNemar's test of all of them, of one unpaired stratum Fisher's.
+    Strata are independent, so the sum's distribution is the convolution of theirs; all its terms are sums of products
+    of positive numbers, so that the smallest are as precise as the largest. Outcomes at most as probable as the
+    observed one count, as in Fisher's test. This is the exact conditional form of the test of Cochran (1954),
+    Biometrics 10, and Mantel and Haenszel (1959), J. Nat. Cancer Inst. 22; of paired episodes, each a stratum of its
+    own, it is McNemar's test of all of them, of one unpaired stratum Fisher's.
     """
     paired = [counts for counts in strata if isinstance(counts, PairedCounts)]
     observed = sum(counts.only_first for counts in paired)
     discordant = observed + sum(counts.only_second for counts in paired)
     if len(paired) == len(strata):
         return mcnemar(observed, discordant - observed)  # the same, without all the terms
-    weights = _binomials(discordant)
+    k = np.arange(discordant)
+    law = _distribution((discordant - k) / (k + 1))
     for counts in strata:
         if isinstance(counts, UnpairedCounts):
             successes = counts.first + counts.second
             fewest = max(0, successes - counts.second_episodes)
-            most = min(counts.first_episodes, successes)
-            here = [
-                math.comb(counts.first_episodes, k) * math.comb(counts.second_episodes, successes - k)
-                for k in range(fewest, most + 1)
-            ]
-            weights = _convolved(weights, here)
+            k = np.arange(fewest, min(counts.first_episodes, successes))
+            others = counts.second_episodes - successes + k + 1
+            here = (counts.first_episodes - k) * (successes - k) / ((k + 1) * others)
+            law = np.asarray(np.convolve(law, _distribution(here)), dtype=np.float64)
             observed += counts.first - fewest
-    return sum(weight for weight in weights if weight <= weights[observed]) / sum(weights)
+    return min(1.0, float(law[law <= law[observed] * (1.0 + TIE)].sum() / law.sum()))
 
 
-@functools.lru_cache(maxsize=64)
-def _binomials(trials: int) -> tuple[int, ...]:
-    row = [1]
-    for k in range(trials):
-        row.append(row[-1] * (trials - k) // (k + 1))
-    return tuple(row)
+def _distribution(ratios: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Probabilities of the values of a variable, given how much likelier each is than the one before.
+
+    The ratios fall. From the likeliest value outwards nothing overflows, and what is too small for a number is 0.
+    """
+    likeliest = int(np.count_nonzero(ratios >= 1.0))
+    below = np.cumprod(1.0 / ratios[:likeliest][::-1])[::-1]
+    weights = np.concatenate((below, [1.0], np.cumprod(ratios[likeliest:])))
+    weights[weights < np.finfo(float).tiny] = 0.0  # arithmetic with what is between is slow
+    return np.asarray(weights / weights.sum())
 
 
-def _convolved(first: Sequence[int], second: Sequence[int]) -> tuple[int, ...]:
-    total = [0] * (len(first) + len(second) - 1)
-    for i, a in enumerate(first):
-        for j, b in enumerate(second):
-            total[i + j] += a * b
-    return tuple(total)
+def excess(strata: Sequence[Counts]) -> float:
+    """Successes of the first beyond what `stratified_test` expects of equal rates: its sign is the test's direction."""
+    found = Fraction()
+    for counts in strata:
+        if isinstance(counts, PairedCounts):
+            found += Fraction(counts.only_first - counts.only_second, 2)
+        else:
+            episodes = counts.first_episodes + counts.second_episodes
+            found += counts.first - Fraction((counts.first + counts.second) * counts.first_episodes, episodes)
+    return float(found)
 
 
 @dataclass(frozen=True)
@@ -170,28 +184,32 @@ class RateDifference:
 def mean_difference(strata: Sequence[Counts]) -> RateDifference | None:
     """Mean over strata, each counting the same, of the difference of the rates; None without episodes.
 
-    The interval is normal, with variances from counts to which two made episodes per stratum or condition are added:
-    of paired ones as by Agresti and Min (2005), which `stats.contrast` explains; of others as by Agresti, A. and
-    Caffo, B. (2000), Simple and effective confidence intervals for proportions, The American Statistician 54.
+    The interval is normal, from counts to which made episodes are added, as many successes as failures. Of one stratum
+    it is that of Agresti, A. and Min, Y. (2005), Simple improved confidence intervals for comparing matched
+    proportions, Statistics in Medicine 24, where episodes are paired, and otherwise that of Agresti, A. and Caffo, B.
+    (2000), Simple and effective confidence intervals for proportions, The American Statistician 54: two made episodes
+    of each condition move its middle and widen it. Of several strata each has these two in its variance, while the two
+    that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004), An improved confidence interval
+    for a linear function of binomial proportions, Computational Statistics & Data Analysis 45; two in each stratum
+    would draw the middle of many small ones to 0.
     """
     if not strata or any(not counts.first_episodes or not counts.second_episodes for counts in strata):
         return None
-    value = variance = 0.0
+    value, middle, variance, made = Fraction(), 0.0, 0.0, 2.0 / len(strata)
     for counts in strata:
         n, m = counts.first_episodes, counts.second_episodes
-        value += counts.first / n - counts.second / m
+        value += Fraction(counts.first, n) - Fraction(counts.second, m)
+        middle += (counts.first + made / 2) / (n + made) - (counts.second + made / 2) / (m + made)
         if isinstance(counts, PairedCounts):
-            differing, mean = (
-                counts.only_first + counts.only_second + 1,
-                (counts.only_first - counts.only_second) / (n + 2),
-            )
+            differing = counts.only_first + counts.only_second + 1
+            mean = (counts.only_first - counts.only_second) / (n + 2)
             variance += (differing - (n + 2) * mean * mean) / (n + 2) ** 2
         else:
             first, second = (counts.first + 1) / (n + 2), (counts.second + 1) / (m + 2)
             variance += first * (1 - first) / (n + 2) + second * (1 - second) / (m + 2)
     number = len(strata)
     half = Z95 * math.sqrt(variance) / number
-    return RateDifference(value / number, max(-1.0, value / number - half), min(1.0, value / number + half))
+    return RateDifference(float(value / number), max(-1.0, middle / number - half), min(1.0, middle / number + half))
 
 
 def letters(number: int, differing: Collection[tuple[int, int]]) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NotRequired
 
+from arena_newton.errors import InputError
 from arena_newton.eval import rounds
 from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.failure_counts import FailureCell, failure_cells
@@ -14,7 +15,16 @@ from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.sharding import read_shard
 from arena_newton.eval.stats import Aggregate, aggregate
 
-__all__ = ["Results", "RunRecord", "due_episodes", "in_plan_order", "load_run", "results_json"]
+__all__ = [
+    "Results",
+    "RunRecord",
+    "check_whole_plan",
+    "due_episodes",
+    "in_plan_order",
+    "is_complete",
+    "load_run",
+    "results_json",
+]
 
 
 @dataclass(frozen=True)
@@ -79,7 +89,18 @@ def due_episodes(document: Document) -> int:
     return document["planned"] if shard is None else shard.size(document["planned"])
 
 
-def _complete(run: RunRecord) -> bool:
+def check_whole_plan(run: RunRecord) -> None:
+    """Refuse a shard, whose episodes are a part of a result.
+
+    Raises:
+        InputError: The folder is one.
+    """
+    shard = run.document.get("shard")
+    if shard is not None:
+        raise InputError(f"{run.folder}: is shard {shard} of a run; name the folder into which eval merge joins all")
+
+
+def is_complete(run: RunRecord) -> bool:
     """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
     planned, keep = run.document["planned"], run.config.get("keep")
     if keep is None:
@@ -96,7 +117,7 @@ def results_json(run: RunRecord) -> Results:
         "config": run.config,
         "planned": due_episodes(run.document),
         "finished": len(run.records),
-        "complete": _complete(run),
+        "complete": is_complete(run),
         "cells": figures["cells"],
         "suites": figures["suites"],
     }

@@ -12,6 +12,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from arena_newton.errors import InputError
 from arena_newton.eval import report
@@ -21,8 +22,9 @@ from arena_newton.eval.identity import differing_key, moving_versions
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
 from arena_newton.eval.options import RunMergeOptions, RunOptions
 from arena_newton.eval.records import Json, JsonObject, shown
-from arena_newton.eval.results import Results, RunRecord, due_episodes, load_run
+from arena_newton.eval.results import Results, RunRecord, due_episodes, is_complete, load_run
 from arena_newton.eval.sharding import Shard, dealt, read_shard
+from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.files import PARTIAL, file_label, replace_atomically
 from arena_newton.text import counted, is_printable, plain_text
 
@@ -51,10 +53,13 @@ class MergedRun:
 
 @dataclass(frozen=True)
 class _Kept:
-    """The episode that is kept of one number, and the folder that it is from."""
+    """The episode that is kept of one number."""
 
     record: EpisodeRecord
     folder: Path
+    """Where it is from."""
+    others: tuple[Path, ...] = ()
+    """Folders where the same came of it."""
 
 
 def run(folders: Sequence[Path], options: RunMergeOptions) -> int:
@@ -101,18 +106,26 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
             played, episodes are missing, or `out` holds something.
         StorageError: `out` cannot be written.
     """
-    _check_out(out)
+    _check_out(out, folders)
+    for folder in folders:
+        if (folder / SUITE_FILE).is_file():
+            raise InputError(f"merge {folder}: is a suite, whose parts are joined by copying one folder over the other")
     runs = sorted((load_run(folder) for folder in folders), key=_order)
     for other in runs[1:]:
         _check_alike(runs[0], other, accept_versions)
+    _check_environments(runs)
     kept, notes = _joined(runs)
-    missing = runs[0].document["planned"] - len(kept)
-    if missing:
-        said = f"{counted(missing, 'episode')} of {runs[0].document['planned']:,} missing: {_missing(runs, kept)}"
+    whole = _whole(runs, kept)
+    if not whole:
+        planned = runs[0].document["planned"]
+        some = f"{counted(planned - len(kept), 'episode')} of {planned:,}"
+        if runs[0].config.get("keep") is not None:
+            some = f"successes of at most {counted(planned, 'episode')}"
+        said = f"{some} missing: {_missing(runs, kept)}"
         if not partial:
             raise InputError(f"merge: {said}; finish them, or join what there is with --partial")
         notes.append(f"Joined with {said}.")
-    document = _document(runs, out, whole=not missing)
+    document = _document(runs, out, whole=whole)
     temporary = Path(os.path.abspath(out) + PARTIAL)
     if temporary.exists() or temporary.is_symlink():
         raise InputError(f"{temporary}: was left by a merge that was killed, or one is writing it; remove it")
@@ -139,7 +152,7 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
     return MergedRun(load_run(out), results, tuple(notes))
 
 
-def _check_out(out: Path) -> None:
+def _check_out(out: Path, folders: Sequence[Path]) -> None:
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         raise InputError(f"--out {out}: is a {'link' if out.is_symlink() else 'file'}; name a new folder")
     try:
@@ -147,6 +160,9 @@ def _check_out(out: Path) -> None:
             raise InputError(f"--out {out}: is not empty; name a new folder")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be read ({error.strerror})") from None
+    inside = next((folder for folder in folders if out.resolve().is_relative_to(folder.resolve())), None)
+    if inside is not None:
+        raise InputError(f"--out {out}: is in {inside}, which stays as it is; name a new folder beside it")
 
 
 def _shard(run: RunRecord) -> Shard | None:
@@ -163,8 +179,7 @@ def _check_alike(first: RunRecord, other: RunRecord, accept_versions: bool) -> N
     """Refuse two folders that are not of one configuration, or whose episodes were not played alike."""
 
     def refuse(key: str, was: object, now: object, more: str = "") -> InputError:
-        shown_was, shown_now = (plain_text(setting(value), 100) for value in (was, now))
-        return InputError(f"{other.folder}: {plain_text(key, 100)} is {shown_now}, in {first.folder} {shown_was}{more}")
+        return _differ(first.folder, other.folder, key, was, now, more)
 
     difference = differing_key(first.config, other.config)
     if difference is not None:
@@ -178,15 +193,26 @@ def _check_alike(first: RunRecord, other: RunRecord, accept_versions: bool) -> N
         values = [_plain(run.document["options"].get(name, getattr(RunOptions, name))) for run in (first, other)]
         if values[0] != values[1]:
             raise refuse(f"--{name.replace('_', '-')}", *values)
-    for group, facts in other.document.get("environments", {}).items():
-        known = first.document.get("environments", {}).get(group, facts)
-        difference = differing_key(comparable(known), comparable(facts))
-        if difference is not None:
-            raise refuse(f"{group}: {difference[0]}", *difference[1:])
     versions = [moving_versions(run.document.get("versions", {})) for run in (first, other)]
     difference = differing_key(*versions)
     if difference is not None and not accept_versions:
         raise refuse(*difference, "; results may differ; join both with --accept-versions")
+
+
+def _check_environments(runs: Sequence[RunRecord]) -> None:
+    """Refuse folders whose environments said something else of themselves; a shard may lack some of them."""
+    known: dict[str, tuple[JsonObject, Path]] = {}
+    for run in runs:
+        for group, facts in run.document.get("environments", {}).items():
+            was, where = known.setdefault(group, (facts, run.folder))
+            difference = differing_key(comparable(was), comparable(facts))
+            if difference is not None:
+                raise _differ(where, run.folder, f"{group}: {difference[0]}", *difference[1:])
+
+
+def _differ(first: Path, other: Path, key: str, was: object, now: object, more: str = "") -> InputError:
+    shown_was, shown_now = (plain_text(setting(value), 100) for value in (was, now))
+    return InputError(f"{other}: {plain_text(key, 100)} is {shown_now}, in {first} {shown_was}{more}")
 
 
 def _plain(value: Json) -> Json:
@@ -199,27 +225,35 @@ def _joined(runs: Sequence[RunRecord]) -> tuple[list[_Kept], list[str]]:
     Raises:
         InputError: Two folders played an episode, and something else came of it.
     """
-    kept: dict[int, _Kept] = {}
-    twice, repaired = 0, 0
+    found: dict[int, list[_Kept]] = {}
     for run in runs:
         for record in run.records:
-            known = kept.setdefault(record.index, _Kept(record, run.folder))
-            if known.record is record:
-                continue
-            if "error" in (known.record.outcome, record.outcome):
-                # As in a journal: an error says nothing of the episode, and what was played after it counts.
-                if known.record.outcome == "error" != record.outcome:
-                    kept[record.index] = _Kept(record, run.folder)
-                repaired += known.record.outcome != record.outcome
-                continue
-            _check_same(known, record, run.folder)
-            twice += 1
+            found.setdefault(record.index, []).append(_Kept(record, run.folder))
+    kept: list[_Kept] = []
+    twice, repaired = 0, 0
+    for _, parts in sorted(found.items()):
+        # As in a journal: an error says nothing of the episode, and what was played after it counts.
+        ended = [part for part in parts if part.record.outcome != "error"]
+        for other in ended[1:]:
+            _check_same(ended[0], other.record, other.folder)
+        twice += len(ended) > 1
+        repaired += 0 < len(ended) < len(parts)
+        best = max(ended or parts, key=lambda part: len(part.record.media or {}))  # of equals the first
+        others = tuple(part.folder for part in ended if part is not best)
+        kept.append(_Kept(best.record, best.folder, others))
     notes = [f"{counted(twice, 'episode')} in several folders, each alike."] if twice else []
     if repaired:
         notes.append(
             f"{counted(repaired, 'episode')} ended as an error in one folder and not in another, which counts."
         )
-    return [kept[index] for index in sorted(kept)], notes
+    return kept, notes
+
+
+def _whole(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> bool:
+    """Whether the plan is played: every episode, or as many successes as were to be kept."""
+    document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
+    document.pop("shard", None)
+    return is_complete(RunRecord(runs[0].folder, document, [part.record for part in kept]))
 
 
 def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
@@ -248,15 +282,16 @@ def _outcome(record: EpisodeRecord) -> JsonObject:
 def _missing(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> str:
     """Which shards are unfinished, and which are missing, in words."""
     known = {part.record.index for part in kept}
+    count = max((shard.count for shard in map(_shard, runs) if shard), default=0)
+    keys = list(plan_numbers(runs[0].folder / CONFIG_FILE, runs[0].config)) if count else []
     found = []
     for run in runs:
-        shard, due = _shard(run), due_episodes(run.document)
-        if len(run.records) < due:
-            name = f"{run.folder} (shard {shard})" if shard else str(run.folder)
-            found.append(f"{name} has {len(run.records):,} of {counted(due, 'episode')}")
-    count = max((shard.count for shard in map(_shard, runs) if shard), default=0)
+        shard = _shard(run)
+        if is_complete(run) or (shard and known.issuperset(dealt(keys, shard))):  # others may have what it lacks
+            continue
+        name = f"{run.folder} (shard {shard})" if shard else str(run.folder)
+        found.append(f"{name} has {len(run.records):,} of {counted(due_episodes(run.document), 'episode')}")
     given = {_shard(run) for run in runs}
-    keys = list(plan_numbers(runs[0].folder / CONFIG_FILE, runs[0].config)) if count else []
     absent = [Shard(number, count) for number in range(1, count + 1)]
     absent = [shard for shard in absent if shard not in given and not known.issuperset(dealt(keys, shard))]
     if absent:
@@ -322,29 +357,49 @@ def _files(part: _Kept, options: Mapping[str, Json]) -> Iterator[tuple[str, bool
 
 
 def _copied(part: _Kept, options: Mapping[str, Json], target: Path) -> list[str]:
-    """Copy the recordings of an episode; returns those that are missing."""
+    """Copy the recordings of an episode, from the first folder that has each; returns those that none has."""
     lost = []
     for path, due in _files(part, options):
-        source = part.folder / path
-        for folder in (source.parent, source.parent.parent):
-            if folder != part.folder and folder.is_symlink() and folder.is_relative_to(part.folder):
-                raise InputError(f"{folder}: is a link; a run writes inside its own folder only")
-        try:
-            handle = os.open(source, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        except FileNotFoundError:
+        for folder in (part.folder, *part.others):
+            file = _opened(folder, path)
+            if file is not None:
+                break
+        else:
             lost += [path] if due else []
             continue
-        except OSError as error:
-            cause = "is a link" if error.errno == errno.ELOOP else f"cannot be read ({error.strerror})"
-            raise InputError(f"{source}: {cause}") from None
-        with os.fdopen(handle, "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise InputError(f"{source}: is not a regular file")
+        with file:
             try:
                 with replace_atomically(target / path, sync=True) as copy:
                     shutil.copyfileobj(file, copy, _BLOCK)
             except OSError as error:
                 full = error.errno in (errno.ENOSPC, errno.EDQUOT)
                 cause = "disk full" if full else f"cannot be copied ({error.strerror})"
-                raise StorageError(f"{source} -> {target / path}: {cause}; the shards are as they were") from None
+                raise StorageError(f"{file.name} -> {target / path}: {cause}; the shards are as they were") from None
     return lost
+
+
+def _opened(run: Path, path: str) -> BinaryIO | None:
+    """A recording below a results folder, to be read; None where there is none.
+
+    Raises:
+        InputError: It, or its folder, is a link or no regular file.
+    """
+    source = run / path
+    for folder in (source.parent, source.parent.parent):
+        if folder != run and folder.is_symlink() and folder.is_relative_to(run):
+            raise InputError(f"{folder}: is a link; a run writes inside its own folder only")
+
+    def unfollowed(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+    try:
+        file = open(source, "rb", opener=unfollowed)  # noqa: SIM115 (the caller closes it)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        cause = "is a link" if error.errno == errno.ELOOP else f"cannot be read ({error.strerror})"
+        raise InputError(f"{source}: {cause}") from None
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise InputError(f"{source}: is not a regular file")
+    return file

@@ -16,6 +16,7 @@ from arena_newton.eval.sharding import parse_shard
 from arena_newton.eval.suite_file import SuiteFile, read_suite_file, suite_path
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, read_suite
+from arena_newton.text import counted
 
 __all__ = ["SuiteCall", "plan_call"]
 
@@ -59,6 +60,8 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit {options.limit}: expected at least 1")
     cells = expand_cells(suite)
+    if shard.count > max(len(cells), 1):
+        raise InputError(f"--shard {shard}: the suite has {counted(len(cells), 'cell')}, expected no more shards")
     chosen = {cell.id for cell in dealt(cells, shard.number, shard.count)}
     chosen &= {cell.id for cell in (selected(cells, only) if only else cells)}
     checked, problem = {}, None

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
-from arena_newton.eval.results import RunRecord
+from arena_newton.eval.results import RunRecord, due_episodes, is_complete
 from arena_newton.eval.stats import wilson
 from arena_newton.eval.wording import markdown_table, plain
 from arena_newton.rules import MODES
@@ -125,8 +125,12 @@ def _notes(runs: Sequence[RunRecord], records: Sequence[EpisodeRecord]) -> list[
     """What a reader of the table must know besides it."""
     found = []
     for run in runs:
-        if len(run.records) < run.document["planned"]:
-            found.append(f"{run.folder} is incomplete: {len(run.records)} of {run.document['planned']} episodes.")
+        played, shard, planned = len(run.records), run.document.get("shard"), run.document["planned"]
+        if shard is not None:
+            due = f"{played} of {counted(due_episodes(run.document), 'episode')}"
+            found.append(f"{run.folder} is shard {shard} of a plan of {planned:,} episodes: {due}.")
+        elif not is_complete(run):
+            found.append(f"{run.folder} is incomplete: {played} of {planned} episodes.")
     falls, errors = (sum(record.outcome == outcome for record in records) for outcome in ("fall", "error"))
     found += [f"{counted(falls, 'episode')} of {len(records)} ended in a fall."] if falls else []
     found += [f"{counted(errors, 'episode')} of {len(records)} ended with an error."] if errors else []

@@ -14,6 +14,7 @@ from arena_newton.eval.paper_numbers import paper_numbers
 from arena_newton.eval.suite_tables import suite_tables
 from arena_newton.eval.table_options import FORMATS, TablesOptions
 from arena_newton.extras import require
+from arena_newton.flags import user_path
 
 __all__ = ["run"]
 
@@ -36,7 +37,7 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
     tables = suite_tables(cells.cells, paper)
     if not tables:
         raise InputError(f"{folders[0]}: holds no cell of any table (policies executed by another tracker only)")
-    out = Path(options.out).expanduser()
+    out = user_path(options.out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

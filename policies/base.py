@@ -73,6 +73,9 @@ class Policy:
     """Fraction of the gap between commanded and measured heading that is closed each tick, by who decodes v4."""
     chunk_size: int = 1
     """Actions per chunk, where the policy knows it in advance."""
+    in_pieces: bool = False
+    """Whether a chunk is given in pieces, so that the policy is shown more ticks than those at which it decides. A
+    piece may be shorter than the latency of a run; the chunk must not."""
     depends_on_worlds: bool = False
     """Whether an episode may depend on how many worlds ask at once; the number is then part of a run's identity. Final
     after `check`."""

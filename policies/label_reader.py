@@ -66,6 +66,7 @@ class V4Policy(Policy):
         self.name = policy.name
         self.needs_image, self.camera = policy.needs_image, policy.camera
         self.chunk_size = policy.chunk_size
+        self.in_pieces = bool(getattr(policy, "in_pieces", False))
         self._realign = float(getattr(policy, "realign", 0.0))
         self._decoder: V4Decoder | None = None
 

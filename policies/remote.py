@@ -11,6 +11,7 @@ import functools
 import http.client
 import importlib
 import json
+import secrets
 import select
 import socket
 import ssl
@@ -29,6 +30,7 @@ from arena_newton.policies.base import Json, Observation
 from arena_newton.policies.remote_address import TOKEN_VARIABLE, read_address
 from arena_newton.policies.remote_client import MAX_CHUNK, MAX_FAILURES, MAX_REPLY, RemoteClient
 from arena_newton.policies.remote_link import AskAgain, RemoteError, ServerLink, episode_lost
+from arena_newton.policies.serve.arena_codec import CLIENT_HEADER
 from arena_newton.policies.serve.handshake import ServedFacts, read_facts
 from arena_newton.policies.serve.wire_error import WireError
 
@@ -37,10 +39,11 @@ __all__ = ["MAX_CHUNK", "MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIAB
 ROBOT_TYPE = LABELS["v3.1"].robot_type
 """Robot type that the original's server checks: actions of v3.1; those of other protocols have their own."""
 _RETRY_STATUS = (502, 503, 504)
-_OTHERS = {
+_OTHERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "openpi": ("remote_openpi", "serve", ("websockets", "msgpack")),
     "roboarena": ("remote_openpi", "serve", ("websockets", "msgpack")),
     "vla-eval": ("remote_vla_eval", "serve", ("websockets", "msgpack")),
+    "simple": ("remote_simple", "", ()),
     "gr00t": ("remote_gr00t", "gr00t", ("zmq", "msgpack")),
 }
 """Protocol of an address → its module, and the extra with the libraries that it needs."""
@@ -162,6 +165,16 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
     camera = CameraConfig(width=640, height=480, fit="native")
     """The original's client sends the head camera as it is, 640×480; resizing is the server's work."""
 
+    def __init__(self, url: str, **options: Any):
+        """As of `RemoteClient`."""
+        super().__init__(url, **options)
+        self._name = secrets.token_hex(8)
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """With a name, by which a server tells the worlds of this client from those of others on this machine."""
+        return {**super().headers, CLIENT_HEADER: self._name}
+
     def check(self) -> None:
         """Reach the server, begin an episode there, and read what it declares.
 
@@ -202,7 +215,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         server = (self.address.host, self.address.port)
         return _Connection(self.url, server, self.address.path, self.context, self.headers)
 
-    def _beginning(self, world: int, task: str) -> bytes:
+    def _beginning(self, world: int, task: str) -> bytes | None:
         return json.dumps({"seed": self._seeds[world], "world": world, "task": task}).encode()
 
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
@@ -276,6 +289,7 @@ def from_spec(argument: str | None, **options: Any) -> RemoteClient[Any, Any]:
     if spoken == "arena":
         return RemotePolicy(argument, **options)
     module, extra, libraries = _OTHERS[spoken]
-    require(extra, f"--policy remote:{argument}", libraries)
+    if libraries:
+        require(extra, f"--policy remote:{argument}", libraries)
     made: RemoteClient[Any, Any] = importlib.import_module(f"arena_newton.policies.{module}").make(argument, **options)
     return made

@@ -35,11 +35,14 @@ DOORS: dict[str, tuple[str, str, int]] = {
     "vla-eval": ("vla-eval", "ws", 8000),
     "vla-eval+ws": ("vla-eval", "ws", 8000),
     "vla-eval+wss": ("vla-eval", "wss", 443),
+    "simple": ("simple", "http", 22085),
+    "simple+http": ("simple", "http", 22085),
+    "simple+https": ("simple", "https", 443),
     "gr00t": ("gr00t", "tcp", 5555),
     "gr00t+tcp": ("gr00t", "tcp", 5555),
 }
 """What stands in front of `://` → protocol, transport and usual port. A web address has its scheme's, the
-others have the default of the servers themselves (openpi, RoboArena and vla-eval 8000, GR00T 5555)."""
+others have the default of the servers themselves (openpi, RoboArena and vla-eval 8000, SIMPLE 22085, GR00T 5555)."""
 _ESCAPES = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|.)?", re.DOTALL)
 """What a terminal interprets as a command (ECMA-48: CSI and OSC sequences, and ESC with one more)."""
 
@@ -49,7 +52,7 @@ class ServerAddress:
     """An address of a policy server, taken apart."""
 
     protocol: str
-    """`arena`, `openpi`, `roboarena`, `vla-eval` or `gr00t`."""
+    """`arena`, `openpi`, `roboarena`, `vla-eval`, `simple` or `gr00t`."""
     transport: str
     """`http`, `https`, `ws`, `wss` or `tcp`."""
     host: str

@@ -144,6 +144,8 @@ def _unpaired(rng: np.random.Generator, comparisons: int, episodes: int, differe
         case.count("Cochran-Mantel-Haenszel, all tasks", kind, pair.p <= LEVEL)
         interval = pair.difference
         case.count("interval of the mean difference covers", "coverage", interval.low <= -difference <= interval.high)
+        interval = pair.strata[0].difference
+        case.count("interval of a task's difference covers", "coverage", interval.low <= -difference <= interval.high)
     return case.found
 
 

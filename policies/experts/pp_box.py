@@ -71,7 +71,7 @@ WAITING = 0.2
 """Time before that begins [s]."""
 CLOSING = 0.15
 """Speed of each hand when closing [m/s]; twice as fast where it presses too little."""
-OVERLAP = 0.09
+OVERLAP = 0.115
 """How much deeper than it gets each palm is commanded into the box [m]: about 100 N/m times this, 10-12 N a side.
 Below 8 N weak arms drop the box in the carry."""
 TURNED = 0.08
@@ -81,8 +81,12 @@ SERVO = 5.0
 comes to lie flat between the fists only when they press, and is then narrower."""
 SQUEEZED = 0.4
 """Least time of the squeeze [s]."""
-DEEPEST = 0.17
+DEEPEST = 0.20
 """Most that a palm is commanded into the box [m]."""
+HOLDING = 0.12
+"""The same from the lift on, alike for all boxes: whoever learns from demonstrations need not know how it was held."""
+RELAXING = 0.05
+"""Speed at which each hand gets there [m/s]."""
 LIFT = 0.12
 """Height to which the box is lifted above the table [m]."""
 LIFTED = 0.07
@@ -91,46 +95,58 @@ LIFTING = 0.10
 """Speed of that [m/s]."""
 BACK = 0.45
 """Way back from the table [m] before the robot turns."""
-NEAR = 0.30
+NEAR = 0.32
 """Distance ahead of the pelvis at which the fists carry the box [m]: with stretched arms a step's roll of the torso
 raises one hand over the other and the box slips."""
 DRAWING = 0.10
-"""Speed at which they are drawn there, and stretched again at the shelf [m/s]."""
+"""Speed at which they are drawn there, and stretched again on the way to the shelf [m/s]."""
 CLEAR = 0.08
 """Height of the box's underside above the deck while it is carried there [m]."""
-HEIGHT_GAIN = 0.8
-"""Integral gain on the box's height [1/s]: arms sink under load and the box slips by centimetres."""
+RAISED = 0.115
+"""How much higher than to the wanted height the hands are commanded [m]: arms sink by that under the box."""
+HEIGHT_GAIN = 1.5
+"""More of it for what the box's height lacks. No integral: whoever learns from demonstrations does not know it."""
 MOST_RAISED = 0.20
 """Largest correction of the height [m]."""
+RAISING = 0.10
+"""Speed at which it changes [m/s]."""
 FACING = 0.9
-"""Heading from which the whole shelf is in view: this close to the direction of its place behind the table [rad]."""
-BEFORE = (0.50, 0.70)
-"""Least and largest distance of pelvis and front edge of the deck from which the robot walks straight to the shelf
-[m]."""
-AT_SHELF = 0.17
-"""The same when it places the box [m]."""
+"""Heading from which the whole shelf is in view: this close to the direction of its place behind the table [rad].
+From there to `reach` all commands follow from what is in view: no goal is remembered, no clock is waited for."""
+AT_SHELF = 0.05
+"""Distance of pelvis and front edge of the deck to which the robot walks [m]; it never gets there ..."""
+STOP = (0.16, 0.15)
+"""... but stops where the errors there are smaller than these [m, rad]: it walks briskly until then."""
+BESIDE = (0.10, 0.25)
+"""Ways to the side between which the robot keeps from the shelf, so that the box does not meet an upright [m] ..."""
+CLEARANCE = 0.60
+"""... by this distance of pelvis and front edge [m]."""
+STRETCHING = (0.50, 0.25)
+"""Distances of pelvis and front edge between which the arms stretch to the box's place on the deck [m]."""
+AHEAD = 0.02
+"""How much farther than the palms are commanded the box gets [m]."""
 SIDE = 0.55
 """Largest distance of the spot from the deck's middle [m]: the opening hands clear the uprights."""
-INSIDE = 0.20
-"""Distance of the placed box's centre from the front edge [m]: 9.5 cm more than half of it."""
-DEPTH_GAIN = 2.0
-"""Gain of the hands' way ahead on that distance [1/s]."""
+INSIDE = 0.21
+"""Distance of the placed box's centre from the front edge [m]: 10.5 cm more than half of it."""
+ENOUGH = 0.05
+"""Lack of depth with which the box is lowered [m]: it goes on inwards meanwhile."""
 SHORT = 0.01
-"""Lack of depth, and of overlap, that does not matter [m]."""
+"""Lack of overlap that does not matter [m]."""
 FARTHEST = 0.52
 """Largest distance ahead of the pelvis to which the palms are commanded at the shelf [m]."""
 BEND = 0.15
 """Waist pitch at the shelf [rad]."""
-SETTLED = 0.4
-"""Least time of reaching into the shelf [s]."""
 SINKING = 0.05
 """Speed of the box from the lift to the height in which it is carried over the deck [m/s]."""
 LOWERING = 0.08
 """Speed of the box on its way down [m/s]."""
 SUNK = 0.06
-"""How much farther than to the deck the hands are commanded down [m]: arms that follow roughly get there too."""
+"""How much farther than to the deck the hands are commanded down before they open [m]: a posture that can be seen."""
 DOWN = (0.006, 0.02)
-"""Heights above the deck at which the box counts as put down; one is drawn an episode [m]."""
+"""How much less that is; one is drawn an episode [m]."""
+RESTS = 0.03
+"""Height above the deck, and that, below which the box counts as put down [m]."""
 TURNING = 0.35
 """Yaw rate of the turn to the shelf [rad/s]: at 0.6 SONIC dropped four more boxes of 60."""
 OPENING = 0.5
@@ -159,7 +175,6 @@ LONGEST = {
     "back": 4.0,
     "turn": 6.0,
     "carry": 20.0,
-    "step in": 8.0,
     "reach": 3.0,
     "lower": 2.5,
     "open": 1.0,
@@ -169,13 +184,13 @@ LONGEST = {
 }
 """Phases in their usual order with their longest times [s]; `retreat` goes back to the first one."""
 
-HELD = ("lift", "back", "turn", "carry", "step in", "reach", "lower")
+HELD = ("lift", "back", "turn", "carry", "reach", "lower")
 """Phases in which the box must be between the hands."""
 SIDES = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Directions from the box to left and right palm, pelvis' heading frame."""
 BRISK = NavigationLimits(forward=0.6, turn=0.9, arrive_position=0.045, arrive_heading=0.06)
 """Walk with free hands."""
-LADEN = NavigationLimits(forward=0.4, turn=0.45, arrive_position=0.045, arrive_heading=0.06)
+LADEN = NavigationLimits(forward=0.4, turn=0.45, near=0.6, far=1.1, arrive_position=0.045, arrive_heading=0.06)
 """Walk with the box."""
 
 
@@ -218,7 +233,7 @@ class PPBoxExpert(Expert):
         self._lean = self._deep = zero
         self._angles = torch.zeros(worlds, 2, 3, device=device)
         self._stand = self._spot = torch.zeros(worlds, 3, device=device)
-        self._off = self._near = self._inside = self._aside = self._pace = self._down = zero
+        self._off = self._near = self._inside = self._pace = self._down = zero
 
     def begin(self, mask: Tensor, style: Style) -> None:
         """Draw the style and go to the box."""
@@ -229,7 +244,6 @@ class PPBoxExpert(Expert):
         self._off = drawn("stand-off", self._off, STAND_OFF - 0.03, STAND_OFF + 0.05)
         self._near = drawn("near", self._near, NEAR - 0.01, NEAR + 0.01)
         self._inside = drawn("inside", self._inside, INSIDE - 0.01, INSIDE + 0.01)
-        self._aside = drawn("spot", self._aside, -0.10, 0.10)
         self._pace = drawn("pace", self._pace, 0.9, 1.0)
         self._down = drawn("down", self._down, *DOWN)
         self.walk.begin(mask)
@@ -242,7 +256,8 @@ class PPBoxExpert(Expert):
         """Walk, and lead both hands, as the phase of each world says."""
         self.state.advance(mask, dt)
         walk = self.walk.command(mask & self.state.at("approach", "step up"), dt)
-        haul = self.haul.command(mask & self.state.at("carry", "step in"), dt)
+        self._choose_spot(mask & self.state.at("turn", "carry"))
+        haul = self.haul.command(mask & self.state.at("carry"), dt)
         self._go_on(mask, walk, haul)
         self._watch(mask)
         self._squeeze(mask, dt)
@@ -286,6 +301,11 @@ class PPBoxExpert(Expert):
         local = rotate_xy(-self._deck_yaw(), points - self._deck()[:, :2])
         return torch.stack([local[:, 0], local[:, 1] + self._deck_half[1]], dim=1)
 
+    def _beside(self) -> Tensor:
+        """How far aside of all places on the deck the robot is, 0 to 1, shape [worlds]."""
+        aside = self._depth(self.sight.pose[:, :2])[:, 0].abs() - SIDE
+        return ((aside - BESIDE[0]) / (BESIDE[1] - BESIDE[0])).clamp(0.0, 1.0)
+
     def _deck_yaw(self) -> Tensor:
         return heading(self.sight.body(self._deck_body)[1])
 
@@ -309,14 +329,14 @@ class PPBoxExpert(Expert):
         self.state.begin(mask)
 
     def _choose_spot(self, mask: Tensor) -> None:
-        """Take the place on the deck nearest to the robot, and go in front of it."""
+        """Go to the place on the deck nearest to the robot."""
         here, yaw = self._depth(self.sight.pose[:, :2]), self._deck_yaw()
-        x = (here[:, 0] + self._aside).clamp(-SIDE, SIDE)
+        x = here[:, 0].clamp(-SIDE, SIDE)
         edge = torch.stack([x, torch.full_like(x, -self._deck_half[1])], dim=1)
         edge = self._deck()[:, :2] + rotate_xy(yaw, edge)
         facing = wrap_angle(yaw + 0.5 * math.pi)
         self._spot = select(mask, pose_before(edge, facing, torch.full_like(x, AT_SHELF)), self._spot)
-        self.haul.to(mask, pose_before(edge, facing, (-here[:, 1]).clamp(*BEFORE)))
+        self.haul.to(mask, pose_before(edge, facing, AT_SHELF + self._beside() * (CLEARANCE - AT_SHELF)))
 
     def _go_on(self, mask: Tensor, walk: NavigationCommand, haul: NavigationCommand) -> None:
         """Enter the next phase where the present one is done or has lasted too long.
@@ -342,11 +362,11 @@ class PPBoxExpert(Expert):
         enter("open", "leave", (self.half >= self._opened()) & (clock > LET_GO))
         flat = self._deck_top() + self._box_half[2] + self._down
         sunk = self.underside < self._deck_top() - SUNK + self._down
-        enter("lower", "open", (self._centre()[:, 2] < flat) | sunk)
-        enter("reach", "lower", (clock > SETTLED) & ((deck >= self._inside - SHORT) | (self.grip[:, 0] >= FARTHEST)))
-        enter("step in", "reach", passing(haul, PASSING))
-        self.haul.to(enter("carry", "step in", passing(haul, PASSING)), beyond(self._spot))
-        self._choose_spot(enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING))
+        enter("lower", "open", sunk & (self._centre()[:, 2] < flat + RESTS))
+        enter("reach", "lower", deck >= self._inside - ENOUGH)
+        close = self._depth(pose[:, :2])[:, 1] > -STRETCHING[1] - ENOUGH
+        enter("carry", "reach", passing(haul, STOP) & close)
+        enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING)
         enter("back", "turn", away > BACK)
         lifted = done("lift", self._underside() > self._table + LIFTED)
         held = self._underside() > self._table + SLIPPED
@@ -422,26 +442,32 @@ class PPBoxExpert(Expert):
         closing = dt * (SERVO * (self._deep - self._overlap())).clamp(-CLOSING, 2.0 * CLOSING)
         squeezed = torch.maximum(self.half - closing, self._box_half[:2].amin() + FIST - DEEPEST)
         self.half = select(mask & state.at("close", "lift"), squeezed, self.half)
+        holding = self._box_half[:2].amin() + FIST - HOLDING
+        step = dt * RELAXING
+        held = self.half + (holding - self.half).clamp(-step, step)
+        self.half = select(mask & state.at("back", "turn", "carry", "reach", "lower"), held, self.half)
         opening = torch.minimum(self.half + OPENING * dt, self._opened())
         self.half = select(mask & state.at("open", "retreat"), opening, self.half)
 
     def _carry(self, mask: Tensor, dt: float) -> None:
         """Height of the box and distance of the fists from the body."""
         state, deck = self.state, self._deck_top()
-        over = state.at("turn", "carry", "step in", "reach")
+        over = state.at("turn", "carry", "reach")
         target = torch.where(state.at("lift", "back"), self._table + LIFT, torch.where(over, deck + CLEAR, deck - SUNK))
         speed = torch.where(state.at("lift", "back"), LIFTING, torch.where(over, SINKING, LOWERING)) * dt
         moved = self.underside + torch.minimum(torch.maximum(target - self.underside, -speed), speed)
         carried = mask & state.at(*HELD)
         self.underside = select(carried, moved, self.underside)
-        lacking = self._raised + HEIGHT_GAIN * dt * (self.underside - self._underside())
-        learn = carried & ~state.at("lower")
-        self._raised = select(learn, lacking.clamp(-MOST_RAISED, MOST_RAISED), self._raised)
+        lacking = (RAISED + HEIGHT_GAIN * (self.underside - self._underside())).clamp(-MOST_RAISED, MOST_RAISED)
+        raised = self._raised + (lacking - self._raised).clamp(-RAISING * dt, RAISING * dt)
+        self._raised = select(carried & ~state.at("lower"), raised, self._raised)
 
         x, step = self.grip[:, 0], DRAWING * dt
-        depth = self._depth(self._centre()[:, :2])[:, 1]
-        placing = (DEPTH_GAIN * dt * (self._inside - depth)).clamp(-step, step)
-        drawn = torch.where(state.at("reach", "lower"), placing, (self._near - x).clamp(-step, step))
+        gap = -self._depth(self.sight.pose[:, :2])[:, 1]
+        stretched = ((STRETCHING[0] - gap) / (STRETCHING[0] - STRETCHING[1])).clamp(0.0, 1.0)
+        stretched = stretched * state.at("carry", "reach", "lower") * (1.0 - self._beside())
+        wanted = self._near + stretched * ((gap + self._inside - AHEAD).clamp(max=FARTHEST) - self._near)
+        drawn = (wanted - x).clamp(-step, step)
         x = torch.where(state.at("lift"), x, (x + drawn).clamp(max=FARTHEST))
         z = self._level + self.underside - self._table + self._raised
         grip = torch.stack([x, self.grip[:, 1], z], dim=1)
@@ -455,7 +481,7 @@ class PPBoxExpert(Expert):
         leave = along(pose, self._spot[:, :2], self._spot[:, 2], slow)
         velocity = torch.zeros_like(walk)
         velocity = select(state.at("approach", "step up"), paced(walk, self._pace), velocity)
-        velocity = select(state.at("carry", "step in"), paced(haul, self._pace), velocity)
+        velocity = select(state.at("carry"), paced(haul, self._pace), velocity)
         velocity = select(state.at("back", "retreat"), backward, velocity)
         velocity = select(state.at("leave"), leave, velocity)
         return select(state.at("turn"), self._turning, velocity)

@@ -6,9 +6,11 @@ batches among them, whose variances can exceed float16's range) in float32; both
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,12 +19,14 @@ import torch
 from safetensors.torch import save
 
 from arena_newton.errors import InputError
-from arena_newton.files import replace_atomically
-from arena_newton.policies.learned.act_network import ActNetwork
+from arena_newton.files import PARTIAL
+from arena_newton.foreign import create
 from arena_newton.policies.learned.learned_card import CARD_FILE, CARD_PAGE, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import (
+    PROCESSOR_FILES,
     WEIGHTS_NAME,
     ActCheckpoint,
+    loaded_network,
     read_act_checkpoint,
     read_weights,
 )
@@ -129,14 +133,7 @@ def pack(folder: Path, out: Path, card: PolicyCard) -> PolicyCard:
 
 def _try(checkpoint: ActCheckpoint, weights: dict[str, torch.Tensor]) -> None:
     """Refuse weights that do not fit the network, or whose answer in half precision is not finite."""
-    network = ActNetwork(checkpoint.sizes)
-    try:
-        network.load(weights)
-    except (KeyError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(
-            f"{checkpoint.folder / WEIGHTS_NAME}: does not hold the weights of this network: {said}"
-        ) from None
+    network = loaded_network(checkpoint.folder / WEIGHTS_NAME, checkpoint.sizes, weights)
     facts, sizes = checkpoint.facts, checkpoint.sizes
     task = torch.zeros(1, sizes.tasks) if sizes.tasks else None
     with torch.inference_mode():
@@ -153,26 +150,68 @@ def _small_files(checkpoint: ActCheckpoint) -> dict[str, bytes]:
     files[CONFIG_FILE] = (
         json.dumps(config | {k: v for k, v in PRIVATE.items() if k in config}, indent=2) + "\n"
     ).encode()
+    for name in PROCESSOR_FILES:  # a stock LeRobot fails to load steps on a device that a machine lacks
+        content = json.loads(files[name])
+        for step in content["steps"]:
+            if "device" in (step.get("config") or {}):
+                step["config"]["device"] = PRIVATE["device"]
+        files[name] = (json.dumps(content, indent=2) + "\n").encode()
     facts = json.loads(files[FACTS_FILE]) | {"options": {}}
     files[FACTS_FILE] = (json.dumps(facts, indent=2, sort_keys=True) + "\n").encode()
     return files
 
 
 def _write(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write a folder; the card comes last, and goes first from one that is replaced."""
+    """Write a folder; an earlier packed policy stays whole until all that replaces it is on the disk.
+
+    Raises:
+        InputError: The folder holds something else, or cannot be written.
+    """
+    before = _packed_files(out)
+    staged = {name: out / f"{name}{PARTIAL}" for name in files}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        present = sorted(path.name for path in out.iterdir())
-        if present and CARD_FILE not in present:
-            raise InputError(f"--out {out}: is not empty and holds no packed policy; choose another folder")
-        for name in (CARD_FILE, *present):
-            if name == CARD_FILE or name.endswith((".safetensors", ".json")):
-                (out / name).unlink(missing_ok=True)
-        for name in sorted(files, key=lambda name: name == CARD_FILE):
-            with replace_atomically(out / name) as file:
-                file.write(files[name])
+        try:
+            for name, content in files.items():
+                if (out / name).is_dir():
+                    raise InputError(f"--out {out}: {name} is a folder; choose another one")
+                with create(staged[name]) as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            (out / CARD_FILE).unlink(missing_ok=True)  # without which the folder is no policy
+            for name in sorted(files, key=lambda name: name == CARD_FILE):
+                os.replace(staged[name], out / name)
+        finally:
+            for path in staged.values():
+                with contextlib.suppress(OSError):
+                    path.unlink(missing_ok=True)
+        for name in sorted(before - set(files)):
+            (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from None
+
+
+def _packed_files(out: Path) -> set[str]:
+    """Names of the files of the packed policy in a folder; none in a new or an empty one.
+
+    Raises:
+        InputError: The folder holds something else.
+    """
+    try:
+        if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+            return set()
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be read ({error.strerror})") from None
+    if not out.is_dir():
+        raise InputError(f"--out {out}: is a file; name a folder")
+    try:
+        read_card(out)
+        return {CARD_FILE, CARD_PAGE, *read_act_checkpoint(out).files}
+    except InputError as error:
+        raise InputError(
+            f"--out {out}: is not empty and holds no packed policy; choose another folder ({error})"
+        ) from None
 
 
 def training_command(options: Mapping[str, object]) -> str:

@@ -21,7 +21,15 @@ from arena_newton.foreign import check_size, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
 
-__all__ = ["PROCESSOR_FILES", "WEIGHTS_NAME", "ActCheckpoint", "Spread", "read_act_checkpoint", "read_weights"]
+__all__ = [
+    "PROCESSOR_FILES",
+    "WEIGHTS_NAME",
+    "ActCheckpoint",
+    "Spread",
+    "loaded_network",
+    "read_act_checkpoint",
+    "read_weights",
+]
 
 WEIGHTS_NAME = "model.safetensors"
 """File of the weights."""
@@ -97,15 +105,34 @@ class ActCheckpoint:
             InputError: They do not fit.
         """
         path = self.folder / WEIGHTS_NAME
-        network = ActNetwork(self.sizes)
         weights = read_weights(path)
         kept = {name: value for name, value in weights.items() if not name.startswith("model.vae_encoder")}
-        try:
-            network.load(kept if self.trains_latent else weights)
-        except (KeyError, RuntimeError) as error:
-            said = " ".join(str(error).split())[:300]
-            raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
-        return network
+        return loaded_network(path, self.sizes, kept if self.trains_latent else weights)
+
+
+def loaded_network(path: Path, sizes: ActSizes, weights: dict[str, torch.Tensor]) -> ActNetwork:
+    """A network of these sizes with the weights of a file, on the CPU, in float32.
+
+    Raises:
+        InputError: They do not fit.
+    """
+    largest = {
+        "model.decoder_pos_embed.weight": (sizes.chunk_size, sizes.dim_model),
+        "model.encoder_latent_input_proj.weight": (sizes.dim_model, sizes.latent_dim),
+    }
+    for stack, layers in (("encoder", sizes.n_encoder_layers), ("decoder", sizes.n_decoder_layers)):
+        shape = (sizes.dim_feedforward, sizes.dim_model)
+        largest |= {f"model.{stack}.layers.{layer}.linear1.weight": shape for layer in range(layers)}
+    try:
+        for name, wanted in largest.items():  # before memory is taken for sizes that the file does not have
+            if tuple(weights[name].shape) != wanted:
+                raise RuntimeError(f"{name} has shape {list(weights[name].shape)}, expected {list(wanted)}")
+        network = ActNetwork(sizes)
+        network.load(weights)
+    except (KeyError, RuntimeError) as error:
+        said = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
+    return network
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
@@ -119,7 +146,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         with safe_open(path, framework="pt") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: not readable as safetensors ({error})") from None
+        said = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: not readable as safetensors ({said})") from None
     for name, value in found.items():
         if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
             raise InputError(f"{path}: {name} holds something else than finite floating-point numbers")
@@ -219,6 +247,9 @@ def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str
             options = _object(path, f"steps[{index}].config", step.get("config") or {})
             if options.get("rename_map"):
                 raise InputError(f"{path}: steps[{index}] renames observations, which a packed policy does not")
+            if options.get("float_dtype") not in (None, "float32"):
+                given = f"{options['float_dtype']!r:.40}"
+                raise InputError(f"{path}: steps[{index}] computes in {given}, a packed policy in float32")
             if step["registry_name"] in NORMALISES:
                 state, part = _statistics(path, index, step, options, sizes)
                 files.append(state)
@@ -241,6 +272,11 @@ def _statistics(
     if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):
         raise InputError(f"{path}: {where}.state_file is {state!r:.60}, expected a name of a safetensors file")
     modes = _object(path, f"{where}.config.norm_map", options.get("norm_map"))
+    chosen = options.get("normalize_observation_keys")
+    if chosen is not None:
+        raise InputError(f"{path}: {where} normalises only {str(chosen)[:80]}, a packed policy whatever has statistics")
+    features = options.get("features")  # LeRobot normalises what is named here, by the kind that is named
+    named = None if features is None else _object(path, f"{where}.config.features", features)
     eps = options.get("eps", 1e-8)
     if not isinstance(eps, int | float) or not 0.0 <= eps < 1.0:
         raise InputError(f"{path}: {where}.config.eps is {eps!r:.40}, expected 0 to 1")
@@ -257,6 +293,10 @@ def _statistics(
                 f"{path}: {where} normalises {KINDS[feature]} by {mode!r:.40}, expected MEAN_STD or IDENTITY"
             )
         mean, std = tensors.get(f"{feature}.mean"), tensors.get(f"{feature}.std")
+        if named is not None and feature != "action" and path.name == PROCESSOR_FILES[0]:
+            kind = _object(path, f"{where}.config.features.{feature}", named.get(feature, {})).get("type")
+            if kind != KINDS[feature]:
+                raise InputError(f"{path}: {where} takes {feature} for {kind!r:.40}, expected {KINDS[feature]}")
         if mean is None or std is None or mean.shape != shape or std.shape != shape:
             raise InputError(f"{path.parent / state}: {feature} has no mean and std of shape {list(shape)}")
         found[feature] = Spread(mean.float(), std.float(), float(eps))

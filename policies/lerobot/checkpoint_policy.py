@@ -77,6 +77,7 @@ class LeRobotPolicy(Policy):
         self.labels = facts.labels
         self.realign = facts.realign
         self.chunk_size = replan
+        self.in_pieces = self.checkpoint.observations > 1
         self.ensemble = ensemble
         self.looked: np.ndarray | None = None
         """Worlds whose last answer began with a look of the network, bool, shape [worlds]."""

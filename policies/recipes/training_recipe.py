@@ -14,7 +14,7 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 
-__all__ = ["FAMILIES", "REALIGN", "RECIPES", "TrainingRecipe", "paper_file", "recipe"]
+__all__ = ["FAMILIES", "REALIGN", "RECIPES", "TrainingRecipe", "paper_file", "recipe", "with_pretrained"]
 
 FAMILIES: dict[str, str] = {
     "act": "act",
@@ -88,6 +88,8 @@ class TrainingRecipe:
     """Training pictures are shifted by up to this in each direction [px]."""
     colour: float = 0.0
     """Brightness and each colour of training pictures are scaled by up to this fraction."""
+    image_transforms: bool = False
+    """Training pictures have LeRobot's default image transforms (`train.image_transforms`)."""
     batch_norm: bool = False
     """ACT's vision encoder is normalised by its batches. LeRobot's has the statistics of its pretrained weights, and
     without such weights none."""
@@ -183,6 +185,19 @@ def recipe(family: str, name: str = "fast", **overrides: object) -> TrainingReci
     return paper
 
 
+def with_pretrained(recipe: TrainingRecipe) -> TrainingRecipe:
+    """The recipe for a vision encoder that begins with `--weights`.
+
+    Where the paper's recipe tunes a pretrained encoder more slowly than the rest (flow matching: LeRobot's
+    `vision_encoder_lr_multiplier` 0.1 of 2e-5), the encoder has that learning rate, whatever the recipe gives new
+    weights: the rest's would wash out what CLIP knows.
+    """
+    paper = _read_paper(recipe.family)
+    if paper.lr_backbone >= paper.lr:
+        return recipe
+    return replace(recipe, lr_backbone=min(recipe.lr_backbone, paper.lr_backbone))
+
+
 def _changed(recipe: TrainingRecipe, changes: Mapping[str, object]) -> TrainingRecipe:
     known = {one.name for one in fields(TrainingRecipe)}
     for name in changes:
@@ -202,6 +217,9 @@ def _read_paper(family: str) -> TrainingRecipe:
     network = {
         name: value for name, value in policy.items() if name != "type" and not name.startswith(_OPTIMIZER_FIELDS)
     }
+    transforms = content["dataset"]["image_transforms"]
+    if set(transforms) != {"enable"}:
+        raise InputError(f"{path}: dataset.image_transforms: only LeRobot's defaults are known, with the field enable")
     lr = policy["optimizer_lr"]
     backbone = policy.get("optimizer_lr_backbone", lr * policy.get("vision_encoder_lr_multiplier", 1.0))
     return TrainingRecipe(
@@ -224,6 +242,7 @@ def _read_paper(family: str) -> TrainingRecipe:
         seed=content["seed"],
         chunk=policy["n_action_steps"],
         horizon=policy.get("horizon", policy.get("chunk_size")),
+        image_transforms=transforms["enable"],
     )
 
 
@@ -243,6 +262,7 @@ _FAST: dict[str, object] = {
     "precision": "bfloat16",
     "shift_px": 6,
     "colour": 0.1,
+    "image_transforms": False,
 }
 """What was measured for ACT (60 of 60 episodes of VisNavi after three GPU minutes)."""
 _SMALL: dict[str, object] = {
@@ -260,6 +280,7 @@ _SMALL: dict[str, object] = {
     "picture": 64,
     "shift_px": 2,
     "colour": 0.1,
+    "image_transforms": False,
 }
 _SMALL_CLIP = {"hidden": 32, "layers": 1, "heads": 2, "patch": 16}
 _CHANGES: dict[tuple[str, str], dict[str, object]] = {

@@ -11,6 +11,7 @@ import base64
 import binascii
 import json
 import math
+import re
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from arena_newton.policies.serve.wire_error import WireError
 from arena_newton.text import plain_text
 
 __all__ = [
+    "CLIENT_HEADER",
     "MAX_WORLD",
     "pack_begin",
     "pack_begun",
@@ -38,6 +40,7 @@ __all__ = [
     "pack_config",
     "pack_failure",
     "pack_look",
+    "read_client",
     "unpack_begin",
     "unpack_begun",
     "unpack_chunk",
@@ -45,8 +48,24 @@ __all__ = [
     "unpack_look",
 ]
 
+CLIENT_HEADER = "X-Arena-Client"
+"""Header by which a client names itself: ours, the original's has none."""
 MAX_WORLD = 2**31 - 1
 """Largest number of a world."""
+_CLIENT = re.compile(r"[\w.-]{1,64}", re.ASCII)
+
+
+def read_client(header: str | None) -> str:
+    """The name of a client; empty where it has none.
+
+    Raises:
+        WireError: It is not 1 to 64 letters, digits, dots, lines and dashes.
+    """
+    if header is None:
+        return ""
+    if not _CLIENT.fullmatch(header):
+        raise WireError(f"{CLIENT_HEADER}: expected 1 to 64 letters, digits, '.', '_' and '-'")
+    return header
 
 
 def pack_begin(begin: Begin) -> bytes:

@@ -1,7 +1,6 @@
 """The door of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
 
-A robot is known by its client's address, the number of its world and its episode's seed, not by its connection: clients
-may open a new one at any time. The original's client names no world, so there is one robot at its address.
+Which robot a request is of is said by `policies.serve.http_robots`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -24,14 +23,17 @@ import numpy as np
 
 from arena_newton.errors import ArenaError
 from arena_newton.policies.serve.arena_codec import (
+    CLIENT_HEADER,
     pack_begun,
     pack_chunk,
     pack_config,
     pack_failure,
+    read_client,
     unpack_begin,
     unpack_look,
 )
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
+from arena_newton.policies.serve.http_robots import HttpRobot, HttpRobots
 from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
 from arena_newton.policies.serve.raw_arrays import MAX_FRAME
@@ -45,8 +47,6 @@ BODY_SECONDS = 60.0
 """Time that a client has to send the body of a request [s]."""
 POLL = 0.05
 """Time after which a door notices that it is closed [s]."""
-MOST_WORLDS = 4096
-"""Most worlds whose episode is remembered."""
 _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "closing": 503}
 """Reason of a refusal → HTTP status; clients ask again after 503."""
 
@@ -66,7 +66,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def handle(self) -> None:
         """Serve until the client leaves; one connection too many is told so."""
-        self.begun: dict[str, str] = {}
         self.room = False
         with self.server.listed(self.connection), ExitStack() as self.visit:
             super().handle()
@@ -96,13 +95,13 @@ class _Handler(BaseHTTPRequestHandler):
             return
         policy, address = self.server.policy, self.client_address[0]
         try:
+            client = read_client(self.headers.get(CLIENT_HEADER))
             if path == "/reset":
-                begin = unpack_begin(body)
-                self.server.begin(address, begin, self.begun)
+                self.server.begin(address, client, self.connection, unpack_begin(body))
                 self._send(200, pack_begun(policy.facts))
             elif path == "/infer":
                 look, chunk = unpack_look(body)
-                actions = self.server.look(address, look) if chunk else self.server.next_action(address, look)
+                actions = self.server.look(address, client, self.connection, look, chunk=chunk)
                 self._send(200, pack_chunk(actions, chunk=chunk))
             else:
                 self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
@@ -165,6 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
         if self.close_connection:
+            self.server.leaves(self.connection)  # before the client, which knows now, asks over another
             self.send_header("Connection", "close")
         self.end_headers()
         self.wfile.write(body)
@@ -193,10 +193,7 @@ class _Listener(ThreadingHTTPServer):
         self.socket.close()
         self.socket = listening
         self.policy, self.guard, self.tls = policy, guard, tls
-        self._worlds: OrderedDict[tuple[str, str], str] = OrderedDict()
-        """Client's address and world → session that was begun there last."""
-        self._kept: OrderedDict[tuple[str, str], deque[np.ndarray]] = OrderedDict()
-        """Client's address and session → actions that a client which takes one at a time has not been given yet."""
+        self._robots = HttpRobots()
         self._open: dict[socket.socket, float] = {}
         """Connection → when it must have said who it is [s]."""
         self._lock = threading.Lock()
@@ -224,6 +221,12 @@ class _Listener(ThreadingHTTPServer):
         finally:
             with self._lock:
                 self._open.pop(connection, None)
+            self.leaves(connection)
+
+    def leaves(self, connection: socket.socket) -> None:
+        """No more requests come over a connection: its robots may ask over another, or never again."""
+        for robot in self._robots.left(connection):
+            self.policy.abandon(robot.owner, robot.session)
 
     def known(self, connection: socket.socket) -> None:
         """A connection has been let in."""
@@ -265,55 +268,28 @@ class _Listener(ThreadingHTTPServer):
                 with suppress(OSError):
                     connection.shutdown(socket.SHUT_RDWR)
 
-    def begin(self, address: str, begin: Begin, begun: dict[str, str]) -> None:
-        """Begin the episode of a world, and end the one that this connection began there before."""
-        owner, session = f"http {address}", _session(begin.session, begin.seed)
-        before = begun.get(begin.session)
-        if before is not None and before != session:
-            self.policy.end(owner, before)
-        self.policy.begin(owner, replace(begin, session=session), held=False)
-        begun[begin.session] = session
-        with self._lock:
-            self._kept.pop((address, session), None)
-            _remember(self._worlds, (address, begin.session), session)
+    def begin(self, address: str, client: str, connection: socket.socket, begin: Begin) -> None:
+        """Begin an episode of a robot, and end the one that it had before."""
+        robot, before = self._robots.beginning(address, client, connection, begin.session, begin.seed)
+        if before is not None:
+            self.policy.end(robot.owner, before)
+        self.policy.begin(robot.owner, replace(begin, session=robot.session), held=False)
+        robot.kept.clear()
 
-    def look(self, address: str, look: Look) -> np.ndarray:
-        """The chunk of a world; a look without a seed is of the episode that was begun there last."""
-        session = self._known_session(address, look)
-        with self._lock:
-            self._kept.pop((address, session), None)
-        return self.policy.look(f"http {address}", replace(look, session=session), held=False).actions
+    def look(
+        self, address: str, client: str, connection: socket.socket, look: Look, *, chunk: bool = True
+    ) -> np.ndarray:
+        """The chunk of a robot; without `chunk` one action, shape [1, 40]: of its last chunk while some are left."""
+        robot = self._robots.looking(address, client, connection, look.session, look.seed, begins=look.step == 0)
+        if not chunk and look.step is None:
+            with suppress(IndexError):
+                return robot.kept.popleft()[None]
+        return self._asked(robot, look, chunk=chunk)
 
-    def next_action(self, address: str, look: Look) -> np.ndarray:
-        """One action, shape [1, 40], of the world's last chunk, or of a new one where all of it is given."""
-        session = self._known_session(address, look)
-        with self._lock:
-            kept = self._kept.get((address, session))
-            if kept and look.step is None:
-                return kept.popleft()[None]
-        actions = self.look(address, look)
-        with self._lock:
-            _remember(self._kept, (address, session), deque(actions[1:]))
-        return actions[:1]
-
-    def _known_session(self, address: str, look: Look) -> str:
-        session = _session(look.session, look.seed)
-        if look.seed is None:
-            with self._lock:
-                session = self._worlds.get((address, look.session), session)
-        return session
-
-
-def _remember[V](values: OrderedDict[tuple[str, str], V], key: tuple[str, str], value: V) -> None:
-    """Keep a value, and forget the oldest beyond `MOST_WORLDS`."""
-    values[key] = value
-    values.move_to_end(key)
-    while len(values) > MOST_WORLDS:
-        values.popitem(last=False)
-
-
-def _session(world: str, seed: int | None) -> str:
-    return f"{world}/{seed}" if world and seed is not None else world
+    def _asked(self, robot: HttpRobot, look: Look, *, chunk: bool) -> np.ndarray:
+        actions = self.policy.look(robot.owner, replace(look, session=robot.session), held=False).actions
+        robot.kept = deque() if chunk else deque(actions[1:])
+        return actions if chunk else actions[:1]
 
 
 class HttpDoor:

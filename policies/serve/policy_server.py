@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sys
 import threading
 import time
@@ -44,6 +45,8 @@ LONGEST_ACT = 600.0
 IDLE = 30.0
 """Time without a request after which no batch waits for a session any more, and after which one that no connection
 holds may lose its row to another [s]."""
+ABANDONED = 5.0
+"""The same of a session whose connection has closed, until it asks over another one [s]."""
 WARM_UP_SEED = 0
 """Seed of the look before the first one, which nobody is answered."""
 
@@ -121,6 +124,8 @@ class _Session:
     held: bool
     """Whether a connection holds it, so that it leaves with the connection."""
     used: float
+    abandoned: bool = False
+    """Whether its last connection has closed."""
     last: tuple[int | None, int] | None = None
     """Step and content of the last look."""
     answer: np.ndarray | None = None
@@ -263,6 +268,12 @@ class PolicyServer:
         """End a session's episode and free its row."""
         self._put(_Job("end", owner, session, None, Future()))
 
+    def abandon(self, owner: str, session: str) -> None:
+        """The connection of a session that is not held has closed: it loses its row sooner, unless it asks again."""
+        found = self._sessions.get((owner, session))
+        if found is not None:
+            found.abandoned = True
+
     def leave(self, owner: str) -> None:
         """End all sessions of an owner."""
         self._put(_Job("leave", owner, "", None, Future()))
@@ -375,9 +386,13 @@ class PolicyServer:
     def _row(self, owner: str) -> int:
         """A free row, or that of an idle session that no connection holds, or that is of the same connection."""
         if not self._free:
-            idle = [(s.used, key) for key, s in self._sessions.items() if not s.held or key[0] == owner]
-            used, key = min(idle, default=(time.monotonic(), ("", "")))
-            if time.monotonic() - used < IDLE:
+            idle = [
+                (s.used + (ABANDONED if s.abandoned else IDLE), key)
+                for key, s in self._sessions.items()
+                if not s.held or key[0] == owner
+            ]
+            until, key = min(idle, default=(math.inf, ("", "")))
+            if time.monotonic() < until:
                 raise Refused("full", f"all {self.max_sessions} sessions are in use; --max-sessions of the server")
             self._drop(key)
         return self._free.pop()
@@ -415,7 +430,7 @@ class PolicyServer:
             )
         if session is None:
             session = self._begin(key, Begin(look.session, look.seed, look.task, look.instruction), job.held)
-        session.used = time.monotonic()
+        session.used, session.abandoned = time.monotonic(), False
         task = self._task(look.task, look.instruction) if look.task or look.instruction else session.task
         if task != session.task:
             if task.name != session.task.name:

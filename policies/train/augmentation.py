@@ -9,11 +9,14 @@ from __future__ import annotations
 import torch
 
 from arena_newton.policies.train.frame_store import FrameStore
+from arena_newton.policies.train.image_transforms import drawn_transforms, transformed
 
 __all__ = ["gathered_pictures"]
 
 
-def gathered_pictures(store: FrameStore, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0) -> torch.Tensor:
+def gathered_pictures(
+    store: FrameStore, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0, transforms: bool = False
+) -> torch.Tensor:
     """Pictures of rows, whole again and on the scale 0 to 1.
 
     A shift repeats the edge of what the camera saw and leaves the black rows around it where they are: a policy always
@@ -24,6 +27,7 @@ def gathered_pictures(store: FrameStore, rows: torch.Tensor, *, shift: int = 0, 
         rows: Rows of the samples, int64, shape [B].
         shift: Most pixels by which a picture is shifted in each direction.
         colour: Most relative change of the brightness, and of each colour on top.
+        transforms: Apply LeRobot's image transforms, to the whole picture as LeRobot does.
 
     Returns:
         float32, shape [B, 3, height, width].
@@ -41,9 +45,11 @@ def gathered_pictures(store: FrameStore, rows: torch.Tensor, *, shift: int = 0, 
     if colour:
         change = torch.rand((batch, 4, 1, 1), device=device).mul_(2.0 * colour).add_(1.0 - colour)
         pictures = pictures.mul_(change[:, :1] * change[:, 1:]).clamp_(0.0, 1.0)
-    if not (store.top or store.bottom):
-        return pictures
-    # Channels last, as the pictures are stored and as a GPU's convolutions read them.
-    whole = pictures.new_zeros((batch, store.height, width, 3)).permute(0, 3, 1, 2)
-    whole[:, :, store.top : store.top + height] = pictures
-    return whole
+    if store.top or store.bottom:
+        # Channels last, as the pictures are stored and as a GPU's convolutions read them.
+        whole = pictures.new_zeros((batch, store.height, width, 3)).permute(0, 3, 1, 2)
+        whole[:, :, store.top : store.top + height] = pictures
+        pictures = whole
+    if transforms:
+        pictures = transformed(pictures, drawn_transforms(batch, store.height, width, device))
+    return pictures

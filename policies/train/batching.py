@@ -85,7 +85,9 @@ class BatchMaker:
         numbers = [self.task_vector.index(task) if self.task_vector else 0 for task in self.store.tasks]
         self._vectors = torch.eye(max(1, len(self.task_vector)), device=device)[torch.tensor(numbers, device=device)]
 
-    def __call__(self, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0) -> dict[str, torch.Tensor]:
+    def __call__(
+        self, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0, transforms: bool = False
+    ) -> dict[str, torch.Tensor]:
         """The batch of rows.
 
         Actions before or after an episode are those of its first or last row, and marked in `action_is_pad`.
@@ -94,6 +96,7 @@ class BatchMaker:
             rows: int64, shape [B].
             shift: Most pixels by which a picture is shifted.
             colour: Most relative change of brightness and colours.
+            transforms: Apply LeRobot's image transforms.
 
         Returns:
             `observation.images.front` [B, 3, H, W], `observation.state` [B, 64], `action` [B, n, 40], `action_is_pad`
@@ -103,7 +106,7 @@ class BatchMaker:
         wanted = rows[:, None] + self._offsets
         inside = torch.minimum(torch.maximum(wanted, store.first[rows][:, None]), store.last[rows][:, None])
         batch = {
-            CAMERA_KEY: gathered_pictures(store, rows, shift=shift, colour=colour),
+            CAMERA_KEY: gathered_pictures(store, rows, shift=shift, colour=colour, transforms=transforms),
             STATE_KEY: store.states[rows],
             ACTION_KEY: store.actions[inside],
         }

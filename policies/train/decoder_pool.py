@@ -45,8 +45,9 @@ PROCESS_PICTURES = 1000
 """Pictures for which a process is worth its start: 0.3 s."""
 SLOT_BYTES = 4 * 2**20
 """Memory of a slot, or that of one picture: 37 pictures of 224x168."""
-DEATH_PATIENCE = 1.0
-"""Time for which the exit code of a process that is gone is waited for [s]."""
+DEATH_PATIENCE = 10.0
+"""Time for which the exit code of a process that is gone is waited for [s]: its pipe closes a little before it ends,
+and where all cores are busy that little takes long."""
 
 
 CPU = torch.device("cpu")
@@ -333,7 +334,9 @@ def _how(process: subprocess.Popen[bytes]) -> str:
     """How a process ended, in words."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(DEATH_PATIENCE)
-    code = process.returncode or 0
+    code = process.returncode
+    if code is None:
+        return "it closed its output"
     if code >= 0:
         return f"exit code {code}"
     return f"{signal.Signals(-code).name}{'; out of memory?' if -code == signal.SIGKILL else ''}"

@@ -19,9 +19,15 @@ from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.data.frame_reader import Frames
 from arena_newton.errors import InputError
 from arena_newton.policies.train.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
-from arena_newton.policies.train.demonstration_rows import DatasetRows, EpisodeRows
+from arena_newton.policies.train.demonstration_rows import (
+    ACTION_KEY,
+    STATE_KEY,
+    VECTOR_KEY,
+    DatasetRows,
+    EpisodeRows,
+)
 
-__all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "needed_memory"]
+__all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "made_statistics", "needed_memory"]
 
 BLACK = 12
 """Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
@@ -292,3 +298,19 @@ def made_frames(
         actions = rng.normal(size=(rows, ACTION_WIDTH)).astype(np.float32)
         episodes.append(EpisodeRows(states, actions, "Walk to the sign.", "vis_navi"))
     return assembled(episodes, pictures, [False] * len(episodes), band, band)
+
+
+def made_statistics() -> dict[str, dict[str, torch.Tensor]]:
+    """Statistics of rows of noise, of one task."""
+    found = {}
+    for key, width in ((STATE_KEY, STATE_WIDTH), (ACTION_KEY, ACTION_WIDTH), (VECTOR_KEY, 1)):
+        ones = torch.ones(width)
+        found[key] = {
+            "mean": 0 * ones,
+            "std": ones,
+            "min": -4 * ones,
+            "max": 4 * ones,
+            "q01": -2 * ones,
+            "q99": 2 * ones,
+        }
+    return found

@@ -16,13 +16,12 @@ from pathlib import Path
 
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import ArenaError
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
 from arena_newton.policies.train import families
-from arena_newton.policies.train.demonstration_rows import ACTION_KEY, STATE_KEY, VECTOR_KEY, read_rows, statistics
+from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, read_rows, statistics
 from arena_newton.policies.train.feature_scaling import Stats
-from arena_newton.policies.train.frame_store import FrameStore, load_frames, made_frames
+from arena_newton.policies.train.frame_store import FrameStore, load_frames, made_frames, made_statistics
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_options import TrainingBenchOptions
@@ -60,27 +59,11 @@ def bench_recipe(options: TrainingBenchOptions) -> TrainingRecipe:
     return recipe(options.policy, options.recipe, **changes)
 
 
-def _made_statistics() -> dict[str, dict[str, torch.Tensor]]:
-    """Statistics of made-up rows."""
-    found = {}
-    for key, width in ((STATE_KEY, STATE_WIDTH), (ACTION_KEY, ACTION_WIDTH), (VECTOR_KEY, 1)):
-        ones = torch.ones(width)
-        found[key] = {
-            "mean": 0 * ones,
-            "std": ones,
-            "min": -4 * ones,
-            "max": 4 * ones,
-            "q01": -2 * ones,
-            "q99": 2 * ones,
-        }
-    return found
-
-
 def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch.device) -> tuple[FrameStore, Stats]:
     """Rows on the device and their statistics."""
     network = network_bytes(settings, device)
     if not options.dataset:
-        return made_frames(options.frames, settings.picture, device, network=network), _made_statistics()
+        return made_frames(options.frames, settings.picture, device, network=network), made_statistics()
     datasets = [read_rows(root, settings.labels) for root in options.dataset]
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     arrays = statistics(datasets, episodes, settings.labels)

@@ -1,4 +1,4 @@
-"""Memory of a GPU that a training needs besides its pictures, from the parameters of its network."""
+"""What the parameters of a network take: memory of a GPU in training, and the disk for a checkpoint."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 
-__all__ = ["network_bytes"]
+__all__ = ["checkpoint_bytes", "network_bytes"]
 
 CONTEXT_BYTES = 2 * 2**30
 """CUDA's own, workspaces of cuDNN and cuBLAS, and what torch's allocator keeps unused."""
@@ -23,22 +23,27 @@ class NetworkSize:
     """Of a parameter: itself, its gradient, AdamW's two moments, and their copies while a graph is captured."""
     sample_bytes: int
     """Activations of a sample that the backward pass needs."""
+    stored_bytes: int
+    """Of a parameter in a checkpoint: itself, and AdamW's two moments where it is trained."""
 
 
 SIZES = {
     # float32: 16, a copy of weights and moments for the capture 12, the weights in bfloat16 2. Activations: ACT with
     # batch 64 in bfloat16 was measured at 2.6 GB in all; ResNet-18 in float32 has twice as much.
-    "act": NetworkSize(52_000_000, 30, 30_000_000),
-    "diffusion": NetworkSize(263_000_000, 30, 60_000_000),
+    "act": NetworkSize(52_000_000, 30, 30_000_000, 12),
+    "diffusion": NetworkSize(263_000_000, 30, 60_000_000, 12),
     # ViT-B/16 and CLIP's text encoder (150 million), the transformer (50 million). In float32 each of the vision
-    # encoder's 12 layers keeps about 15 vectors of 768 for each of 197 tokens.
-    "flow": NetworkSize(200_000_000, 30, 130_000_000),
+    # encoder's 12 layers keeps about 15 vectors of 768 for each of 197 tokens. The text encoder has no moments.
+    "flow": NetworkSize(200_000_000, 30, 130_000_000, 9),
     # 3.2 billion parameters in bfloat16 (8 bytes with gradient and moments), 0.4 billion of the vision tower in float32
     # (16 bytes): 9 on average; no graph. Layers are computed again in the backward pass: 18 inputs of 600 tokens of
     # 2048 numbers are kept, and one layer's activations (0.2 MB a token) exist at a time.
-    "pi05": NetworkSize(3_620_000_000, 9, 250_000_000),
+    "pi05": NetworkSize(3_620_000_000, 9, 250_000_000, 6),
 }
 """Of `paper`, which no other recipe exceeds; counted, and computed where nothing was measured."""
+
+SMALLER = {("diffusion", "fast"): 76_000_000, ("flow", "fast"): 64_000_000, ("act", "compact"): 15_600_000}
+"""Parameters of networks that are smaller than their family's largest, with new weights; counted."""
 
 
 def network_bytes(recipe: TrainingRecipe, device: torch.device) -> int:
@@ -54,3 +59,18 @@ def network_bytes(recipe: TrainingRecipe, device: torch.device) -> int:
         return CONTEXT_BYTES
     size = SIZES[recipe.family]
     return CONTEXT_BYTES + size.parameters * size.parameter_bytes + recipe.batch_size * size.sample_bytes
+
+
+def checkpoint_bytes(recipe: TrainingRecipe, *, pretrained: bool) -> int:
+    """Disk that a checkpoint with its training state takes [bytes]; 0 for `small`: its networks are too small to count.
+
+    Args:
+        recipe: Family and name count.
+        pretrained: Whether `--weights` gives the vision encoder, which then has the size of the paper's.
+    """
+    if recipe.name == "small":
+        return 0
+    size = SIZES[recipe.family]
+    smaller = SMALLER.get((recipe.family, recipe.name), size.parameters)
+    parameters = size.parameters if pretrained and recipe.family == "flow" else smaller
+    return parameters * size.stored_bytes

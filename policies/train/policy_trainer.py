@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
@@ -155,7 +156,10 @@ class PolicyTrainer:
 
     def _descend(self) -> None:
         """Batch, loss and gradient."""
-        batch = self.batches(self._rows, shift=self.recipe.shift_px, colour=self.recipe.colour)
+        recipe = self.recipe
+        batch = self.batches(
+            self._rows, shift=recipe.shift_px, colour=recipe.colour, transforms=recipe.image_transforms
+        )
         # LeRobot makes some constants on the host and copies them, which no graph can hold; here they are made on the
         # device.
         with self.device if self.graphed else contextlib.nullcontext(), self._precision():
@@ -222,7 +226,7 @@ class PolicyTrainer:
             graph = torch.cuda.CUDAGraph()
             try:
                 # Other threads (a process group's watchdog) may use the device meanwhile.
-                with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+                with _nothing_collected(), torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
                     part()
             except RuntimeError as error:
                 reason = " ".join(str(error).split())[:200]
@@ -312,3 +316,16 @@ def _restore_moments(
                     tensor.copy_(moments[parameter][name])
                 else:
                     tensor.zero_()
+
+
+@contextlib.contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """No collection of garbage: what it frees of an earlier training on the device would break a capture off."""
+    gc.collect()
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()

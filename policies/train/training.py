@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
-from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe
+from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe, with_pretrained
 from arena_newton.policies.train import families
 from arena_newton.policies.train.batching import BatchMaker
 from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
@@ -170,7 +170,9 @@ def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
         InputError: The family has no such recipe.
     """
     named = recipe(options.policy, options.recipe)
-    changes: dict[str, object] = {}
+    if options.weights:
+        named = with_pretrained(named)
+    changes: dict[str, object] = {"lr_backbone": named.lr_backbone}
     if options.labels:
         changes["labels"] = options.labels
         # Integrated yaw rates drift; a recipe of v3.1 says nothing of it.

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from arena_newton.__main__ import COMMANDS, main
+from arena_newton.command_line import exit_code
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = Path(sys.executable).with_name("arena-newton")
@@ -106,3 +107,22 @@ def test_a_command_ends_without_a_search_for_garbage():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
     assert (done.stdout, done.returncode) == ("True\n", 0), done.stderr
+
+
+def test_a_crash_of_native_code_names_the_line():
+    """A program that dies in a kernel or a driver leaves the Python lines of its threads on the error stream."""
+    crash = (
+        "import ctypes\n"
+        "from arena_newton.command_line import exit_code\n"
+        "def work():\n    ctypes.string_at(0)\n"
+        "exit_code(work)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", crash], capture_output=True, text=True, check=False)
+    assert done.returncode < 0
+    assert "Fatal Python error: Segmentation fault" in done.stderr and "in work" in done.stderr
+
+
+def test_a_home_that_is_nobodys_is_bad_input(capsys):
+    """A path with the name of an unknown user is one line and exit code 2, in whichever command."""
+    assert exit_code(lambda: int(Path("~nosuchuser/x").expanduser().exists())) == 2
+    assert capsys.readouterr().err.count("\n") == 1

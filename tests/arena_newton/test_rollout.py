@@ -13,6 +13,7 @@ from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, EpisodeEvent, Predicate, Recorder
 from arena_newton.policies.base import Policy
+from arena_newton.policies.lerobot.chunk_memory import ChunkMemory
 from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.football import FootballJudge
@@ -422,3 +423,50 @@ def test_a_chunk_no_longer_than_the_latency_is_refused(env):
     """A chunk that would be over before it begins is one error that names flag, policy and length."""
     with pytest.raises(InputError, match="--latency-ticks 6: policy dated gives chunks of 6 actions"):
         Rollout(env, Dated(), _episodes(1), max_steps=8, latency=6).run()
+
+
+class Pieces(Dated):
+    """The same chunks from two ticks: all actions but the last at once, the last one singly."""
+
+    name, chunk_size, in_pieces = "pieces", 6, True
+
+    def __init__(self):
+        super().__init__()
+        self.memory, self.seen = None, []
+
+    def reset(self, seeds, tasks, mask=None):
+        self.memory = self.memory or ChunkMemory(
+            len(seeds), torch.device("cpu"), observations=2, predicted=6, executed=6, ensemble=False
+        )
+        for world in np.flatnonzero(mask).tolist():
+            self.memory.reset(world)
+
+    def act(self, observation):
+        whole, asking = super().act(observation), np.flatnonzero(observation.mask).tolist()
+        for world in asking:
+            self.memory.glimpse(world, {"tick": torch.tensor(int(self.env.tick[world]))})
+        looking = [world for world in asking if not self.memory.waits(world)]
+        if looking:
+            self.memory.answer(looking, whole.actions[looking])
+            if 0 in looking:
+                self.seen.append(tuple(int(one["tick"]) for one in self.memory.looked_at(0)))
+        given = self.memory.give(asking)
+        actions = torch.zeros(len(observation.state), given.shape[1], 40, dtype=given.dtype)
+        actions[asking] = given
+        return Chunk(actions)
+
+
+@pytest.mark.parametrize("latency", [0, 1, 4, 5])
+def test_a_late_policy_of_two_ticks_sees_the_tick_before_its_look(env, latency):
+    """Its chunks begin `latency` ticks after a look at that tick and the one before, as a policy's of one tick do."""
+    policy, executed = Pieces(), Executed()
+    Rollout(env, policy, _episodes(2), recorder=executed, max_steps=20, latency=latency).run()
+    chunks = [100 * look + action for look in (0, 6, 12, 18) for action in range(6)]
+    assert executed.steps[0] == executed.steps[1] == ([0] * latency + chunks)[:20]
+    assert policy.seen == [(0, 0), (5, 6), (11, 12), (17, 18)]
+
+
+def test_a_late_policy_in_pieces_decides_once_at_a_time(env):
+    """Its whole chunk, not a piece of it, must be longer than the latency."""
+    with pytest.raises(InputError, match="--latency-ticks 6: policy pieces gives chunks of 6 actions"):
+        Rollout(env, Pieces(), _episodes(1), max_steps=8, latency=6).run()

@@ -1,6 +1,7 @@
 """The command line: defaults, one-line answers to bad input, exit codes, quick help."""
 
 import dataclasses
+import errno
 import json
 import os
 import re
@@ -12,6 +13,7 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton import rule_sets, tasks
+from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
 from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
@@ -353,3 +355,36 @@ def test_default_run_leaves_out_a_task_without_an_expert(without_an_expert):
     assert resolve(RunOptions(engine="mujoco")).flags.task == tuple(TASKS[1:])
     assert resolve(RunOptions(engine="mujoco", policy="stand")).flags.task == tuple(TASKS)
     assert resolve(RunOptions(engine="mujoco", task=("all",))).flags.task == tuple(TASKS)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["run --task boxing --out", "run --policy learned:", "report", "merge . --out", "merge", "pack", "pack . --out"]
+    + ["tables", "compare", "resume", "matrix", "run --task boxing --policy replay:", "film"],
+)
+def test_a_path_too_long_to_exist_is_one_line(words, capsys, tmp_path, monkeypatch):
+    """A name that no file system takes is bad input of every command, not a break."""
+    monkeypatch.chdir(tmp_path)
+    words = [*words.split()[:-1], words.split()[-1] + "x" * 300] if words.endswith(":") else [*words.split(), "x" * 300]
+    assert main(words, factories()) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1, error
+
+
+def test_a_path_that_may_not_be_read_is_one_line(capsys, monkeypatch, tmp_path):
+    """A folder of somebody else's, in which nothing may be looked for, is named; other faults stay faults."""
+
+    def refused(self, **_):
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    with monkeypatch.context() as closed:
+        closed.setattr(Path, "exists", refused)
+        assert main(["merge", str(tmp_path), "--out", str(tmp_path / "theirs")]) == 2
+    error = capsys.readouterr().err
+    assert "theirs" in error and "Permission denied" in error and error.count("\n") == 1, error
+
+    def broken():
+        raise OSError(errno.EIO, "Input/output error")
+
+    with pytest.raises(OSError, match="Input/output"):
+        exit_code(broken)

@@ -3,7 +3,9 @@
 import csv
 import html
 import json
+import os
 import re
+import shutil
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -13,7 +15,12 @@ from rows import episodes
 from test_report import folder_with
 
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.comparison import Contender, compare
+from arena_newton.eval.comparison_text import difference_text, p_text, verdict
+from arena_newton.eval.rate_tests import RateDifference
+from arena_newton.eval.sharding import Shard, dealt
 from arena_newton.eval.stats import mcnemar, wilson
+from arena_newton.eval.suite_records import CellEvent, event_line
 
 
 def run_in(folder, per_seed, *, task="football", tracker="t", policy="p", strips=False, rules="paper", **config):
@@ -24,6 +31,8 @@ def run_in(folder, per_seed, *, task="football", tracker="t", policy="p", strips
         if strips:
             name = f"{task}__base__seed{row['group_seed']}__repeat{row['repeat']}__world.jpg"
             row["media"] = {"world strip": f"strips/{name}"}
+            (folder / "strips").mkdir(parents=True, exist_ok=True)
+            (folder / "strips" / name).touch()
     config = {"tracker": [tracker], "task": [task], "policy": policy, "rules": rules, "engine": "mujoco"} | config
     return folder_with(folder, rows, len(rows), **config)
 
@@ -63,12 +72,33 @@ def test_the_page_links_what_differs(tmp_path):
     assert len(links) == 11
     for link in links:
         target = (tmp_path / "out" / unquote(html.unescape(link))).resolve()
-        assert target.parent == a / "strips"
+        assert target.parent == a / "strips" and target.is_file()
     names = {Path(unquote(link)).name for link in links}
     assert "football__base__seed0__repeat4__world.jpg" in names and not any("seed1" in name for name in names)
     assert page.count("play it again") == 11 and "--seeds 0 --repeats 5" in page  # those of b have no strip
     assert 'href="../a%20b/report.html"' in page
     assert "<script" not in page and "script-src" not in page and "default-src &#39;none&#39;" in page
+    shutil.rmtree(a / "strips")  # results that came without their recordings
+    compared(tmp_path, a, b)
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert ".jpg" not in page and page.count("play it again") == 22
+
+
+def test_folders_may_have_any_name(tmp_path):
+    """Long names that differ at their end, and names that are no text, are compared and linked."""
+    odd = os.fsdecode(b"b\xff")
+    a, b = run_in(tmp_path / ("a" * 250 + "1"), (4, 5, 7), strips=True), run_in(tmp_path / ("a" * 250 + "2"), (4, 6, 7))
+    found = compared(tmp_path, a, b)
+    assert [one["name"] for one in found["policies"]] == [a.name, b.name]
+    try:
+        c = run_in(tmp_path / odd, (10, 5, 12), strips=True)
+    except OSError:
+        return  # a file system of text alone
+    (a / "report.html").touch(), (c / "report.html").touch()
+    compared(tmp_path, a, c)
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert page.count('href="../b%FF/strips/') == 11 and 'href="../b%FF/report.html"' in page
+    assert f'href="../{a.name}/report.html"' in page  # its path is too long for a table, not for a link
 
 
 def test_the_same_runs_give_the_same_bytes(tmp_path):
@@ -102,6 +132,8 @@ def test_other_seeds_are_compared_unpaired(tmp_path):
     assert (task["test"], task["first"], task["second"]) == ("Boschloo", 16, 46) and not task["paired"]
     assert any("share no episode seed" in note for note in found["notes"])
     assert "compared unpaired" in (tmp_path / "out" / "compare.html").read_text()
+    row = (tmp_path / "out" / "compare.md").read_text().split("## Within tasks")[1].splitlines()[4]
+    assert [cell.strip() for cell in row.split("|")][4:9] == ["", "", "", "", "16/60, 46/60"]
     shared = [row | {"index": 20 + number} for number, row in enumerate(episodes("football", (9,)))]
     few = folder_with(tmp_path / "few", rows[:20] + shared, 40, tracker=["t"], seeds=[3, 0], engine="mujoco")
     found = compared(tmp_path, a, few)
@@ -144,6 +176,16 @@ def test_a_suite_holds_its_policies(tmp_path):
     assert [[task["stratum"] for task in pair["tasks"]] for pair in found["pairs"]] == [strata] * 3
     assert any("Left out, because not all have it: vis_navi" in note for note in found["notes"])
     assert sum("is unfinished, and left out: 30 of 60" in note for note in found["notes"]) == 3
+    beginning = cell_of("act", "act", "twist2", "sit_sofa")
+    broken = cell_of("act", "act", "sonic", "sit_sofa")
+    suite = write_suite(tmp_path / "more", [*cells, (beginning, None), (broken, None)])
+    (suite / beginning.folder).mkdir(parents=True)
+    with (suite / "suite.1-of-1.jsonl").open("ab") as journal:
+        journal.write(event_line(CellEvent(cell=broken.id, event="failed", at="2026-01-02", error="no weights")))
+    notes = compared(tmp_path, suite, "--only", "act", "flow")["notes"]
+    assert any(note.endswith("more: 1 cell of 19 not played yet.") for note in notes)
+    assert any(note.endswith(f"{broken.folder}: failed (no weights).") for note in notes)
+    suite = tmp_path / "suite"
     found = compared(tmp_path, suite, "--per-tracker", "--only", "act sonic", "act swapped sonic", "act twist2")
     assert [one["all"]["successes"] for one in found["policies"]] == [20, 22, 5]
     assert [task["task"] for task in found["pairs"][0]["tasks"]] == ["football"]
@@ -162,6 +204,9 @@ REFUSED = [
     (["a", "capped"], "--max-steps differs"),
     (["a", "recorded"], "holds recordings for training"),
     (["a", "empty"], "holds no finished episode"),
+    (["a", "shard"], "shard: is shard 1/2 of a run; name the folder into which eval merge joins all"),
+    (["a", "~nosuchuser/b"], "~nosuchuser/b: no home folder of that user"),
+    (["a", "b", "--out", "~nosuchuser/b"], "~nosuchuser/b: no home folder of that user"),
     (["a", "half"], "half: is unfinished (30 of 60 episodes)"),
     (["a", "b", "--only", "c"], "--only c: unknown, found are a, b"),
     (["a", "b", "--differ", "policy"], "--differ policy: choose from rules engine"),
@@ -183,6 +228,11 @@ def folders(tmp_path_factory):
     run_in(root / "capped", (4, 5, 7), max_steps=1300)
     folder_with(root / "recorded", [], 60, tracker=["t"], engine="mujoco", seed_range="demonstration")
     folder_with(root / "half", episodes("football", (4, 5))[:30], 60, tracker=["t"], engine="mujoco")
+    every_other = dealt([("football", "t", "base", n // 20, n % 20) for n in range(60)], Shard(1, 2))
+    rows = [row for row in episodes("football", (4, 5, 7)) if row["index"] in every_other]
+    folder_with(root / "shard", rows, 60, tracker=["t"], task=["football"], mode=["base"], engine="mujoco")
+    document = json.loads((root / "shard" / "config.json").read_text()) | {"shard": "1/2"}
+    (root / "shard" / "config.json").write_text(json.dumps(document))
     folder_with(root / "empty", [], 60, tracker=["t"], engine="mujoco")
     return root
 
@@ -197,6 +247,14 @@ def test_what_cannot_be_compared_is_refused(folders, monkeypatch, capsys, argume
     assert not (folders / "comparison").exists()
 
 
+def test_a_file_that_cannot_be_written_is_named(folders, tmp_path, capsys):
+    """Where a file of the comparison cannot be written its path is said, with exit code 2 and no talk of journals."""
+    (tmp_path / "compare.html").mkdir()
+    assert main(["compare", str(folders / "a"), str(folders / "b"), "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "compare.html: cannot be written" in error and "journal" not in error and error.count("\n") == 1
+
+
 def test_what_is_compared_may_differ(folders, tmp_path):
     """--differ compares runs that differ in a condition, and the page says so."""
     found = compared(tmp_path, folders / "a", folders / "warp", "--differ", "engine")
@@ -204,8 +262,47 @@ def test_what_is_compared_may_differ(folders, tmp_path):
     assert any(note.startswith("Engine differs: a: mujoco; warp: warp") for note in found["notes"])
 
 
+def test_rules_and_scenes_that_have_changed_are_named(tmp_path):
+    """Runs under rules of the same name but other content, or in other scenes, are compared, and it is said."""
+    a, b = (run_in(tmp_path / name, (4, 5, 7), rules_hash=name * 12, scenes=f"{name}1") for name in ("a", "b"))
+    notes = compared(tmp_path, a, b)["notes"]
+    assert f"The rules have changed between the runs: {'a' * 12} {'b' * 12}, of the same tasks." in notes
+    assert "The scenes have changed between the runs: a1 b1, of the same tasks." in notes
+    c = run_in(tmp_path / "c", (4, 5, 7), rules_hash="a" * 12, scenes="a1")
+    assert not any("changed" in note for note in compared(tmp_path, a, c)["notes"])
+
+
 def test_a_plan_says_what_it_can_tell(capsys):
     """`eval list` prints the smallest difference of the plan's episodes below their number."""
     assert main(["list", "--task", "boxing", "football"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("120 episodes") and "60 episodes of a cell 13 to 26.5 points, all 120" in said[1]
+    assert main(["list", "--task", "boxing", "--seeds", "0", "--repeats", "2001"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("    0 boxing")  # too many to compute: no empty line
+
+
+def test_the_sentence_has_the_direction_of_the_test():
+    """Where few episodes of one task outweigh the mean, the better one is who won more episodes, and it is said."""
+    outcomes = [
+        {("big",): dict(enumerate([won] * 15 + [False] * 45)), ("small",): dict(enumerate([not won] * 4))}
+        for won in (True, False)
+    ]
+    comparison = compare([Contender("a", outcomes[0]), Contender("b", outcomes[1])])
+    (pair,) = comparison.pairs
+    assert pair.differs and pair.difference.value < 0
+    assert verdict(comparison, pair) == "a succeeds in more episodes than b, which has the higher mean rate"
+    outcomes = [
+        {("big",): dict(enumerate([won] * 15 + [False] * 45)), ("small",): dict(enumerate([not won] + [False] * 3))}
+        for won in (True, False)
+    ]
+    comparison = compare([Contender("a", outcomes[0]), Contender("b", outcomes[1])])
+    (pair,) = comparison.pairs
+    assert pair.differs and pair.difference.value == 0
+    assert verdict(comparison, pair) == "a succeeds in more episodes than b, with equal mean rates"
+
+
+def test_figures_have_no_minus_zero():
+    """A difference and its bounds that are shown as 0 have no minus, and what is too small for a number is said so."""
+    assert difference_text(RateDifference(-0.0001, -0.004, 0.02)) == "+0.0 (0 to 2)"
+    assert difference_text(RateDifference(0.12, 0.034, 0.206)) == "+12.0 (3 to 21)"
+    assert (p_text(mcnemar(1680, 0)), p_text(3e-5), p_text(0.034), p_text(1.0)) == ("<1e-300", "3e-05", "0.034", "1.00")

@@ -1,5 +1,6 @@
 """The policy that ships: its row in the default run, its flags, and its card with results."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -131,7 +132,9 @@ def test_without_weights_the_default_run_goes_on(absent, tmp_path, capsys):
 
 def test_it_plays_the_tasks_of_its_card(shipped, folder, tmp_path, capsys):
     """Without --task these are all of its card; another task is one error that names them; a folder may be named."""
-    assert {episode.task for episode in resolve(RunOptions(policy="learned")).episodes} == {"vis_navi", "boxing"}
+    for more in ({}, {"repeats": 1}, {"mode": ("visual",)}, {"seeds": (1,), "shard": "1/3"}):
+        played = {episode.task for episode in resolve(RunOptions(policy="learned", **more)).episodes}
+        assert played == {"vis_navi", "boxing"}
     assert main(["list", "--policy", "learned", "--task", "boxing", "football"]) == 2
     assert "--policy learned: does vis_navi, boxing (card.md says how well), not football" in capsys.readouterr().err
     short = ["--task", "boxing", "--repeats", "1", "--seeds", "0", "--device", "cpu", "--engine", "mujoco"]
@@ -172,7 +175,10 @@ def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
     page = (out / "card.md").read_text()
     assert "Made for a test." in page and page.count("| boxing | twist2 |") == 2
     assert main(["pack", str(out), "--out", str(out), "--tasks", "boxing"]) == 0
-    assert read_card(out).note == "Made for a test."
+    again = read_card(out)
+    assert (again.note, set(again.results), again.tasks) == ("Made for a test.", set(card.results), ("boxing",))
+    assert [(one.task, one.mode) for one in again.results][:2] == [("boxing", "base"), ("boxing", "visual")]
+    assert again.packed_by.startswith(card.packed_by + "; then python -m arena_newton.eval pack packed --tasks")
     other = checkpoint(tmp_path / "other", seed=9, tasks=("vis_navi", "boxing"))
     capsys.readouterr()
     weights = (other / "model.safetensors").read_bytes()
@@ -181,12 +187,88 @@ def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
     assert "no cell of this checkpoint" in capsys.readouterr().err and not (tmp_path / "p").exists()
 
 
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """A checkpoint of two trackers, `made`, and runs of its packed form through one of them."""
+    root = tmp_path_factory.mktemp("evaluated")
+    made = checkpoint(root / "made", trackers=("twist2", "sonic"))
+    assert main(["pack", str(made), "--out", str(root / "packed")]) == 0
+    flags = ["--policy", f"learned:{root / 'packed'}", "--device", "cpu", "--engine", "mujoco"]
+    flags += ["--seeds", "0", "--repeats", "4", "--task", "boxing"]
+    for name, more in {"whole": [], "shard": ["--shard", "1/2"], "capped": ["--max-steps", "50"]}.items():
+        assert main([*flags, *more, "--out", str(root / name)], stand_ins()) == 0
+    lines = (root / "whole" / "episodes.jsonl").read_text().splitlines(keepends=True)
+    for name, kept in {
+        "half": [line for line in lines if '"success"' in line],
+        "won": [line.replace('"fall"', '"success"').replace('"timeout"', '"success"') for line in lines],
+    }.items():
+        (root / name).mkdir()
+        (root / name / "config.json").write_bytes((root / "whole" / "config.json").read_bytes())
+        (root / name / "episodes.jsonl").write_text("".join(kept))
+    assert main([*flags, "--rules", "released", "--out", str(root / "released")], stand_ins()) == 0
+    return root
+
+
+@pytest.mark.parametrize(
+    ("results", "said"),
+    [
+        (["half"], "half: is unfinished (2 of 4 episodes), and what ends first is no fair sample"),
+        (["shard"], "shard: is shard 1/2 of a run; name the folder into which eval merge joins all"),
+        (["capped"], "capped: was played with --max-steps, which makes it no result of the benchmark"),
+        (["won"], "--tasks: none is solved at 75 %"),  # its demonstrations are of two trackers
+    ],
+)
+def test_pack_takes_results_alone(evaluated, results, said, tmp_path, capsys):
+    """A part of a run or one under conditions of its own is none, and one tracker of two is not every tracker."""
+    folders = [str(evaluated / name) for name in results]
+    assert main(["pack", str(evaluated / "made"), "--out", str(tmp_path / "p"), "--results", *folders]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1, error
+    assert not (tmp_path / "p").exists()
+
+
+def test_pack_says_what_it_leaves_out(evaluated, tmp_path, capsys, monkeypatch):
+    """Episodes under other rules do not count, and are named; the card names a checkpoint given as `.`."""
+    monkeypatch.chdir(evaluated / "made")
+    folders = [str(evaluated / name) for name in ("whole", "released")]
+    command = ["pack", ".", "--out", str(tmp_path / "p"), "--results", *folders, "--tasks", "boxing"]
+    assert main(command) == 0
+    assert "4 episodes under the rules released left out." in capsys.readouterr().out
+    card = read_card(tmp_path / "p")
+    assert card.packed_by == "python -m arena_newton.eval pack made --tasks boxing --results whole released"
+    assert [(one.task, one.episodes) for one in card.results] == [("boxing", 4)]
+
+
+def test_a_policy_is_packed_again_with_more_results(evaluated, tmp_path, capsys):
+    """Cells of its card stay beside those that come anew, and tasks follow from all of them."""
+    won, out = evaluated / "won", tmp_path / "again"
+    assert main(["pack", str(evaluated / "made"), "--out", str(out), "--results", str(won), "--tasks", "boxing"]) == 0
+    card = json.loads((out / "card.json").read_text())
+    other = {"task": "vis_navi", "mode": "base", "episodes": 4, "successes": 1, "falls": 0}
+    card["results"] += [other | {"tracker": tracker} for tracker in ("sonic", "twist2")]
+    card["results"] += [
+        card["results"][0] | {"tracker": "sonic", "successes": 3},
+        other | {"tracker": "x", "mode": "?"},
+    ]
+    (out / "card.json").write_text(json.dumps(card))
+    assert main(["pack", str(out), "--out", str(out), "--results", str(evaluated / "whole")]) == 2
+    assert "none is solved" in capsys.readouterr().err
+    assert main(["pack", str(out), "--out", str(out)]) == 0
+    cells = [(one.task, one.tracker, one.mode, one.successes) for one in read_card(out).results]
+    boxing = [("boxing", "sonic", "base", 3), ("boxing", "twist2", "base", 4)]
+    assert sorted(cells) == boxing + sorted(
+        ("vis_navi", name, mode, 1) for name, mode in (("sonic", "base"), ("twist2", "base"), ("x", "?"))
+    )
+    assert read_card(out).tasks == ("boxing",)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["pack"], "pack: name the checkpoint"),
         (["pack", "nowhere"], "pack:nowhere: no such folder"),
         (["pack", "."], "holds no checkpoint"),
+        (["pack", ".", "--out", ""], "--out: is empty, name a folder"),
     ],
 )
 def test_pack_refuses_what_is_no_checkpoint(arguments, said, tmp_path, monkeypatch, capsys):
@@ -216,6 +298,19 @@ def test_a_damaged_card_is_one_error(folder, tmp_path, field, value):
     with pytest.raises(InputError, match=rf"card\.json: .*{field}") as error:
         read_card(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_what_ships_can_be_packed_again(tmp_path):
+    """Packing the policy in the package gives the same files, and a card that says no less."""
+    card = learned_card.shipped_card()
+    if card is None:
+        pytest.skip("no policy comes with this build")
+    assert main(["pack", str(learned_card.SHIPPED), "--out", str(tmp_path / "p")]) == 0
+    again = read_card(tmp_path / "p")
+    assert dataclasses.replace(again, packed_by="", bytes=0) == dataclasses.replace(card, packed_by="", bytes=0)
+    for name in ("model.safetensors", "config.json", "arena_policy.json"):
+        assert (tmp_path / "p" / name).read_bytes() == (learned_card.SHIPPED / name).read_bytes(), name
+    assert card.bytes == sum(p.stat().st_size for p in learned_card.SHIPPED.iterdir() if p.stem != "card")
 
 
 def test_what_ships_fits(capsys):

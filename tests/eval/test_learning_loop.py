@@ -1,14 +1,19 @@
 """The whole loop: every stage resumes, none is repeated, other folders are refused, the report says what happened."""
 
 import dataclasses
+import importlib.util
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
+from collections import namedtuple
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from arena_newton.errors import InputError
 from arena_newton.eval import learning_loop, loop_report
@@ -199,6 +204,78 @@ def test_unfit_flags_are_refused_first(tmp_path, capsys, flags, says):
     out = tmp_path / "out"
     assert main(["loop", "--engine", "mujoco", "--device", "cpu", *flags, "--out", str(out)]) == 2
     assert says in capsys.readouterr().err and not out.exists()
+
+
+LACKING = [
+    (["--weights", "{tmp}/absent"], "--weights {tmp}/absent: no such folder"),
+    (["--weights", "somebody/absent-resnet"], "HF_HUB_OFFLINE forbids"),
+    (["--weights", "{tmp}/empty"], "holds no weights"),
+    (["--weights", "{tmp}/other"], "not those of a resnet18"),
+    (["--policy", "pi05", "--recipe", "fast", "--size", "224x224"], "lerobot/pi05_base: neither a folder nor"),
+    (["--seed", "-1"], "--seed -1"),
+]
+
+
+@pytest.mark.parametrize(("flags", "says"), LACKING)
+def test_what_a_later_stage_lacks_is_said_first(tmp_path, capsys, monkeypatch, flags, says):
+    """Weights that are absent or another network's end a loop with code 2 before anything is recorded or made."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(learning_loop, "execute", lambda *a: pytest.fail("recorded"))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "other").mkdir()
+    save_file({"conv1.weight": torch.zeros(2, 2)}, tmp_path / "other" / "model.safetensors")
+    given = [flag.format(tmp=tmp_path) for flag in flags]
+    assert main(["loop", *FLAGS, *given, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert says.format(tmp=tmp_path) in error and len(error.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_is_said_first(tmp_path, capsys, monkeypatch):
+    """The extra of a family that the training needs is looked for at the beginning."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "diffusers" else find(name))
+    assert main(["loop", *FLAGS, "--policy", "diffusion", "--out", str(tmp_path / "out")]) == 2
+    assert "needs the extra [policies]" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_hold_the_loop_is_refused(tmp_path, capsys, monkeypatch):
+    """A disk that is too full, a path through a file and one without permission are found before anything is made."""
+    (tmp_path / "file").touch()
+    parts = LoopParts(check=lambda options: 3_000_000_000)
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**12, 0, 3_000_000_000))
+    with pytest.raises(InputError, match=r"take about 3\.1 GB, 3\.0 GB are free there"):
+        learning_loop.run(dataclasses.replace(_small(), out=str(tmp_path / "out")), parts=parts)
+    assert main(["loop", *FLAGS, "--out", str(tmp_path / "file" / "out")]) == 2
+    assert f"{tmp_path}/file is a file" in capsys.readouterr().err
+    monkeypatch.setattr(os, "access", lambda *a: False)
+    assert main(["loop", *FLAGS, "--out", str(tmp_path / "out")]) == 2
+    assert "no permission" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_loop_that_goes_on_is_checked_for_what_is_left(tmp_path, monkeypatch):
+    """A loop whose training is to come is checked again when it goes on; what is recorded counts as free."""
+    options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
+    stages = {"record": StageRecord(True, 1.0, 1, 0, ""), "build": StageRecord(True, 1.0, 1, 0, "")}
+    loop = learning_loop._Loop(options, tmp_path, None, LoopParts(), stages)
+    loop._write()
+
+    def lacking(options):
+        raise InputError("--weights: absent now")
+
+    with pytest.raises(InputError, match="absent now"):
+        learning_loop.run(options, parts=LoopParts(check=lacking))
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**12, 0, 50_000_000))
+    (tmp_path / "demonstrations").mkdir()
+    (tmp_path / "demonstrations" / "film.mp4").write_bytes(bytes(2_000_000))
+    trained = []
+    loop.parts = LoopParts(check=lambda options: trained.append(options.out) or 1_000_000)
+    loop.check()
+    assert trained == [tmp_path / "training"]
 
 
 def test_two_processes_do_not_share_a_folder(tmp_path, capsys):

@@ -3,6 +3,7 @@
 import itertools
 import math
 import random
+import time
 
 import pytest
 from scipy.stats import binomtest, fisher_exact, hypergeom
@@ -10,11 +11,12 @@ from scipy.stats import binomtest, fisher_exact, hypergeom
 from arena_newton.eval.certification import error_rates
 from arena_newton.eval.comparison import Contender, compare
 from arena_newton.eval.comparison_page import beta_density
-from arena_newton.eval.detectable import POWER, STEP, detectable_difference, detectable_text, paired_power
+from arena_newton.eval.detectable import MOST_PAIRS, POWER, STEP, detectable_difference, detectable_text, paired_power
 from arena_newton.eval.rate_tests import (
     LARGEST_BOSCHLOO,
     PairedCounts,
     UnpairedCounts,
+    excess,
     letters,
     mean_difference,
     rate_test,
@@ -129,7 +131,7 @@ def test_letters_say_exactly_what_differs():
 
 
 def test_the_difference_is_the_contrast_of_the_tables():
-    """The paired interval is that of `stats.contrast`, and both kinds shrink as episodes grow."""
+    """Of paired episodes value and width are those of `stats.contrast`, and both kinds shrink as episodes grow."""
     rng = random.Random(8)
     strata, counts = [], []
     for _ in range(3):
@@ -138,14 +140,112 @@ def test_the_difference_is_the_contrast_of_the_tables():
         cells = [sum((first[n], second[n]) == ends for n in range(30)) for ends in itertools.product((1, 0), repeat=2)]
         counts.append(PairedCounts(*cells))
     found, expected = mean_difference(counts), contrast(strata)
-    assert (found.value, found.low, found.high) == pytest.approx((expected.value, expected.low, expected.high))
+    assert (found.value, found.high - found.low) == pytest.approx((expected.value, expected.high - expected.low))
+    assert found.low < expected.low < found.high < expected.high  # the middle is moved towards 0
     few, many = (mean_difference([UnpairedCounts(6 * k, 10 * k, 3 * k, 10 * k)]) for k in (1, 50))
     assert few.value == many.value == pytest.approx(0.3)
     assert few.low < 0 < many.low and many.high - many.low < 0.2 * (few.high - few.low)
+    assert mean_difference([]) is None
+
+
+def test_published_intervals_of_one_task():
+    """Of one task the interval is that of Agresti and Min where paired, of Agresti and Caffo where not."""
     # Agresti and Caffo: p1' = 7/12, p2' = 4/12.
     half = 1.959963984540054 * math.sqrt((7 / 12 * 5 / 12 + 4 / 12 * 8 / 12) / 12)
-    assert few.high - few.low == pytest.approx(2 * half)
-    assert mean_difference([]) is None
+    found = mean_difference([UnpairedCounts(6, 10, 3, 10)])
+    assert (found.low, found.high) == pytest.approx((3 / 12 - half, 3 / 12 + half))
+    # Agresti and Min: half an episode more of each kind.
+    n, b, c = 22, 8.5, 2.5
+    half = 1.959963984540054 * math.sqrt((b + c) - (b - c) ** 2 / n) / n
+    found = mean_difference([PairedCounts(4, 8, 2, 6)])
+    assert found.value == pytest.approx(6 / 20)
+    assert (found.low, found.high) == pytest.approx(((b - c) / n - half, (b - c) / n + half))
+
+
+def coverage(n, first, second, interval):
+    """Probability that the interval of n paired episodes holds the true difference, by enumeration."""
+    held = 0.0
+    for a, b in itertools.product(range(n + 1), repeat=2):
+        if a + b <= n:
+            ways = math.comb(n, a) * math.comb(n - a, b) * first**a * second**b
+            found = interval([PairedCounts(0, a, b, n - a - b)])
+            held += ways * (1 - first - second) ** (n - a - b) * (found.low <= first - second <= found.high)
+    return held
+
+
+def test_few_episodes_of_a_task_are_covered():
+    """Of ten episodes of a task the interval holds the difference in about 95 of 100 experiments, wherever it is."""
+    for first, second in ((0.3, 0.1), (0.5, 0.3), (0.6, 0.1), (0.3, 0.6), (0.15, 0.15)):
+        assert coverage(10, first, second, mean_difference) > 0.93
+
+
+def test_many_small_tasks_are_covered():
+    """The middle of the interval is not drawn to 0 where many tasks have few episodes each."""
+    rng, held = random.Random(6), 0
+    for _ in range(300):
+        strata = []
+        for _ in range(28):
+            both = [(rng.random() < 0.8, rng.random() < 0.2) for _ in range(3)]
+            strata.append(
+                PairedCounts(
+                    *[both.count(ends) for ends in ((True, True), (True, False), (False, True), (False, False))]
+                )
+            )
+        found = mean_difference(strata)
+        held += found.low <= 0.6 <= found.high
+    assert held > 0.92 * 300
+
+
+def test_the_difference_lies_in_its_interval_and_is_exact():
+    """Whatever the counts are, the interval holds the difference; differences that cancel are 0, not nearly 0."""
+    rng = random.Random(9)
+    for _ in range(300):
+        strata = []
+        for _ in range(rng.randint(1, 5)):
+            n, m = rng.choice((1, 2, 3, 20)), rng.choice((1, 2, 5, 20))
+            if rng.random() < 0.5:
+                ends = [rng.randrange(4) for _ in range(n)] if rng.random() < 0.5 else [1] * n
+                strata.append(PairedCounts(*(ends.count(k) for k in range(4))))
+            else:
+                strata.append(UnpairedCounts(rng.choice((0, n)), n, rng.choice((0, m)), m))
+        found = mean_difference(strata)
+        assert -1 <= found.low <= found.value <= found.high <= 1
+    lot = [PairedCounts(0, a, b, 60 - a - b) for a, b in ((2, 0), (3, 0), (0, 5))]
+    assert mean_difference(lot).value == 0.0
+
+
+def test_many_episodes_take_no_time():
+    """Thousands of episodes a task are tested in a blink, precisely to the last digit that is shown."""
+    began = time.perf_counter()
+    assert mcnemar(50_100, 49_900) == pytest.approx(binomtest(49_900, 100_000).pvalue, rel=1e-8)
+    n = 1500
+    p = stratified_test([UnpairedCounts(n // 2, n, n // 2 - 10, n)] * 7 + [PairedCounts(0, 900, 880, 9)])
+    assert time.perf_counter() - began < 10.0  # with whole numbers of thousands of digits it took hours
+    exact = normal_tail(excess([UnpairedCounts(n // 2, n, n // 2 - 10, n)] * 7 + [PairedCounts(0, 900, 880, 9)]), n)
+    assert p == pytest.approx(exact, rel=0.01)
+
+
+def normal_tail(more, n):
+    """The normal limit, with continuity, of that test of 7 tasks of n and 1,780 coins."""
+    won = n - 10
+    variance = 7 * won * (2 * n - won) * n * n / ((2 * n) ** 2 * (2 * n - 1)) + 1780 / 4
+    return math.erfc((more - 0.5) / math.sqrt(2 * variance))
+
+
+def test_small_probabilities_are_precise():
+    """A probability far out is as precise as one near 1."""
+    strata = [UnpairedCounts(60, 60, 2, 60)] * 4
+    one = {k: math.comb(60, k) * math.comb(60, 62 - k) for k in range(2, 61)}
+    total = {0: 1}
+    for _ in strata:
+        new = {}
+        for a, b in itertools.product(total, one):
+            new[a + b] = new.get(a + b, 0) + total[a] * one[b]
+        total = new
+    assert stratified_test(strata) == pytest.approx(
+        sum(w for w in total.values() if w <= total[240]) / sum(total.values()), rel=1e-9
+    )
+    assert stratified_test(strata) < 1e-100
 
 
 def test_posterior_is_a_density():
@@ -176,6 +276,16 @@ def test_the_power_is_the_enumeration():
     text = detectable_text([60] * 7)
     assert f"60 episodes of a cell 13 to {100 * gain:g} points" in text and "all 420" in text
     assert "3 episodes of a cell at no difference" in detectable_text([3]) and detectable_text([]) == ""
+
+
+def test_every_plan_that_is_said_to_be_computed_is():
+    """Up to the largest plan whose difference is computed there is one, and the largest tells smaller ones apart."""
+    few, many = (detectable_difference(n) for n in (420, MOST_PAIRS))
+    assert many < few == 0.1
+    # In the normal limit: 0.84 + 1.96 standard deviations of half the discordant pairs.
+    assert many == pytest.approx(2.8 * math.sqrt(0.5 / MOST_PAIRS), abs=STEP)
+    assert f"all {MOST_PAIRS:,}" in detectable_text([MOST_PAIRS // 2] * 2)
+    assert detectable_text([MOST_PAIRS + 1]) == ""
 
 
 def test_comparisons_keep_their_level_and_find_what_is_there():

@@ -8,7 +8,7 @@ import shutil
 import pytest
 from eval_fakes import factories
 
-from arena_newton import doctor
+from arena_newton import doctor, rule_sets, seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import shard_merge
 from arena_newton.eval.__main__ import main
@@ -119,6 +119,16 @@ def test_unfinished_shards_are_named(copied):
     assert merge(shards(copied), copied / "m").results["complete"]
 
 
+def test_who_misses_what(copied):
+    """A folder whose missing episodes others have is not named as unfinished."""
+    shutil.copytree(copied / "s1", copied / "again")
+    path = copied / "s1" / "episodes.jsonl"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
+    with pytest.raises(InputError) as caught:
+        merge([copied / "s1", copied / "again", copied / "s2"], copied / "m")
+    assert str(caught.value).startswith("merge: 16 episodes of 48 missing: shard 3/3 is not named;")
+
+
 def test_other_counts_of_shards_join(played, tmp_path):
     """Whole plans and shards of other counts join where they have every episode, alike in several."""
     half = tmp_path / "half"
@@ -170,6 +180,83 @@ def test_an_error_gives_way(copied, played):
     assert main(["merge", *map(str, shards(copied)), "--out", str(copied / "n")]) == 1, "an error is not 0"
 
 
+def test_episodes_are_counted_once(copied):
+    """However many folders have an episode, it is one that several have, or one that was repaired."""
+    for name in ("b", "c"):
+        shutil.copytree(copied / "s1", copied / name)
+        edited(copied / name, lambda line: line.update(outcome="error", reason="environment", error="broken", steps=0))
+    merged = merge([*shards(copied), copied / "b", copied / "c"], copied / "m")
+    assert merged.notes == (
+        "15 episodes in several folders, each alike.",
+        "1 episode ended as an error in one folder and not in another, which counts.",
+    )
+
+
+def test_environments_of_any_two_folders_are_held_together(copied):
+    """Two shards whose environments differ are refused also where the first folder has none of that group."""
+    lines = [json.loads(line) for line in (copied / "s1" / "episodes.jsonl").read_text().splitlines()]
+    kept = [line for line in lines if line["task"] == "football"]
+    text = "".join(json.dumps(line, separators=(",", ":")) + "\n" for line in kept)
+    (copied / "s1" / "episodes.jsonl").write_text(text)
+    rewritten(copied / "s1", lambda document: document["environments"].pop("boxing twist2 base"))
+    rewritten(copied / "s3", lambda document: document["environments"]["boxing twist2 base"].update(physics_dt=1))
+    with pytest.raises(InputError, match="s3: boxing twist2 base: physics_dt is 1, in .*s2 0.001"):
+        merge(shards(copied), copied / "m", partial=True)
+
+
+def strips(folder, *without):
+    """Give the episodes of a folder strips, some of which get lost."""
+    (folder / "strips").mkdir()
+    lines = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["media"] = {"world strip": f"strips/{line['index']}.jpg"}
+        if line["index"] not in without:
+            (folder / "strips" / f"{line['index']}.jpg").write_text(str(line["index"]))
+    text = "".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines)
+    (folder / "episodes.jsonl").write_text(text)
+    return [line["index"] for line in lines]
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["one has no strips", "one lost a strip"])
+def test_recordings_come_from_any_folder(copied, first):
+    """Of an episode that two folders have, a recording that one of them lacks is taken from the other."""
+    shutil.copytree(copied / "s1", copied / "twin")
+    numbers = strips(copied / "twin")
+    if not first:
+        strips(copied / "s1", numbers[3])
+    merged = merge([*shards(copied), copied / "twin"], copied / "m")
+    assert not any("no folder has" in note for note in merged.notes)
+    assert {path.name: path.read_text() for path in (copied / "m" / "strips").iterdir()} == {
+        f"{number}.jpg": str(number) for number in numbers
+    }
+
+
+def test_successes_that_were_to_be_kept(copied):
+    """A recording that has its successes before its attempts end is whole, and an unfinished one is not."""
+    folder = copied / "s1"
+    config = json.loads((folder / "config.json").read_text())
+    config["config"] |= {"seed_range": "demonstration", "keep": 4, "seeds": [0], "repeats": 12}
+    del config["shard"]
+    (folder / "config.json").write_text(json.dumps(config))
+    line = json.loads((folder / "episodes.jsonl").read_text().splitlines()[0])
+    line |= {"group_seed": 0, "outcome": "success", "steps": 9}
+    lines = []
+    for number in (number for number in range(48) if number % 12 < 4):
+        task, mode = ("football", "boxing")[number // 24], ("base", "execution")[number // 12 % 2]
+        seed = seeding.planned_seed(tasks.get(task).gym_id, "demonstration", 0, number % 12)
+        part = {"index": number, "task": task, "mode": mode, "repeat": number % 12, "episode_seed": seed}
+        budget = tasks.get(task).max_steps(rule_sets.get("paper"))
+        lines.append(json.dumps(line | part | {"object_seed": seeding.object_seed(seed), "max_steps": budget}) + "\n")
+    (folder / "episodes.jsonl").write_text("".join(lines))
+    merged = merge([folder], copied / "m")
+    assert merged.results["complete"] and merged.run.status["state"] == "success"
+    (folder / "episodes.jsonl").write_text("".join(lines[:-1]))
+    with pytest.raises(InputError, match="successes of at most 48 episodes missing: .*s1 has 15 of 48"):
+        merge([folder], copied / "n")
+    merged = merge([folder], copied / "n", partial=True)
+    assert not merged.results["complete"] and merged.run.status["state"] == "partial"
+
+
 def rewritten(folder, change):
     """Change a config.json, and its hash as a run of that configuration has it."""
     path = folder / "config.json"
@@ -215,18 +302,22 @@ def test_bad_calls(copied, capsys, monkeypatch):
     (copied / "link").symlink_to("s1")
     (copied / "file").write_text("x")
     (copied / "busy.part").mkdir()
+    (copied / "suite").mkdir()
+    (copied / "suite" / "suite.json").write_text("{}")
     before = sorted(str(path) for path in copied.rglob("*"))
     cases = {
         (): "name the folders of the shards",
         ("s1", "s2", "s3"): "--out",
         ("s1", "s1", "--out", "m"): "named twice",
         ("s1", "nowhere", "--out", "m"): "nowhere: no results folder",
+        ("s1", "suite", "--out", "m"): "suite: is a suite, whose parts are joined by copying",
         ("s1", "s2", "s3", "--out", "s1"): "--out s1: is not empty",
         ("s1", "s2", "s3", "--out", "link"): "is a link",
         ("s1", "s2", "s3", "--out", "file"): "is a file",
         ("s1", "s2", "s3", "--out", "file/m"): "cannot be created",
         ("s1", "s2", "s3", "--out", ""): "--out",
         ("s1", "s2", "s3", "--out", "."): "is not empty",
+        ("s1", "s2", "s3", "--out", "s1/all"): "--out s1/all: is in s1, which stays as it is",
         ("s1", "s2", "s3", "--out", "a\nb"): "control characters",
         ("s1", "s2", "s3", "--out", "busy"): "busy.part: was left",
         ("s1", "--out", "m", "--shard", "1/2"): "--shard: unknown argument",

@@ -144,6 +144,14 @@ def test_suites_take_arrays_too(monkeypatch):
     assert call.chosen == plan_call("tiny", MatrixOptions(shard="2/2")).chosen
 
 
+def test_suites_have_a_cell_for_each_shard(tmp_path):
+    """More shards than cells are refused, as a run refuses more shards than episodes."""
+    cells = len(plan_call("tiny", MatrixOptions()).cells)
+    assert len(plan_call("tiny", MatrixOptions(shard=f"{cells}/{cells}")).chosen) == 1
+    with pytest.raises(InputError, match=f"^--shard 1/{cells + 1}: the suite has {cells} cells, expected no more"):
+        plan_call("tiny", MatrixOptions(shard=f"1/{cells + 1}"))
+
+
 def test_list_shows_a_shard(capsys):
     """`list` prints the episodes of a shard with their numbers in the plan."""
     assert main(["list", *FLAGS, "--shard", "2/3"]) == 0
@@ -176,6 +184,23 @@ def test_a_folder_belongs_to_one_shard(tmp_path, capsys):
     assert main(["run", *FLAGS, "--repeats", "1", "--out", str(tmp_path / "b")], factories()) == 0
     assert main(["run", *FLAGS, "--repeats", "1", "--shard", "1/3", "--out", str(tmp_path / "b")], factories()) == 2
     assert "was begun with the whole plan" in capsys.readouterr().err
+
+
+def test_shards_are_no_results(tmp_path, capsys):
+    """Tables and comparisons refuse a finished shard and name merge; a joint table of all shards says what they are."""
+    flags = ["run", "--task", "boxing", "--repeats", "2", "--engine", "mujoco", "--shard"]
+    folders = [str(tmp_path / name) for name in ("a", "b")]
+    for number, folder in enumerate(folders, start=1):
+        assert main([*flags, f"{number}/2", "--out", folder], factories()) == 0
+    for command in (["tables", *folders], ["compare", *folders], ["tables", folders[1]]):
+        capsys.readouterr()
+        assert main([*command, "--out", str(tmp_path / "out")]) == 2
+        error = capsys.readouterr().err
+        assert "of a run; name the folder into which eval merge joins all" in error and error.count("\n") == 1
+    assert main(["report", *folders]) == 0
+    printed = capsys.readouterr().out
+    assert f"{folders[0]} is shard 1/2 of a plan of 6 episodes: 3 of 3 episodes." in printed
+    assert "incomplete" not in printed
 
 
 def test_shards_without_out_have_folders_of_their_own(tmp_path, monkeypatch):

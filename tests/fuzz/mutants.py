@@ -451,13 +451,33 @@ def shards(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple
     return read, made
 
 
+def comparisons(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+    from damaged_comparisons import comparisons
+
+    return comparisons(folder, rng, damaged)
+
+
 def void(_: object) -> None:
     """Nothing is made of what was read."""
 
 
 READERS = {
     f.__name__: f
-    for f in (usda, usdc, usdz, images, motions, recordings, datasets, pickles, tables, onnx, safetensors, shards)
+    for f in (
+        usda,
+        usdc,
+        usdz,
+        images,
+        motions,
+        recordings,
+        datasets,
+        pickles,
+        tables,
+        onnx,
+        safetensors,
+        shards,
+        comparisons,
+    )
 }
 
 

@@ -9,7 +9,7 @@ import pytest
 
 MUTANTS = 200
 READERS = ("usda", "usdc", "usdz", "images", "motions", "recordings", "pickles", "tables", "onnx", "safetensors")
-READERS += ("datasets", "shards")
+READERS += ("datasets", "shards", "comparisons")
 
 
 @pytest.mark.timeout(300)

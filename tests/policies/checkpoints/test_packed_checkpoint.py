@@ -2,18 +2,21 @@
 
 import json
 import random
+import resource
 import shutil
 import subprocess
 import sys
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
 from made_checkpoints import CHUNK, edit, facts, follow, save, seen
 from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
 from arena_newton.policies import Observation
-from arena_newton.policies.learned import checkpoint_packing
+from arena_newton.policies.learned import checkpoint_packing, learned_card
 from arena_newton.policies.learned.checkpoint_packing import pack, packed_digest, training_command
 from arena_newton.policies.learned.learned_card import CARD_FILE, PolicyCard, read_card
 from arena_newton.policies.learned.learned_policy import LearnedPolicy
@@ -217,7 +220,40 @@ def test_a_foreign_folder_is_not_overwritten(trained, tmp_path):
         pack(trained, tmp_path, CARD)
     assert (tmp_path / "note.txt").read_text() == "mine"
     pack(trained, tmp_path / "out", CARD)
+    (tmp_path / "out" / "mine.json").write_text("mine")
+    (tmp_path / "out" / "mine.safetensors").write_text("mine")
     assert pack(trained, tmp_path / "out", PolicyCard(tasks=TASKS)).tasks == TASKS
+    assert {(tmp_path / "out" / name).read_text() for name in ("mine.json", "mine.safetensors")} == {"mine"}
+    (tmp_path / "cards").mkdir()
+    kept = {"card.json": '{"my": "card"}', "thesis.json": "{}", "data.safetensors": "x"}
+    for name, text in kept.items():
+        (tmp_path / "cards" / name).write_text(text)
+    with pytest.raises(InputError, match="is not empty and holds no packed policy"):
+        pack(trained, tmp_path / "cards", CARD)
+    assert {path.name: path.read_text() for path in (tmp_path / "cards").iterdir()} == kept
+
+
+@pytest.mark.parametrize("fault", ["disk", "folder"])
+def test_a_policy_that_cannot_be_replaced_is_kept(packed, tmp_path, monkeypatch, fault):
+    """Where the new files cannot be written, the packed policy that is there answers as before."""
+    folder = copy(packed, tmp_path)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def full(file):
+        raise OSError(28, "No space left on device")
+
+    if fault == "disk":
+        monkeypatch.setattr(checkpoint_packing.os, "fsync", full)
+    else:
+        (folder / "card.md").unlink()
+        (folder / "card.md").mkdir()
+    with pytest.raises(InputError, match=f"--out {folder}: "):
+        pack(folder, folder, PolicyCard(tasks=("vis_navi",)))
+    assert not list(folder.glob("*.part"))
+    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == {
+        name: data for name, data in before.items() if fault == "disk" or name != "card.md"
+    }
+    assert LearnedPolicy(folder).card.tasks == ("boxing",)
 
 
 @pytest.mark.parametrize(
@@ -242,6 +278,55 @@ def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp
     with pytest.raises(InputError, match=said) as error:
         LearnedPolicy(folder)
     assert "config.json" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("index", "changes", "said"),
+    [
+        (2, {"float_dtype": "float16"}, "computes in 'float16', a packed policy in float32"),
+        (3, {"normalize_observation_keys": ["observation.state"]}, "normalises only"),
+        (3, {"features": {}}, "takes observation.images.front for None, expected VISUAL"),
+        (3, {"features": {"observation.images.front": {"type": "STATE"}}}, "for 'STATE', expected VISUAL"),
+    ],
+)
+def test_processors_that_would_compute_otherwise_are_refused(packed, tmp_path, index, changes, said):
+    """What LeRobot's processors would do otherwise with the same files is one error that names file and step."""
+    folder = copy(packed, tmp_path)
+    path = folder / "policy_preprocessor.json"
+    content = json.loads(path.read_text())
+    content["steps"][index]["config"] |= changes
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=said) as error:
+        LearnedPolicy(folder)
+    assert f"{path}: steps[{index}]" in str(error.value)
+
+
+def test_sizes_that_the_weights_lack_take_no_memory(packed, tmp_path):
+    """A configuration of 100 GB beside small weights is one error, and nothing of that size is allocated."""
+    folder = copy(packed, tmp_path)
+    sizes = {"dim_model": 4096, "dim_feedforward": 16384, "n_encoder_layers": 32, "n_decoder_layers": 32}
+    edit(folder / "config.json", **sizes)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="does not hold the weights of this network"):
+        LearnedPolicy(folder).check()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20, "more than 1 GiB"
+
+
+def test_a_stock_lerobot_loads_it_without_a_gpu(trained, tmp_path):
+    """A checkpoint whose processors name the device of its training is packed for any machine."""
+    made = shutil.copytree(trained, tmp_path / "made")
+    for name in ("pre", "post"):
+        path = made / f"policy_{name}processor.json"
+        content = json.loads(path.read_text())
+        for step in content["steps"]:
+            step["config"] |= {"device": "cuda"} if step["registry_name"] == "device_processor" else {}
+        path.write_text(json.dumps(content))
+    pack(made, tmp_path / "out", CARD)
+    shipped = [learned_card.SHIPPED] if learned_card.shipped_card() is not None else []
+    for folder in (tmp_path / "out", *shipped):
+        config = PreTrainedConfig.from_pretrained(folder)
+        pre, post = make_pre_post_processors(config, pretrained_path=str(folder))
+        assert {step.device for step in (*pre.steps, *post.steps) if hasattr(step, "device")} <= {"cpu", None}
 
 
 def test_mutated_files_are_read_or_refused(packed, tmp_path):

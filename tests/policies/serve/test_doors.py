@@ -9,10 +9,11 @@ import time
 import msgpack
 import numpy as np
 import pytest
-from served_policies import Fails, Remembers, look, state, together
+from served_policies import Fails, Remembers, TurnsV4, look, state, together
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from arena_newton.policies.serve import arena_codec, openpi_codec, vla_eval_codec
+from arena_newton.policies.label_reader import read_by
+from arena_newton.policies.serve import arena_codec, openpi_codec, policy_server, vla_eval_codec
 from arena_newton.policies.serve.policy_messages import Begin, End
 from arena_newton.policies.serve.policy_server import Refused
 
@@ -178,6 +179,124 @@ def test_two_evaluations_at_one_address(served):
             reply = post(one, "/infer", arena_codec.pack_look(look(value, seed=seed, step=4 * i, session="0")))[1]
             got[seed].append(np.float32(reply["action_chunk"]))
     assert np.array_equal(got[3], expected(one, 3)) and np.array_equal(got[4], expected(one, 4))
+
+
+class Robot:
+    """A client of the original's protocol: its body, its headers, and whether it keeps its connection."""
+
+    def __init__(self, port, *, name="", keeps=True, chunk=True, **fields):
+        self.port, self.keeps, self.chunk, self.fields = port, keeps, chunk, fields
+        self.headers = {"X-Arena-Client": name} if name else {}
+        self.connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+
+    def ask(self, route, content):
+        self.connection.request("POST", route, json.dumps(content | self.fields), self.headers)
+        reply = self.connection.getresponse()
+        content = json.loads(reply.read())
+        if not self.keeps:
+            self.connection.close()
+        return reply.status, content
+
+    def begin(self, seed):
+        assert self.ask("/reset", {"seed": seed})[0] == 200
+
+    def look(self, value):
+        seen = {"observation": {"state": [float(v) for v in state(value)]}, "task": "boxing"}
+        status, reply = self.ask("/infer", {**seen, "return_chunk": self.chunk})
+        assert status == 200, reply
+        return np.float32(reply["action_chunk" if self.chunk else "action"])
+
+
+@pytest.mark.parametrize("labels", ["v3.1", "v4"])
+@pytest.mark.parametrize(
+    "clients",
+    [
+        pytest.param([{}, {}], id="each keeps its connection"),
+        pytest.param([{"chunk": False}, {"chunk": False}], id="one action a look"),
+        pytest.param([{"world": 0, "seed": 3}, {"world": 0, "seed": 3}], id="the same world and seed"),
+        pytest.param([{"name": "a", "keeps": False}, {"name": "b", "keeps": False}], id="named, over any connection"),
+        pytest.param(
+            [{"name": n, "keeps": False, "world": 1, "seed": 3} for n in "ab"], id="named, the same world and seed"
+        ),
+        pytest.param([{}, {"keeps": False}], id="one keeps its connection"),
+    ],
+)
+def test_two_clients_at_one_address_in_lockstep(served, clients, labels):
+    """Two clients whose looks alternate have two memories: each is given, bit for bit, what it is given alone."""
+    values = [[0.1, -0.7, 0.3, 0.9, 0.2, -0.4], [0.8, 0.5, -0.6, 0.4, -0.3, 0.7]]
+
+    def played(*chosen):
+        policy = Remembers() if labels == "v3.1" else read_by(Turns(), "v4")
+        one = served(policy, "arena")
+        robots = [Robot(one.port, **clients[number]) for number in chosen]
+        for robot in robots:
+            robot.begin(3)
+        got = [[] for _ in robots]
+        for turn in range(6):
+            for robot, of, number in zip(robots, got, chosen, strict=True):
+                of.append(robot.look(values[number][turn]))
+        return got
+
+    first, second = played(0, 1)
+    assert np.array_equal(first, played(0)[0]) and np.array_equal(second, played(1)[0])
+    assert not np.array_equal(first, second)
+
+
+class Turns(TurnsV4):
+    """A yaw rate that follows from the state: what is decoded remembers the heading."""
+
+    def act(self, observation):
+        chunk = super().act(observation)
+        chunk.actions[..., 5] = observation.state[:, 6:7]
+        return chunk
+
+
+def test_a_client_goes_on_over_another_connection(served):
+    """A client without a name whose connection broke goes on over a new one; where two could be meant, none is."""
+    one = served(Remembers(), "arena")
+    robot = Robot(one.port)
+    robot.begin(3)
+    got = [robot.look(VALUES[0])]
+    robot.connection.close()
+    got += [robot.look(value) for value in VALUES[1:]]
+    assert np.array_equal(got, expected(one, 3))
+    pool = [Robot(one.port, world=0, seed=5) for _ in range(3)]
+    for client in pool[:2]:
+        client.begin(5)
+    status, reply = pool[2].ask("/infer", {"observation": {"state": [0.0] * 64}, "step": 4})
+    assert status == 409 and "X-Arena-Client" in reply["error"]
+
+
+def test_a_client_with_several_connections(served):
+    """A client without a name may ask for the world of an episode over another connection than it began it on."""
+    one = served(Remembers(), "arena")
+    first, other = (Robot(one.port, world=0, seed=3) for _ in range(2))
+    first.begin(3)
+    got = [client.look(value) for client, value in zip([first, other, first, other], VALUES, strict=False)]
+    assert np.array_equal(got, expected(one, 3)[: len(got)])
+
+
+def test_an_unfit_name_is_refused(served):
+    """A client's name is a word; anything else is one line and status 400."""
+    one = served(Remembers(), "arena")
+    for name in ("", "a b", "x" * 65, "\u00e9"):
+        status, reply = one.http("POST", "/reset", b"{}", {"X-Arena-Client": name.encode("latin-1")})
+        assert status == 400 and "X-Arena-Client" in reply["error"]
+
+
+def test_a_client_that_left_gives_its_rows_away(served, monkeypatch):
+    """Rows of a client whose connections have closed are given to the next one sooner than those of one that stays."""
+    monkeypatch.setattr(policy_server, "ABANDONED", 0.0)
+    one = served(Remembers(), "arena", max_sessions=2)
+    staying, leaving, coming = (Robot(one.port, name=name) for name in "abc")
+    staying.begin(3)
+    leaving.begin(4)
+    assert coming.ask("/reset", {"seed": 5})[0] == 503
+    leaving.connection.close()
+    deadline = time.monotonic() + 10
+    while coming.ask("/reset", {"seed": 5})[0] == 503:
+        assert time.monotonic() < deadline
+    assert np.array_equal([staying.look(value) for value in VALUES], expected(served(Remembers()), 3))
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "arena"])

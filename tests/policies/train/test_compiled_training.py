@@ -6,6 +6,7 @@ import shutil
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch._inductor.utils import fresh_cache
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
@@ -140,7 +141,9 @@ def test_a_compiler_that_fails_is_one_error(dataset, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", str(broken))
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, str(broken)))
     torch.compiler.reset()
-    with pytest.raises(ArenaError, match="--compile: the network could not be compiled") as error:
+    # A cache that other processes fill could spare this one the compiler, and a pool of processes be slow to start.
+    own = fresh_cache(dir=str(tmp_path)), torch._inductor.config.patch(compile_threads=1)
+    with own[0], own[1], pytest.raises(ArenaError, match="--compile: the network could not be compiled") as error:
         train(options(dataset, tmp_path / "out", compile=True))
     assert "\n" not in str(error.value)
     with pytest.raises(RuntimeError, match="other"), network_compiler.compiler_errors():

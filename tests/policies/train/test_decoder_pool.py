@@ -1,5 +1,6 @@
 """Episodes that processes decode: the same pictures as threads give, and nothing left behind, whatever happens."""
 
+import contextlib
 import errno
 import os
 import resource
@@ -7,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -36,6 +38,16 @@ def few_pictures_at_once(monkeypatch):
     monkeypatch.setattr(decoder_pool, "SLOT_BYTES", 5 * SIZE * SIZE * 3)
 
 
+@pytest.fixture(autouse=True)
+def earlier_children():
+    """Children of earlier tests, which others did not wait for, are none of a pool."""
+    EARLIER.clear()
+    EARLIER.update(decoders())
+
+
+EARLIER = set()
+
+
 def decoders():
     """Processes of this one that decode, and those that it did not wait for."""
     found = []
@@ -45,20 +57,19 @@ def decoders():
         except OSError:
             continue
         parent = int(stat.rpartition(")")[2].split()[1])
-        if parent == os.getpid() and (b"decoder_process" in command or " Z " in stat):
+        state = stat.rpartition(")")[2].split()[0]
+        if parent == os.getpid() and (b"decoder_process" in command or state == "Z"):
             found.append(int(folder.name))
-    return found
+    return [number for number in found if number not in EARLIER]
 
 
 def shared_files():
     """Open files of memory for pictures."""
-    names = (os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if alive(fd))
+    names = []
+    for fd in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):  # another thread has closed it meanwhile
+            names.append(os.readlink(f"/proc/self/fd/{fd}"))
     return [name for name in names if "arena_newton_decoded" in name]
-
-
-def alive(fd):
-    """Whether an open file is still one."""
-    return os.path.lexists(f"/proc/self/fd/{fd}")
 
 
 def test_processes_give_what_threads_give(rows, tmp_path):
@@ -141,6 +152,18 @@ def test_a_process_that_dies_is_an_error(rows):
     assert not decoders() and not shared_files()
 
 
+def test_how_a_process_ended(monkeypatch):
+    """The signal of a process that ends slowly is waited for; one that only closed its output has no exit code."""
+    monkeypatch.setattr(decoder_pool, "DEATH_PATIENCE", 0.05)
+    code = "import os, time; os.close(1); time.sleep(600)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        assert not process.stdout.read()
+        assert decoder_pool._how(process) == "it closed its output"
+        monkeypatch.undo()
+        threading.Timer(1.5, process.kill).start()
+        assert decoder_pool._how(process) == "SIGKILL; out of memory?"
+
+
 def test_ctrl_c_leaves_nothing(rows):
     """An interrupt between two episodes ends all processes and gives their memory back."""
     with pytest.raises(KeyboardInterrupt):
@@ -161,7 +184,7 @@ def test_processes_end_with_a_training_that_is_killed(rows):
         numbers = training.stdout.readline().split()
         training.kill()
     assert len(numbers) == 2
-    limit = time.monotonic() + 30
+    limit = time.monotonic() + 300  # a process hears of it when its libraries are loaded
     while any(running(number.decode()) for number in numbers):
         assert time.monotonic() < limit
         time.sleep(0.05)

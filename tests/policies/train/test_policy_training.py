@@ -416,6 +416,24 @@ def test_flags_change_what_belongs_together(flags, expected):
     assert [found.realign, found.lr, found.lr_backbone] == pytest.approx(rates)
 
 
+@pytest.mark.parametrize(
+    ("flags", "rates"),
+    [
+        ({"policy": "flow", "weights": "a/clip"}, (1e-4, 2e-6)),
+        ({"policy": "flow", "weights": "a/clip", "lr": 5e-5}, (5e-5, 1e-6)),
+        ({"policy": "flow", "weights": "a/clip", "recipe": "paper"}, (2e-5, 2e-6)),
+        ({"policy": "flow"}, (1e-4, 1e-4)),
+        ({"policy": "act", "weights": "a/resnet"}, (1e-4, 1e-4)),
+        ({"policy": "diffusion", "weights": "a/resnet"}, (1e-4, 1e-4)),
+        ({"policy": "pi05", "weights": "a/base"}, (2.5e-5, 2.5e-5)),
+    ],
+)
+def test_a_pretrained_encoder_is_tuned_as_slowly_as_the_papers(flags, rates):
+    """With --weights CLIP has the paper's learning rate, 2e-6; new weights, and families without one, the recipe's."""
+    found = chosen_recipe(PolicyTrainOptions(**flags))
+    assert [found.lr, found.lr_backbone] == pytest.approx(rates)
+
+
 def test_two_datasets_and_a_task_vector(dataset, tmp_path):
     """Merged training: the vector has a number per task, and LeRobot's network takes it as a token."""
     other = make_dataset(tmp_path, lengths=(22,), task="football", labels="v4")
