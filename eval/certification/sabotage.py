@@ -172,14 +172,13 @@ class BlindExpert(MisledExpert):
 
 
 class MisaimedExpert(MisledExpert):
-    """Stops where the object cannot be touched: short of it, since it believes itself nearer; of a place, beside it."""
+    """Stops short of where the object can be touched: it believes itself nearer to it, or a place nearer to itself."""
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
         view, far, aside = self.sight.view, self.style.uniform("short", *SHORT), self.style.uniform("to", -ASIDE, ASIDE)
-        if view.spec.level:  # as wide as it is, and to the left or right, where the way there does not lead over it
-            far, turn = far + 1.2 * view.box.half[0], aside + math.pi * self.style.coin("left")
-            self.sight.object_off = _level(far, turn)
+        if view.spec.level:  # a place is missed as a whole, on the side from which the robot comes
+            self.sight.object_off = _level(far + 1.6 * view.box.half[0], aside - 0.5 * math.pi)
             return
         way = view.centre - view.root[:, :3]
         grown = (self.since / GROWS).clamp(0.0, 1.0)
