@@ -34,7 +34,7 @@ _REPORTING = """__main__ action_map bench bench_figure bench_learned bench_polic
     certify compare_command comparison comparison_page comparison_text config console contenders
     cost_table detectable document engines episode_signals evaluated_cells failure_counts
     failure_rules failure_text folder html_report identity journal learned_row learning_loop
-    loop_report matrix_cells options original_format pack_command pack_options paper_claims
+    loop_report loop_requirements matrix_cells options original_format pack_command pack_options paper_claims
     paper_numbers predicted_actions progress rate_tests recording records report rerecord results
     rounds shard_merge sharding signal_recorder stats success_film suite_call suite_figures
     suite_file suite_folder suite_options suite_records suite_run suite_tables table_entries
@@ -45,7 +45,8 @@ _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_cop
 _TRAINING = """__main__ act_family augmentation batching decoder_pool decoder_process demonstration_rows
     diffusion_family families feature_scaling flow_family frame_store measured_training network_compiler
     network_memory pi05_family policy_model policy_options policy_trainer pretrained_weights prompts
-    resnet_weights stored_flags training training_bench training_log training_loop training_state"""
+    resnet_weights stored_flags training training_bench training_check training_log training_loop
+    training_state"""
 UNHASHED = (
     *(f"data/{name}.py" for name in _DATASETS.split()),
     *(f"eval/{name}.py" for name in _REPORTING.split()),
