@@ -176,6 +176,8 @@ def test_the_check_fails_below_the_bar():
     assert good.verdict == "pass" and good.summary.startswith("30 of 30")
     assert good.sheets[0].rows[0] == ("perception", "5", "0", "0", "0", "0", "0", "1.00", "1.00")
     assert any("football" in note for note in good.notes)
+    one = check(played(lambda body: OF[body] * 5 + OF["clumsy"] * (body == "misaimed")))
+    assert one.verdict == "pass" and one.summary.startswith("30 of 31")
     bad = check(played(lambda body: OF["misaimed" if body == "blinded" else body] * 5))
     assert bad.verdict == "fail" and f"expected at least {LEAST:g}" in bad.notes[0]
     assert any("recall of perception" in note for note in bad.notes)
