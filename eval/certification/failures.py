@@ -13,6 +13,7 @@ from arena_newton.eval.certification.sabotage import SABOTAGES
 from arena_newton.eval.failure_rules import stage_of
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction import INTERACTIONS
+from arena_newton.eval.wording import markdown_table
 
 __all__ = ["CHECKS", "LEAST", "Confusion", "confusion"]
 
@@ -73,6 +74,8 @@ def failures(context: Context) -> CheckFinding:
     right = sum(matrices[list(matrices)[-1]].counts.get((stage, stage), 0) for stage in FailureStage)
     summary = f"{right} of {failed} scripted failures get their stage ({total} episodes)"
     sheets = tuple(_sheet(task, matrix) for task, matrix in matrices.items())
+    for sheet in sheets:
+        print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
     return CheckFinding("fail" if weak else "pass", summary, sheets, (*weak, *notes))
 
 
