@@ -19,6 +19,7 @@ from arena_newton.eval.certification import (
     axes,
     certificate,
     error_rates,
+    failures,
     legs,
     sill,
     solvable,
@@ -48,6 +49,7 @@ CHECKS: tuple[Check, ...] = (
     *swap.CHECKS,
     *visible.CHECKS,
     *sill.CHECKS,
+    *failures.CHECKS,
     *error_rates.CHECKS,
 )
 """All checks, in the order in which they run."""
@@ -57,7 +59,7 @@ def run(
     options: CertifyOptions,
     factories: Factories | None = None,
     *,
-    bodies: Mapping[str, Body] = BODIES,
+    bodies: Mapping[str, Body] = BODIES | failures.BODIES,
     checks: Sequence[Check] = CHECKS,
 ) -> int:
     """Run the checks, print a line for each, and write certify.json, certify.md and certify.html.
@@ -65,7 +67,7 @@ def run(
     Args:
         options: The flags.
         factories: What evaluations are built with; the real parts by default.
-        bodies: Robots for the checks of legs.
+        bodies: Robots for the checks of legs, and scripted failures.
         checks: What is checked, of which `options.checks` may choose.
 
     Returns:

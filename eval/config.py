@@ -21,6 +21,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import plan, rounds
 from arena_newton.eval.document import Identity
 from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
+from arena_newton.eval.interaction import check_interactions
 from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RecordOptions, RunOptions, is_quick
 from arena_newton.eval.play_flags import RAY_FLAGS, check_ray, check_width
 from arena_newton.eval.records import JsonObject
@@ -271,6 +272,8 @@ def resolve(options: RunOptions) -> RunConfig:
         card = _card(target)
         tasks = tasks if options.task else card.tasks
         card.check_tasks(tasks)
+    if options.failures:
+        check_interactions(tasks)
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
     used = tuple(options.tracker) or several

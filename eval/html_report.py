@@ -18,6 +18,8 @@ from pathlib import Path
 import jinja2
 
 from arena_newton.eval.document import Document, trackers_of
+from arena_newton.eval.failure_rules import stage_of
+from arena_newton.eval.failure_text import SENTENCES, stage_bars
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.results import Results, RunRecord
 from arena_newton.eval.stats import ErrorReason, ResultCell
@@ -136,6 +138,8 @@ def page(
         outcomes=OUTCOMES,
         ticks=TICKS,
         cells=_bars(results["cells"]),
+        stages=SENTENCES,
+        failures=stage_bars(results.get("failures", [])),
         reasons=reasons,
         opening=[(_Episode(record), strip) for record, strip in opening],
         shown=[_Episode(record) for record in shown],
@@ -288,6 +292,11 @@ class _Episode:
     def why(self) -> str:
         reason = self.record.reason
         return f" ({plain(reason)})" if reason and reason != self.record.outcome else ""
+
+    @property
+    def stage(self) -> str:
+        """Stage at which it failed; empty without one."""
+        return stage_of(self.record) or ""
 
     @property
     def error(self) -> str:

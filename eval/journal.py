@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Self
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval.episode_signals import EpisodeSignals
 from arena_newton.eval.records import (
     MAX_JOURNAL_BYTES,
     Count,
@@ -114,11 +115,15 @@ class EpisodeRecord:
     """Fraction of the task's predicates that have held; None in a line of schema 1."""
     events: Annotated[tuple[EpisodeEvent, ...], Fit("objects with kind, tick and detail")] = ()
     """What happened once in the episode, in the order of its ticks."""
+    signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
+    """What tells why it failed; None, and absent in the line, without `eval run --failures`."""
 
     def to_json(self) -> JsonObject:
         """The line as a JSON object."""
         values = {key.name: getattr(self, key.name) for key in dataclasses.fields(self)}
-        return values | {"events": [dataclasses.asdict(event) for event in self.events]}
+        values["events"] = [dataclasses.asdict(event) for event in self.events]
+        signals = values.pop("signals")
+        return values if signals is None else values | {"signals": dataclasses.asdict(signals)}
 
     @classmethod
     def from_json(cls, where: str, line: Mapping[str, Json]) -> EpisodeRecord:
@@ -137,6 +142,8 @@ class EpisodeRecord:
         known = {key: line[key] for key in cls.__dataclass_fields__ if key in line}
         known["phases"] = tuple((name, tick) for name, tick in line.get("phases", ()))
         known["events"] = tuple(EpisodeEvent(**event) for event in line.get("events", ()))
+        if line.get("signals") is not None:
+            known["signals"] = EpisodeSignals.from_json(line["signals"])
         return cls(**known)
 
 

@@ -120,6 +120,8 @@ class RunOptions:
     actions: bool = False
     """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
     tracker in a run."""
+    failures: bool = False
+    """Keep the signals that tell why an episode failed (docs/failures.md); looks at the head camera twice a second."""
     shard: str | None = None
     """Play part n of N of the plan, such as 3/16, into a folder of its own; `merge` joins them. slurm: the part of this
     task of a Slurm array; slurm/16 where the array has not all 16."""
@@ -420,7 +422,7 @@ class CertifyOptions:
     """Trackers, with the weights they come with; the first one alone where one is enough."""
     checks: tuple[str, ...] = ()
     """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official swap
-    visible sill statistics; all when none is named."""
+    visible sill failures statistics; all when none is named."""
     episodes: int | None = None
     """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
     worlds: int = 20

@@ -7,6 +7,7 @@ import io
 import json
 
 from arena_newton.eval import html_report
+from arena_newton.eval.failure_text import failures_markdown
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.learned_row import ROW_FOLDER, row_results
 from arena_newton.eval.original_format import write_original
@@ -169,6 +170,7 @@ def _markdown(run: RunRecord, results: Results) -> str:
         "tracker settled.",
         "",
     ]
+    lines += failures_markdown(results.get("failures", []))
     reasons = error_reasons(run.records)
     if reasons:
         lines += ["## Errors", "", "| reason | message | episodes |", "|---|---|---:|"]

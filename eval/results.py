@@ -10,6 +10,7 @@ from typing import NotRequired
 from arena_newton.errors import InputError
 from arena_newton.eval import rounds
 from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
+from arena_newton.eval.failure_counts import FailureCell, failure_cells
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.sharding import read_shard
 from arena_newton.eval.stats import Aggregate, aggregate
@@ -59,6 +60,8 @@ class Results(Aggregate):
     complete: bool
     shard: NotRequired[str]
     """Part of the plan, such as `3/16`; absent where the folder is of all."""
+    failures: NotRequired[list[FailureCell]]
+    """Failures by stage; absent where no episode has signals (`eval run --failures`)."""
     status: NotRequired[str]
     """State of `document.Status`; absent in a folder of a version without status."""
 
@@ -127,6 +130,9 @@ def results_json(run: RunRecord) -> Results:
         "cells": figures["cells"],
         "suites": figures["suites"],
     }
+    failures = failure_cells(run.records)
+    if failures:
+        results["failures"] = failures
     if "shard" in run.document:
         results["shard"] = run.document["shard"]
     if run.status is not None:

@@ -21,12 +21,14 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval import console, recording
 from arena_newton.eval.config import DRIVES, RunConfig
+from arena_newton.eval.episode_signals import EpisodeSignals
 from arena_newton.eval.folder import ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import kernels_to_compile
 from arena_newton.eval.recordings import ActionRecorder
+from arena_newton.eval.signal_recorder import SignalRecorder
 from arena_newton.eval.whole_run import (
     Group,
     RunStopped,
@@ -299,6 +301,8 @@ class RunPlayer:
             recorders += [ActionRecorder(self.folder.path / "actions")] if flags.actions else []
             if flags.viewer_failures:
                 recorders.append(FailureRecorder(self.folder.path / "failures", _prefix(flags, tracker)))
+            signals = SignalRecorder(env) if flags.failures else None
+            recorders += [] if signals is None else [signals]
             if self.viewer is not None:
                 self.viewer.open(env, group)
                 recorders.append(self.viewer)
@@ -310,7 +314,8 @@ class RunPlayer:
 
             def keep(result: EpisodeResult, media: dict[str, str]) -> None:
                 pictures = recorder.media(result.episode) if recorder is not None else {}
-                self._keep(result, pictures | media)
+                found = None if signals is None else signals.taken(result.episode.index)
+                self._keep(result, pictures | media, found)
                 left.pop(result.episode.index, None)
 
             def on_finish(result: EpisodeResult) -> None:
@@ -371,7 +376,7 @@ class RunPlayer:
             where = {name: path.relative_to(self.folder.path).as_posix() for name, path in saved.files.items()}
             keep(saved.result, where)
 
-    def _keep(self, result: EpisodeResult, media: dict[str, str]) -> None:
+    def _keep(self, result: EpisodeResult, media: dict[str, str], signals: EpisodeSignals | None = None) -> None:
         """Append an episode to the journal.
 
         Raises:
@@ -379,7 +384,7 @@ class RunPlayer:
         """
         where, records = self.folder.path, self.journal.records
         check_again(self.config, where, records, result, result.episode, media.values())
-        record = _record(result, media, self.hashes)
+        record = _record(result, media, self.hashes, signals)
         self.journal.append(record)
         self.ended[record.index] = record
 
@@ -414,7 +419,12 @@ def _viewer(config: RunConfig, folder: Path) -> WorldViewer | None:
     return viewer
 
 
-def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str | None]) -> EpisodeRecord:
+def _record(
+    result: EpisodeResult,
+    media: dict[str, str],
+    hashes: dict[str, str | None],
+    signals: EpisodeSignals | None = None,
+) -> EpisodeRecord:
     """Journal line of an episode that ended now."""
     finished = time.time()
     planned = dataclasses.asdict(result.episode)
@@ -439,4 +449,5 @@ def _record(result: EpisodeResult, media: dict[str, str], hashes: dict[str, str 
         predicates=dict(result.predicates),
         progress=float(result.progress),
         events=tuple(result.events),
+        signals=signals,
     )

@@ -278,7 +278,7 @@ def _gliding(factories: Factories) -> Factories:
     return dataclasses.replace(factories, env=GlidingEnv, tracker=tracker)
 
 
-BODIES: Mapping[str, Body] = {
+BODIES: dict[str, Body] = {
     body.name: body
     for body in (
         Body("robot", "the whole robot", lambda factories: factories),

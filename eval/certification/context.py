@@ -53,6 +53,8 @@ class CertifyCell:
     """Record the policy's actions."""
     strip: bool = False
     """Draw film strips."""
+    failures: bool = False
+    """Keep the signals of failures."""
 
     @property
     def folder(self) -> str:
@@ -129,6 +131,7 @@ class Context:
                 actions=cell.actions,
                 strip=cell.strip,
                 follow=cell.strip,
+                failures=cell.failures,
                 out=str(self.path(cell)),
             )
         )

@@ -194,8 +194,9 @@ class ExpertPolicy(Policy):
     labels = "v3.1"
     chunk_size = 1
 
-    def __init__(self) -> None:
-        """Know no environment yet."""
+    def __init__(self, sight: Callable[[World], Sight] | None = None) -> None:
+        """Know no environment yet; `sight` is what the expert sees worlds with, `Sight` when None."""
+        self._sight_of = sight or Sight
         self.expert: Expert | None = None
         """The expert of the environment's task; None before `attach`."""
 
@@ -206,7 +207,7 @@ class ExpertPolicy(Policy):
     def attach(self, env: World) -> None:
         """Take the privileged view of an environment and pick the expert of its task."""
         expert = expert_class(env.spec.name)
-        self.sight = Sight(env)
+        self.sight = self._sight_of(env)
         self.expert = expert(self.sight)
         self.generator = self.expert.reference = ReferenceGenerator(env.worlds, env.torch_device)
         self.style = Style(env.worlds, env.torch_device)

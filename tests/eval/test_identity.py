@@ -70,7 +70,7 @@ def test_a_new_module_anywhere_counts(tmp_path):
 def test_the_exceptions_move_nothing():
     """No hashed module imports an exception of trackers; of eval's only the run uses those that keep and report."""
     used = "config console folder journal options progress recording records report results rounds viewing".split()
-    used.append("whole_run")
+    used += ["episode_signals", "signal_recorder", "whole_run"]
     for name, file in modules().items():
         if excluded(name):
             continue

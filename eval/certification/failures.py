@@ -1,0 +1,119 @@
+"""Are failures labelled right? Scripted failures of each stage against what the rules of `failure_rules` say."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from arena_newton.eval.certification.bodies import Body
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, skipped
+from arena_newton.eval.certification.sabotage import SABOTAGES
+from arena_newton.eval.failure_rules import stage_of
+from arena_newton.eval.failure_stage import FailureStage
+from arena_newton.eval.interaction import INTERACTIONS
+from arena_newton.eval.wording import markdown_table
+
+__all__ = ["CHECKS", "LEAST", "Confusion", "confusion"]
+
+LEAST = 0.8
+"""Least precision and recall of each stage."""
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """Scripted failures by the stage that was scripted and the stage that was said."""
+
+    counts: Mapping[tuple[FailureStage, FailureStage], int]
+    """(scripted, said) → episodes."""
+
+    def recall(self, stage: FailureStage) -> float | None:
+        """Part of the scripted failures of a stage that are said to be of it; None without any."""
+        return self._part(stage, [self.counts.get((stage, said), 0) for said in FailureStage])
+
+    def precision(self, stage: FailureStage) -> float | None:
+        """Part of those said to be of a stage that were scripted so; None where none is."""
+        return self._part(stage, [self.counts.get((scripted, stage), 0) for scripted in FailureStage])
+
+    def _part(self, stage: FailureStage, counts: Sequence[int]) -> float | None:
+        return self.counts.get((stage, stage), 0) / sum(counts) if sum(counts) else None
+
+
+def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Confusion:
+    """Counts of pairs (scripted, said); pairs without a failure are left out."""
+    return Confusion(Counter((scripted, said) for scripted, said in pairs if said is not None))
+
+
+def failures(context: Context) -> CheckFinding:
+    """Let saboteurs fail, and compare what was scripted with what is said."""
+    tasks = [task for task in context.tasks if task in INTERACTIONS]
+    if not tasks:
+        return skipped(f"no signals are defined for {' '.join(context.tasks)}")
+    pairs: dict[str, list[tuple[FailureStage, FailureStage | None]]] = {}
+    notes, total = [], 0
+    for task in tasks:
+        for tracker in context.sample:
+            for name, sabotage in SABOTAGES.items():
+                if task in sabotage.without:
+                    continue
+                cell = CertifyCell(task, tracker, body=name, failures=True)
+                records = context.evaluate(cell)
+                found = [(sabotage.stage, stage_of(record)) for record in records]
+                pairs.setdefault(task, []).extend(found)
+                solved = sum(record.outcome == "success" for record in records)
+                total += len(records)
+                if solved:
+                    notes.append(f"{task} {tracker}, {name}: {solved} of {len(records)} episodes succeed all the same")
+    left_out = [task for task in context.tasks if task not in INTERACTIONS]
+    notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
+    matrices = {task: confusion(found) for task, found in pairs.items()}
+    matrices |= {"all": confusion([pair for found in pairs.values() for pair in found])} if len(tasks) > 1 else {}
+    weak = [f"{task}: {text}" for task, matrix in matrices.items() for text in _below(matrix)]
+    failed = sum(matrices[list(matrices)[-1]].counts.values())
+    right = sum(matrices[list(matrices)[-1]].counts.get((stage, stage), 0) for stage in FailureStage)
+    summary = f"{right} of {failed} scripted failures get their stage ({total} episodes)"
+    sheets = tuple(_sheet(task, matrix) for task, matrix in matrices.items())
+    for sheet in sheets:
+        print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
+    return CheckFinding("fail" if weak else "pass", summary, sheets, (*weak, *notes))
+
+
+def _below(matrix: Confusion) -> list[str]:
+    """Stages whose precision or recall is too low.
+
+    One that was not scripted has no bar: what is said to be of it counts against the recall of the others.
+    """
+    found = []
+    for stage in FailureStage:
+        if matrix.recall(stage) is None:
+            continue
+        for name, value in (("recall", matrix.recall(stage)), ("precision", matrix.precision(stage))):
+            if value is not None and value < LEAST:
+                found.append(f"{name} of {stage} is {value:.2f}, expected at least {LEAST:g}")
+    return found
+
+
+def _sheet(task: str, matrix: Confusion) -> Sheet:
+    """The matrix: a row for each stage that was scripted."""
+
+    def part(value: float | None) -> str:
+        return "-" if value is None else f"{value:.2f}"
+
+    rows = [
+        (
+            str(scripted),
+            *(str(matrix.counts.get((scripted, said), 0)) for said in FailureStage),
+            part(matrix.recall(scripted)),
+            part(matrix.precision(scripted)),
+        )
+        for scripted in FailureStage
+    ]
+    head = ("scripted", *(f"said {stage}" for stage in FailureStage), "recall", "precision")
+    return Sheet(f"{task}: scripted failures (rows) and what the rules say (columns)", head, tuple(rows))
+
+
+BODIES: dict[str, Body] = {name: sabotage.body for name, sabotage in SABOTAGES.items()}
+"""Bodies of the scripted failures by name, for `Context.bodies`."""
+CHECKS = (Check("failures", "Do failures get the stage at which they were scripted to happen?", failures),)
+"""This module's checks."""

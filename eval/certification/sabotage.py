@@ -1,0 +1,354 @@
+"""Experts, worlds and trackers that fail at a known stage: what the rules of `failure_rules` are held against.
+
+A saboteur changes one thing that an expert believes, does or is executed by, and nothing of how episodes are judged.
+What differs between two of its episodes is drawn from the episode seed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from arena_newton.canonical import ACTION
+from arena_newton.env import ArenaEnv
+from arena_newton.errors import InputError
+from arena_newton.eval.certification.bodies import Body
+from arena_newton.eval.failure_stage import FailureStage
+from arena_newton.eval.interaction_view import InteractionView
+from arena_newton.eval.run import Factories
+from arena_newton.interfaces import Chunk, Observation, RobotState, Spawn, TrackerCommand, World
+from arena_newton.physics_mujoco import MujocoPhysics
+from arena_newton.policies.base import Mask
+from arena_newton.policies.experts import ExpertPolicy, Sight
+from arena_newton.robot import DEFAULT_POSE, LEGS
+from arena_newton.rotations import matrix_from_quat, quat_from_euler, quat_from_rot6d
+from arena_newton.tasks.base import Sample
+from arena_newton.tasks.judge import PALMS
+from arena_newton.trackers.base import Tracker
+
+__all__ = ["SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
+
+UNSEEN = (0.0, 0.0, 30.0)
+"""Displacement of an object that nobody can see: in the sky, where no camera looks [m]."""
+ELSEWHERE = (2.4, 3.2)
+"""Distance of the place where a blind robot believes the object, drawn between these [m]."""
+SHORT = (0.55, 0.80)
+"""Distance that a robot that aims badly stops short of where it wants to stop, drawn between these [m] ..."""
+ASIDE = math.radians(35)
+"""... and how far to either side of the straight way that is at most [rad]."""
+CLOSE = 1.6
+"""Distance to the object at which what goes wrong on the approach begins [m]."""
+LEAN = math.radians(80)
+"""Lean of the reference of a robot that loses its balance [rad]; trackers stay on their feet up to about 60 degrees."""
+GROWS = 40
+"""Ticks in which what goes wrong on the approach grows to its size."""
+OFF_CENTRE = (0.18, 0.22)
+"""Height by which a fist misses its target, drawn between these [m]: it is still on the bag."""
+AWAY = 1.5
+"""Distance that an object is moved by when it is touched first [m]."""
+
+
+class MisledSight(Sight):
+    """A view of the world in which robot, hands or object are not where they are."""
+
+    def __init__(self, env: World):
+        """Nothing is displaced yet."""
+        super().__init__(env)
+        self.view = InteractionView(env)
+        worlds = env.worlds
+        self.robot_off, self.hands_off, self.object_off = (torch.zeros(worlds, 3, device=self.device) for _ in range(3))
+        """Where robot, hands and object are believed minus where they are [m], shape [worlds, 3]."""
+        self._robot = frozenset(int(body) for body in env.scene.robot.bodies)
+        self._object = self.view.box.body_id
+
+    @property
+    def pose(self) -> Tensor:
+        """See `Sight.pose`."""
+        return super().pose + torch.nn.functional.pad(self.robot_off[:, :2], (0, 1))
+
+    @property
+    def root_position(self) -> Tensor:
+        """See `Sight.root_position`."""
+        return super().root_position + self.robot_off
+
+    def body(self, body: int) -> tuple[Tensor, Tensor]:
+        """See `Sight.body`."""
+        position, quat = super().body(body)
+        if body in self._robot:
+            position = position + self.robot_off
+        return position + self.object_off if body == self._object else position, quat
+
+    def frame(self, name: str) -> Callable[[], Tensor]:
+        """See `Sight.frame`."""
+        read = super().frame(name)
+        return (lambda: read() + self.hands_off) if name in PALMS else read
+
+
+class MisledExpert(ExpertPolicy):
+    """The expert under a `MisledSight`; a subclass says what it is misled about."""
+
+    sight: MisledSight
+
+    def __init__(self) -> None:
+        """Know no environment yet."""
+        super().__init__(MisledSight)
+        self.name = "expert"
+
+    def attach(self, env: World) -> None:
+        """See `Policy.attach`."""
+        super().attach(env)
+        self.env = env
+        self.since = torch.full((env.worlds,), -1.0, device=env.torch_device)
+        """Ticks since the robot came close to the object, shape [worlds]; -1 before."""
+        self.touched = torch.zeros(env.worlds, dtype=torch.bool, device=env.torch_device)
+        """The object was touched in this episode, shape [worlds]."""
+
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
+        """See `Policy.reset`."""
+        super().reset(seeds, tasks, mask)
+        begins = self._begins_now(mask, len(seeds))
+        for off in (self.sight.robot_off, self.sight.hands_off, self.sight.object_off):
+            off[begins] = 0.0
+        self.since[begins], self.touched[begins] = -1.0, False
+
+    def _begins_now(self, mask: Mask, worlds: int) -> Tensor:
+        every = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+        return torch.from_numpy(every).to(self.sight.device)
+
+    @torch.inference_mode()
+    def act(self, observation: Observation) -> Chunk:
+        """See `Policy.act`."""
+        view = self.sight.view
+        asking = torch.from_numpy(np.asarray(observation.mask)).to(self.sight.device)
+        counts = asking & ((view.distance < CLOSE) | (self.since >= 0))
+        self.since = torch.where(counts, self.since + 1.0, self.since)
+        self.touched |= asking & (view.reach <= view.spec.touch)
+        self.mislead()
+        chunk = super().act(observation)
+        return Chunk(self.spoil(chunk.actions), chunk.errors, chunk.phases)
+
+    def mislead(self) -> None:
+        """Displace what is believed, from the truth of this tick."""
+
+    def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
+        """What is done in place of the expert's actions, shape [worlds, n, 40]."""
+        return actions
+
+
+def _level(length: Tensor, turn: Tensor) -> Tensor:
+    """Displacements of some lengths [m] in some directions [rad], both [worlds], over the floor; [worlds, 3]."""
+    return torch.stack([length * torch.cos(turn), length * torch.sin(turn), torch.zeros_like(length)], dim=1)
+
+
+class BlindExpert(MisledExpert):
+    """Knows nothing of the object: in every other episode it believes it elsewhere, in the others nowhere."""
+
+    def mislead(self) -> None:
+        """See `MisledExpert.mislead`."""
+        far, turn = (
+            self.style.uniform("far", *ELSEWHERE),
+            self.style.uniform("to", math.radians(150), math.radians(190)),
+        )
+        aside = torch.stack([far * torch.cos(turn), far * torch.sin(turn), torch.zeros_like(far)], dim=1)
+        self.sight.object_off = self._elsewhere(aside)
+
+    def _elsewhere(self, aside: Tensor) -> Tensor:
+        if self.env.spec.name != "boxing":
+            return aside
+        # The other bag, or none.
+        bags = [self.env.scene.frame(f"/World/Bag_{number}").pos for number in (1, 2)]
+        mine = (self.sight.view.centre[:, 0] > 0.5 * (bags[0][0] + bags[1][0])) == (bags[0][0] > bags[1][0])
+        way = torch.tensor(bags[1], device=self.sight.device) - torch.tensor(bags[0], device=self.sight.device)
+        other = torch.where(mine[:, None], way, -way).float()
+        nowhere = torch.tensor(UNSEEN, device=self.sight.device).expand_as(other)
+        return torch.where(self.style.coin("nowhere")[:, None], nowhere, other)
+
+
+class MisaimedExpert(MisledExpert):
+    """Stops short of where the object can be touched: it believes itself nearer to it, or a place nearer to itself."""
+
+    def mislead(self) -> None:
+        """See `MisledExpert.mislead`."""
+        view, far, aside = self.sight.view, self.style.uniform("short", *SHORT), self.style.uniform("to", -ASIDE, ASIDE)
+        if view.spec.level:  # a place is missed as a whole, on the side from which the robot comes
+            self.sight.object_off = _level(far + 1.6 * view.box.half[0], aside - 0.5 * math.pi)
+            return
+        way = view.centre - view.root[:, :3]
+        grown = (self.since / GROWS).clamp(0.0, 1.0)
+        self.sight.robot_off = _level(grown * far, torch.atan2(way[:, 1], way[:, 0]) + aside)
+
+
+class UnbalancedExpert(MisledExpert):
+    """Leans over more and more once it is close, until it falls."""
+
+    def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
+        """See `MisledExpert.spoil`."""
+        spoilt = torch.as_tensor(actions).clone()
+        lean = LEAN * (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
+        side = self.style.uniform("side", -1.0, 1.0)
+        turn = torch.stack([lean * torch.sin(side), lean * torch.cos(side), torch.zeros_like(lean)], dim=1)
+        own = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))
+        leaning = own @ matrix_from_quat(quat_from_euler(turn))
+        spoilt[:, :, ACTION["root_rot6d"]] = leaning[:, :, :2].reshape(-1, 1, 6)
+        return spoilt
+
+
+class ClumsyExpert(MisledExpert):
+    """Touches without effect: its fist lands above or below the target."""
+
+    def mislead(self) -> None:
+        """See `MisledExpert.mislead`."""
+        size = self.style.uniform("off", *OFF_CENTRE)
+        side = torch.where(self.style.coin("above"), 1.0, -1.0)
+        zero = torch.zeros_like(size)
+        self.sight.object_off = torch.stack([zero, zero, side * size], dim=1)
+
+
+class StubbornExpert(MisledExpert):
+    """Believes the object where it was when the episode began, in a world that moves it when it is touched."""
+
+    env: RelocatingEnv
+
+    def mislead(self) -> None:
+        """See `MisledExpert.mislead`."""
+        self.sight.object_off = -self.env.relocated
+
+
+class RelocatingEnv(ArenaEnv):
+    """Moves the object away at its first touch; engine `mujoco` alone."""
+
+    @functools.cached_property
+    def view(self) -> InteractionView:
+        """Where the robot is."""
+        return InteractionView(self)
+
+    @functools.cached_property
+    def relocated(self) -> Tensor:
+        """How far the object was moved [m], shape [worlds, 3]."""
+        if not isinstance(self.physics, MujocoPhysics):
+            raise InputError("--checks failures: an object is moved on engine mujoco alone; choose --engine mujoco")
+        return torch.zeros(self.worlds, 3, device=self.torch_device)
+
+    def reset(
+        self,
+        seeds: Sequence[int],
+        worlds: Sequence[int] | np.ndarray | None = None,
+        *,
+        spawn: Spawn | None = None,
+        samples: Sequence[Mapping[str, Sample]] | None = None,
+    ) -> None:
+        """See `ArenaEnv.reset`."""
+        super().reset(seeds, worlds, spawn=spawn, samples=samples)
+        self.relocated[slice(None) if worlds is None else list(worlds)] = 0.0
+
+    def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
+        """See `ArenaEnv.step`."""
+        status = super().step(action, worlds)
+        moved = self.relocated.abs().sum(dim=1) > 0
+        touched = (self.view.reach <= self.view.spec.touch) & ~moved
+        for world in np.flatnonzero(touched.cpu().numpy() & self.active & (self.tick > 0)).tolist():
+            self._relocate(world)
+        return status
+
+    def _relocate(self, world: int) -> None:
+        way = np.array([-AWAY, 0.0, 0.0])
+        body = self.view.box.body_id
+        mocap = int(self.scene.mj_model.body_mocapid[body])
+        assert isinstance(self.physics, MujocoPhysics)
+        self.physics.data[world].mocap_pos[mocap] += way
+        self.relocated[world] = torch.from_numpy(way).float()
+
+
+class WeakTracker(Tracker):
+    """A tracker whose legs do only a part of what its network says."""
+
+    def __init__(self, inner: Tracker, part: float):
+        """Take a tracker that is bound to no worlds yet, and the part of each leg's excursion that is executed."""
+        self.inner, self.part = inner, part
+        self.name, self.joints = inner.name, inner.joints
+        self.checkpoint, self.checkpoint_hash = inner.checkpoint, inner.checkpoint_hash
+        self.drive, self.original_drive = inner.drive, inner.original_drive
+        self.physics_rate, self.fast_physics_rate = inner.physics_rate, inner.fast_physics_rate
+        self.ignores, self.max_root_delta_deg = inner.ignores, inner.max_root_delta_deg
+        self._takes_mask = "mask" in inspect.signature(inner.step).parameters
+
+    def bind(self, worlds: int, device: torch.device | str = "cpu") -> None:
+        """See `Tracker.bind`."""
+        super().bind(worlds, device)
+        self.inner.bind(worlds, device)
+        self._rest = torch.tensor([DEFAULT_POSE[joint] for joint in LEGS], device=device)
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """See `Tracker.reset`."""
+        self.inner.reset(mask)
+
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """See `Tracker.prefill`."""
+        self.inner.prefill(command, state, mask)
+
+    def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """See `Tracker.step`."""
+        masked = self._takes_mask and mask is not None
+        targets = (self.inner.step(command, state, mask) if masked else self.inner.step(command, state)).clone()
+        legs = list(LEGS)
+        targets[:, legs] = self._rest + self.part * (targets[:, legs] - self._rest)
+        return targets
+
+    def describe(self) -> dict[str, object]:
+        """See `Tracker.describe`."""
+        return self.inner.describe() | {"legs": f"{self.part:g} of the network's excursions"}
+
+
+PART = 0.5
+"""Part of the legs' excursions that a weakened tracker executes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sabotage:
+    """A scripted failure."""
+
+    stage: FailureStage
+    """The stage at which it fails."""
+    body: Body
+    """What a task is played with."""
+    without: tuple[str, ...] = ()
+    """Tasks in which there is no such failure."""
+
+
+def _expert(expert: type[MisledExpert], env: type[ArenaEnv] | None = None) -> Callable[[Factories], Factories]:
+    def equip(factories: Factories) -> Factories:
+        return dataclasses.replace(factories, env=env or factories.env, policy=lambda spec, **options: expert())
+
+    return equip
+
+
+def _weak(factories: Factories) -> Factories:
+    def tracker(spec: str, checkpoint: Path | None) -> Tracker:
+        return WeakTracker(factories.tracker(spec, checkpoint), PART)
+
+    return dataclasses.replace(factories, tracker=tracker)
+
+
+_NO_EFFECT = ("vis_navi",)
+"""Tasks whose object is only to be reached: a touch has no effect that could fail to come."""
+_MADE = (
+    (FailureStage.PERCEPTION, "blinded", "expert that does not see the object", _expert(BlindExpert)),
+    (FailureStage.APPROACH, "misaimed", "expert that stops beside its place", _expert(MisaimedExpert)),
+    (FailureStage.POSTURE, "unbalanced", "expert that leans until it falls", _expert(UnbalancedExpert)),
+    (FailureStage.CONTACT, "clumsy", "expert that touches without effect", _expert(ClumsyExpert)),
+    (FailureStage.RECOVERY, "stubborn", "object that moves away unnoticed", _expert(StubbornExpert, RelocatingEnv)),
+    (FailureStage.TRACKER, "weakened", "tracker with weak legs", _weak),
+)
+SABOTAGES: Mapping[str, Sabotage] = {
+    name: Sabotage(stage, Body(name, title, equip), _NO_EFFECT if stage is FailureStage.CONTACT else ())
+    for stage, name, title, equip in _MADE
+}
+"""Scripted failures by name."""

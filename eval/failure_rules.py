@@ -1,0 +1,76 @@
+"""At which stage an episode failed: the taxonomy of the paper's appendix on failures as rules over recorded signals.
+
+Pure and deterministic: an episode's line of the journal in, one stage out. The paper names six stages in words; what
+they mean here is this file. A failure gets the first stage that broke down, from the robot outward: what the tracker
+did, then contact and what came after it, then posture, approach, and last whether the object was found at all.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from arena_newton.eval.episode_signals import EpisodeSignals
+from arena_newton.eval.failure_stage import FailureStage
+
+__all__ = ["FALLING", "Judged", "sees_at_start", "stage_of"]
+
+
+class Judged(Protocol):
+    """What the rules read of an episode's line (`journal.EpisodeRecord`)."""
+
+    @property
+    def outcome(self) -> str:
+        """`success`, `fall`, `timeout` or `error`."""
+
+    @property
+    def steps(self) -> int:
+        """Its length [ticks]."""
+
+    @property
+    def startup_fall(self) -> bool:
+        """It fell before the policy acted."""
+
+    @property
+    def signals(self) -> EpisodeSignals | None:
+        """None where they were not kept."""
+
+
+TRACKING = 0.09
+"""Mean error of the leg joints from which on the tracker does not follow [rad]. Experts' successes have 0.036 to 0.069
+through `twist2` and `sonic`; with half the legs' excursions both have 0.10 to 0.13 (6 and 4 episodes each)."""
+LEANING = 0.60
+"""Tilt of a reference from which on no tracker can be blamed [rad]: the experts' is 0.05 to 0.08 here."""
+SEEN = 10
+"""Pixels of 224 x 168 from which on the first picture shows the object, as in the check `visible`."""
+ENGAGED = 100
+"""Ticks for which a robot must stay slow near the object to have come for it: two seconds. A searching robot slows
+down for about one (up to 56 ticks measured), where its way turns; one that has arrived stays (300 and more)."""
+ALIGNED = 100
+"""The same where the object can be touched without a step."""
+MOVED = 0.25
+"""Distance from where it was touched first at which the object has moved away [m]."""
+FALLING = 50
+"""A touch within so many ticks before a fall is a part of the fall: it takes about a second."""
+
+
+def stage_of(episode: Judged) -> FailureStage | None:
+    """Stage at which an episode failed; None for a success, an error, and an episode without signals."""
+    signals = episode.signals
+    if signals is None or episode.outcome not in ("fall", "timeout"):
+        return None
+    if episode.startup_fall:
+        return FailureStage.TRACKER
+    fell = episode.outcome == "fall"
+    if signals.tracking_error > TRACKING and signals.reference_tilt < LEANING:
+        return FailureStage.TRACKER
+    if signals.first_touch is not None and not (fell and episode.steps - signals.first_touch < FALLING):
+        lost = signals.moved > MOVED and not signals.touches_moved
+        return FailureStage.RECOVERY if fell or lost else FailureStage.CONTACT
+    if fell or signals.aligned_ticks >= ALIGNED:
+        return FailureStage.POSTURE
+    return FailureStage.APPROACH if signals.engaged_ticks >= ENGAGED else FailureStage.PERCEPTION
+
+
+def sees_at_start(signals: EpisodeSignals) -> bool:
+    """Whether the first picture shows the object."""
+    return signals.first_pixels >= SEEN

@@ -1,0 +1,24 @@
+"""The stages of the paper's taxonomy of failures."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+__all__ = ["FailureStage"]
+
+
+class FailureStage(StrEnum):
+    """A stage at which an episode fails, in the order of the paper's appendix."""
+
+    PERCEPTION = "perception"
+    """The object is not found: the robot never stops near it."""
+    APPROACH = "approach"
+    """It is found, but the robot stops where it cannot be touched."""
+    POSTURE = "posture"
+    """The robot stands where it could touch the object and does not, or loses its balance before."""
+    CONTACT = "contact"
+    """The object is touched without the effect that the task wants."""
+    RECOVERY = "recovery"
+    """After a touch the robot falls, or does not follow an object that moved away."""
+    TRACKER = "tracker"
+    """The robot does not do what a plausible reference says."""

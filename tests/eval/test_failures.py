@@ -1,0 +1,276 @@
+"""Failures get the stage of the paper's taxonomy that their signals show, in journal, figures and reports."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_signals import UNTOUCHED, WELL, signals
+from rows import episodes, full, record
+from test_report import folder_with
+
+from arena_newton import seeding, tasks, trackers
+from arena_newton.env import ArenaEnv
+from arena_newton.errors import InputError
+from arena_newton.eval import report
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.certification.failures import LEAST, confusion
+from arena_newton.eval.certification.failures import failures as check
+from arena_newton.eval.certification.sabotage import SABOTAGES, MisledSight, RelocatingEnv, WeakTracker
+from arena_newton.eval.certification.traces import StateTrace, first_difference
+from arena_newton.eval.failure_counts import failure_cells
+from arena_newton.eval.failure_rules import FALLING, sees_at_start, stage_of
+from arena_newton.eval.failure_stage import FailureStage
+from arena_newton.eval.interaction import INTERACTIONS
+from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.results import load_run
+from arena_newton.eval.signal_recorder import SEEN, SignalRecorder
+from arena_newton.policies.experts import ExpertPolicy
+from arena_newton.robot import DEFAULT_POSE, LEGS
+from arena_newton.rollout import Rollout
+
+NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}
+BESIDE = UNTOUCHED | {"aligned_ticks": 0}
+
+
+def judged(outcome="timeout", startup_fall=False, steps=900, **changes):
+    """An ended episode."""
+    return SimpleNamespace(outcome=outcome, steps=steps, startup_fall=startup_fall, signals=signals(**changes))
+
+
+@pytest.mark.parametrize(
+    ("stage", "outcome", "changes"),
+    [
+        ("perception", "timeout", NOT_NEAR),
+        ("approach", "timeout", BESIDE),
+        ("posture", "timeout", UNTOUCHED),
+        ("posture", "fall", NOT_NEAR),
+        ("posture", "fall", {"first_touch": 900 - FALLING + 1}),
+        ("recovery", "fall", {"first_touch": 900 - FALLING}),
+        ("posture", "fall", UNTOUCHED | {"tracking_error": 0.4, "reference_tilt": 1.0}),
+        ("contact", "timeout", {}),
+        ("contact", "timeout", {"touches": 3, "moved": 0.4, "touches_moved": 1}),
+        ("recovery", "fall", {}),
+        ("recovery", "timeout", {"moved": 0.4}),
+        ("tracker", "timeout", NOT_NEAR | {"tracking_error": 0.4, "tracking_worst": 0.6}),
+        ("tracker", "fall", UNTOUCHED | {"tracking_error": 0.4, "tracking_worst": 0.6}),
+    ],
+)
+def test_signals_name_a_stage(stage, outcome, changes):
+    """Each stage has its picture of signals."""
+    assert stage_of(judged(outcome, **changes)) == stage
+
+
+def test_only_failures_with_signals_have_a_stage():
+    """A success, an error and an episode without signals have none; a fall in the start-up is the tracker's."""
+    assert stage_of(judged("success")) is None
+    assert stage_of(judged("error")) is None
+    assert stage_of(SimpleNamespace(outcome="fall", startup_fall=False, signals=None)) is None
+    assert stage_of(judged("fall", startup_fall=True)) == "tracker"
+
+
+def test_a_line_holds_signals_only_if_they_were_kept():
+    """The bytes of an ordinary line stay as they were; signals come back from a line as they went in."""
+    plain = record(episodes("boxing", (1,))[0])
+    assert plain.signals is None and "signals" not in plain.to_json()
+    kept = dataclasses.replace(plain, signals=signals())
+    line = json.loads(json.dumps(kept.to_json()))
+    assert line["signals"] == WELL
+    assert EpisodeRecord.from_json("here", line) == kept
+    assert {key: line[key] for key in line if key != "signals"} == json.loads(json.dumps(plain.to_json()))
+
+
+@pytest.mark.parametrize("key", WELL)
+def test_unfit_signals_are_refused(key):
+    """A signal that is missing, of another type or out of range is no signal."""
+    line = full(episodes("boxing", (1,))[0])
+    for value in ("much", [1], {}, True, -1e9, 1e300, -(10**400)):
+        with pytest.raises(InputError, match="here: signals is"):
+            EpisodeRecord.from_json("here", line | {"signals": WELL | {key: value}})
+    with pytest.raises(InputError, match="here: signals is"):
+        EpisodeRecord.from_json("here", line | {"signals": {k: v for k, v in WELL.items() if k != key}})
+
+
+def rows_with(*given):
+    """Journal lines of boxing with outcomes and signals."""
+    rows = episodes("boxing", (0,))[: len(given)]
+    return [row | {"outcome": o, "signals": WELL | s} for row, (o, s) in zip(rows, given, strict=True)]
+
+
+MIXED = (
+    ("success", {}),
+    ("success", {"first_pixels": SEEN - 1}),
+    ("timeout", NOT_NEAR | {"first_pixels": 0, "first_seen": None, "looks_seen": 0}),
+    ("timeout", BESIDE),
+    ("fall", {"first_touch": 20}),
+)
+
+
+def test_figures_count_stages_and_what_was_seen(tmp_path):
+    """Stages, of them the falls, and successes apart by the first picture; errors and lines without signals are out."""
+    rows = rows_with(*MIXED)
+    plain = [row | {"index": 7 + n, "repeat": 10 + n} for n, row in enumerate(episodes("boxing", (2,))[:2])]
+    found = [record(row) for row in [*rows, *plain, rows[0] | {"index": 9, "repeat": 9, "outcome": "error"}]]
+    (cell,) = failure_cells(found)
+    assert (cell["episodes"], cell["successes"]) == (5, 2)
+    assert {name: count for name, count in cell["stages"].items() if count} == {
+        "perception": 1,
+        "approach": 1,
+        "recovery": 1,
+    }
+    assert cell["falls"]["recovery"] == 1 and sum(cell["falls"].values()) == 1
+    assert [(cell[key]["successes"], cell[key]["episodes"]) for key in ("seen", "unseen")] == [(1, 3), (1, 2)]
+    assert failure_cells([record(row) for row in plain]) == []
+    assert not sees_at_start(signals(first_pixels=SEEN - 1)) and sees_at_start(signals(first_pixels=SEEN))
+
+
+def test_reports_show_stages_and_what_was_seen(tmp_path):
+    """results.json, report.md and the page hold them; a folder without signals has no such part."""
+    run = load_run(folder_with(tmp_path / "a", rows_with(*MIXED), 60))
+    results = report.write_reports(run)
+    assert json.loads((tmp_path / "a" / "results.json").read_text())["failures"] == results["failures"]
+    text = (tmp_path / "a" / "report.md").read_text()
+    assert "## Failures by stage" in text and "| seen at the start |" in text and " 1/3 |" in text
+    page = (tmp_path / "a" / "report.html").read_text()
+    assert page.count('class="stage perception"') == 2 and "1 perception, 1 approach, 1 recovery" in page
+    assert '<div class="why">perception</div>' in page
+    without = report.write_reports(load_run(folder_with(tmp_path / "b", episodes("boxing", (2,)), 60)))
+    assert "failures" not in without
+    assert "Failures by stage" not in (tmp_path / "b" / "report.html").read_text()
+
+
+def test_a_confusion_has_precision_and_recall():
+    """Recall is of what was scripted, precision of what is said; what did not fail counts for neither."""
+    a, b = FailureStage.APPROACH, FailureStage.CONTACT
+    matrix = confusion([(a, a)] * 8 + [(a, b)] * 2 + [(b, b)] * 6 + [(b, None)] * 5)
+    assert (matrix.recall(a), matrix.precision(a)) == (0.8, 1.0)
+    assert (matrix.recall(b), matrix.precision(b)) == (1.0, 0.75)
+    assert matrix.recall(FailureStage.TRACKER) is None and matrix.precision(FailureStage.TRACKER) is None
+
+
+def played(signals_of):
+    """A context of the check whose episodes of a sabotage have the signals that a function says."""
+
+    def evaluate(cell):
+        return [judged(outcome, **changes) for outcome, changes in signals_of(cell.body)]
+
+    return SimpleNamespace(tasks=("boxing", "football"), sample=("twist2",), evaluate=evaluate)
+
+
+OF = {
+    "blinded": [("timeout", NOT_NEAR)],
+    "misaimed": [("timeout", BESIDE)],
+    "unbalanced": [("fall", UNTOUCHED)],
+    "clumsy": [("timeout", {})],
+    "stubborn": [("timeout", {"moved": 1.5})],
+    "weakened": [("timeout", NOT_NEAR | {"tracking_error": 0.5, "tracking_worst": 0.7})],
+}
+
+
+def test_the_check_fails_below_the_bar(capsys):
+    """Scripted failures with their stages pass; one kind that is mostly said to be another fails and is named."""
+    assert set(OF) == set(SABOTAGES)
+    assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
+    good = check(played(lambda body: OF[body] * 5))
+    assert good.verdict == "pass" and good.summary.startswith("30 of 30")
+    assert "| perception |               5 |" in capsys.readouterr().out
+    assert good.sheets[0].rows[0] == ("perception", "5", "0", "0", "0", "0", "0", "1.00", "1.00")
+    assert any("football" in note for note in good.notes)
+    one = check(played(lambda body: OF[body] * 5 + OF["clumsy"] * (body == "misaimed")))
+    assert one.verdict == "pass" and one.summary.startswith("30 of 31")
+    bad = check(played(lambda body: OF["misaimed" if body == "blinded" else body] * 5))
+    assert bad.verdict == "fail" and f"expected at least {LEAST:g}" in bad.notes[0]
+    assert any("recall of perception" in note for note in bad.notes)
+
+
+def test_tasks_without_signals_are_refused(capsys):
+    """--failures says of which tasks there are none, and plays nothing."""
+    assert main(["run", "--failures", "--task", "football", "boxing", "--out", "nowhere"]) == 2
+    error = capsys.readouterr().err
+    assert "--failures: no signals are defined for football" in error and error.count("\n") == 1
+
+
+SEEDS = [seeding.episode_seed(tasks.get("boxing").gym_id, 0, repeat) for repeat in range(2)]
+
+
+@pytest.fixture(scope="module")
+def boxing():
+    """Two worlds of boxing."""
+    return ArenaEnv("boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", threads=1)
+
+
+def test_signals_follow_the_episode_and_leave_it_alone(boxing):
+    """Distances, looks and tracking are those of the episode, and no bit of it depends on whether they are kept."""
+    planned = [SimpleNamespace(index=n, episode_seed=seed) for n, seed in enumerate(SEEDS)]
+    kept, traces = SignalRecorder(boxing), (StateTrace(), StateTrace())
+    for recorder in ([traces[0]], [traces[1], kept]):
+        Rollout(boxing, ExpertPolicy(), planned, recorder=recorder, max_steps=80).run()
+    for one, other in zip(traces[0].traces.values(), traces[1].traces.values(), strict=True):
+        assert first_difference(one, other) is None
+    found = [kept.taken(n) for n in range(2)]
+    assert kept.taken(0) is None
+    for one in found:
+        assert one.looks == 4 and one.touches == 0 and one.first_touch is None
+        assert 0.2 < one.start_distance - one.nearest_distance < 1.5
+        assert 0.005 < one.tracking_error < 0.15 and 0.005 < one.tracking_worst < 0.15
+        assert 0.7 < one.height_min < 0.81 and 0.5 < one.posture_margin < np.radians(60)
+        assert EpisodeRecord.from_json("x", full(episodes("boxing", (1,))[0]) | {"signals": dataclasses.asdict(one)})
+
+
+def test_a_misled_sight_displaces_what_it_says(boxing):
+    """Robot, hands and object are believed where the displacements say, and nothing else moves."""
+    boxing.reset(SEEDS)
+    truth, misled = ExpertPolicy(), ExpertPolicy(MisledSight)
+    truth.attach(boxing)
+    misled.attach(boxing)
+    target, palm = INTERACTIONS["boxing"].box, INTERACTIONS["boxing"].effectors[0]
+    readers = [(one.sight.frame(target), one.sight.frame(palm)) for one in (truth, misled)]
+    off = misled.sight.object_off.new_tensor([0.1, 0.2, 0.3])
+    misled.sight.object_off += off
+    moved = [after() - before() for before, after in zip(*readers, strict=True)]
+    assert moved[0].numpy() == pytest.approx(np.tile(off, (2, 1)), abs=1e-6) and not moved[1].any()
+    misled.sight.hands_off += off
+    misled.sight.robot_off += off
+    assert (readers[1][1]() - readers[0][1]()).numpy() == pytest.approx(np.tile(2 * off, (2, 1)), abs=1e-6)
+    pose = (misled.sight.pose - truth.sight.pose).numpy()
+    assert pose == pytest.approx(np.tile([0.1, 0.2, 0.0], (2, 1)), abs=1e-6)
+
+
+def test_a_weak_tracker_does_a_part_of_its_legs():
+    """Legs go a part of their way from the default pose; waist and arms go all of it."""
+
+    class Seven(trackers.Tracker):
+        def step(self, command, state):
+            import torch
+
+            return torch.full((2, 29), 7.0)
+
+    weak = WeakTracker(Seven(), 0.25)
+    weak.bind(2)
+    targets = weak.step(None, None)
+    rest = np.array([DEFAULT_POSE[i] for i in LEGS])
+    assert targets[0, list(LEGS)].numpy() == pytest.approx(rest + 0.25 * (7.0 - rest))
+    assert (targets[:, len(LEGS) :] == 7.0).all()
+
+
+def test_an_object_is_moved_at_its_first_touch():
+    """The object leaves the touching hand's world alone, once, and comes back at the reset."""
+    env = RelocatingEnv("boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", threads=1)
+    env.reset(SEEDS)
+    before = env.view.centre.clone()
+    env.view.spec = dataclasses.replace(env.view.spec, touch=0.0)
+    stand = np.tile(env.loop.action.numpy(), (1, 1))
+    stand[:, 2], stand[:, 3], stand[:, 6] = 0.8, 1.0, 1.0
+    while env.tick.min() < 1:
+        env.step(stand)
+    assert (env.view.centre == before).all()
+    near = float(env.view.reach[0])
+    env.view.spec = dataclasses.replace(env.view.spec, touch=near + 0.05)
+    for _ in range(3):
+        env.step(stand)
+    gone = (env.view.centre - before).norm(dim=1)
+    assert gone[0] > 1.0 and float(env.relocated[0].norm()) == pytest.approx(float(gone[0]), abs=1e-5)
+    env.reset(SEEDS)
+    assert (env.view.centre == before).all() and not env.relocated.any()
+    env.close()
