@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import threading
@@ -115,6 +116,8 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
         beside = ResultsFolder(results_folder(row.out), resolve(row), versions())
         beside.check()
     if config.flags.ray is not None:
+        # Read when ray is imported: under `uv run` it would start every process by another `uv run`, elsewhere.
+        os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
         from arena_newton.eval import ray_run
 
         return ray_run.execute(folder, factories, beside)

@@ -109,9 +109,13 @@ class ResultsFolder:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"--out {folder}: is a file")
         if not (folder / CONFIG_FILE).exists():
-            begun = {JOURNAL_FILE}  # what a run leaves that was killed at its very start
+            # What a run leaves that was killed at its very start: an empty journal, a configuration half written.
             found = {path.name: path for path in folder.iterdir()} if folder.exists() else {}
-            if any(name not in begun or path.is_symlink() or path.stat().st_size for name, path in found.items()):
+            half = found.pop(CONFIG_FILE + PARTIAL, None)
+            others = any(
+                name != JOURNAL_FILE or path.is_symlink() or path.stat().st_size for name, path in found.items()
+            )
+            if others or (half is not None and (half.is_symlink() or not half.is_file())):
                 raise InputError(f"--out {folder}: is not empty and holds no results; choose another folder")
             return None
         for name in SUBFOLDERS:

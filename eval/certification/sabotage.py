@@ -29,7 +29,7 @@ from arena_newton.physics_mujoco import MujocoPhysics
 from arena_newton.policies.base import Mask
 from arena_newton.policies.experts import ExpertPolicy, Sight
 from arena_newton.robot import DEFAULT_POSE, LEGS
-from arena_newton.rotations import matrix_from_quat, quat_from_euler, quat_from_rot6d
+from arena_newton.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
 from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
@@ -183,7 +183,7 @@ class MisaimedExpert(MisledExpert):
             return
         way = view.centre - view.root[:, :3]
         grown = (self.since / GROWS).clamp(0.0, 1.0)
-        self.sight.robot_off = _level(grown * far, torch.atan2(way[:, 1], way[:, 0]) + aside)
+        self.sight.robot_off = _level(grown * far, atan2(way[:, 1], way[:, 0]) + aside)
 
 
 class UnbalancedExpert(MisledExpert):
