@@ -346,12 +346,14 @@ def test_other_versions_are_refused_unless_accepted(tmp_path, uninterrupted, cap
 
 
 def test_a_killed_beginning_can_be_begun_again(tmp_path):
-    """A folder with an empty journal and no configuration holds nothing: the run begins in it."""
+    """A folder with an empty journal, or half a configuration, holds nothing: the run begins in it."""
     folder = tmp_path / "a"
     folder.mkdir()
     (folder / "episodes.jsonl").touch()
+    (folder / "config.json.part").write_text('{"schema": 2, "opt')
     flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "1", "--out", str(folder)]
     assert main(flags, factories()) == 0
+    assert not (folder / "config.json.part").exists()
 
 
 def status(folder):
