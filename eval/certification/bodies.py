@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from arena_newton.interfaces import World
     from arena_newton.tasks.base import Sample
 
-__all__ = ["BODIES", "Body", "FrozenLegsEnv", "GlidingBase", "GlidingEnv", "HeldLegs", "freeze_legs"]
+__all__ = ["BODIES", "Body", "FrozenLegsEnv", "GlidingBase", "GlidingEnv", "HeldLegs", "WithOtherLegs", "freeze_legs"]
 
 LEG_COLUMNS = tuple(
     ACTION["joint_pos"].start + column for column, joint in enumerate(CANONICAL_TO_MUJOCO) if joint in LEGS
@@ -120,25 +120,28 @@ def stiffened(drive: DriveGains) -> DriveGains:
     )
 
 
-class HeldLegs(Tracker):
-    """A tracker whose legs hold the standing posture stiffly, whatever its network says; waist and arms are its own."""
+class WithOtherLegs(Tracker):
+    """A tracker whose legs do something else than its network says; waist and arms are its own."""
 
     def __init__(self, inner: Tracker):
         """Take a tracker that is bound to no worlds yet."""
         self.inner = inner
         self.name, self.joints = inner.name, inner.joints
         self.checkpoint, self.checkpoint_hash = inner.checkpoint, inner.checkpoint_hash
-        self.drive = stiffened(inner.drive)
-        self.original_drive = None if inner.original_drive is None else stiffened(inner.original_drive)
+        self.drive, self.original_drive = inner.drive, inner.original_drive
         self.physics_rate, self.fast_physics_rate = inner.physics_rate, inner.fast_physics_rate
         self.ignores, self.max_root_delta_deg = inner.ignores, inner.max_root_delta_deg
         self._takes_mask = "mask" in inspect.signature(inner.step).parameters
+
+    def legs(self, asked: torch.Tensor) -> torch.Tensor:
+        """Targets of the legs' joints [rad] in place of those of the network, shape [worlds, 12] or one row for all."""
+        raise NotImplementedError
 
     def bind(self, worlds: int, device: torch.device | str = "cpu") -> None:
         """See `Tracker.bind`."""
         super().bind(worlds, device)
         self.inner.bind(worlds, device)
-        self._held = torch.tensor([DEFAULT_POSE[joint] for joint in LEGS], device=device)
+        self.standing = torch.tensor([DEFAULT_POSE[joint] for joint in LEGS], device=device)
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """See `Tracker.reset`."""
@@ -152,8 +155,23 @@ class HeldLegs(Tracker):
         """See `Tracker.step`."""
         masked = self._takes_mask and mask is not None
         targets = (self.inner.step(command, state, mask) if masked else self.inner.step(command, state)).clone()
-        targets[:, list(LEGS)] = self._held
+        legs = list(LEGS)
+        targets[:, legs] = self.legs(targets[:, legs])
         return targets
+
+
+class HeldLegs(WithOtherLegs):
+    """A tracker whose legs hold the standing posture stiffly, whatever its network says."""
+
+    def __init__(self, inner: Tracker):
+        """Take a tracker that is bound to no worlds yet."""
+        super().__init__(inner)
+        self.drive = stiffened(inner.drive)
+        self.original_drive = None if inner.original_drive is None else stiffened(inner.original_drive)
+
+    def legs(self, asked: torch.Tensor) -> torch.Tensor:
+        """See `WithOtherLegs.legs`."""
+        return self.standing
 
     def describe(self) -> dict[str, object]:
         """See `Tracker.describe`."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,15 +19,14 @@ from torch import Tensor
 from arena_newton.canonical import ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
-from arena_newton.eval.certification.bodies import Body
+from arena_newton.eval.certification.bodies import Body, WithOtherLegs
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction_view import InteractionView
 from arena_newton.eval.run import Factories
-from arena_newton.interfaces import Chunk, Observation, RobotState, Spawn, TrackerCommand, World
+from arena_newton.interfaces import Chunk, Observation, Spawn, World
 from arena_newton.physics_mujoco import MujocoPhysics
 from arena_newton.policies.base import Mask
 from arena_newton.policies.experts import ExpertPolicy, Sight
-from arena_newton.robot import DEFAULT_POSE, LEGS
 from arena_newton.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
 from arena_newton.tasks.judge import PALMS
@@ -267,40 +265,17 @@ class RelocatingEnv(ArenaEnv):
         self.relocated[world] = torch.from_numpy(way).float()
 
 
-class WeakTracker(Tracker):
+class WeakTracker(WithOtherLegs):
     """A tracker whose legs do only a part of what its network says."""
 
     def __init__(self, inner: Tracker, part: float):
         """Take a tracker that is bound to no worlds yet, and the part of each leg's excursion that is executed."""
-        self.inner, self.part = inner, part
-        self.name, self.joints = inner.name, inner.joints
-        self.checkpoint, self.checkpoint_hash = inner.checkpoint, inner.checkpoint_hash
-        self.drive, self.original_drive = inner.drive, inner.original_drive
-        self.physics_rate, self.fast_physics_rate = inner.physics_rate, inner.fast_physics_rate
-        self.ignores, self.max_root_delta_deg = inner.ignores, inner.max_root_delta_deg
-        self._takes_mask = "mask" in inspect.signature(inner.step).parameters
+        super().__init__(inner)
+        self.part = part
 
-    def bind(self, worlds: int, device: torch.device | str = "cpu") -> None:
-        """See `Tracker.bind`."""
-        super().bind(worlds, device)
-        self.inner.bind(worlds, device)
-        self._rest = torch.tensor([DEFAULT_POSE[joint] for joint in LEGS], device=device)
-
-    def reset(self, mask: torch.Tensor | None = None) -> None:
-        """See `Tracker.reset`."""
-        self.inner.reset(mask)
-
-    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
-        """See `Tracker.prefill`."""
-        self.inner.prefill(command, state, mask)
-
-    def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """See `Tracker.step`."""
-        masked = self._takes_mask and mask is not None
-        targets = (self.inner.step(command, state, mask) if masked else self.inner.step(command, state)).clone()
-        legs = list(LEGS)
-        targets[:, legs] = self._rest + self.part * (targets[:, legs] - self._rest)
-        return targets
+    def legs(self, asked: torch.Tensor) -> torch.Tensor:
+        """See `WithOtherLegs.legs`."""
+        return self.standing + self.part * (asked - self.standing)
 
     def describe(self) -> dict[str, object]:
         """See `Tracker.describe`."""
