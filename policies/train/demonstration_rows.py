@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -77,6 +78,16 @@ class DatasetRows:
     def frames(self) -> int:
         """Rows of all episodes."""
         return sum(episode.length for episode in self.episodes)
+
+    def first(self, episodes: int) -> DatasetRows:
+        """The dataset's first episodes.
+
+        Raises:
+            InputError: It has fewer.
+        """
+        if episodes > len(self.episodes):
+            raise InputError(f"--episodes {episodes}: {self.root} has {len(self.episodes)}")
+        return dataclasses.replace(self, episodes=self.episodes[:episodes])
 
     @property
     def described(self) -> dict[str, object]:

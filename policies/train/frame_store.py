@@ -197,7 +197,7 @@ def episode_films(datasets: Sequence[DatasetRows]) -> list[EpisodeFilm]:
     found: list[EpisodeFilm] = []
     row = 0
     for dataset in datasets:
-        parts = Frames(dataset.root, dataset.camera).parts
+        parts = Frames(dataset.root, dataset.camera).parts[: len(dataset.episodes)]
         for number, (episode, part) in enumerate(zip(dataset.episodes, parts, strict=True)):
             found.append(EpisodeFilm(dataset.root, number, part.path, part.first, part.frames, row))
             row += episode.length

@@ -64,6 +64,8 @@ class PolicyTrainOptions:
     """Steps between checkpoints; 0: only the last one."""
     keep: int = field(default=2, metadata=bounds(0))
     """Number of latest checkpoints that are kept; 0: all."""
+    episodes: int = field(default=0, metadata=bounds(0, 100_000_000))
+    """Episodes of each dataset that are used, its first ones; 0: all."""
     hold_out: int = field(default=0, metadata=bounds(0, 100_000))
     """Episodes of each dataset, its last ones, that are not trained on; their loss is measured at intervals."""
     hold_out_every: int = field(default=1000, metadata=bounds(1))

@@ -98,6 +98,8 @@ def _train(
         check_compiler(device)
     families.check_weights(settings, options.weights or None)
     datasets = [read_rows(root, settings.labels) for root in options.dataset]
+    if options.episodes:
+        datasets = [dataset.first(options.episodes) for dataset in datasets]
     if progress is not None:
         _check_same_data(datasets, progress)
     check_pictures(datasets, settings)

@@ -59,6 +59,15 @@ def test_pictures_are_the_datasets(dataset, store):
         assert np.array_equal((found[row] * 255).round().byte().permute(1, 2, 0).numpy(), wanted), row
 
 
+def test_the_first_episodes_alone(rows, store):
+    """Two of three episodes before another dataset: its rows follow theirs, and every picture stays with its state."""
+    few = load_frames([rows.first(2), rows], CPU, jobs=2)
+    two, three = sum(LENGTHS[:2]), sum(LENGTHS)
+    assert few.lengths == (*LENGTHS[:2], *LENGTHS) and few.rows == two + three
+    order = [*range(two), *range(three)]
+    assert torch.equal(few.pictures, store.pictures[order]) and torch.equal(few.states, store.states[order])
+
+
 def test_a_late_picture_keeps_its_rows(tmp_path):
     """Rows that are black at the beginning of all episodes and not later are not cut off."""
 
@@ -218,6 +227,8 @@ def test_what_does_not_fit_is_refused(rows, monkeypatch):
     with pytest.raises(InputError, match=r"0\.0 GB are free beside the network, for which 10\.0 GB are kept"):
         load_frames([rows], CPU, network=10_000_000_000)
     load_frames([rows], CPU, network=9_900_000_000, jobs=1)
+    with pytest.raises(InputError, match=r"--episodes 4: .* has 3$"):
+        rows.first(4)
     with pytest.raises(InputError, match="--hold-out 3: .* has 3 episodes, none would be left"):
         load_frames([rows], CPU, hold_out=3)
     with pytest.raises(InputError, match="pictures of 32x64 pixels, .* has 64x64"):
