@@ -47,7 +47,8 @@ _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_cop
 _TRAINING = """__main__ act_family augmentation batching decoder_pool decoder_process demonstration_rows
     diffusion_family families feature_scaling flow_family frame_store measured_training network_compiler
     network_memory pi05_family policy_model policy_options policy_trainer pretrained_weights prompts
-    resnet_weights stored_flags training training_bench training_check training_log training_loop training_state"""
+    resnet_weights stored_flags training training_bench training_check training_log training_loop training_state
+    teachable teachable_network"""
 UNHASHED = (
     *(f"data/{name}.py" for name in _DATASETS.split()),
     *(f"eval/{name}.py" for name in _REPORTING.split()),
