@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from arena_newton.eval.records import Json, JsonObject
     from arena_newton.physics_batch import Physics
 
-__all__ = ["CHECKS", "TOLERANCE", "Slopes", "agreement_of", "flight_slopes"]
+__all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "agreement_of", "flight_slopes"]
 
 TOLERANCE = 0.0025
 """An exact slope may differ from its estimate by so much of it, or of the root mean square of all if that is larger."""

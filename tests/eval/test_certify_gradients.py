@@ -8,7 +8,7 @@ import torch
 from arena_newton.differentiable import RollingBall
 from arena_newton.eval import certify
 from arena_newton.eval.certification import gradients
-from arena_newton.eval.certification.gradients import Slopes, agreement_of, flight_slopes
+from arena_newton.eval.certification.gradients import Agreement, Slopes, agreement_of, flight_slopes
 from arena_newton.eval.options import CertifyOptions
 
 ESTIMATES = torch.tensor([1.0, -2.0, 0.001, 0.5, 1.5])
@@ -40,7 +40,8 @@ def test_kinks_are_left_out_but_not_all():
     """Where slopes within the step differ nothing is compared; too many such points, or no slope at all, fail."""
     wrong = ESTIMATES * torch.tensor([1.0, 1.5, 1.0, 1.0, 1.0])
     assert agreement_of(slopes(wrong, torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0]))) == (4, 5, 0.0)
-    assert not agreement_of(slopes(ESTIMATES, torch.tensor([0.5, 0.5, 0.5, 0.5, 0.0]))).holds
+    assert not agreement_of(slopes(ESTIMATES, 0.5)).holds and agreement_of(slopes(ESTIMATES, 0.5)).compared == 0
+    assert Agreement(1, 10, 0.0).holds and not Agreement(1, 11, 0.0).holds
     assert not agreement_of(Slopes(*torch.zeros(3, 5))).holds
 
 
