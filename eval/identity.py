@@ -36,7 +36,7 @@ _REPORTING = """__main__ action_map adversary bench bench_figure bench_learned b
     failure_rules failure_text folder html_report identity journal learned_row learning_loop loop_report
     loop_requirements matrix_cells options original_format pack_command pack_options paper_claims
     paper_numbers placed_play placement_axes placement_files placement_map placement_options play_flags
-    predicted_actions progress rate_tests ray_actor ray_crew ray_run recording records report rerecord
+    predicted_actions progress rate_tests ray_actor ray_crew ray_run ray_suite recording records report rerecord
     results rounds sensitivity shard_merge sharding signal_recorder slice_events slice_player stats
     success_film suite_call suite_figures suite_file suite_folder suite_options suite_records suite_run
     suite_tables table_entries table_options table_text tables tables_command tsne_command whole_run
