@@ -38,9 +38,9 @@ _REPORTING = """__main__ action_map adversary bench bench_figure bench_learned b
     paper_numbers placed_play placement_axes placement_files placement_map placement_options play_flags
     predicted_actions progress rate_tests ray_actor ray_crew ray_run ray_suite recording records report rerecord
     results rounds sensitivity shard_merge sharding signal_recorder slice_events slice_player stats
-    success_film suite_call suite_figures suite_file suite_folder suite_options suite_records suite_run
-    suite_tables table_entries table_options table_text tables tables_command tsne_command whole_run
-    wording worst_placement"""
+    success_film suite_call suite_estimate suite_figures suite_file suite_folder suite_options suite_records
+    suite_run suite_tables suite_timing table_entries table_options table_text tables tables_command
+    tsne_command whole_run wording worst_placement"""
 _CHECKS = "agreement axes certificate context error_rates failures finding jobs legs sill solvable swap traces visible"
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""

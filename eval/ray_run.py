@@ -11,7 +11,7 @@ import dataclasses
 import shlex
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -42,7 +42,7 @@ from arena_newton.text import counted, plain_text
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
 
-__all__ = ["DealtRun", "execute"]
+__all__ = ["DealtRun", "execute", "round_seconds"]
 
 BATCHES = 2
 """Most episodes of a slice, in batches of --worlds."""
@@ -76,17 +76,47 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
 
 def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
-    crew, job = Crew(folder.config, len(folder.config.episodes), factories), Job(folder)
+    crew = Crew(folder.config, len(folder.config.episodes), factories)
+    try:
+        return _played_by(crew, folder)
+    finally:
+        crew.dismiss()
+
+
+def round_seconds(folders: Sequence[ResultsFolder], number: int, factories: Factories | None) -> list[float] | None:
+    """Time of each of several runs that so many processes play one after the other, each run as a whole [s].
+
+    Returns:
+        None where the cluster has no room for as many processes.
+    """
+    config = folders[0].config
+    found = []
+    with in_cluster(config.flags.ray or ()):
+        crew = Crew(config, number, factories)
+        try:
+            if crew.room() < number:
+                return None
+            for folder in folders:
+                began = time.perf_counter()
+                if not _played_by(crew, folder):
+                    raise KeyboardInterrupt
+                found.append(time.perf_counter() - began)
+        finally:
+            crew.dismiss()
+    return found
+
+
+def _played_by(crew: Crew, folder: ResultsFolder) -> bool:
+    """Play what is missing in a folder by a crew; False when it was interrupted."""
+    job = Job(folder)
     resume = f"{command(folder, 'resume')} {shlex.join(['--ray', *(folder.config.flags.ray or ())])}"
     with contextlib.ExitStack() as ended:
-        ended.callback(crew.dismiss)
         config = crew.opened(job)
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
         folder.settle(config, journal.records)
         folder.sweep()
-        ended.callback(folder.sweep)
-        ended.callback(crew.dismiss)  # before the sweep: who writes files has ended
+        ended.callback(_swept, crew, folder)
         try:
             with told_how_to_go_on(resume, lambda: kept(config, journal.records)):
                 done, waiting = begun(config, folder, journal)
@@ -96,6 +126,13 @@ def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
             print(f"\ninterrupted: {kept(config, journal.records)}; continue with: {resume}")
             return False
     return True
+
+
+def _swept(crew: Crew, folder: ResultsFolder) -> None:
+    """Remove what unfinished recordings left, once who writes them has ended."""
+    if any(member.lease is not None for member in crew.members):
+        crew.dismiss()
+    folder.sweep()
 
 
 def _play(run: DealtRun) -> None:

@@ -59,6 +59,8 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
+    if options.estimate and min(options.estimate) < 1:
+        raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
     check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit {options.limit}: expected at least 1")
@@ -71,7 +73,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     try:
         checked = {c.id: c for c in check_policies(suite, [cell for cell in cells if cell.id in chosen])}
     except InputError as error:
-        if not options.dry_run:  # which shows the matrix first
+        if not options.dry_run and options.estimate is None:  # which show the matrix first, or need no checkpoint
             raise
         problem = error
     return SuiteCall(
