@@ -141,7 +141,8 @@ def suite_time(
             residuals = sum((m.seconds - rates[kind] * m.size.ticks) ** 2 for m in ms) / (n - 1)
         else:
             residuals = pooled * (rates[kind] * sum(c.ticks for c in whole) / many) ** 2
-        variance += many**2 * (1 - n / many) * residuals / n
+        # Without the correction for a finite plan: where all cells are measured, chance in the measuring is left.
+        variance += many**2 * residuals / n
     seconds = sum(rates[cell.kind] * cell.ticks for cell in cells)
     build = statistics.fmean(max(0.0, m.build) for m in measured)
     building = build * (1 + sum(a.group != b.group for a, b in pairwise(cells)))

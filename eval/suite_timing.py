@@ -242,7 +242,8 @@ class _Timing:
             "extrapolated to the step budgets: episodes that succeed or fall take less"
         )
         if self.replaced:
-            lines.append(f"random weights where checkpoints are absent: {' '.join(sorted(self.replaced))}")
+            names = " ".join(sorted(self.replaced))
+            lines.append(f"random weights of recipe fast where checkpoints are absent: {names}")
         lines.append(f"environments: {_time(found.building)} in all, each built once")
         if slowdown is not None:
             low, high = slowdown.range

@@ -39,7 +39,7 @@ def test_without_chance_the_estimate_is_exact():
 
 
 def test_the_interval_holds_the_truth():
-    """Of 400 plans whose cells differ by chance about 95 % of the intervals hold their time."""
+    """Of 400 plans whose cells differ by chance at least about 95 % of the intervals hold their time, and not all."""
     held = 0
     for seed in range(400):
         every = measured(cells(60), 0.2, seed)
@@ -52,7 +52,7 @@ def test_the_interval_holds_the_truth():
         build = found.on[0].seconds - found.seconds
         truth = sum(one.seconds for one in every) + build
         held += found.on[0].low <= truth <= found.on[0].high
-    assert 0.90 <= held / 400 <= 0.99
+    assert 0.93 <= held / 400 < 1
 
 
 def test_drawn_cells_are_of_each_kind():
