@@ -266,8 +266,8 @@ _FAST: dict[str, object] = {
 }
 """What was measured for ACT (60 of 60 episodes of VisNavi after three GPU minutes)."""
 _BY_DEVIATION = {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
-"""Every number by its standard deviation. By its range, as the paper has it, the turning of labels v4 is a seventh of the
-range and a fiftieth of the squared error that walking legs have: policies walked and did not steer."""
+"""Every number by its standard deviation. By its range, as the paper has it, the turning of labels v4 is a seventh of
+the range and a fiftieth of the squared error that walking legs have: policies walked and did not steer."""
 _SMALL: dict[str, object] = {
     "steps": 4,
     "batch_size": 2,
