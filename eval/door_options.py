@@ -19,7 +19,7 @@ class DoorOptions:
     """
 
     checkpoint: str | None = None
-    """Folder of a checkpoint of LeRobot with arena_policy.json; the policy that comes with the package by default."""
+    """A checkpoint of LeRobot, or the folder of a training; the policy that comes with the package by default."""
     task: str = "vis_navi"
     """Task."""
     tracker: str = "twist2"
