@@ -222,11 +222,7 @@ class _RayPlayer(CellPlayer):
 
     def _close(self, cell: _Cell, error: BaseException | None) -> None:
         """Let go of the journal; the folder's status says how the run ended."""
-        try:
-            cell.held.__exit__(type(error) if error is not None else None, error, None)
-        except BaseException as raised:
-            if raised is not error:
-                raise
+        cell.held.__exit__(None if error is None else type(error), error, None)
 
     def _leave(self, interrupt: KeyboardInterrupt | None) -> None:
         """End all cells that have begun, before they are whole."""
