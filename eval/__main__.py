@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
+from arena_newton.eval.door_options import DoorOptions
 from arena_newton.eval.options import (
     BenchOptions,
     CertifyOptions,
@@ -53,6 +54,7 @@ OVERVIEW = f"""commands:
   {PROG} sensitivity [flags]     map success and margin over the placements of a task
   {PROG} adversary [flags]       search the placement at which a policy does worst
   {PROG} bench [--what ...]      measure this machine against the figures to reach
+  {PROG} doors [flags]           one checkpoint through lerobot-eval and each served protocol, compared
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
 """
@@ -306,6 +308,13 @@ def _engines(arguments: list[str], factories: Factories | None) -> int:
     return engines.run(options)
 
 
+def _doors(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(DoorOptions, arguments, f"{PROG} doors")
+    from arena_newton.eval import door_comparison
+
+    return door_comparison.run(options)
+
+
 def _certify(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(CertifyOptions, arguments, f"{PROG} certify")
     from arena_newton.eval import certify
@@ -378,6 +387,7 @@ _COMMANDS = {
     "sensitivity": _sensitivity,
     "adversary": _adversary,
     "bench": _bench,
+    "doors": _doors,
     "engines": _engines,
     "certify": _certify,
     "list": _list,
