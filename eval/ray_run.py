@@ -194,7 +194,7 @@ class DealtRun:
         """Episodes to play, by group and by how often they were lost."""
         for group, episodes in waiting.items():
             self._queues[group, 0] = deque(episodes)
-        self._batch = min(self.config.flags.worlds, self._fair())
+        self._batch = max(1, min(self.config.flags.worlds, self._fair()))
         """Worlds of environments."""
         self._losses: Counter[int] = Counter()
         """Losses of each episode while it was played alone."""
@@ -204,6 +204,11 @@ class DealtRun:
     def waiting(self) -> int:
         """Episodes that no process has."""
         return sum(map(len, self._queues.values()))
+
+    @property
+    def slices(self) -> int:
+        """Slices that what nobody plays would make, at least."""
+        return ceil(self.waiting / self._batch)
 
     @property
     def leased(self) -> bool:

@@ -139,11 +139,17 @@ class _RayPlayer(CellPlayer):
         """Give work to a process that waits: a slice of the run that it has open, or another run to open."""
         busy = {one.lease.group for one in self.crew.members if one.lease is not None}
 
+        def wanted(cell: _Cell) -> bool:
+            if not cell.open or cell.dealt is None or cell.job is member.job:
+                return cell.open
+            coming = [one for one in self.crew.members if one.job is cell.job and one.lease is None]
+            return len(coming) < cell.dealt.slices  # no more open it than find something to play
+
         def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int]:
             fresh = cell.dealt is None
             return cell.job is not member.job, cell.group != member.last, fresh, cell.group in busy, cell.number
 
-        found = min((cell for cell in self.cells if cell.open), key=order, default=None)
+        found = min(filter(wanted, self.cells), key=order, default=None)
         if found is None:
             return
         if found.job is not member.job:
@@ -216,11 +222,7 @@ class _RayPlayer(CellPlayer):
 
     def _close(self, cell: _Cell, error: BaseException | None) -> None:
         """Let go of the journal; the folder's status says how the run ended."""
-        try:
-            cell.held.__exit__(type(error) if error is not None else None, error, None)
-        except BaseException as raised:
-            if raised is not error:
-                raise
+        cell.held.__exit__(None if error is None else type(error), error, None)
 
     def _leave(self, interrupt: KeyboardInterrupt | None) -> None:
         """End all cells that have begun, before they are whole."""

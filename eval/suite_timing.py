@@ -199,8 +199,8 @@ class _Timing:
 
         cell = self.cells[one.size.name]
         spec, flags = self._spec(cell), {name: getattr(self.options, name) for name in ("ray", *RAY_FLAGS)}
-        rounds: list[list[float]] = []
-        for number in (1, 2):
+        rounds: dict[int, tuple[float, ...]] = {}
+        for number in (2, 1):  # first two: there may be no room for them
             count = worlds[cell.id] * number
             wanted = {**flags, "ray_actors": number, "worlds": worlds[cell.id]}
             folders = []
@@ -211,8 +211,8 @@ class _Timing:
                 seconds = round_seconds(folders, number, self.given)
             if seconds is None:
                 return None
-            rounds.append(seconds[1:])
-        return Slowdown(tuple(rounds[0]), tuple(rounds[1]))
+            rounds[number] = tuple(seconds[1:])
+        return Slowdown(alone=rounds[1], pair=rounds[2])
 
     # Said
 
