@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton.command_line import exit_code
 from arena_newton.errors import InputError
+from arena_newton.eval.door_options import DoorOptions
 from arena_newton.eval.options import (
     BenchOptions,
     CertifyOptions,
@@ -53,6 +54,7 @@ OVERVIEW = f"""commands:
   {PROG} sensitivity [flags]     map success and margin over the placements of a task
   {PROG} adversary [flags]       search the placement at which a policy does worst
   {PROG} bench [--what ...]      measure this machine against the figures to reach
+  {PROG} doors [flags]           one checkpoint through lerobot-eval and each served protocol, compared
   {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
 """
@@ -116,14 +118,18 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
         beside = ResultsFolder(results_folder(row.out), resolve(row), versions())
         beside.check()
     if config.flags.ray is not None:
-        # Read when ray is imported: under `uv run` it would start every process by another `uv run`, elsewhere.
-        os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
+        _before_ray()
         from arena_newton.eval import ray_run
 
         return ray_run.execute(folder, factories, beside)
     from arena_newton.eval.run import execute
 
     return execute(folder, factories, beside)
+
+
+def _before_ray() -> None:
+    """Set what is read when ray is imported: under `uv run` it would start every process by another `uv run`."""
+    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
 
 
 def _record(arguments: list[str], factories: Factories | None) -> int:
@@ -256,6 +262,16 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
         if call.problem is not None:
             raise call.problem
         return 0
+    if options.ray is not None:
+        _before_ray()
+    if options.estimate is not None:
+        from arena_newton.eval import suite_timing
+
+        return suite_timing.run(call, factories)
+    if options.ray is not None:
+        from arena_newton.eval import ray_suite
+
+        return ray_suite.run(call, factories)
     from arena_newton.eval import suite_run
 
     return suite_run.run(call, factories)
@@ -290,6 +306,13 @@ def _engines(arguments: list[str], factories: Factories | None) -> int:
     from arena_newton.eval import engines
 
     return engines.run(options)
+
+
+def _doors(arguments: list[str], factories: Factories | None) -> int:
+    options = parse_flags(DoorOptions, arguments, f"{PROG} doors")
+    from arena_newton.eval import door_comparison
+
+    return door_comparison.run(options)
 
 
 def _certify(arguments: list[str], factories: Factories | None) -> int:
@@ -364,6 +387,7 @@ _COMMANDS = {
     "sensitivity": _sensitivity,
     "adversary": _adversary,
     "bench": _bench,
+    "doors": _doors,
     "engines": _engines,
     "certify": _certify,
     "list": _list,

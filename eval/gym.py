@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import string
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, cast, get_args
 
 import gymnasium
 import numpy as np
@@ -30,7 +30,7 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import PROTOCOL_REPEATS, PROTOCOL_SEEDS
 from arena_newton.pictures.camera import Camera
-from arena_newton.pictures.settings import STRIP_SIZES, CameraConfig
+from arena_newton.pictures.settings import STRIP_SIZES, CameraConfig, Fit
 from arena_newton.robot import TICK
 from arena_newton.rollout import ending
 
@@ -95,6 +95,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         variant_file: str | None = None,
         fast_physics: bool = False,
         image_size: Sequence[int] | None = IMAGE_SIZE,
+        fit: Fit = "pad",
         cameras: Mapping[str, str] | None = None,
         state_keys: Sequence[str] = ("agent_pos",),
         instruction: bool = True,
@@ -121,6 +122,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             variant_file: A USD layer instead of the task's own scene.
             fast_physics: Use the tracker's fast physics rate.
             image_size: Width and height of observed pictures [px]; None: no pictures are taken, which is much faster.
+            fit: `pad` or `native`, as in `CameraConfig`: how the camera's 4:3 picture goes into another size.
             cameras: Name in `pixels` → camera (`ego`, `left_wrist`, `right_wrist`, `world` or a prim's path); by
                 default `pixels` is the head camera's picture itself.
             state_keys: Names under which the state is observed.
@@ -152,6 +154,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self.num_envs = _at_least_1("num_envs", num_envs)
         cap = None if max_episode_steps is None else _at_least_1("max_episode_steps", max_episode_steps)
         size = None if image_size is None else _size(image_size)
+        _choice("fit", fit, get_args(Fit))
         prims = {"": "ego"} if cameras is None else dict(cameras)
         self.env = ArenaEnv(
             task,
@@ -177,7 +180,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._cameras: dict[str, Camera] = {}
         if size is not None:
             for name, prim in prims.items():
-                self._cameras[name] = self._camera(CameraConfig(width=size[0], height=size[1], prim=prim))
+                self._cameras[name] = self._camera(CameraConfig(width=size[0], height=size[1], prim=prim, fit=fit))
         self._state_keys = tuple(state_keys)
         self._make_spaces(size)
         n = self.num_envs
@@ -195,8 +198,8 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._margin = np.full(n, np.nan)
 
     def _camera(self, config: CameraConfig) -> Camera:
-        env, fit = self.env, config.fit
-        return Camera.from_scene(env.scene, config.prim, config.width, config.height, lights=env.lights, fit=fit)
+        size, lights = (config.width, config.height), self.env.lights
+        return Camera.from_scene(self.env.scene, config.prim, *size, lights=lights, fit=config.fit)
 
     def _make_spaces(self, size: tuple[int, int] | None) -> None:
         """Spaces of one world and of the batch."""
@@ -510,8 +513,7 @@ class ArenaGymEnv(gymnasium.Env[Observations, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, Info]:
         """Advance by one tick under a canonical action, float32, shape [40]; after the end nothing moves."""
-        batch = np.asarray(action)[None]
-        observation, reward, terminated, truncated, info = self.batch.step(batch)
+        observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
         flags = bool(terminated[0]), bool(truncated[0])
         return _row(observation, 0), float(reward[0]), *flags, _row_of_info(info)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,36 @@ from arena_newton.eval.plan import Episode
 from arena_newton.files import replace_atomically
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 
-__all__ = ["ActionRecorder"]
+__all__ = ["OUTCOMES_FILE", "ActionRecorder", "write_actions"]
+
+OUTCOMES_FILE = "outcomes.jsonl"
+"""File of the episodes that LeRobot's command line played: a line with outcome, reason, steps and margin of each."""
+
+
+def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: int, gym_id: str, mode: str) -> None:
+    """Write the actions that an episode executed, as `--policy replay:` reads them.
+
+    Args:
+        path: The file, `<task>_<mode>_s<group seed>_r<repeat>.npz`.
+        actions: Canonical actions, one per tick, each of shape [40].
+        episode_seed: The episode's seed.
+        gym_id: The task's Gym id.
+        mode: `base`, `execution`, `semantic` or `visual`.
+
+    Raises:
+        StorageError: The file cannot be written.
+    """
+    try:
+        with replace_atomically(path) as file:
+            np.savez_compressed(
+                file,
+                action=np.stack(actions),
+                episode_seed=np.int64(episode_seed),
+                task=np.str_(gym_id),
+                mode=np.str_(mode),
+            )
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 class ActionRecorder(Recorder):
@@ -46,15 +76,6 @@ class ActionRecorder(Recorder):
         actions = self._actions.pop(world)
         if result.steps < 1:
             return
-        path = self.folder / f"{result.episode.key.replace('/', '_')}.npz"
-        try:
-            with replace_atomically(path) as file:
-                np.savez_compressed(
-                    file,
-                    action=np.stack(actions),
-                    episode_seed=np.int64(result.episode.episode_seed),
-                    task=np.str_(env.spec.gym_id),
-                    mode=np.str_(result.episode.mode),
-                )
-        except OSError as error:
-            raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
+        episode = result.episode
+        path = self.folder / f"{episode.key.replace('/', '_')}.npz"
+        write_actions(path, actions, episode_seed=episode.episode_seed, gym_id=env.spec.gym_id, mode=episode.mode)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from arena_newton import tasks as task_registry
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
+from arena_newton.eval.lerobot_env.policy_worlds import PolicyWorlds, policy_worlds
+from arena_newton.flags import user_path
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -25,8 +28,11 @@ FPS = 50
 """Ticks per second."""
 CAMERAS = {"front": "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
 """Name in datasets (the original's) → camera of the scene."""
-REPEATED = f"observation.{OBS_STATE}"
-"""What LeRobot makes of an observation that has a dataset's name already."""
+REPEATED = (f"observation.{OBS_STATE}", f"observation.{OBS_ENV_STATE}")
+"""What LeRobot makes of observations that have a dataset's name already."""
+FITS = ("pad", "native")
+"""`pictures.settings.Fit`."""
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -34,8 +40,8 @@ class DropRepeated(ObservationProcessorStep):  # type: ignore[misc]  # LeRobot's
     """Drops what is observed under a dataset's name, for `--eval.recording`; policies get it as `observation.state`."""
 
     def observation(self, observation: dict[str, object]) -> dict[str, object]:
-        """The observation without its second copy of the state."""
-        return {key: value for key, value in observation.items() if key != REPEATED}
+        """The observation without its second copies of state and task vector."""
+        return {key: value for key, value in observation.items() if key not in REPEATED}
 
     def transform_features(self, features: dict[str, object]) -> dict[str, object]:
         """Features are those of the policy already."""
@@ -69,25 +75,31 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """Use the tracker's fast physics rate."""
     cameras: str = "front"
     """Observed cameras, with commas between: front, left_wrist, right_wrist, world."""
-    image_width: int = 224
-    """Width of pictures [px]."""
-    image_height: int = 224
-    """Height of pictures [px]."""
+    image_width: int | None = None
+    """Width of pictures [px]; the policy's, or 224."""
+    image_height: int | None = None
+    """Height of pictures [px]; the policy's, or 224."""
+    fit: Literal["native", "pad"] | None = None
+    """`pad` or `native`: how the camera's 4:3 picture goes into another size; the policy's, or `pad`."""
     episode_length: int | None = None
     """Cap on the step budget of the rule set [ticks]."""
-    labels: str = "v3.1"
-    """Protocol of the policy's actions: v3.1, or v4, which is decoded per world."""
-    realign: float = 0.0
-    """Of v4: fraction of the gap between commanded and measured heading that is closed each tick."""
-    look_ticks: int = 20
+    labels: str | None = None
+    """Protocol of the policy's actions: v3.1, or v4, which is decoded per world; the policy's, or v3.1."""
+    realign: float | None = None
+    """Of v4: fraction of the gap between commanded and measured heading that is closed each tick; the policy's."""
+    look_ticks: int | None = None
     """Of v4: ticks between two looks of the policy, at which `realign` measures the heading: its n_action_steps."""
+    task_vector: str | None = None
+    """Tasks in the order of the one-hot vector that the policy is given, with commas between; the policy's, or none."""
+    episodes: str | None = None
+    """Folder that gets what LeRobot's files leave out: a line per episode, and its actions for `replay:`."""
 
     def __post_init__(self) -> None:
-        """Name the features.
+        """Take over what the policy of `--policy.path` says of itself, and name the features.
 
         Raises:
-            InputError: An unknown task, camera or protocol, a number that is out of range, or another number of ticks
-                per second than the world has.
+            InputError: An unknown task, camera or protocol, a number that is out of range, another number of ticks
+                per second than the world has, or a damaged file of the policy.
         """
         if self.fps != FPS:
             raise InputError(f"--env.fps {self.fps}: the world has {FPS} ticks per second")
@@ -95,34 +107,52 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError(
                 f"--env.max_parallel_tasks {self.max_parallel_tasks}: tasks run one after the other, use 1"
             )
-        if self.labels not in LABELS:
-            raise InputError(f"--env.labels {self.labels}: unknown, choose from {', '.join(LABELS)}")
-        if not 0.0 <= self.realign <= 1.0:
-            raise InputError(f"--env.realign {self.realign}: expected 0 to 1")
-        if self.look_ticks < 1:
-            raise InputError(f"--env.look_ticks {self.look_ticks}: expected at least 1")
+        said = policy_worlds()
+        if said.source is not None:
+            logger.info("%s says %s; flags that are given count more", said.source, said.sentence)
+        worlds = self.policy_worlds = PolicyWorlds(
+            labels=said.labels if self.labels is None else self.labels,
+            realign=said.realign if self.realign is None else self.realign,
+            look_ticks=said.look_ticks if self.look_ticks is None else self.look_ticks,
+            task_vector=said.task_vector if self.task_vector is None else _names(self.task_vector),
+            width=said.width if self.image_width is None else self.image_width,
+            height=said.height if self.image_height is None else self.image_height,
+            fit=said.fit if self.fit is None else self.fit,
+        )
+        if worlds.labels not in LABELS:
+            raise InputError(f"--env.labels {worlds.labels}: unknown, choose from {', '.join(LABELS)}")
+        if worlds.fit not in FITS:
+            raise InputError(f"--env.fit {worlds.fit}: unknown, choose from {', '.join(FITS)}")
+        if not 0.0 <= worlds.realign <= 1.0:
+            raise InputError(f"--env.realign {worlds.realign}: expected 0 to 1")
+        if worlds.look_ticks < 1:
+            raise InputError(f"--env.look_ticks {worlds.look_ticks}: expected at least 1")
         for task in self.tasks:
             task_registry.get(task)
-        shape = (self.image_height, self.image_width, 3)
+            if worlds.task_vector and task not in worlds.task_vector:
+                raise InputError(f"--env.task {task}: the policy was trained on {', '.join(worlds.task_vector)}")
+        shape = (worlds.height, worlds.width, 3)
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_WIDTH,)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, (STATE_WIDTH,)),
             **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
         }
+        if worlds.task_vector:
+            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (len(worlds.task_vector),))
         self.features_map = {key: key for key in self.features}
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """Task names."""
-        names = [name.strip() for name in (self.task or "").split(",") if name.strip()]
+        names = _names(self.task or "")
         if not names:
             raise InputError("--env.task: nothing named, at least one task is needed")
-        return task_registry.names() if names == ["all"] else tuple(names)
+        return task_registry.names() if names == ("all",) else names
 
     @property
     def prims(self) -> dict[str, str]:
         """Name in datasets → camera of the scene."""
-        names = [name.strip() for name in self.cameras.split(",") if name.strip()]
+        names = _names(self.cameras)
         for name in names:
             if name not in CAMERAS:
                 raise InputError(f"--env.cameras {name}: unknown, choose from {', '.join(CAMERAS)}")
@@ -144,7 +174,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             "device": self.device,
             "variant_file": self.variant_file,
             "fast_physics": self.fast_physics,
-            "image_size": (self.image_width, self.image_height),
+            "image_size": (self.policy_worlds.width, self.policy_worlds.height),
+            "fit": self.policy_worlds.fit,
             "cameras": self.prims,
             "state_keys": ("agent_pos", OBS_STATE),
             "instruction": False,
@@ -162,9 +193,17 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
         """
         from arena_newton.eval.lerobot_env.labelled_worlds import make_worlds
 
-        options, of = self.gym_kwargs, (self.labels, self.realign, self.look_ticks)
-        return {task: {0: make_worlds(task, n_envs, *of, options)} for task in self.tasks}
+        folder = None if self.episodes is None else user_path(self.episodes)
+        made: dict[str, dict[int, VectorEnv]] = {}
+        for task in self.tasks:
+            made[task] = {0: make_worlds(task, n_envs, self.policy_worlds, folder, self.gym_kwargs)}
+        return made
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """What changes observations before the policy's own processors, and actions after them."""
         return PolicyProcessorPipeline(steps=[DropRepeated()]), PolicyProcessorPipeline(steps=[])
+
+
+def _names(given: str) -> tuple[str, ...]:
+    """What is named with commas between."""
+    return tuple(name.strip() for name in given.split(",") if name.strip())

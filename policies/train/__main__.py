@@ -1,4 +1,4 @@
-"""Command line: ``python -m arena_newton.policies.train [flags]``, and ``bench``."""
+"""Command line: ``python -m arena_newton.policies.train [flags]``, ``bench`` and ``teachable``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from collections.abc import Sequence
 from arena_newton.command_line import exit_code
 from arena_newton.extras import require
 from arena_newton.flags import parse_flags
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions, check_numbers
+from arena_newton.policies.train.policy_options import (
+    PolicyTrainOptions,
+    TeachableOptions,
+    TrainingBenchOptions,
+    check_numbers,
+    check_teachable,
+)
 
 __all__ = ["main"]
 
@@ -25,7 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 done, 1 training failed, 2 bad input, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    return exit_code(lambda: _bench(arguments[1:]) if arguments[:1] == ["bench"] else _train(arguments))
+    commands = {"bench": _bench, "teachable": _teachable}
+    if arguments and arguments[0] in commands:
+        return exit_code(lambda: commands[arguments[0]](arguments[1:]))
+    return exit_code(lambda: _train(arguments))
 
 
 def _train(arguments: list[str]) -> None:
@@ -44,6 +53,14 @@ def _bench(arguments: list[str]) -> None:
     from arena_newton.policies.train.training_bench import bench
 
     bench(options)
+
+
+def _teachable(arguments: list[str]) -> int | None:
+    options = parse_flags(TeachableOptions, arguments, f"{PROG} teachable")
+    check_teachable(options)
+    from arena_newton.policies.train.teachable import teachable
+
+    return teachable(options)
 
 
 def _require(family: str) -> None:

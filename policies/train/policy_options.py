@@ -10,7 +10,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
-__all__ = ["PolicyTrainOptions", "TrainingBenchOptions", "check_numbers"]
+__all__ = ["PolicyTrainOptions", "TeachableOptions", "TrainingBenchOptions", "check_numbers", "check_teachable"]
 
 MOST_TRAININGS = 16
 """Most trainings that are measured side by side."""
@@ -114,12 +114,57 @@ class TrainingBenchOptions:
     """Processes of LeRobot's data loader."""
 
 
-def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
-    """Refuse flags that no training can use, before anything is loaded.
+@dataclass(frozen=True)
+class TeachableOptions:
+    """Say in minutes, without pictures and without a GPU, whether a policy without memory can learn demonstrations.
+
+    A small network that is given the true poses is trained on them and plays. What it cannot do no policy of these
+    families will; what it can is still to be seen in pictures.
+    """
+
+    recording: Path = Path()
+    """Folder of `eval record`."""
+    task: str = ""
+    """Task of the demonstrations and of the episodes."""
+    tracker: str = "twist2"
+    """Tracker through which they were recorded, and which executes what the network decides."""
+    steps: int = field(default=3000, metadata=bounds(1, 10_000_000))
+    """Optimizer steps."""
+    batch_size: int = field(default=256, metadata=bounds(1, 65536))
+    """Ticks of a step."""
+    chunk: int = field(default=20, metadata=bounds(1, 1000))
+    """Actions of an answer, which are executed whole."""
+    seed: int = field(default=0, metadata=bounds(0, 2**31))
+    """Of weights, order and noise."""
+    episodes: int = field(default=30, metadata=bounds(1, 1000))
+    """Episodes that are played, spread over the protocol's group seeds 0 1 2."""
+    worlds: int = field(default=30, metadata=bounds(1, 4096))
+    """Episodes that are simulated at once."""
+    max_steps: int | None = field(default=None, metadata=bounds(1, 10_000_000))
+    """Cap on the step budget of the task [ticks of 0.02 s]."""
+    engine: str = "mujoco"
+    """Physics engine: mujoco, warp or auto."""
+    device: str = "cpu"
+    """Device of the worlds: cpu, cuda, cuda:N."""
+    out: Path | None = None
+    """Write the result to this JSON file."""
+
+
+def check_teachable(options: TeachableOptions) -> None:
+    """Refuse flags before anything is loaded.
 
     Raises:
         InputError: A flag's value is unfit.
     """
+    _check_ranges(options)
+    if options.recording == Path() or not options.recording.is_dir():
+        raise InputError(f"--recording {options.recording}: name a folder that eval record wrote")
+    if not options.task:
+        raise InputError("--task: name the task of the demonstrations")
+
+
+def _check_ranges(options: PolicyTrainOptions | TrainingBenchOptions | TeachableOptions) -> None:
+    """Refuse numbers that are out of the ranges of their fields."""
     for one in dataclasses.fields(options):
         if "range" in one.metadata:
             low, high = one.metadata["range"]
@@ -128,6 +173,15 @@ def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
                 flag = "--" + one.name.replace("_", "-")
                 until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise InputError(f"{flag} {value}: expected a number {until}")
+
+
+def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
+    """Refuse flags that no training can use, before anything is loaded.
+
+    Raises:
+        InputError: A flag's value is unfit.
+    """
+    _check_ranges(options)
     for flag, value, known in (("--policy", options.policy, FAMILIES), ("--recipe", options.recipe, RECIPES)):
         if value not in known:
             raise InputError(f"{flag} {value}: unknown, choose from {', '.join(known)}")
