@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import cast
 
 from arena_newton.errors import InputError
-from arena_newton.eval import shard_merge
+from arena_newton.eval import report, shard_merge
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
 from arena_newton.eval.certification.same_files import contents, digest
@@ -151,9 +151,11 @@ def ray(context: Context) -> CheckFinding:
 
 
 def _alone(context: Context, plan: RunOptions) -> Path:
-    """Results folder of the plan that one process played."""
+    """Results folder of the plan that one process played; its reports are written by the present code, as all are."""
     context.play(plan, "plan, in one process")
-    return Path(str(plan.out))
+    folder = Path(str(plan.out))
+    report.write_reports(load_run(folder))
+    return folder
 
 
 def compared(alone: Path, other: Path) -> JsonObject:

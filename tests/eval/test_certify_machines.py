@@ -72,6 +72,9 @@ def test_shards_of_a_plan_are_one_run(tmp_path):
     before = (tmp_path / "certify.json").read_text()
     assert certified(tmp_path, "shards", resume=True)[0] == 0
     assert (tmp_path / "certify.json").read_text() == before
+    (tmp_path / "measured" / "shards.json").unlink()
+    edit(tmp_path / "runs" / "plan" / "alone" / "report.html", "</h1>", " of an older version</h1>")
+    assert certified(tmp_path, "shards", resume=True)[0] == 0
 
 
 @pytest.mark.parametrize("name", ["episodes.jsonl", "results.json"])
