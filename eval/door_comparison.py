@@ -26,6 +26,7 @@ from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.eval.door_options import DOOR_NAMES, DoorOptions
 from arena_newton.eval.journal import StorageError, write_atomic
+from arena_newton.eval.picture_differences import picture_rows, picture_table
 from arena_newton.eval.plan import PROTOCOL_REPEATS
 from arena_newton.eval.recordings import OUTCOMES_FILE
 from arena_newton.eval.results import load_run
@@ -33,7 +34,7 @@ from arena_newton.extras import require
 from arena_newton.flags import user_path
 from arena_newton.own_processes import environment
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED
-from arena_newton.policies.lerobot.checkpoint_facts import FACTS_FILE, CheckpointFacts, checkpoint_folder
+from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
 
 __all__ = ["DoorEpisode", "DoorPlay", "DoorRow", "compare_doors", "door_table", "run"]
 
@@ -126,6 +127,10 @@ def run(options: DoorOptions) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
+    pictures = ""
+    if options.pictures:
+        pictures = picture_table(picture_rows(options, checkpoint))
+        print(pictures, flush=True)
     plays = []
     for door in doors:
         plays.append(_play(door, options, checkpoint, out / door))
@@ -137,7 +142,7 @@ def run(options: DoorOptions) -> int:
     said = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
     text = door_table(rows, options.first)
     commands = "\n".join(f"- {row.door}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
-    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n")
+    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n" + (f"\n{pictures}" if pictures else ""))
     facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": [asdict(row) for row in rows]}
     write_atomic(out / "doors.json", json.dumps(facts, indent=2) + "\n")
     print(f"\n{said}\n\n{text}")
@@ -220,9 +225,6 @@ def _largest(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 def _checked(options: DoorOptions, checkpoint: Path) -> tuple[str, ...]:
     """The doors that can be played, once the flags are checked."""
-    facts = CheckpointFacts.read(checkpoint)
-    if facts is None:
-        raise InputError(f"--checkpoint {checkpoint}: holds no {FACTS_FILE}, which says what its actions mean")
     tasks.get(options.task)
     for name in options.doors:
         if name not in DOOR_NAMES:

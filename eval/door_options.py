@@ -19,7 +19,7 @@ class DoorOptions:
     """
 
     checkpoint: str | None = None
-    """Folder of a checkpoint of LeRobot with arena_policy.json; the policy that comes with the package by default."""
+    """A checkpoint of LeRobot, or the folder of a training; the policy that comes with the package by default."""
     task: str = "vis_navi"
     """Task."""
     tracker: str = "twist2"
@@ -36,5 +36,8 @@ class DoorOptions:
     """Physics engine: mujoco or warp."""
     device: str = "cpu"
     """Device of worlds and networks: cpu, cuda."""
+    pictures: bool = False
+    """Also show the policy each episode's first look as PNG, as JPEG, scaled and through the other lens, and print what
+    it decides otherwise."""
     out: str = "doors"
     """Folder of the episodes, the programs' output and the table; must be empty or new."""

@@ -47,10 +47,10 @@ ENDING = 60.0
 """Time for the cluster to end when it is told to [s]."""
 COMMAND = (sys.executable, "-P", "-m", "arena_newton.eval")
 """What plays by a cluster."""
-ACTOR = "ray::Episode"
-"""How the name of a process begins that plays for a cluster."""
-REPLACED = "is replaced:"
-"""What a run says of a process that it lost."""
+ACTOR = b"ray::EpisodeActor.play"
+"""How the title of a process begins while it plays for a cluster."""
+REPLACED = "left: a process"
+"""What a run says of a process that it lost with the episodes that it played."""
 SHOWN = (CONFIG_FILE, JOURNAL_FILE, "results.json", "table.md", "table.csv", "report.md", "report.html")
 """Files that a page names; the others are counted."""
 NAMED = 20
@@ -254,20 +254,20 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _actors(pid: int) -> list[int]:
-    """Processes below one that play for a cluster, as Linux tells."""
-    names: dict[int, str] = {}
+    """Processes below one that play for a cluster now, as Linux tells."""
+    titles: dict[int, bytes] = {}
     children: dict[int, list[int]] = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
-            number, _, rest = path.read_text(errors="replace").partition(" (")
-            name, _, rest = rest.rpartition(") ")
-            names[int(number)] = name
-            children.setdefault(int(rest.split()[1]), []).append(int(number))
+            parent = path.read_text(errors="replace").rpartition(") ")[2].split()[1]
+            number = int(path.parent.name)
+            titles[number] = path.with_name("cmdline").read_bytes()
+            children.setdefault(int(parent), []).append(number)
     found, waiting = [], [pid]
     while waiting:
         below = sorted(children.get(waiting.pop(), ()))
         waiting += below
-        found += [one for one in below if names[one].startswith(ACTOR)]
+        found += [one for one in below if titles[one].startswith(ACTOR)]
     return found
 
 

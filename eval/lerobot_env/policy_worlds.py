@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from lerobot.configs import parser
+from lerobot.utils.constants import OBS_IMAGES
 
 from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
@@ -48,43 +50,68 @@ class PolicyWorlds:
 
 
 def policy_worlds() -> PolicyWorlds:
-    """What the policy of LeRobot's flag `--policy.path` says; defaults without one, or where it is none of ours.
+    """What the policy of LeRobot's flag `--policy.path` says; defaults without one that is a folder.
+
+    Of a checkpoint without `arena_policy.json`, such as one of `lerobot-train`, the size of its pictures is known.
 
     Raises:
         InputError: A file of the checkpoint is damaged.
     """
     given = parser.get_path_arg("policy")
-    folder = Path(given) if given else None
-    facts = CheckpointFacts.read(folder) if folder is not None and folder.is_dir() else None
-    if folder is None or facts is None:
+    if not given or not (Path(given) / CONFIG_FILE).is_file():
         return PolicyWorlds()
+    path = Path(given) / CONFIG_FILE
+    content = _config(path)
+    facts, ticks = CheckpointFacts.read(path.parent), _look_ticks(path, content)
+    if facts is None:
+        width, height = _picture(path, content)
+        fit: Literal["native", "pad"] = "native" if 3 * width == 4 * height else "pad"  # as eval record takes them
+        return PolicyWorlds(look_ticks=ticks, width=width, height=height, fit=fit, source=path)
     camera = facts.camera
     return PolicyWorlds(
         labels=facts.labels,
         realign=facts.realign,
-        look_ticks=_look_ticks(folder / CONFIG_FILE),
+        look_ticks=ticks,
         task_vector=facts.task_vector,
         width=camera.width,
         height=camera.height,
         fit=camera.fit,
-        source=folder / FACTS_FILE,
+        source=path.with_name(FACTS_FILE),
     )
 
 
-def _look_ticks(path: Path) -> int:
-    """Ticks between two looks, by LeRobot's flags of the policy where they change them."""
+def _config(path: Path) -> Mapping[str, object]:
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as JSON ({error})") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
+    return content
+
+
+def _picture(path: Path, content: Mapping[str, object]) -> tuple[int, int]:
+    """Width and height of the head camera's pictures [px]; 224 for a policy that names none."""
+    inputs = content.get("input_features")
+    front = inputs.get(f"{OBS_IMAGES}.front") if isinstance(inputs, dict) else None
+    if front is None:
+        return PolicyWorlds.width, PolicyWorlds.height
+    shape = front.get("shape") if isinstance(front, dict) else None
+    if not isinstance(shape, list) or len(shape) != 3 or not all(isinstance(n, int) and 1 <= n <= 4096 for n in shape):
+        raise InputError(f"{path}: input {OBS_IMAGES}.front has shape {shape!r:.40}, expected [3, height, width]")
+    return shape[2], shape[1]
+
+
+def _look_ticks(path: Path, content: Mapping[str, object]) -> int:
+    """Ticks between two looks, by LeRobot's flags of the policy where they change them."""
     values: dict[str, object] = {}
     for name in ("n_action_steps", "temporal_ensemble_coeff"):
         flag = parser.parse_arg(f"policy.{name}")
         values[name] = content.get(name) if flag is None else flag
     if values["temporal_ensemble_coeff"] not in (None, "null", "None"):
         return 1  # LeRobot's ensembling looks at every tick
+    if values["n_action_steps"] is None:
+        return 1
     try:
         return int(str(values["n_action_steps"]))
     except ValueError:

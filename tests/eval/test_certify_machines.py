@@ -165,8 +165,9 @@ def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     """Of the processes below a run the one that plays is killed, once an episode has ended and not before."""
     monkeypatch.setattr(machines, "POLL", 0.05)
     (tmp_path / "episodes.jsonl").write_text("")
-    rename = "import ctypes,time; ctypes.CDLL(None).prctl(15, b'ray::EpisodeAct', 0, 0, 0); time.sleep(60)"
-    run = subprocess.Popen(["bash", "-c", f'{sys.executable} -c "{rename}"; touch {tmp_path}/gone; exec sleep 30'])
+    waits = "import time; time.sleep(60)"
+    idle, plays = (f'(exec -a ray::EpisodeActor{what} {sys.executable} -c "{waits}")' for what in ("", ".play"))
+    run = subprocess.Popen(["bash", "-c", f"{idle} & other=$!; {plays}; touch {tmp_path}/gone; kill $other"])
     try:
         wait_for(lambda: machines._actors(run.pid))
         assert len(machines._actors(run.pid)) == 1 and not (tmp_path / "gone").exists()

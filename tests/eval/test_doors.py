@@ -19,10 +19,11 @@ from arena_newton.eval.door_comparison import DoorEpisode, DoorPlay, compare_doo
 from arena_newton.eval.door_options import DOOR_NAMES, DoorOptions
 from arena_newton.eval.lerobot_env import ArenaNewtonEnv
 from arena_newton.eval.lerobot_env.labelled_worlds import V4VectorEnv
+from arena_newton.eval.picture_differences import picture_rows, picture_table
 from arena_newton.policies.replay import ReplayEpisodes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies" / "checkpoints"))
-from made_checkpoints import SIDE, edit, facts, save
+from made_checkpoints import SIDE, facts, save
 
 TASKS = ("boxing", "vis_navi")
 TICKS = 8
@@ -134,6 +135,10 @@ def test_the_checkpoint_says_how_it_is_played(checkpoint, monkeypatch, tmp_path)
     argv(monkeypatch, tmp_path)  # none of ours
     other = ArenaNewtonEnv(task="football").policy_worlds
     assert (other.labels, other.fit, other.width, other.task_vector) == ("v3.1", "pad", 224, ())
+    features = {"observation.images.front": {"type": "VISUAL", "shape": [3, 480, 640]}}
+    (tmp_path / "config.json").write_text(json.dumps({"n_action_steps": 8, "input_features": features}))
+    trained = ArenaNewtonEnv(task="football").policy_worlds  # by lerobot-train, on pictures of the sensor's own shape
+    assert (trained.width, trained.height, trained.fit, trained.labels) == (640, 480, "native", "v3.1")
     with pytest.raises(InputError, match="--env.fit wide"):
         ArenaNewtonEnv(task="boxing", fit="wide")
 
@@ -145,6 +150,15 @@ def test_a_damaged_checkpoint_is_named(tmp_path, monkeypatch, content):
     (tmp_path / "config.json").write_text(content)
     argv(monkeypatch, tmp_path)
     with pytest.raises(InputError, match="config.json"):
+        ArenaNewtonEnv(task="boxing")
+
+
+def test_a_picture_of_no_size_is_named(tmp_path, monkeypatch):
+    """A foreign checkpoint whose picture cannot be rendered is one error with its path."""
+    features = {"observation.images.front": {"type": "VISUAL", "shape": [3, "wide"]}}
+    (tmp_path / "config.json").write_text(json.dumps({"n_action_steps": 8, "input_features": features}))
+    argv(monkeypatch, tmp_path)
+    with pytest.raises(InputError, match="config.json: input observation.images.front has shape"):
         ArenaNewtonEnv(task="boxing")
 
 
@@ -195,6 +209,24 @@ def test_the_vector_names_the_task():
     batch.close()
 
 
+def test_other_pictures_change_the_answer(checkpoint):
+    """What is packed without loss decides the same bits; JPEG, the other lens and blackness something else each."""
+    options = DoorOptions(task="boxing", episodes=2)
+    rows = picture_rows(options, checkpoint)
+    assert [row.name for row in rows] == [
+        f"{SIDE}x{SIDE} native, as rendered",
+        "the same as PNG",
+        "the same as JPEG, quality 95",
+        "the same as JPEG, quality 75",
+        f"{SIDE}x{SIDE} pad",
+        "black",
+    ]
+    assert [row.largest for row in rows[:2]] == [row.brightness for row in rows[:2]] == [0.0, 0.0]
+    assert all(row.largest >= row.mean > 0.0 and row.brightness > 0.0 for row in rows[2:])
+    assert rows[2].brightness < rows[3].brightness < rows[5].brightness
+    assert picture_table(rows).count("\n") == 2 + len(rows)
+
+
 @pytest.mark.slow
 def test_every_door_gives_the_same_episodes(checkpoint, tmp_path, capsys):
     """The command itself, each door a program: equal bits, exit code 0, and a table with every command."""
@@ -216,11 +248,3 @@ def test_our_runner_as_a_door(checkpoint, tmp_path):
     assert main(["doors", *flags, "--doors", "lerobot", "--out", str(tmp_path / "out")]) == 0
     (row,) = json.loads((tmp_path / "out" / "doors.json").read_text())["doors"]
     assert row["steps"] == [TICKS] and row["episodes"] == 1 and row["promised"]
-
-
-def test_a_checkpoint_without_facts_is_refused(checkpoint, tmp_path):
-    """What its actions mean is not guessed."""
-    edit(checkpoint / "config.json")
-    (tmp_path / "config.json").write_text((checkpoint / "config.json").read_text())
-    with pytest.raises(InputError, match="holds no arena_policy.json"):
-        door_comparison.run(DoorOptions(checkpoint=str(tmp_path), out=str(tmp_path / "out")))
