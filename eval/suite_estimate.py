@@ -3,7 +3,7 @@
 Cells are of one kind when policies of one family play them in one mode. A few cells of each kind are drawn by the hash
 of their names and measured. A cell's size is known: ticks of its batches of worlds up to their step budget. The time of
 a kind is the time of its measured cells by their size times the size of all its cells (Cochran, Sampling Techniques,
-3rd ed., 1977, chapter 6), its variance that of the residuals; the interval is Student's.
+3rd ed., 1977, chapter 6), its variance that of the residuals; the interval is Student's, of the logarithm.
 """
 
 from __future__ import annotations
@@ -148,15 +148,13 @@ def suite_time(
     building = build * (1 + sum(a.group != b.group for a, b in pairwise(cells)))
     error = math.sqrt(variance)
     reach = error * float(stats.t.ppf((1 + LEVEL) / 2, degrees)) if degrees else 0.0
-    part = reach / seconds
+    part = math.exp(reach / seconds)  # of the logarithm: no time is below 0
     found = []
     for number in devices:
         alone = _makespan(cells, rates, build, number)
         ratio, (low, high) = (1.0, (1.0, 1.0)) if slowdown is None else (slowdown.ratio, slowdown.range)
         more = [1 + (r - 1) * (number - 1) for r in (ratio, low, high)]
-        found.append(
-            DeviceTime(number, alone * more[0], alone * more[1] * max(0.0, 1 - part), alone * more[2] * (1 + part))
-        )
+        found.append(DeviceTime(number, alone * more[0], alone * more[1] / part, alone * more[2] * part))
     return SuiteTime(rates, seconds, error, building, degrees, tuple(found))
 
 
