@@ -118,14 +118,18 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
         beside = ResultsFolder(results_folder(row.out), resolve(row), versions())
         beside.check()
     if config.flags.ray is not None:
-        # Read when ray is imported: under `uv run` it would start every process by another `uv run`, elsewhere.
-        os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
+        _before_ray()
         from arena_newton.eval import ray_run
 
         return ray_run.execute(folder, factories, beside)
     from arena_newton.eval.run import execute
 
     return execute(folder, factories, beside)
+
+
+def _before_ray() -> None:
+    """Set what is read when ray is imported: under `uv run` it would start every process by another `uv run`."""
+    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
 
 
 def _record(arguments: list[str], factories: Factories | None) -> int:
@@ -258,6 +262,16 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
         if call.problem is not None:
             raise call.problem
         return 0
+    if options.ray is not None:
+        _before_ray()
+    if options.estimate is not None:
+        from arena_newton.eval import suite_timing
+
+        return suite_timing.run(call, factories)
+    if options.ray is not None:
+        from arena_newton.eval import ray_suite
+
+        return ray_suite.run(call, factories)
     from arena_newton.eval import suite_run
 
     return suite_run.run(call, factories)

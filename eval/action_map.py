@@ -8,6 +8,7 @@ observations themselves. Needs the extra [plots].
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,8 @@ CONSTANT = 1e-6
 """Spread below which a channel counts as constant."""
 COLOURS = {"sonic": "#1f77b4", "twist2": "#ff7f0e"}
 """The paper's: blue for SONIC, orange for TWIST2."""
+LEAST_WIDTH, LETTER = 4.8, 0.1
+"""Width of a figure that its legend needs, and of a letter of its title, a wide one [inch]."""
 OTHERS = ("#2ca02c", "#9467bd")
 """Colours of other sources."""
 
@@ -142,15 +145,16 @@ def draw(maps: Sequence[ActionMap], title: str, path: Path) -> None:
     """A panel per task, as the paper's figures."""
     columns = min(4, len(maps))
     rows = -(-len(maps) // columns)
+    width = max(LEAST_WIDTH, 3.4 * columns)
     figure, all_axes = pyplot.subplots(
-        rows, columns, figsize=(3.4 * columns, 0.9 + 3.4 * rows), squeeze=False, layout="constrained"
+        rows, columns, figsize=(width, 0.9 + 3.4 * rows), squeeze=False, layout="constrained"
     )
     for axes in all_axes.flat[len(maps) :]:
         axes.set_axis_off()
     for axes, one in zip(all_axes.flat, maps, strict=False):
         _panel(axes, one)
     handles, labels = all_axes.flat[0].get_legend_handles_labels()
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(textwrap.fill(title, int(width / LETTER)), fontsize=11)
     legend = figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     for handle in legend.legend_handles:
         if handle is not None:

@@ -42,19 +42,20 @@ PARTS = ("physics", "pictures", "tracker", "policy")
 """Parts of a tick whose times are told apart."""
 
 
-def random_checkpoint(folder: Path, name: str = "fast", tasks: tuple[str, ...] = ()) -> Path:
-    """A checkpoint of a recipe of ACT with random weights, whose actions stay near standing.
+def random_checkpoint(folder: Path, name: str = "fast", tasks: tuple[str, ...] = (), family: str = "act") -> Path:
+    """A checkpoint of a recipe with random weights, whose actions stay near standing.
 
     Args:
         folder: To write.
         name: Of the recipe.
         tasks: Of its task vector, where the recipe has one.
+        family: Of the recipe.
     """
     from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
     from arena_newton.policies.recipes.training_recipe import recipe
     from arena_newton.policies.train import families
 
-    settings = recipe("act", name, labels="v3.1", realign=0.0)
+    settings = recipe(family, name, labels="v3.1", realign=0.0)
 
     def around(mean: torch.Tensor, deviation: float) -> dict[str, torch.Tensor]:
         spread = torch.full_like(mean, deviation)

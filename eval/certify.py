@@ -6,6 +6,7 @@ Each check is a question with a measurement (`eval.certification`). Evaluations 
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,9 @@ from arena_newton.eval.certification import (
     certificate,
     error_rates,
     failures,
+    gradients,
     legs,
+    machines,
     sill,
     solvable,
     swap,
@@ -29,7 +32,7 @@ from arena_newton.eval.certification import (
 from arena_newton.eval.certification.bodies import BODIES, Body
 from arena_newton.eval.certification.context import Context, with_expert
 from arena_newton.eval.certification.finding import Check, CheckFinding
-from arena_newton.eval.certification.jobs import play_ahead
+from arena_newton.eval.certification.jobs import command_line, play_ahead
 from arena_newton.eval.config import plain_facts
 from arena_newton.eval.identity import code_hash
 from arena_newton.eval.options import CertifyOptions
@@ -46,11 +49,13 @@ CHECKS: tuple[Check, ...] = (
     *legs.CHECKS,
     *axes.CHECKS,
     *agreement.CHECKS,
+    *machines.CHECKS,
     *swap.CHECKS,
     *visible.CHECKS,
     *sill.CHECKS,
     *failures.CHECKS,
     *error_rates.CHECKS,
+    *gradients.CHECKS,
 )
 """All checks, in the order in which they run."""
 
@@ -86,18 +91,18 @@ def run(
     quiet_warp()
     if options.jobs > 1:
         play_ahead(options, context.tasks, [check.name for check in chosen], _say)
-    findings: dict[str, CheckFinding] = {}
+    findings: dict[Check, CheckFinding] = {}
+    facts = _facts(context, left_out, planned=[check.name for check in chosen])
     for check in chosen:
         started = time.perf_counter()
-        finding = check.run(context)
-        findings[check.name] = finding
+        finding = findings[check] = check.run(context)
         spent = duration(time.perf_counter() - started)
         print(f"{finding.verdict:<4}  {check.name:<12}  {finding.summary}  ({spent})", flush=True)
-        if options.jobs == 0:
-            continue
-        facts = _facts(context, left_out, planned=[one.name for one in chosen])
-        certificate.write(context.folder, facts, {one: findings[one.name] for one in chosen if one.name in findings})
-    failed = [name for name, finding in findings.items() if finding.verdict == "fail"]
+        if options.jobs:
+            certificate.write(context.folder, facts, findings)
+    if options.jobs:
+        print(f"\n{certificate.printed(facts, findings)}\n")
+    failed = [check.name for check, finding in findings.items() if finding.verdict == "fail"]
     result = f"{len(failed)} of {len(findings)} checks failed: {' '.join(failed)}" if failed else "no check failed"
     print(
         f"{result}; this took {duration(time.perf_counter() - began)}\ncertificate: {context.folder / 'certify.html'}"
@@ -169,5 +174,7 @@ def _facts(context: Context, left_out: Sequence[str], planned: Sequence[str]) ->
         "device": device,
         "code": code_hash(),
         "planned": list(planned),
+        "command": command_line(options),
+        "cores": len(os.sched_getaffinity(0)),
         "versions": plain_facts(versions()),
     }

@@ -252,6 +252,11 @@ class ResultsFolder:
         known = self.document.setdefault("environments", {})
         if group not in known:
             known[group] = plain
+            # In the plan's order, whoever builds them first, so that reports are the same bytes.
+            planned = dict.fromkeys(f"{e.task} {e.tracker} {e.mode}" for e in self.config.episodes)
+            order = {name: number for number, name in enumerate(planned)}
+            known = dict(sorted(known.items(), key=lambda named: order.get(named[0], len(order))))
+            self.document["environments"] = known
             self._save()
         difference = differing_key(comparable(known[group]), comparable(plain))
         if difference is not None:

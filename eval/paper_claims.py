@@ -16,6 +16,7 @@ from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumber
 from arena_newton.eval.stats import Contrast, Outcomes, contrast, holm, paired_rates, suites
 from arena_newton.eval.table_entries import PAPER_NAMES, points, probability
 from arena_newton.eval.wording import escaped
+from arena_newton.text import counted
 
 __all__ = ["NEGLIGIBLE", "ClaimResult", "findings", "findings_text"]
 
@@ -191,7 +192,7 @@ def _best_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
             leads = [_contrast([*cells.mean(t, a, tasks), *cells.mean(t, rest[t], tasks, -1.0)]) for t in top]
             clear = all(lead is not None and lead.low > 0 for lead in leads)
             verdict = "does not" if clear else "undecided"
-            said = f"{a} is best with both over {len(tasks)} tasks"
+            said = f"{a} is best with both over {counted(len(tasks), 'task')}"
         else:
             leads = [
                 _contrast([*cells.mean("twist2", a, tasks), *cells.mean("twist2", b, tasks, -1.0)]),
@@ -199,7 +200,7 @@ def _best_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
             ]
             clear = all(lead is not None and lead.low > 0 for lead in leads)
             verdict = "reproduces" if clear else "undecided"
-            said = f"{a} is best with twist2, {b} with sonic over {len(tasks)} tasks"
+            said = f"{a} is best with twist2, {b} with sonic over {counted(len(tasks), 'task')}"
         said += f"; leads {_said(leads[0], 'twist2')} and {_said(leads[1], 'sonic')}"
     theirs = []
     for tracker, suite in itertools.product(("twist2", "sonic"), HALVES):
@@ -224,7 +225,9 @@ def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
             best = {t: _ranked(cells, t, policies, tasks)[0][1] for t in ("twist2", "sonic")}
             terms = cells.mean("sonic", best["sonic"], tasks) + cells.mean("twist2", best["twist2"], tasks, -1.0)
             result = _contrast(terms)
-            said = _said(result, f"{best['sonic']} with sonic minus {best['twist2']} with twist2, {len(tasks)} tasks")
+            said = _said(
+                result, f"{best['sonic']} with sonic minus {best['twist2']} with twist2, {counted(len(tasks), 'task')}"
+            )
         theirs = {t: max(paper.in_gmt[t, "base", f, suite].sr for f in FAMILIES.values()) for t in ("twist2", "sonic")}
         name = suite.removesuffix("_AVG")
         found.append(

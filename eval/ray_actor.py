@@ -1,4 +1,4 @@
-"""A process of a Ray cluster that plays slices of a plan: it is given numbers of episodes and gives journal lines back.
+"""A process of a Ray cluster that plays slices of runs: it is given numbers of episodes and gives journal lines back.
 
 Ray imports this module before the process knows its GPU, so torch, Warp and what needs them load inside the methods.
 """
@@ -33,29 +33,30 @@ class EpisodeActor:
             os.environ["CUDA_VISIBLE_DEVICES"] = ""
         self._thread = ThreadPoolExecutor(1, "episodes")
         self._config: RunConfig
-        self._factories: Factories
-        self._policy: Policy
+        self._factories: Factories | None = None
+        self._policy: Policy | None = None
         self._folder: Path
 
     def node(self) -> Node:
         """Where this process is."""
         import ray
 
-        return Node(ray.get_runtime_context().get_node_id(), socket.gethostname(), os.getpid())
+        gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+        return Node(ray.get_runtime_context().get_node_id(), socket.gethostname(), os.getpid(), gpus)
 
     def open(
         self, options: RunOptions, folder: str, cores: tuple[int, int], factories: Factories | None
     ) -> Broke | Opened:
-        """Build tracker and policy of a run.
+        """Build tracker and policy of a run, in place of those of the run before; an environment may last.
 
         Args:
             options: Its resolved flags.
             folder: Results folder, absolute.
             cores: First core of this process and their number, among those that the machine lets it use.
-            factories: What the run is built with; the real parts by default.
+            factories: What runs are built with, the same for all; the real parts by default.
         """
         usable, (first, number) = sorted(os.sched_getaffinity(0)), cores
-        if first + number <= len(usable):  # otherwise the cluster counts more cores than there are
+        if first + number <= len(usable):  # otherwise the cluster counts more cores than there are, or it has them
             os.sched_setaffinity(0, usable[first : first + number])
         self._folder = Path(folder)
         return self._thread.submit(self._open, options, factories).result()
@@ -70,9 +71,12 @@ class EpisodeActor:
     def _open(self, options: RunOptions, factories: Factories | None) -> Broke | Opened:
         try:
             from arena_newton.doctor import versions
-            from arena_newton.eval.slice_player import parts
+            from arena_newton.eval.slice_player import device_name, parts
 
-            self._config, self._policy, self._factories = parts(options, factories)
+            policy, self._policy = self._policy, None
+            if policy is not None:
+                policy.close()
+            self._config, self._policy, self._factories = parts(options, self._factories or factories)
             config = self._config
             return Opened(
                 config.identity(),
@@ -81,6 +85,7 @@ class EpisodeActor:
                 config.tracker_facts,
                 config.policy_facts,
                 versions(),
+                device_name(config.device),
             )
         except (Exception, SystemExit) as error:
             return broke(error)
@@ -89,6 +94,7 @@ class EpisodeActor:
         try:
             from arena_newton.eval.slice_player import play
 
+            assert self._policy is not None and self._factories is not None, "plays before it has opened a run"
             play(part, self._config, self._folder, self._factories, self._policy, events.put)
         except (Exception, SystemExit) as error:
             events.put(broke(error))

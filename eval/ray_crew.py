@@ -1,6 +1,6 @@
-"""Processes of a Ray cluster for one run: asked for, opened, held to a deadline, and replaced when they are lost.
+"""Processes of a Ray cluster: asked for, given runs to open, held to a deadline, and replaced when they are lost.
 
-Ray restarts none by itself (`max_restarts=0`), so that the run knows of every loss and what was running.
+Ray restarts none by itself (`max_restarts=0`), so that who deals out knows of every loss and what was running.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, cast
 import ray
 from ray.exceptions import RayError
 
-from arena_newton.errors import InputError
+from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.config import RunConfig
 from arena_newton.eval.folder import ResultsFolder
 from arena_newton.eval.identity import differing_key, moving_versions
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
 
 
-__all__ = ["Crew", "Done", "Lease", "Lost", "Member", "in_cluster"]
+__all__ = ["Crew", "Done", "Job", "Lease", "Lost", "Member", "in_cluster"]
 
 OWN = "local"
 """Address that makes Ray start a cluster of its own."""
@@ -68,10 +68,33 @@ PATIENCE = 30.0
 """While no process has begun, a line says so as often [s]."""
 
 
+@dataclass(eq=False)
+class Job:
+    """A run that processes open, to play slices of it."""
+
+    folder: ResultsFolder
+    opened: Opened | None = None
+    """What the first process says that has opened it."""
+    seconds: float = 0.0
+    """Time that processes were busy with it, each with its part of a GPU where they are on one [s]."""
+
+    def configured(self) -> RunConfig:
+        """The configuration, with what tracker and policy of the first process say of themselves."""
+        assert self.opened is not None
+        told = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
+        return dataclasses.replace(self.folder.config, **{name: getattr(self.opened, name) for name in told})
+
+    def options(self) -> RunOptions:
+        """The flags that a process opens it with."""
+        alone = {name: getattr(RunOptions, name) for name in ("ray", *RAY_FLAGS, "shard", "out")}
+        return dataclasses.replace(self.folder.config.flags, **alone)
+
+
 @dataclass
 class Lease:
-    """A slice of the plan that a process plays."""
+    """A slice of a run that a process plays."""
 
+    job: Job
     group: Group
     left: dict[int, Episode]
     """Episodes that have not ended, by number, in their order."""
@@ -116,9 +139,11 @@ class Member:
     rank: int = 0
     """Its number among the processes of its node."""
     pending: ObjectRef[object] | ObjectRefGenerator[Event] | None = None
-    """What it is to answer; None while it waits for a slice."""
-    ready: bool = False
-    """Whether it has built what all slices need."""
+    """What it is to answer; None while it waits for work."""
+    since: float = 0.0
+    """Monotonic time at which it was asked [s]."""
+    job: Job | None = None
+    """The run that it has opened, or is opening."""
     lease: Lease | None = None
     last: Group | None = None
     """What its environment is of."""
@@ -199,22 +224,23 @@ def _native_silence() -> Iterator[None]:
 
 
 class Crew:
-    """The processes of a run."""
+    """Processes that play one run, or several with the same flags of --ray on the same kind of device."""
 
-    def __init__(self, folder: ResultsFolder, factories: Factories | None):
-        """Ask the cluster for them, one per episode of the plan at most.
+    def __init__(self, config: RunConfig, most: int, factories: Factories | None):
+        """Ask the cluster for them.
 
         Args:
-            folder: Of the run, whose flags say how many.
-            factories: What they build the run with; the real parts by default.
+            config: A run whose flags say how many.
+            most: No more than so many.
+            factories: What they build runs with; the real parts by default.
 
         Raises:
             InputError: A cluster of our own has no room for one.
         """
-        self.folder, self.config, self._factories = folder, folder.config, factories
-        flags = self.config.flags
+        self._flags, self._most, self._factories = config.flags, most, factories
+        flags = config.flags
         nodes = _resources()
-        self._gpus = 0.0 if self.config.device == "cpu" else flags.ray_gpus or 1.0
+        self._gpus = 0.0 if config.device == "cpu" else flags.ray_gpus or 1.0
         fit = [node for node in nodes if node.get("GPU", 0.0) >= self._gpus] or nodes
         self._cpus = flags.ray_cpus or min([USUAL_CPUS, *(max(1, int(node.get("CPU", 1.0))) for node in fit)])
         if not flags.ray and not any(map(self._room, nodes)):
@@ -222,14 +248,11 @@ class Crew:
         self.members: list[Member] = []
         self.shown: Progress | None = None
         """Where losses are told of."""
-        self._opened: Opened | None = None
         self._said = self._grown = time.monotonic()
-        alone = {name: getattr(RunOptions, name) for name in ("ray", *RAY_FLAGS, "shard", "out")}
-        self._options = dataclasses.replace(flags, **alone)
         self._grow(nodes)
 
-    def opened(self) -> RunConfig:
-        """Wait until one process has built tracker and policy.
+    def opened(self, job: Job) -> RunConfig:
+        """Wait until one process has built tracker and policy of a run.
 
         Returns:
             The configuration with what they say of themselves.
@@ -238,32 +261,46 @@ class Crew:
             InputError: They cannot be built, or a node has another version of the code or of a file.
             RunStopped: No process begins.
         """
-        while self._opened is None:
-            for _ in self.heard():
-                pass
-        facts = {f.name: getattr(self._opened, f.name) for f in dataclasses.fields(Opened)}
-        told = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
-        self.config = dataclasses.replace(self.config, **{name: facts[name] for name in told})
-        return self.config
+        while job.opened is None:
+            for member in self.idle():
+                if member.job is not job:
+                    self.prepare(member, job)
+            for _, _, said in self.heard():
+                if isinstance(said, ArenaError):
+                    raise said
+        return job.configured()
 
     def idle(self) -> list[Member]:
-        """Those that wait for a slice."""
-        return [member for member in self.members if member.ready and member.lease is None]
+        """Those that wait for work."""
+        return [member for member in self.members if member.node is not None and member.pending is None]
+
+    def prepare(self, member: Member, job: Job) -> None:
+        """Let a process that waits build tracker and policy of a run, in place of those that it has."""
+        assert member.actor is not None
+        member.job, member.since = job, time.monotonic()
+        member.until = max(self._late(), member.since + BEGINNING)
+        path = os.path.abspath(job.folder.path)
+        cores = (member.rank * self._cpus, self._cpus)
+        member.pending = member.actor.open.remote(job.options(), path, cores, self._factories)
 
     def lend(self, member: Member, lease: Lease) -> None:
-        """Let a process play a slice."""
-        assert member.actor is not None
-        part = Slice(" ".join(lease.group), tuple(lease.left), lease.worlds, self.folder.document["config_hash"])
-        member.lease, member.last, member.until = lease, lease.group, self._late()
+        """Let a process that waits play a slice of the run that it has opened."""
+        assert member.actor is not None and member.job is lease.job
+        config_hash = lease.job.folder.document["config_hash"]
+        part = Slice(" ".join(lease.group), tuple(lease.left), lease.worlds, config_hash)
+        member.lease, member.last, member.since, member.until = lease, lease.group, time.monotonic(), self._late()
         member.pending = member.actor.play.options(num_returns="streaming").remote(part)
 
-    def heard(self) -> Iterator[tuple[Lease, Event | Done | Lost]]:
-        """What processes tell of their slices; waits a little for it. Those that are lost are replaced.
+    def heard(self) -> Iterator[tuple[Job, Lease | None, Opened | Event | Done | Lost | ArenaError]]:
+        """What processes tell; waits a little for it. Those that are lost are replaced.
+
+        Yields:
+            The run, the slice of it where one is played, and what is told: an error where another process could not
+            go on with the run either.
 
         Raises:
-            InputError: Something is wrong that every process would say.
-            StorageError: A process cannot write its files.
-            RunStopped: A process cannot go on, and another one could not either.
+            InputError: A node has another version of the code or of a file.
+            RunStopped: No process begins.
         """
         now = time.monotonic()
         if now - self._grown >= GROWTH:
@@ -273,7 +310,7 @@ class Crew:
             if member.actor is None and now >= member.again_at:
                 self._hire(member)
             elif member.actor is not None and now >= member.until:
-                minutes = self.config.flags.ray_minutes
+                minutes = self._flags.ray_minutes
                 yield from self._lose(member, Lost(f"took longer than {minutes:g} min (--ray-minutes)"))
         self._say_if_none_begins(now)
         asked = {member.pending: member for member in self.members if member.pending is not None}
@@ -288,24 +325,32 @@ class Crew:
                     next(cast("ObjectRefGenerator[Event]", pending)) if member.lease is not None else pending
                 )
             except StopIteration:
-                lease, member.lease, member.pending, member.until = member.lease, None, None, math.inf
-                assert lease is not None
-                yield lease, Done()
+                job, lease, member.lease = member.job, member.lease, None
+                self._rest(member)
+                assert job is not None
+                yield job, lease, Done()
                 continue
             except RayError:
                 gone = member.node is not None and not _lives(member.node)
                 yield from self._lose(member, Lost("its machine left the cluster" if gone else DIED, with_node=gone))
                 continue
-            if isinstance(said, Broke):
-                _stop(said)
+            job = member.job
+            if job is None:
+                self._begin(member, cast("Node", said))
+            elif isinstance(said, Broke) and (error := _error(said)) is not None:
+                lease = member.lease
+                self._replace(member)
+                yield job, lease, error
+            elif isinstance(said, Broke):
                 yield from self._lose(member, Lost(said.message, said.trace))
             elif member.lease is not None:
-                yield member.lease, said
-            elif isinstance(said, Opened):
-                self._check(member, said)
-                member.ready, member.pending, member.until = True, None, math.inf
+                yield job, member.lease, said
             else:
-                self._open(member, said)
+                assert isinstance(said, Opened)
+                self._check(member, job, said)
+                job.opened = job.opened or said
+                self._rest(member)
+                yield job, None, said
 
     def dismiss(self) -> None:
         """End all processes."""
@@ -313,10 +358,14 @@ class Crew:
             self._end(member)
             member.again_at = math.inf
 
+    def room(self) -> int:
+        """Processes that the cluster holds now."""
+        return sum(map(self._room, _resources()))
+
     def _grow(self, nodes: list[dict[str, float]]) -> None:
         """Ask for as many processes as there is room for now, or as --ray-actors says."""
-        wanted = self.config.flags.ray_actors or max(1, sum(map(self._room, nodes)))
-        for _ in range(min(wanted, len(self.config.episodes)) - len(self.members)):
+        wanted = self._flags.ray_actors or max(1, sum(map(self._room, nodes)))
+        for _ in range(min(wanted, self._most) - len(self.members)):
             self.members.append(Member())
             self._hire(self.members[-1])
 
@@ -327,54 +376,64 @@ class Crew:
         member.actor = cast("ActorHandle[EpisodeActor]", made)
         member.pending = member.actor.node.remote()
 
-    def _open(self, member: Member, node: Node) -> None:
-        """Let a process that has begun build what all slices need."""
+    def _begin(self, member: Member, node: Node) -> None:
+        """A process has begun, and waits."""
         taken = {one.rank for one in self.members if one.node is not None and one.node.name == node.name}
-        member.node, member.until = node, max(self._late(), time.monotonic() + BEGINNING)
-        member.rank = min(set(range(len(self.members))) - taken)
-        assert member.actor is not None
-        cores = (member.rank * self._cpus, self._cpus)
-        path = os.path.abspath(self.folder.path)
-        member.pending = member.actor.open.remote(self._options, path, cores, self._factories)
+        member.node, member.rank = node, min(set(range(len(self.members))) - taken)
+        member.pending = None
 
-    def _check(self, member: Member, opened: Opened) -> None:
+    def _rest(self, member: Member) -> None:
+        """A process has done what it was asked, and waits; its time counts for the run."""
+        if member.job is not None and member.pending is not None:
+            member.job.seconds += (time.monotonic() - member.since) * (self._gpus or 1.0)
+        member.pending, member.until = None, math.inf
+
+    def _check(self, member: Member, job: Job, opened: Opened) -> None:
         """Hold what a process built to what is planned, and to what the first one built."""
         assert member.node is not None
-        first = self._opened
-        unknown = () if first is not None else ("tracker_facts", "policy_facts", "worlds", "labels")
-        planned = self.config.identity() if first is None else first.identity
+        unknown = () if job.opened is not None else ("tracker_facts", "policy_facts", "worlds", "labels")
+        planned = job.folder.config.identity() if job.opened is None else job.opened.identity
         difference = differing_key(planned, opened.identity, unknown)
-        difference = difference or differing_key(*map(moving_versions, (self.folder.installed, opened.versions)))
+        difference = difference or differing_key(*map(moving_versions, (job.folder.installed, opened.versions)))
         if difference is not None:
             key, here, there = (plain_text(str(part), 80) for part in difference)
             raise InputError(
                 f"--ray: on node {member.node.host} {key} is {there}, here {here}; all nodes need the same code, files "
                 "and libraries"
             )
-        self._opened = self._opened or opened
 
-    def _lose(self, member: Member, lost: Lost) -> Iterator[tuple[Lease, Lost]]:
-        """End a process, if it has not ended, to be replaced after a pause; tells of its slice."""
-        lease, where = member.lease, f" on {member.node.host}" if member.node is not None else ""
-        self._end(member)
+    def _lose(self, member: Member, lost: Lost) -> Iterator[tuple[Job, Lease | None, Lost | ArenaError]]:
+        """End a process, if it has not ended, to be replaced after a pause; tells of what it did."""
+        job, lease, where = member.job, member.lease, f" on {member.node.host}" if member.node is not None else ""
         member.starts = 0 if lease is not None and lease.built else member.starts + 1
-        member.again_at = time.monotonic() + min(LONGEST_PAUSE, FIRST_PAUSE * 2.0**member.starts)
-        if member.starts >= STARTS:
-            raise RunStopped(f"--ray: {STARTS} processes{where} ended one after the other: {lost.cause}")
+        starts = member.starts
+        self._replace(member)
         say = self.shown.say if self.shown is not None else _print
         doing = (
             f"  {' '.join(lease.group)}, {counted(len(lease.left), 'episode')} left" if lease else "  it had not begun"
         )
+        if starts >= STARTS:
+            error = RunStopped(f"--ray: {STARTS} processes{where} ended one after the other: {lost.cause}")
+            if job is None:
+                raise error
+            member.starts = 0
+            yield job, lease, error
+            return
         say(f"{doing}: a process{where} is replaced: {lost.cause}")
-        if lease is not None:
-            yield lease, lost
+        if job is not None:
+            yield job, lease, lost
+
+    def _replace(self, member: Member) -> None:
+        """End a process, to be replaced after a pause."""
+        self._end(member)
+        member.again_at = time.monotonic() + min(LONGEST_PAUSE, FIRST_PAUSE * 2.0**member.starts)
 
     def _end(self, member: Member) -> None:
+        self._rest(member)
         if member.actor is not None:
             with contextlib.suppress(RayError, ValueError):
                 ray.kill(member.actor)
-        member.actor = member.pending = member.lease = member.node = member.last = None
-        member.ready, member.until = False, math.inf
+        member.actor = member.lease = member.node = member.last = member.job = None
 
     def _say_if_none_begins(self, now: float) -> None:
         if any(member.node is not None for member in self.members):
@@ -385,7 +444,7 @@ class Crew:
 
     def _late(self) -> float:
         """When a process that begins something now is stopped [s]."""
-        return time.monotonic() + 60.0 * self.config.flags.ray_minutes
+        return time.monotonic() + 60.0 * self._flags.ray_minutes
 
     def _room(self, node: dict[str, float]) -> int:
         """Processes that a node holds."""
@@ -400,14 +459,10 @@ DIED = "it died"
 """Cause of a loss of which no more is known: killed, out of memory, or native code crashed."""
 
 
-def _stop(said: Broke) -> None:
-    """Raise what playing again would not mend."""
-    if said.kind == "input":
-        raise InputError(said.message)
-    if said.kind == "storage":
-        raise StorageError(said.message)
-    if said.kind == "stop":
-        raise RunStopped(said.message)
+def _error(said: Broke) -> ArenaError | None:
+    """What playing again would not mend; None where it may."""
+    kinds = {"input": InputError, "storage": StorageError, "stop": RunStopped}
+    return kinds[said.kind](said.message) if said.kind in kinds else None
 
 
 def _resources() -> list[dict[str, float]]:

@@ -11,6 +11,7 @@ import dataclasses
 import shlex
 import time
 from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -20,8 +21,9 @@ from arena_newton.errors import ArenaError
 from arena_newton.eval.folder import BREAK_FILE, ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.plan import Episode
-from arena_newton.eval.ray_crew import Crew, Done, Lease, Lost, Member, in_cluster
-from arena_newton.eval.slice_events import Built, Ended, Event, Ticks
+from arena_newton.eval.progress import Progress
+from arena_newton.eval.ray_crew import Crew, Done, Job, Lease, Lost, Member, in_cluster
+from arena_newton.eval.slice_events import Built, Ended, Event, Opened, Ticks
 from arena_newton.eval.whole_run import (
     Group,
     RunStopped,
@@ -40,7 +42,7 @@ from arena_newton.text import counted, plain_text
 if TYPE_CHECKING:
     from arena_newton.eval.run import Factories
 
-__all__ = ["execute"]
+__all__ = ["DealtRun", "execute", "round_seconds"]
 
 BATCHES = 2
 """Most episodes of a slice, in batches of --worlds."""
@@ -74,79 +76,155 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
 
 def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
-    crew = Crew(folder, factories)
+    crew = Crew(folder.config, len(folder.config.episodes), factories)
+    try:
+        return _played_by(crew, folder)
+    finally:
+        crew.dismiss()
+
+
+def round_seconds(folders: Sequence[ResultsFolder], number: int, factories: Factories | None) -> list[float] | None:
+    """Time of each of several runs that so many processes play one after the other, each run as a whole [s].
+
+    Returns:
+        None where the cluster has no room for as many processes.
+    """
+    config = folders[0].config
+    found = []
+    with in_cluster(config.flags.ray or ()):
+        crew = Crew(config, number, factories)
+        try:
+            if crew.room() < number:
+                return None
+            for folder in folders:
+                began = time.perf_counter()
+                if not _played_by(crew, folder):
+                    raise KeyboardInterrupt
+                found.append(time.perf_counter() - began)
+        finally:
+            crew.dismiss()
+    return found
+
+
+def _played_by(crew: Crew, folder: ResultsFolder) -> bool:
+    """Play what is missing in a folder by a crew; False when it was interrupted."""
+    job = Job(folder)
     resume = f"{command(folder, 'resume')} {shlex.join(['--ray', *(folder.config.flags.ray or ())])}"
     with contextlib.ExitStack() as ended:
-        ended.callback(crew.dismiss)
-        config = crew.opened()
+        config = crew.opened(job)
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
         folder.settle(config, journal.records)
         folder.sweep()
-        ended.callback(folder.sweep)
-        ended.callback(crew.dismiss)  # before the sweep: who writes files has ended
+        ended.callback(_swept, crew, folder)
         try:
             with told_how_to_go_on(resume, lambda: kept(config, journal.records)):
                 done, waiting = begun(config, folder, journal)
                 if waiting:
-                    _Driver(folder, journal, crew, done, waiting).play()
+                    _play(DealtRun(job, journal, crew, done, waiting, progress_of(config, done, waiting)))
         except KeyboardInterrupt:
             print(f"\ninterrupted: {kept(config, journal.records)}; continue with: {resume}")
             return False
     return True
 
 
-class _Driver:
-    """Deals episodes out to a crew, and journals what comes back."""
+def _swept(crew: Crew, folder: ResultsFolder) -> None:
+    """Remove what unfinished recordings left, once who writes them has ended."""
+    if any(member.lease is not None for member in crew.members):
+        crew.dismiss()
+    folder.sweep()
+
+
+def _play(run: DealtRun) -> None:
+    """Play a run until nothing is left."""
+    crew = run.crew
+    try:
+        with run.folder.running():
+            run.shown.group(counted(len(crew.members), "Ray actor"))
+            while _dealt(run):
+                for _, lease, said in crew.heard():
+                    if lease is not None and not isinstance(said, Opened):
+                        run.take(lease, said)
+                    elif isinstance(said, ArenaError):
+                        raise said
+    except RayError as error:
+        raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
+    finally:
+        run.shown.close()
+
+
+def _dealt(run: DealtRun) -> bool:
+    """Give a slice to each process that waits for one; False when all is played."""
+    for member in run.crew.idle():
+        if member.job is not run.job:
+            run.crew.prepare(member, run.job)
+        elif (lease := run.next(member)) is not None:
+            run.crew.lend(member, lease)
+    return not run.finished
+
+
+class DealtRun:
+    """A run whose episodes are dealt out to a crew: its slices, and the journal of what comes back."""
 
     def __init__(
         self,
-        folder: ResultsFolder,
+        job: Job,
         journal: Journal,
         crew: Crew,
         ended: dict[int, EpisodeRecord],
         waiting: dict[Group, list[Episode]],
+        shown: Progress,
+        besides: Callable[[], int] = lambda: 0,
     ):
-        """Take the finished episodes by number, and those to play by task, tracker and mode."""
-        self.folder, self.config, self.journal, self.crew = folder, folder.config, journal, crew
-        self.ended = ended
-        self.shown = crew.shown = progress_of(self.config, ended, waiting)
+        """Take what is to be played of a run whose folder was settled.
+
+        Args:
+            job: The run.
+            journal: Its journal.
+            crew: Who plays.
+            ended: Finished episodes by number.
+            waiting: Those to play by task, tracker and mode.
+            shown: What shows how far all is.
+            besides: Episodes of other runs that nobody plays yet.
+        """
+        self.job, self.folder, self.config, self.journal, self.crew = job, job.folder, job.folder.config, journal, crew
+        self.ended, self._besides = ended, besides
+        self.shown = crew.shown = shown
         self._queues: dict[tuple[Group, int], deque[Episode]] = {}
         """Episodes to play, by group and by how often they were lost."""
         for group, episodes in waiting.items():
             self._queues[group, 0] = deque(episodes)
-        self._batch = min(self.config.flags.worlds, ceil(self._waiting() / len(crew.members)))
+        self._batch = max(1, min(self.config.flags.worlds, self._fair()))
         """Worlds of environments."""
         self._losses: Counter[int] = Counter()
         """Losses of each episode while it was played alone."""
         self._given_up: Counter[Group] = Counter()
 
-    def play(self) -> None:
-        """Play until nothing is left."""
-        try:
-            with self.folder.running():
-                self.shown.group(counted(len(self.crew.members), "Ray actor"))
-                while self._deal():
-                    for lease, said in self.crew.heard():
-                        self._take(lease, said)
-        except RayError as error:
-            raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
-        finally:
-            self.shown.close()
-
-    def _waiting(self) -> int:
+    @property
+    def waiting(self) -> int:
         """Episodes that no process has."""
         return sum(map(len, self._queues.values()))
 
-    def _deal(self) -> bool:
-        """Give a slice to each process that waits for one; False when all is played."""
-        for member in self.crew.idle():
-            lease = self._next(member)
-            if lease is not None:
-                self.crew.lend(member, lease)
-        return self._waiting() > 0 or any(member.lease is not None for member in self.crew.members)
+    @property
+    def slices(self) -> int:
+        """Slices that what nobody plays would make, at least."""
+        return ceil(self.waiting / self._batch)
 
-    def _next(self, member: Member) -> Lease | None:
+    @property
+    def leased(self) -> bool:
+        """Whether a process plays a slice."""
+        return any(one.lease is not None and one.lease.job is self.job for one in self.crew.members)
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to play."""
+        return not self.waiting and not self.leased
+
+    def _fair(self) -> int:
+        """Episodes for each process, if what nobody plays were divided now."""
+        return ceil((self.waiting + self._besides()) / len(self.crew.members))
+
+    def next(self, member: Member) -> Lease | None:
         """The next slice for a process: of its environment if possible, else of the group that has the most to do."""
         taken = Counter(one.lease.group for one in self.crew.members if one.lease is not None)
         work = {
@@ -158,14 +236,17 @@ class _Driver:
             return None
         group, level = key = max(work, key=lambda one: work[one])
         queue, worlds = self._queues[key], self.config.flags.worlds
-        fair = ceil(self._waiting() / len(self.crew.members))
-        size = min(BATCHES * worlds, max(self._batch, fair)) if not level else max(1, worlds // SMALLER)
+        size = min(BATCHES * worlds, max(self._batch, self._fair())) if not level else max(1, worlds // SMALLER)
         size = 1 if level == ALONE else min(size, len(queue))
         episodes = [queue.popleft() for _ in range(size)]
-        return Lease(group, {e.index: e for e in episodes}, self._batch if not level else size, level)
+        return Lease(self.job, group, {e.index: e for e in episodes}, self._batch if not level else size, level)
 
-    def _take(self, lease: Lease, said: Event | Done | Lost) -> None:
-        """Take what a process tells of its slice."""
+    def take(self, lease: Lease, said: Event | Done | Lost | ArenaError) -> None:
+        """Take what a process tells of its slice.
+
+        Raises:
+            ArenaError: The run cannot go on.
+        """
         if isinstance(said, Built):
             self.folder.register(" ".join(lease.group), said.facts)
             lease.built = True
@@ -177,6 +258,8 @@ class _Driver:
             self._again(lease, said)
         elif isinstance(said, Done) and lease.left:  # told of as ended without a line: no process does that
             self._again(lease, Lost("episodes were left out"))
+        elif isinstance(said, ArenaError):
+            raise said
 
     def _keep(self, lease: Lease, record: EpisodeRecord) -> None:
         """Append an episode to the journal, once."""
@@ -195,8 +278,10 @@ class _Driver:
 
     def _next_round(self, group: Group) -> None:
         """More attempts where successes are missing, when all of a round have ended."""
-        leased = [one.lease for one in self.crew.members if one.lease is not None and one.lease.group == group]
-        if any(lease.left for lease in leased) or any(q for (name, _), q in self._queues.items() if name == group):
+        mine = [one.lease for one in self.crew.members if one.lease is not None and one.lease.job is self.job]
+        if any(lease.left for lease in mine if lease.group == group):
+            return
+        if any(queue for (name, _), queue in self._queues.items() if name == group):
             return
         more = due(self.config, self.ended).get(group, [])
         self._queues[group, 0] = deque(more)

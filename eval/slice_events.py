@@ -23,6 +23,8 @@ class Node:
     """Ray's name of the node."""
     host: str
     pid: int
+    gpus: str = ""
+    """Numbers of the GPUs that it sees, as `CUDA_VISIBLE_DEVICES` names them."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Opened:
     tracker_facts: JsonObject | None
     policy_facts: JsonObject | None
     versions: dict[str, str | None]
+    device: str
+    """Name of what it computes on, such as `NVIDIA H200` or `cpu`."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import torch
 import warp as wp
 
 from arena_newton.doctor import versions
@@ -28,7 +29,7 @@ from arena_newton.eval.slice_events import Broke, Built, Ended, Event, Slice, Ti
 from arena_newton.policies.base import Policy
 from arena_newton.quiet import quiet_warp
 
-__all__ = ["parts", "play"]
+__all__ = ["device_name", "parts", "play"]
 
 TICKS_EVERY = 1.0
 """Ticks are told so often [s]."""
@@ -89,6 +90,11 @@ def play(
             player.play_group(part.group, list(episodes))
         except RunStopped as error:
             tell(folder.broke or broke(error))
+
+
+def device_name(device: str) -> str:
+    """Name of a device of this process, such as `NVIDIA H200`, or `cpu`."""
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu"
 
 
 def _check_shared(path: Path) -> None:

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 from arena_newton.eval.matrix_cells import check_policies, dealt, expand_cells, matrix_table, parse_only, selected
+from arena_newton.eval.options import RunOptions
+from arena_newton.eval.play_flags import RAY_FLAGS, check_ray
 from arena_newton.eval.sharding import parse_shard
 from arena_newton.eval.suite_file import SuiteFile, read_suite_file, suite_path
 from arena_newton.eval.suite_options import MatrixOptions
@@ -57,6 +59,9 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
+    if options.estimate and min(options.estimate) < 1:
+        raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
+    check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit {options.limit}: expected at least 1")
     cells = expand_cells(suite)
@@ -68,7 +73,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     try:
         checked = {c.id: c for c in check_policies(suite, [cell for cell in cells if cell.id in chosen])}
     except InputError as error:
-        if not options.dry_run:  # which shows the matrix first
+        if not options.dry_run and options.estimate is None:  # which show the matrix first, or need no checkpoint
             raise
         problem = error
     return SuiteCall(
@@ -98,4 +103,8 @@ def _again(given: str, options: MatrixOptions) -> str:
         value = getattr(options, name)
         if value != getattr(MatrixOptions, name):
             parts += [f"--{name}", value]
+    for name in ("ray", *RAY_FLAGS):
+        value = getattr(options, name)
+        if value != getattr(MatrixOptions, name):
+            parts += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
     return shlex.join([*parts, *(["--keep-going"] if options.keep_going else [])])

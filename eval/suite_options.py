@@ -29,6 +29,9 @@ class MatrixOptions:
     this task of a Slurm array; slurm/4 where the array has not all 4."""
     dry_run: bool = False
     """Print the matrix and its size, and play nothing."""
+    estimate: tuple[int, ...] | None = None
+    """Measure a few cells of each kind for seconds, and print how long all of them take on so many devices (1 2 8 when
+    no number follows); nothing else is played. With --ray also what a second process costs the first."""
     keep_going: bool = False
     """When a cell cannot be played, go on with the others and list it at the end."""
     accept_changes: bool = False
@@ -39,5 +42,18 @@ class MatrixOptions:
     """Run episodes again that ended with an error."""
     device: str | None = None
     """Device of all cells instead of the suite's: cpu, cuda, cuda:1."""
+    ray: tuple[str, ...] | None = None
+    """Let processes of a Ray cluster play the cells, several at once: its address, such as 10.0.0.1:6379, or auto; with
+    no address, a Ray of its own on this machine."""
+    ray_actors: int | None = None
+    """With --ray: processes that play at once; as many as the cluster has room for when not given."""
+    ray_cpus: int | None = None
+    """With --ray: cores of each of them; 4, or all of the smallest node where it has fewer, when not given."""
+    ray_gpus: float | None = None
+    """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
+    ray_minutes: float = 60.0
+    """With --ray: a slice of a cell, at most two batches of worlds, that takes longer is stopped and played again."""
+    ray_attempts: int = 3
+    """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
     """Print what each run prints, and with --dry-run every cell."""

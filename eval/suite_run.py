@@ -11,8 +11,6 @@ import shlex
 import time
 from collections.abc import Iterator, Sequence
 
-import torch
-
 from arena_newton import doctor
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.config import RunConfig, resolve
@@ -20,8 +18,10 @@ from arena_newton.eval.folder import ResultsFolder, iso, setting
 from arena_newton.eval.journal import StorageError
 from arena_newton.eval.lasting_env import EnvironmentKeeper
 from arena_newton.eval.matrix_cells import matrix_table, run_options
+from arena_newton.eval.play_flags import RAY_FLAGS
 from arena_newton.eval.progress import duration
 from arena_newton.eval.run import Factories, RunStopped, execute
+from arena_newton.eval.slice_player import device_name
 from arena_newton.eval.suite_call import SuiteCall
 from arena_newton.eval.suite_file import SuiteFile
 from arena_newton.eval.suite_folder import SuiteFolder
@@ -30,7 +30,7 @@ from arena_newton.eval.suite_records import SUITE_FILE, CellEnding, CellEvent, S
 from arena_newton.quiet import quiet_warp
 from arena_newton.text import counted, plain_text
 
-__all__ = ["run"]
+__all__ = ["CellPlayer", "run"]
 
 CHECKED_POLICIES = ("expert", "stand", "replay")
 """Policies that are made before the first cell to be checked; others take seconds and memory, or a server."""
@@ -55,20 +55,23 @@ def run(call: SuiteCall, factories: Factories | None = None) -> int:
     suite = call.suite
     folder = SuiteFolder(call.out, suite, *call.shard)
     with folder.locked(call.cells):
-        return _Matrix(suite, folder, call.options, factories, again=call.again).play(call.chosen)
+        return CellPlayer(suite, folder, call.options, factories, again=call.again).play(call.chosen)
 
 
-class _Matrix:
-    """One call: what all its cells share."""
+class CellPlayer:
+    """One call: what all its cells share. It plays one cell after the other."""
 
     def __init__(
         self, suite: SuiteFile, folder: SuiteFolder, options: MatrixOptions, factories: Factories | None, *, again: str
     ):
         self.suite, self.folder, self.options, self.again = suite, folder, options, again
         self.keeper = EnvironmentKeeper()
+        self.given = factories
         self.factories = factories or Factories(env=self.keeper)
         self.installed = doctor.versions()
         self.configs: dict[str, RunConfig] = {}
+        self.devices: dict[str, str] = {}
+        """Where the cells of this call are played."""
         self.failed: list[tuple[str, str]] = []
         self.spent = self.done_ticks = 0.0
 
@@ -84,14 +87,17 @@ class _Matrix:
         # Each run looks for garbage at its end, among millions of objects of loaded libraries: seconds a cell.
         gc.collect()
         gc.freeze()
+        if not self.play_cells(todo):
+            print(f"\ninterrupted; {self._kept(chosen)}; continue with: {self.again}", flush=True)
+            return 130
+        return self._end(chosen)
+
+    def play_cells(self, todo: Sequence[str]) -> bool:
+        """Play cells that were checked; False when it was interrupted."""
         try:
-            for number, name in enumerate(todo):
-                if not self._play_cell(name, number, todo):
-                    print(f"\ninterrupted; {self._kept(chosen)}; continue with: {self.again}", flush=True)
-                    return 130
+            return all(self._play_cell(name, number, todo) for number, name in enumerate(todo))
         finally:
             self.keeper.drop()
-        return self._end(chosen)
 
     def _kept(self, chosen: Sequence[str]) -> str:
         done = sum(self.folder.plan.cell(name).status == "done" for name in chosen)
@@ -108,8 +114,9 @@ class _Matrix:
         for name in chosen:
             cell = self.folder.plan.cell(name)
             options = run_options(self.suite, cell, self.folder.path, self.options.device)
+            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", "ray", *RAY_FLAGS)}
             try:
-                self.configs[name] = resolve(dataclasses.replace(options, retry_errors=self.options.retry_errors))
+                self.configs[name] = resolve(dataclasses.replace(options, **given))
             except InputError as error:
                 raise InputError(f"{self.suite.path}: cell {name}: {error}") from None
         self._check_parts(chosen)
@@ -122,13 +129,14 @@ class _Matrix:
                 continue
             todo.append(name)
             try:
-                self._results(name).check()
+                self.results(name).check()
             except InputError as error:
                 raise InputError(f"cell {name}: {error}") from None
         self.folder.configured({name: config.hash for name, config in self.configs.items()})
         return todo
 
-    def _results(self, name: str) -> ResultsFolder:
+    def results(self, name: str) -> ResultsFolder:
+        """Results folder of a cell that was checked."""
         return ResultsFolder(self.folder.cell_path(name), self.configs[name], self.installed)
 
     def _check_parts(self, chosen: Sequence[str]) -> None:
@@ -212,14 +220,13 @@ class _Matrix:
 
     def _play_cell(self, name: str, number: int, todo: Sequence[str]) -> bool:
         """Play one cell; False when it was interrupted."""
-        cell, config = self.folder.plan.cell(name), self.configs[name]
         print(f"[{number + 1}/{len(todo)}] {name}", flush=True)
-        self.folder.add(CellEvent(cell=name, event="begun", at=_now(), config=config.hash, device=_device(config)))
+        self.begun(name, device_name(self.configs[name].device))
         began = time.perf_counter()
         error: Exception | None = None
         try:
-            with contextlib.nullcontext() if self.options.verbose else contextlib.redirect_stdout(io.StringIO()):
-                code = execute(self._results(name), self.factories)
+            with self.silence():
+                code = execute(self.results(name), self.factories)
         except KeyboardInterrupt:
             code = 130
         except StorageError:
@@ -227,11 +234,39 @@ class _Matrix:
         except Exception as caught:
             code, error = 2, caught
         wall = time.perf_counter() - began
+        if code:
+            self.keeper.drop()  # what broke off in it may have left it in any state
+        return self.ended(name, code, error, wall, todo[number + 1 :])
+
+    def silence(self) -> contextlib.AbstractContextManager[object]:
+        """What a run prints is shown on --verbose only."""
+        return contextlib.nullcontext() if self.options.verbose else contextlib.redirect_stdout(io.StringIO())
+
+    def begun(self, name: str, device: str) -> None:
+        """Journal that a cell begins on a device."""
+        self.devices[name] = device
+        self.folder.add(CellEvent(cell=name, event="begun", at=_now(), config=self.configs[name].hash, device=device))
+
+    def ended(self, name: str, code: int, error: Exception | None, wall: float, left: Sequence[str]) -> bool:
+        """Journal and say how a cell ended.
+
+        Args:
+            name: The cell.
+            code: Exit code of its run; 130 when it was interrupted.
+            error: Why it could not be played.
+            wall: Time that it took [s].
+            left: Cells that are to be played after it.
+
+        Returns:
+            False when it was interrupted.
+
+        Raises:
+            RunStopped: It could not be played, and --keep-going was not given.
+        """
+        cell = self.folder.plan.cell(name)
         if error is None and code != 130 and self.folder.counts(name)["finished"] < cell.episodes:
             error = RunStopped(f"ended before all of {counted(cell.episodes, 'episode')} were played")
-        found = self._ended(name, code, error, wall)
-        if code == 130 or error is not None:
-            self.keeper.drop()  # what broke off in it may have left it in any state
+        found = self._journalled(name, code, error, wall)
         if error is not None:
             message = plain_text(f"{error}", 400) or type(error).__name__
             if not self.options.keep_going:
@@ -246,10 +281,10 @@ class _Matrix:
         if code == 130:
             return False
         self.spent, self.done_ticks = self.spent + wall, self.done_ticks + cell.ticks
-        print(f"  {self._line(found, wall, todo[number + 1 :])}", flush=True)
+        print(f"  {self._line(found, wall, left)}", flush=True)
         return True
 
-    def _ended(self, name: str, code: int, error: Exception | None, wall: float) -> SuiteCell:
+    def _journalled(self, name: str, code: int, error: Exception | None, wall: float) -> SuiteCell:
         """Journal how a cell ended; the cell as it is then."""
         message = None if error is None else plain_text(f"{type(error).__name__}: {error}", 400)
         kind: CellEnding = "failed" if error is not None else "interrupted" if code == 130 else "done"
@@ -259,7 +294,7 @@ class _Matrix:
                 event=kind,
                 at=_now(),
                 config=self.configs[name].hash,
-                device=_device(self.configs[name]),
+                device=self.devices.get(name, ""),
                 wall_s=round(wall, 3),
                 error=message,
                 **self.folder.counts(name),
@@ -274,9 +309,12 @@ class _Matrix:
         parts.append(duration(wall))
         if not left:
             return ", ".join(parts)
-        ticks = sum(self.folder.plan.cell(name).ticks for name in left)
-        coming = duration(ticks * self.spent / max(self.done_ticks, 1.0))
-        return f"{', '.join(parts)}; {counted(len(left), 'cell')} left, about {coming}"
+        coming = self.coming(sum(self.folder.plan.cell(name).ticks for name in left))
+        return f"{', '.join(parts)}; {counted(len(left), 'cell')} left, about {duration(coming)}"
+
+    def coming(self, ticks: int) -> float:
+        """Time that cells with step budgets of so many ticks take, at the speed so far [s]."""
+        return ticks * self.spent / max(self.done_ticks, 1.0)
 
     def _end(self, chosen: Sequence[str]) -> int:
         """Print the end of the call; the exit code."""
@@ -303,8 +341,3 @@ def _named(suite: SuiteFile, name: str) -> Iterator[None]:
 
 def _now() -> str:
     return iso(datetime.datetime.now(datetime.UTC).timestamp())
-
-
-def _device(config: RunConfig) -> str:
-    """Name of the device of a run."""
-    return torch.cuda.get_device_name(config.device) if config.device.startswith("cuda") else "cpu"

@@ -37,6 +37,7 @@ __all__ = [
     "groups",
     "kept",
     "progress_of",
+    "reported",
     "run_and_report",
     "told_how_to_go_on",
 ]
@@ -72,11 +73,21 @@ def run_and_report(folder: ResultsFolder, beside: ResultsFolder | None, played: 
             if whole:
                 code = _exit_code(beside, *_reported(beside))
     finally:  # whatever happened to the other, this one is told
-        loaded, results = _reported(folder)
-        console.result(loaded, results, command(folder, "resume"), time.perf_counter() - began)
-        for line in _recorded(folder, loaded.records):
-            print(line)
-    return max(code, _exit_code(folder, loaded, results)) if whole else INTERRUPTED
+        mine = reported(folder, time.perf_counter() - began)
+    return max(code, mine) if whole else INTERRUPTED
+
+
+def reported(folder: ResultsFolder, seconds: float) -> int:
+    """Write the reports of a run that took so long [s], and print its end.
+
+    Returns:
+        Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise.
+    """
+    loaded, results = _reported(folder)
+    console.result(loaded, results, command(folder, "resume"), seconds)
+    for line in _recorded(folder, loaded.records):
+        print(line)
+    return _exit_code(folder, loaded, results)
 
 
 def command(folder: ResultsFolder, name: str) -> str:

@@ -1,4 +1,7 @@
-"""The certificate: what was found as JSON, as Markdown and as one page with its pictures inside."""
+"""The certificate: what was found as text, JSON, Markdown and one page with its pictures inside.
+
+A page begins with the verdict and the claims, in the order of a reader's questions; the evidence follows.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TypedDict
 
+from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed, verdict_of
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.html_report import FOLDER, page_template
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.wording import plain
+from arena_newton.text import counted
 
-__all__ = ["FILE", "Facts", "document", "html", "markdown", "write"]
+__all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 
 FILE = "certify.json"
 MEANING = {
@@ -44,6 +49,10 @@ class Facts(TypedDict):
     """Hash of the code that moves and judges."""
     planned: list[str]
     """Checks that were asked for; those that have not run yet are in no table."""
+    command: str
+    """The command line that makes this certificate."""
+    cores: int
+    """Cores of the CPU that this process may use."""
     versions: JsonObject
 
 
@@ -80,7 +89,17 @@ def document(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding])
     complete = len(findings) == len(facts["planned"])
     certified: JsonObject = json.loads(json.dumps(facts))
     checks: JsonObject = {check.name: entry(check, finding) for check, finding in findings.items()}
-    return {"certified": certified, "complete": complete, "failed": list(failed), "checks": checks}
+    return {
+        "verdict": verdict_of(findings, len(facts["planned"])),
+        "claims": [
+            {"claim": one.claim.text, "verdict": one.verdict, "checks": [check.name for check, _ in one.findings]}
+            for one in claimed(findings)
+        ],
+        "certified": certified,
+        "complete": complete,
+        "failed": list(failed),
+        "checks": checks,
+    }
 
 
 def _sheet(sheet: Sheet) -> JsonObject:
@@ -90,37 +109,58 @@ def _sheet(sheet: Sheet) -> JsonObject:
 def _said(facts: Facts) -> list[tuple[str, str]]:
     """The facts as name and text."""
     said = [
+        ("made by", facts["command"]),
         ("tasks", " ".join(facts["tasks"])),
         ("trackers", " ".join(facts["trackers"])),
         ("episodes of each cell", str(facts["episodes"])),
-        ("engine", f"{facts['engine']} on {facts['device']}"),
-        ("code", facts["code"]),
+        ("engine", f"{facts['engine']} on {facts['device']}, {counted(facts['cores'], 'CPU core')}"),
+        ("arena-newton", f"{facts['versions'].get('arena-newton')}, code {facts['code']}"),
     ]
     if facts["without_expert"]:
-        said.insert(1, ("without an expert, not checked", " ".join(facts["without_expert"])))
+        said.insert(2, ("without an expert, not checked", " ".join(facts["without_expert"])))
     return said
 
 
-def _warnings(facts: Facts, findings: Mapping[Check, CheckFinding]) -> list[str]:
+def _warnings(facts: Facts) -> list[str]:
     """What limits the certificate as a whole."""
     found = []
     if facts["quick"]:
         found.append(f"--quick: {facts['episodes']} episodes of each cell, so the intervals are wide.")
-    left = len(facts["planned"]) - len(findings)
-    if left:
-        found.append(f"Not finished: {left} of {len(facts['planned'])} checks have not run.")
+    absent = [name for claim in CLAIMS for name in claim.checks if name not in facts["planned"]]
+    if absent:
+        found.append(f"Checks that were not asked for: {' '.join(absent)}.")
     return found
+
+
+def _measured(one: ClaimFinding) -> list[tuple[str, str]]:
+    """Of a claim each check's name and what it measured."""
+    skipped = {"skip": "not measured: "}
+    return [(check.name, f"{skipped.get(finding.verdict, '')}{finding.summary}") for check, finding in one.findings]
+
+
+def printed(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
+    """The first page as text for a terminal: the verdict, then every claim with what was measured."""
+    lines = [verdict_of(findings, len(facts["planned"])), ""]
+    for one in claimed(findings):
+        lines.append(f"{one.verdict:<4}  {one.claim.text}")
+        lines += [f"      {name}: {text}" for name, text in _measured(one)]
+    return "\n".join([*lines, "", *_warnings(facts)]).rstrip()
 
 
 def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as Markdown, without pictures."""
-    lines = ["# Certificate", ""]
-    lines += [f"- {name}: {_escaped(text)}" for name, text in _said(facts)] + [""]
-    lines += [f"> {_escaped(text)}" for text in _warnings(facts, findings)] + [""]
-    lines += ["| check | verdict | measured |", "|---|---|---|"]
-    for check, finding in findings.items():
-        lines.append(f"| {check.name} | {finding.verdict} | {_escaped(finding.summary)} |")
-    for check, finding in findings.items():
+    lines = ["# Certificate", "", f"**{_escaped(verdict_of(findings, len(facts['planned'])))}**", ""]
+    lines += [line for text in _warnings(facts) for line in (f"> {_escaped(text)}", "")]
+    lines += ["| claim | verdict | measured |", "|---|---|---|"]
+    claims = claimed(findings)
+    for one in claims:
+        verdicts = {check.name: finding.verdict for check, finding in one.findings}
+        told = [f"[{name}](#{name}-{verdicts[name]}): {_escaped(text)}" for name, text in _measured(one)]
+        lines.append(f"| {_escaped(one.claim.text)} | {one.verdict} | {'<br>'.join(told)} |")
+    lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
+    lines += ["## What was certified", ""]
+    lines += [f"- {name}: {_escaped(text)}" for name, text in _said(facts)]
+    for check, finding in (part for one in claims for part in one.findings):
         lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", _escaped(finding.summary), ""]
         for sheet in finding.sheets:
             lines += [f"{_escaped(sheet.title)}:", "", "| " + " | ".join(map(_escaped, sheet.head)) + " |"]
@@ -138,11 +178,14 @@ def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as one page that needs no other file."""
     style = (FOLDER / "report.css").read_text(encoding="utf-8") + (FOLDER / "certify.css").read_text(encoding="utf-8")
     known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    claims = claimed(findings)
     return page_template("certify.html").render(
         policy=f"default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
         style=style,
+        verdict=verdict_of(findings, len(facts["planned"])),
+        claims=[{"text": one.claim.text, "verdict": one.verdict, "measured": _measured(one)} for one in claims],
         facts=_said(facts),
-        warnings=_warnings(facts, findings),
+        warnings=_warnings(facts),
         meaning=MEANING,
         versions=facts["versions"].items(),
         checks=[
@@ -152,7 +195,8 @@ def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
                 "finding": finding,
                 "pictures": [(picture.caption, _embedded(picture)) for picture in finding.pictures],
             }
-            for check, finding in findings.items()
+            for one in claims
+            for check, finding in one.findings
         ],
     )
 

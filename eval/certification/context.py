@@ -115,34 +115,46 @@ class Context:
             KeyboardInterrupt: The run was interrupted; what was played is kept.
         """
         seeds, repeats = self.plan()
-        config = resolve(
-            RunOptions(
-                task=(cell.task,),
-                tracker=(cell.tracker,),
-                checkpoint=cell.checkpoint,
-                policy=cell.policy,
-                mode=(cell.mode,),
-                rules=cell.rules,
-                seeds=seeds,
-                repeats=repeats,
-                worlds=min(self.options.worlds, self.episodes),
-                engine=cell.engine or self.options.engine,
-                device="cpu" if cell.engine == "mujoco" else self.options.device,
-                actions=cell.actions,
-                strip=cell.strip,
-                follow=cell.strip,
-                failures=cell.failures,
-                out=str(self.path(cell)),
-            )
+        options = RunOptions(
+            task=(cell.task,),
+            tracker=(cell.tracker,),
+            checkpoint=cell.checkpoint,
+            policy=cell.policy,
+            mode=(cell.mode,),
+            rules=cell.rules,
+            seeds=seeds,
+            repeats=repeats,
+            worlds=min(self.options.worlds, self.episodes),
+            engine=cell.engine or self.options.engine,
+            device="cpu" if cell.engine == "mujoco" else self.options.device,
+            actions=cell.actions,
+            strip=cell.strip,
+            follow=cell.strip,
+            failures=cell.failures,
+            out=str(self.path(cell)),
         )
-        folder = ResultsFolder(self.path(cell), config, versions())
+        return self.play(options, cell.folder.replace("/", " "), self.bodies[cell.body])
+
+    def play(self, options: RunOptions, said: str, body: Body | None = None) -> list[EpisodeRecord]:
+        """Episodes of a run in plan order; played, or continued where its results folder has some of them.
+
+        Args:
+            options: The run; `out` names its folder.
+            said: What it is called in a line about what is going on.
+            body: Changes the robot; none by default.
+
+        Raises:
+            InputError: A flag is wrong, or the folder was begun with another configuration.
+            KeyboardInterrupt: The run was interrupted; what was played is kept.
+        """
+        config = resolve(options)
+        folder = ResultsFolder(Path(str(options.out)), config, versions())
         stored = folder.check()
         if stored is not None and "status" in stored and stored["status"]["state"] == "success":
             return load_run(folder.path).records
-        body = self.bodies[cell.body]
-        self.say(f"{cell.folder.replace('/', ' ')}: {counted(self.episodes, 'episode')}")
+        self.say(f"{said}: {counted(len(config.episodes), 'episode')}")
         with contextlib.redirect_stdout(io.StringIO()):  # its table is part of a larger one here
-            code = run.execute(folder, body.equip(self.factories))
+            code = run.execute(folder, self.factories if body is None else body.equip(self.factories))
         if code == 130:
             raise KeyboardInterrupt
         return load_run(folder.path).records
@@ -159,19 +171,25 @@ class Context:
         return found
 
     def measured(
-        self, name: str, task: str, tracker: str, settings: Mapping[str, Json], measure: Callable[[], Json]
+        self,
+        name: str,
+        task: str | tuple[str, ...],
+        tracker: str | tuple[str, ...],
+        settings: Mapping[str, Json],
+        measure: Callable[[], Json],
     ) -> Json:
         """What a measurement gave that is no evaluation; taken from the folder where the same was measured before.
 
         Args:
             name: Name of the measurement, unique for a task and tracker; it becomes a file's.
-            task: What it plays.
-            tracker: Through which tracker.
+            task: What it plays: a task, or the tasks of a plan.
+            tracker: Through which tracker, or those of a plan.
             settings: What it depends on besides these, code, scenes, weights and engine.
             measure: Measures; its answer is JSON.
         """
-        known = config_hash([self._ground(task, tracker), dict(settings)])
-        name = f"{name}_{task}_{tracker}"
+        played, through = ((given,) if isinstance(given, str) else given for given in (task, tracker))
+        known = config_hash([self._ground(played, through), dict(settings)])
+        name = f"{name}_{task}_{tracker}" if isinstance(task, str) else name
         path = self.folder / "measured" / f"{name}.json"
         with contextlib.suppress(OSError, ValueError, KeyError):
             stored = json.loads(path.read_text(encoding="utf-8"))
@@ -184,9 +202,9 @@ class Context:
         write_atomic(path, json.dumps({"known_by": known, "value": value}, indent=1) + "\n")
         return value
 
-    def _ground(self, task: str, tracker: str) -> Json:
-        """Code, scenes, weights and flags that a measurement of a task depends on."""
-        options = RunOptions(task=(task,), tracker=(tracker,), seeds=(0,), repeats=1)
+    def _ground(self, played: tuple[str, ...], through: tuple[str, ...]) -> Json:
+        """Code, scenes, weights and flags that a measurement of tasks depends on."""
+        options = RunOptions(task=played, tracker=through, seeds=(0,), repeats=1)
         options = replace(options, engine=self.options.engine, device=self.options.device)
         folder = PACKAGE / "eval" / "certification"
         checks = hash_paths(folder, [file for file in package_files(folder) if file.suffix == ".py"])

@@ -8,17 +8,20 @@ from dataclasses import dataclass
 
 from arena_newton.eval.certification.bodies import Body
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
 from arena_newton.eval.certification.sabotage import SABOTAGES
 from arena_newton.eval.failure_rules import stage_of
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.wording import markdown_table
+from arena_newton.intervals import wilson
 
 __all__ = ["CHECKS", "LEAST", "Confusion", "confusion"]
 
 LEAST = 0.8
 """Least precision and recall of each stage."""
+ENOUGH = 20
+"""From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +31,24 @@ class Confusion:
     counts: Mapping[tuple[FailureStage, FailureStage], int]
     """(scripted, said) → episodes."""
 
+    def scripted(self, stage: FailureStage) -> int:
+        """How many failures of a stage were scripted."""
+        return sum(self.counts.get((stage, said), 0) for said in FailureStage)
+
+    def said(self, stage: FailureStage) -> int:
+        """How many failures are said to be of a stage."""
+        return sum(self.counts.get((scripted, stage), 0) for scripted in FailureStage)
+
     def recall(self, stage: FailureStage) -> float | None:
         """Part of the scripted failures of a stage that are said to be of it; None without any."""
-        return self._part(stage, [self.counts.get((stage, said), 0) for said in FailureStage])
+        return self._part(stage, self.scripted(stage))
 
     def precision(self, stage: FailureStage) -> float | None:
         """Part of those said to be of a stage that were scripted so; None where none is."""
-        return self._part(stage, [self.counts.get((scripted, stage), 0) for scripted in FailureStage])
+        return self._part(stage, self.said(stage))
 
-    def _part(self, stage: FailureStage, counts: Sequence[int]) -> float | None:
-        return self.counts.get((stage, stage), 0) / sum(counts) if sum(counts) else None
+    def _part(self, stage: FailureStage, total: int) -> float | None:
+        return self.counts.get((stage, stage), 0) / total if total else None
 
 
 def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Confusion:
@@ -69,28 +80,32 @@ def failures(context: Context) -> CheckFinding:
     notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
     matrices = {task: confusion(found) for task, found in pairs.items()}
     matrices |= {"all": confusion([pair for found in pairs.values() for pair in found])} if len(tasks) > 1 else {}
-    weak = [f"{task}: {text}" for task, matrix in matrices.items() for text in _below(matrix)]
+    below = [(f"{task}: {text}", shown) for task, matrix in matrices.items() for text, shown in _below(matrix)]
+    verdict: Verdict = "fail" if any(shown for _, shown in below) else "note" if below else "pass"
     failed = sum(matrices[list(matrices)[-1]].counts.values())
     right = sum(matrices[list(matrices)[-1]].counts.get((stage, stage), 0) for stage in FailureStage)
     summary = f"{right} of {failed} scripted failures get their stage ({total} episodes)"
     sheets = tuple(_sheet(task, matrix) for task, matrix in matrices.items())
     for sheet in sheets:
         print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
-    return CheckFinding("fail" if weak else "pass", summary, sheets, (*weak, *notes))
+    return CheckFinding(verdict, summary, sheets, (*(text for text, _ in below), *notes))
 
 
-def _below(matrix: Confusion) -> list[str]:
-    """Stages whose precision or recall is too low.
+def _below(matrix: Confusion) -> list[tuple[str, bool]]:
+    """Stages whose precision or recall is below the bar, and whether the episodes are enough to show it.
 
     One that was not scripted has no bar: what is said to be of it counts against the recall of the others.
     """
     found = []
     for stage in FailureStage:
-        if matrix.recall(stage) is None:
+        if not matrix.scripted(stage):
             continue
-        for name, value in (("recall", matrix.recall(stage)), ("precision", matrix.precision(stage))):
-            if value is not None and value < LEAST:
-                found.append(f"{name} of {stage} is {value:.2f}, expected at least {LEAST:g}")
+        right = matrix.counts.get((stage, stage), 0)
+        for name, total in (("recall", matrix.scripted(stage)), ("precision", matrix.said(stage))):
+            if total and right < LEAST * total:
+                text = f"{name} of {stage} is {right} of {total}, expected at least {LEAST:g}"
+                shown = total >= ENOUGH or wilson(right, total)[1] < LEAST
+                found.append((text if shown else f"{text}; too few episodes to say", shown))
     return found
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import queue
+import shlex
 import subprocess
 import sys
 import threading
@@ -13,7 +15,7 @@ from collections.abc import Callable, Sequence
 
 from arena_newton.eval.options import CertifyOptions
 
-__all__ = ["flags", "play_ahead"]
+__all__ = ["command_line", "flags", "play_ahead"]
 
 Piece = tuple[str, str, tuple[str, ...]]
 """Check, task and trackers."""
@@ -25,8 +27,8 @@ COMPARING = (FIRST, "frozen-legs", "gliding-base", "semantic", "engines", "offic
 BY_NAME = "engines"
 """The check that means more when it is named: a process that plays it for others would name it."""
 
-WITHOUT_EPISODES = "statistics"
-"""The check that plays nothing."""
+UNDIVIDED = ("statistics", "shards", "ray")
+"""Checks that play nothing, or one plan of all tasks."""
 
 
 def play_ahead(
@@ -46,7 +48,7 @@ def play_ahead(
     recorded = [(FIRST, task, some) for task in tasks for some in trackers]
     if set(checks) & set(COMPARING):
         _work(options, recorded, say)
-    rest = [check for check in checks if check not in (FIRST, WITHOUT_EPISODES)]
+    rest = [check for check in checks if check not in (FIRST, *UNDIVIDED)]
     rest = [check for check in rest if check != BY_NAME or check in options.checks]
     _work(options, [(check, task, options.tracker) for check in rest for task in tasks], say)
 
@@ -98,9 +100,24 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
 
 def flags(options: CertifyOptions, check: str, task: str, trackers: Sequence[str]) -> list[str]:
     """Command line of a process that plays one piece."""
-    flags = ["--out", options.out, "--resume", "--jobs", "0", "--checks", check, "--task", task]
-    flags += ["--tracker", *trackers, "--worlds", str(options.worlds), "--engine", options.engine]
-    flags += ["--quick"] * options.quick
-    flags += ["--episodes", str(options.episodes)] * (options.episodes is not None)
-    flags += ["--device", str(options.device)] * (options.device is not None)
-    return flags + ["--twist2-checkpoint", str(options.twist2_checkpoint)] * (options.twist2_checkpoint is not None)
+    piece = dataclasses.replace(options, resume=True, jobs=0, checks=(check,), task=(task,), tracker=tuple(trackers))
+    return _written(piece)
+
+
+def command_line(options: CertifyOptions) -> str:
+    """The command line that makes the certificate from nothing."""
+    program = ("python", "-m", "arena_newton.eval", "certify")
+    return shlex.join([*program, *_written(dataclasses.replace(options, resume=False))])
+
+
+def _written(options: CertifyOptions) -> list[str]:
+    """Options as flags: those that differ from the default."""
+    given = []
+    for one in dataclasses.fields(CertifyOptions):
+        value, flag = getattr(options, one.name), f"--{one.name.replace('_', '-')}"
+        if value == one.default:
+            continue
+        given.append(flag)
+        if not isinstance(value, bool):
+            given += map(str, value) if isinstance(value, tuple) else [str(value)]
+    return given

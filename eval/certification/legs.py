@@ -16,6 +16,10 @@ GLIDES: Mapping[str, str] = {
         "the rule asks where the ball goes, not how: the feet that hang from the gliding base meet it as a bumper "
         "would, and push it into the goal at the speed of the base. Only a kick is a matter of legs"
     ),
+    "pp_box": (
+        "the box is on a table and the only empty deck is 0.67 m high, at hip height: arms alone lift the box, hold it "
+        "and set it down, and a base that rolls carries it there. Only a lower deck would ask for a crouch"
+    ),
     "open_door": (
         "lever, leaf and doorway are met by hands and body: a base that rolls presses, leans and drives through, and "
         "the doorway has no sill"

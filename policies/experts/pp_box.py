@@ -146,7 +146,8 @@ SUNK = 0.06
 DOWN = (0.006, 0.02)
 """How much less that is; one is drawn an episode [m]."""
 RESTS = 0.03
-"""Height above the deck, and that, below which the box counts as put down [m]."""
+"""Height of the box's lowest corner above the deck below which it counts as put down [m]. A box that is tilted between
+the fists comes to lie flat when they open; to wait for that is to wait for nothing that can be seen."""
 TURNING = 0.35
 """Yaw rate of the turn to the shelf [rad/s]: at 0.6 SONIC dropped four more boxes of 60."""
 OPENING = 0.5
@@ -360,9 +361,8 @@ class PPBoxExpert(Expert):
         self._approach(done("retreat", away > BACK))
         enter("leave", "stand", off > BACK)
         enter("open", "leave", (self.half >= self._opened()) & (clock > LET_GO))
-        flat = self._deck_top() + self._box_half[2] + self._down
         sunk = self.underside < self._deck_top() - SUNK + self._down
-        enter("lower", "open", sunk & (self._centre()[:, 2] < flat + RESTS))
+        enter("lower", "open", sunk & (self._underside() < self._deck_top() + RESTS))
         enter("reach", "lower", deck >= self._inside - ENOUGH)
         close = self._depth(pose[:, :2])[:, 1] > -STRETCHING[1] - ENOUGH
         enter("carry", "reach", passing(haul, STOP) & close)

@@ -24,15 +24,16 @@ def free_port():
 class Nodes:
     """A cluster whose machines are processes."""
 
-    def __init__(self, log, environment=None):
-        """Start the head, which has a core."""
+    def __init__(self, log, environment=None, cores=1, gpus=0):
+        """Start the head."""
         self.log = open(log, "ab")
         self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         """Environment of who may use the cluster."""
         self.environment = os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | self.token | (environment or {})
         self.address = f"127.0.0.1:{free_port()}"
         port = self.address.split(":")[1]
-        self.head, self.others = self._start("--head", "--port", port, "--include-dashboard=false", cores=1), []
+        flags = ["--head", "--port", port, "--include-dashboard=false", "--num-gpus", str(gpus)]
+        self.head, self.others = self._start(*flags, cores=cores), []
 
     def add(self, cores=1):
         """One more machine."""

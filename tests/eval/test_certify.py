@@ -12,7 +12,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import certify
 from arena_newton.eval import run as runs
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification import certificate, legs, solvable, swap
+from arena_newton.eval.certification import certificate, claims, legs, solvable, swap
 from arena_newton.eval.certification.bodies import Body
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.options import CertifyOptions
@@ -85,6 +85,9 @@ def test_a_sound_benchmark_passes(tmp_path, capsys):
     for name in ("solvable", "frozen-legs", "gliding-base", "swap"):
         assert any(re.match(rf"pass  {name} ", line) for line in lines), name
     assert lines[0].startswith("--quick: 30 episodes") and "intervals are wide" in lines[0]
+    assert "Certified: 3 claims hold." in lines and any(
+        line.startswith("pass  Experts need their legs") for line in lines
+    )
     checks = read(tmp_path / "o")
     assert [row[:4] for row in checks["solvable"]["tables"][0]["rows"]] == [
         [task, tracker, rules, "30/30"]
@@ -216,18 +219,50 @@ def test_the_page_needs_no_other_file(tmp_path):
         "device": "cpu",
         "code": "0" * 12,
         "planned": ["legs", "swap"],
-        "versions": {"python": "3.12"},
+        "command": "python -m arena_newton.eval certify --quick",
+        "cores": 2,
+        "versions": {"python": "3.12", "arena-newton": "1.2.3"},
     }
     certificate.write(tmp_path, facts, {check: found})
     page = (tmp_path / "certify.html").read_text()
     addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(address.startswith(("#", "data:image/png;base64,")) for address in addresses)
     assert "data:image/png;base64," in page and "<script>" not in page and "&lt;script&gt;" in page
-    assert "1 of 2 checks have not run" in page and "intervals are wide" in page
+    assert "1 of 2 checks have not run" in page and "intervals are wide" in page and "not asked for: solvable" in page
+    assert page.index("Not finished") < page.index('id="claims"') < page.index("2 CPU cores") < page.index("A table")
     text = (tmp_path / "certify.md").read_text()
     assert r"a \| note" in text and "data:" not in text
+    assert "[legs](#legs-note): three of four" in text and "## legs: note" in text
     stored = json.loads((tmp_path / "certify.json").read_text())
     assert not stored["complete"] and stored["checks"]["legs"]["pictures"][0]["path"] == "strip.png"
+
+
+def test_every_check_shows_a_claim():
+    """Each check is named by one claim, and the page has claims in their order, with the worst of their verdicts."""
+    named = [name for claim in claims.CLAIMS for name in claim.checks]
+    assert sorted(named) == sorted(check.name for check in certify.CHECKS)
+    verdicts = {
+        "sill": "note",
+        "batches": "pass",
+        "ray": "skip",
+        "shards": "fail",
+        "engines": "skip",
+        "solvable": "pass",
+    }
+    findings = {check: CheckFinding(verdicts[check.name], "x") for check in certify.CHECKS if check.name in verdicts}
+    found = claims.claimed(findings)
+    assert [one.verdict for one in found] == ["pass", "fail", "skip", "note"]
+    assert [check.name for check, _ in found[1].findings] == ["batches", "shards", "ray"]
+    said = claims.verdict_of(findings, planned=6)
+    assert said == (
+        "Not certified (shards): 1 claim does not hold, 1 claim holds, 1 claim holds with what its notes say, "
+        "1 claim was not measured."
+    )
+    good = {check: finding for check, finding in findings.items() if finding.verdict == "pass"}
+    assert claims.verdict_of(good, planned=2) == "Certified: 2 claims hold."
+    assert claims.verdict_of(good, planned=3).startswith("Not finished, 1 of 3 checks have not run: 2 claims hold")
+    skip = {check: finding for check, finding in findings.items() if finding.verdict == "skip"}
+    assert claims.verdict_of(skip, planned=2) == "Nothing was certified: 2 claims were not measured."
 
 
 def test_names_in_the_help_are_the_checks():

@@ -80,6 +80,22 @@ def test_engines_is_left_to_the_check_unless_it_was_named(tmp_path, monkeypatch)
     assert sorted(asked) == ["engines", "execution", "execution", "solvable", "solvable"]
 
 
+def test_one_plan_is_not_divided(tmp_path, monkeypatch):
+    """What plays one plan of all tasks, or nothing, is left to the checks themselves."""
+    log = stand_in(tmp_path, monkeypatch)
+    checks = ["statistics", "shards", "ray", "gradients"]
+    jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing", "football"], checks, lambda text: None)
+    assert [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()] == ["gradients"] * 2
+
+
+def test_the_command_line_on_the_page():
+    """It names what differs from the defaults, and not that a stopped certification went on."""
+    given = CertifyOptions(quick=True, task=("boxing", "vis_navi"), resume=True, episodes=7)
+    program = "python -m arena_newton.eval certify"
+    assert jobs.command_line(given) == f"{program} --quick --task boxing vis_navi --episodes 7"
+    assert jobs.command_line(CertifyOptions(out="my page")) == f"{program} --out 'my page'"
+
+
 def test_a_check_without_recordings_asks_for_itself_alone(tmp_path, monkeypatch):
     """One process plays the one check of the one task."""
     log = stand_in(tmp_path, monkeypatch)

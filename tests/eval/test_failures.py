@@ -181,6 +181,10 @@ def test_the_check_fails_below_the_bar(capsys):
     assert one.verdict == "pass" and one.summary.startswith("30 of 31")
     bad = check(played(lambda body: OF["misaimed" if body == "blinded" else body] * 5))
     assert bad.verdict == "fail" and f"expected at least {LEAST:g}" in bad.notes[0]
+    for times, verdict in ((1, "note"), (5, "fail")):  # 3 of 4 may well be 4 of 5, 15 of 20 are counted
+        few = check(played(lambda body, n=times: n * (OF[body] * 3 + OF["clumsy" if body == "misaimed" else body])))
+        assert few.verdict == verdict and f"recall of approach is {3 * times} of {4 * times}" in few.notes[0]
+        assert ("too few episodes" in few.notes[0]) is (verdict == "note")
     assert any("recall of perception" in note for note in bad.notes)
 
 

@@ -455,5 +455,8 @@ def test_suites_of_the_package_can_be_read(name):
         base = [c for c in cells if c.mode == "base" and not c.merged]
         assert len(base) == 4 * 2 * 2 * 7, "four families, trained on two trackers, executed by two, seven tasks"
         assert {c.matched for c in cells if c.mode != "base"} == {True}
+        own = [c for c in cells if c.matched and not c.merged]
+        assert len(own) == 4 * 2 * 7 * 4 and len(base) - len(own) / 4 == 4 * 2 * 7, "in-GMT, and cross-GMT"
+        assert len(cells) == len(own) + 4 * 2 * 7 + 2 * 4 * 2 * 7 and {c.episodes for c in cells} == {60}
         assert {(c.trained_on, c.matched) for c in cells if c.policy == "act_x14"} == {(("twist2", "sonic"), True)}
     assert len({cell.id for cell in cells}) == len(cells)

@@ -9,6 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 from eval_fakes import factories
+from test_matrix import SUITE, journals
 from test_shard_merge import contents
 
 from arena_newton.eval.__main__ import main
@@ -129,3 +130,34 @@ def test_poison_and_a_deadline(nodes, alone, poison, tmp_path):
                 line["steps"],
                 line["hashes"],
             )
+
+
+@pytest.mark.slow
+def test_kill_9_in_a_suite(nodes, tmp_path):
+    """A process is killed while two play the cells of a suite: every cell has the episodes of one process, once."""
+    (tmp_path / "suite.toml").write_text(SUITE)
+    command = ["matrix", str(tmp_path / "suite.toml"), "--out"]
+    assert main([*command, str(tmp_path / "alone")], factories()) == 0
+    flags = [str(tmp_path / "ray"), "--ray", nodes.address, "--ray-attempts", "9"]
+    run = subprocess.Popen(
+        [sys.executable, str(FAKES), *command, *flags],
+        env=os.environ | nodes.token,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        for killed in range(2):
+            begun = len(list((tmp_path / "ray").glob("*/*/*/*/episodes.jsonl")))
+
+            def another(least=begun + 1):
+                return len(list((tmp_path / "ray").glob("*/*/*/*/episodes.jsonl"))) >= least and nodes.actors()
+
+            wait_for(another, 200)
+            os.kill(nodes.actors()[killed % len(nodes.actors())], 9)
+        said, _ = run.communicate(timeout=240)
+    finally:
+        run.kill()
+    assert run.returncode == 0, said
+    assert said.count("is replaced: it died") == 2
+    assert journals(tmp_path / "ray") == journals(tmp_path / "alone")

@@ -21,7 +21,7 @@ pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
 from arena_newton.eval import ray_crew  # noqa: E402
-from arena_newton.eval.ray_crew import Crew, Done, Lease, Lost  # noqa: E402
+from arena_newton.eval.ray_crew import Crew, Done, Job, Lease, Lost  # noqa: E402
 
 
 class Ref:
@@ -121,31 +121,36 @@ def crew_of(tmp_path, monkeypatch):
             config.tracker_facts,
             config.policy_facts,
             doctor.versions(),
+            "cpu",
         )
         fake = FakeRay(dataclasses.replace(said, **(opened or {})), nodes or [node()])
         monkeypatch.setattr(ray_crew, "ray", fake)
         folder = ResultsFolder(tmp_path / "r", planned, doctor.versions())
         folder.document = {"config_hash": config.hash}
-        return Crew(folder, None), fake, config
+        crew = Crew(planned, len(planned.episodes), None)
+        crew.job = Job(folder)
+        return crew, fake, config
 
     return make
 
 
-def lease(config):
+def lease(crew, config):
     """The first two episodes."""
     episodes = config.episodes[:2]
-    return Lease(("boxing", "twist2", "base"), {episode.index: episode for episode in episodes}, 2, 0)
+    return Lease(crew.job, ("boxing", "twist2", "base"), {episode.index: episode for episode in episodes}, 2, 0)
 
 
 def told(crew, rounds=6):
     """What comes in so many rounds."""
-    return [said for _ in range(rounds) for _, said in crew.heard()]
+    return [said for _ in range(rounds) for _, _, said in crew.heard()]
 
 
 def all_idle(crew):
     """Hear until all have opened the run."""
-    crew.opened()
-    while len(crew.idle()) < len(crew.members):
+    while not (crew.members and all(member.job is crew.job and member.pending is None for member in crew.members)):
+        for member in crew.idle():
+            if member.job is not crew.job:
+                crew.prepare(member, crew.job)
         told(crew, 1)
 
 
@@ -153,7 +158,7 @@ def test_as_many_as_there_is_room_for(crew_of):
     """Cores and fractions of GPUs are asked for per actor; cores of one machine are taken once."""
     crew, fake, config = crew_of()
     assert fake.asked == [{"num_cpus": 4, "num_gpus": 0.0, "max_restarts": 0}] * 2
-    assert crew.opened().hash == config.hash
+    assert crew.opened(crew.job).hash == config.hash
     all_idle(crew)
     assert sorted(member.rank for member in crew.members) == [0, 1] and fake.cores in ((0, 4), (4, 4))
     gpus = [node(GPU=2.0, CPU=32.0), node("n1", CPU=2.0)]
@@ -178,7 +183,7 @@ def test_a_slice_is_told_of(crew_of):
     crew, fake, config = crew_of(ray_actors=1)
     all_idle(crew)
     fake.events = [Built({}), Ticks(3)]
-    crew.lend(crew.idle()[0], lease(config))
+    crew.lend(crew.idle()[0], lease(crew, config))
     assert told(crew) == [Built({}), Ticks(3), Done()] and crew.idle()
 
 
@@ -187,7 +192,7 @@ def test_a_slice_past_its_deadline_is_stopped(crew_of):
     crew, fake, config = crew_of(ray_actors=1, ray_minutes=0.001)
     all_idle(crew)
     fake.hangs = True
-    crew.lend(crew.idle()[0], lease(config))
+    crew.lend(crew.idle()[0], lease(crew, config))
     crew.members[0].until -= 1.0
     assert told(crew, 1) == [Lost("took longer than 0.001 min (--ray-minutes)")]
     assert fake.killed == [0]
@@ -202,7 +207,7 @@ def test_death_is_told_with_its_machine(crew_of):
         crew, fake, config = crew_of(ray_actors=1)
         all_idle(crew)
         fake.events = [ActorDiedError()]
-        crew.lend(crew.idle()[0], lease(config))
+        crew.lend(crew.idle()[0], lease(crew, config))
         fake.node_list[0]["Alive"] = alive
         (lost,) = told(crew, 1)
         assert lost.with_node != alive
@@ -214,7 +219,7 @@ def test_processes_that_never_begin_stop_the_run(crew_of, monkeypatch):
     crew, fake, _ = crew_of(ray_actors=1)
     fake.opened = Broke("broken", "ImportError: no newton", "a trace")
     with pytest.raises(RunStopped, match="--ray: 5 processes on host ended one after the other: ImportError"):
-        crew.opened()
+        crew.opened(crew.job)
     assert len(fake.asked) == 5
 
 
@@ -222,15 +227,16 @@ def test_other_code_or_versions_are_refused(crew_of):
     """A node that would play something else is named, with what differs."""
     versions = doctor.versions() | {"mujoco": "3.0"}
     with pytest.raises(InputError, match=r"--ray: on node host mujoco is 3\.0, here .*; all nodes need the same code"):
-        crew_of(opened={"versions": versions})[0].opened()
+        crew, _, _ = crew_of(opened={"versions": versions})
+        crew.opened(crew.job)
     crew, fake, config = crew_of()
     fake.opened = dataclasses.replace(fake.opened, identity=config.identity() | {"code": "0123"})
     with pytest.raises(InputError, match="on node host code is 0123"):
-        crew.opened()
+        crew.opened(crew.job)
     crew, fake, _ = crew_of()
     fake.opened = Broke("input", "--policy x: no such file", "")
     with pytest.raises(InputError, match="^--policy x: no such file$"):
-        crew.opened()
+        crew.opened(crew.job)
 
 
 def test_the_driver_loads_no_physics():

@@ -4,19 +4,19 @@ import pytest
 from eval_fakes import FakePolicy, factories
 
 from arena_newton import devices, doctor, extras
-from arena_newton.eval import ray_run
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.config import resolve
 from arena_newton.eval.folder import ResultsFolder
 from arena_newton.eval.journal import Journal, read_journal
 from arena_newton.eval.options import RunOptions
-from arena_newton.eval.ray_crew import Done, Lost, Member
 from arena_newton.eval.run import RunStopped, check_parts
 from arena_newton.eval.slice_events import Ended, Slice
 from arena_newton.eval.slice_player import play
-from arena_newton.eval.whole_run import begun
+from arena_newton.eval.whole_run import begun, progress_of
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
+from arena_newton.eval import ray_run  # noqa: E402
+from arena_newton.eval.ray_crew import Done, Job, Lost, Member  # noqa: E402
 
 PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine": "mujoco", "worlds": 4, "ray": ()}
 
@@ -24,8 +24,8 @@ PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine":
 class StubCrew:
     """Processes that play in this one, and are lost where a test says so."""
 
-    def __init__(self, folder, size, lost=lambda lease, told: None, made_of=None):
-        self.folder, self.members, self.lost = folder, [Member(ready=True) for _ in range(size)], lost
+    def __init__(self, job, size, lost=lambda lease, told: None, made_of=None):
+        self.folder, self.members, self.lost = job.folder, [Member(job=job) for _ in range(size)], lost
         self.made_of, self.shown = made_of or factories(), None
         self.policy = FakePolicy("expert")
         self.sizes = []
@@ -47,9 +47,9 @@ class StubCrew:
             play(part, self.folder.config, self.folder.path, self.made_of, self.policy, told.append)
             loss = self.lost(lease, told)
             for event in told if loss is None else told[: loss[0]]:
-                yield lease, event
+                yield lease.job, lease, event
             member.lease = None
-            yield lease, Done() if loss is None else loss[1]
+            yield lease.job, lease, Done() if loss is None else loss[1]
 
 
 @pytest.fixture
@@ -62,11 +62,12 @@ def driven(tmp_path):
         folder = ResultsFolder(tmp_path / out, config, doctor.versions())
         folder.check()
         folder.make()
-        crew = StubCrew(folder, size, lost, made_of)
+        job = Job(folder)
+        crew = StubCrew(job, size, lost, made_of)
         with Journal(folder.journal) as journal:
             folder.settle(config, journal.records)
             done, waiting = begun(config, folder, journal)
-            ray_run._Driver(folder, journal, crew, done, waiting).play()
+            ray_run._play(ray_run.DealtRun(job, journal, crew, done, waiting, progress_of(config, done, waiting)))
         return read_journal(folder.journal)[0], crew, folder
 
     return drive

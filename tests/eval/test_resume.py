@@ -19,6 +19,9 @@ from arena_newton import doctor, seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import journal as journal_module
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.config import resolve
+from arena_newton.eval.folder import ResultsFolder
+from arena_newton.eval.options import RunOptions
 from arena_newton.policies.base import PolicyUnavailable
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
@@ -77,6 +80,19 @@ def test_kill_and_resume_gives_the_same_bytes(tmp_path, uninterrupted):
     assert main(["resume", str(folder)], factories()) == 0
     assert lines(folder) == 48
     assert tables(folder) == tables(uninterrupted)
+
+
+def test_environments_are_stored_in_the_plans_order(tmp_path):
+    """Processes of a cluster build them in any order; config.json, and the report with it, has them in the plan's."""
+    options = RunOptions(task=("football", "boxing"), mode=("base", "visual"), seeds=(0,), repeats=1, engine="mujoco")
+    folder = ResultsFolder(tmp_path, resolve(options), doctor.versions())
+    folder.make()
+    folder.settle(folder.config, ())
+    names = [f"{task} twist2 {mode}" for task in ("football", "boxing") for mode in ("base", "visual")]
+    for name in (names[2], names[3], names[0], names[2], names[1]):
+        assert folder.register(name, {"engine": name}) == {"engine": name}
+    stored = json.loads((tmp_path / "config.json").read_text())["environments"]
+    assert list(stored) == names and stored[names[1]] == {"engine": names[1]}
 
 
 def test_interrupt_says_how_to_go_on(tmp_path, uninterrupted):

@@ -13,6 +13,7 @@ pytest.importorskip("matplotlib")
 from arena_newton import policies, tasks  # noqa: E402
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION  # noqa: E402
 from arena_newton.errors import InputError  # noqa: E402
+from arena_newton.eval import action_map  # noqa: E402
 from arena_newton.eval.__main__ import main  # noqa: E402
 from arena_newton.eval.action_map import embed, separation, shifted  # noqa: E402
 from arena_newton.eval.predicted_actions import FRONT, DatasetObservations, as_many_of_each, predict  # noqa: E402
@@ -270,3 +271,24 @@ def test_a_checkpoint_goes_through_its_own_pipeline(made, tmp_path, capsys):
     )
     assert json.loads((tmp_path / "out" / "tsne.json").read_text())["policy"]["family"] == "diffusion"
     assert "boxing: 8 + 8 observations" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("tasks", [1, 2])
+def test_a_figure_has_room_for_its_texts(tasks, tmp_path, monkeypatch):
+    """Title, legend and headings lie within the figure, whatever the policy is called."""
+    found = []
+    monkeypatch.setattr(action_map, "save", lambda figure, path: found.append(figure))
+    half = action_map.Separation(0.5, 0.45, 0.55, 10)
+    points = np.random.default_rng(0).normal(size=(20, 2))
+    maps = [
+        action_map.ActionMap("double_desk", points, np.arange(20) % 2, ("twist2", "sonic"), half, half)
+        for _ in range(tasks)
+    ]
+    title = f"lerobot:runs/{'act_double_desk_twist2_' * 3}: predicted actions"
+    action_map.draw(maps, title, tmp_path / "map.png")
+    (figure,) = found
+    figure.canvas.draw()
+    texts = [figure._suptitle, *figure.legends, *(axes.title for axes in figure.axes)]
+    for text in texts:
+        box = text.get_window_extent()
+        assert 0 <= box.x0 and box.x1 <= figure.bbox.width and 0 <= box.y0 and box.y1 <= figure.bbox.height, text

@@ -1,0 +1,110 @@
+"""What the benchmark claims of itself, in the order in which a reader of the paper asks, and which checks show it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from arena_newton.eval.certification.finding import Check, CheckFinding, Verdict
+from arena_newton.text import counted
+
+__all__ = ["CLAIMS", "Claim", "ClaimFinding", "claimed", "verdict_of"]
+
+WORST_FIRST: tuple[Verdict, ...] = ("fail", "note", "pass", "skip")
+"""Of several checks the first of these is a claim's verdict: what was not measured says nothing against it."""
+
+WORDS: Mapping[Verdict, tuple[str, str]] = {
+    "fail": ("does not hold", "do not hold"),
+    "pass": ("holds", "hold"),
+    "note": ("holds with what its notes say", "hold with what their notes say"),
+    "skip": ("was not measured", "were not measured"),
+}
+"""Verdict → what is said of one claim and of several."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence about the benchmark."""
+
+    text: str
+    checks: tuple[str, ...]
+    """Names of the checks that show it."""
+
+
+@dataclass(frozen=True)
+class ClaimFinding:
+    """What was found about a claim."""
+
+    claim: Claim
+    findings: tuple[tuple[Check, CheckFinding], ...]
+    """Those of its checks that have run, at least one, in its order."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict of its checks."""
+        found = {finding.verdict for _, finding in self.findings}
+        return next(verdict for verdict in WORST_FIRST if verdict in found)
+
+
+CLAIMS = (
+    Claim("Every task can be solved, through each tracker and under both rule sets.", ("solvable",)),
+    Claim("Experts need their legs, but where a gliding base is known to do.", ("frozen-legs", "gliding-base")),
+    Claim(
+        "Each axis of generalisation moves what its name says, and nothing else.", ("visual", "semantic", "execution")
+    ),
+    Claim("Another tracker costs success although nothing else changes.", ("swap",)),
+    Claim("The trackers' weights that come with the package are as good as the official ones.", ("official",)),
+    Claim("A policy that sees can find what its instruction names.", ("visible",)),
+    Claim("A failure is named by the stage at which it happened.", ("failures",)),
+    Claim("Of two policies one is called better no more often by mistake than the page says.", ("statistics",)),
+    Claim(
+        "An episode depends on its seed alone, not on its batch, its machine or a process that is lost.",
+        ("batches", "shards", "ray"),
+    ),
+    Claim("Both physics engines give the same rates.", ("engines",)),
+    Claim("Exact gradients are those that differences estimate.", ("gradients",)),
+    Claim("What no rule counts is measured: feet on DoubleDesk's sill.", ("sill",)),
+)
+"""All claims, the first that a reader asks for first."""
+
+
+def claimed(findings: Mapping[Check, CheckFinding], claims: Sequence[Claim] = CLAIMS) -> list[ClaimFinding]:
+    """Findings by claim; a check of no claim is one of its own, its question.
+
+    Args:
+        findings: What was found.
+        claims: In their order.
+    """
+    known = {name for claim in claims for name in claim.checks}
+    own = tuple(Claim(check.question, (check.name,)) for check in findings if check.name not in known)
+    by_name = {check.name: (check, finding) for check, finding in findings.items()}
+    found = []
+    for claim in (*claims, *own):
+        parts = tuple(by_name[name] for name in claim.checks if name in by_name)
+        found += [ClaimFinding(claim, parts)] if parts else []
+    return found
+
+
+def verdict_of(findings: Mapping[Check, CheckFinding], planned: int) -> str:
+    """The whole in one sentence.
+
+    Args:
+        findings: What was found so far.
+        planned: How many checks are to be run.
+    """
+    counts = Counter(one.verdict for one in claimed(findings))
+    told = [
+        f"{counted(counts[verdict], 'claim')} {words[counts[verdict] != 1]}"
+        for verdict, words in WORDS.items()
+        if counts[verdict]
+    ]
+    failed = " ".join(check.name for check, finding in findings.items() if finding.verdict == "fail")
+    left = planned - len(findings)
+    if failed:
+        begin = f"Not certified ({failed})"
+    elif left:
+        begin = f"Not finished, {left} of {planned} checks have not run"
+    else:
+        begin = "Certified" if counts["pass"] or counts["note"] else "Nothing was certified"
+    return f"{begin}: {', '.join(told) or 'nothing was measured'}."

@@ -1,0 +1,267 @@
+"""`eval matrix --ray`: one crew plays the cells of a suite, several at once; what is lost is played again.
+
+Processes are objects of this process, which answer in turn; a test says when one dies.
+"""
+
+import contextlib
+import itertools
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEnv, FakePolicy, factories
+from test_matrix import SUITE, journals
+from test_shard_merge import contents
+
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.shard_merge import merge
+from arena_newton.eval.suite_records import load_cell, read_suite
+
+ray = pytest.importorskip("ray", reason="needs the extra [ray]")
+from ray.exceptions import ActorDiedError  # noqa: E402
+
+from arena_newton.eval import ray_crew, ray_run, ray_suite  # noqa: E402
+from arena_newton.eval.ray_actor import EpisodeActor  # noqa: E402
+from arena_newton.eval.slice_events import Node  # noqa: E402
+
+
+class Answer:
+    """An answer that is computed when it is fetched."""
+
+    def __init__(self, work):
+        self.work = work
+
+
+class InlineRay:
+    """What the crew uses of Ray; `dies` is asked before each answer."""
+
+    def __init__(self, dies=lambda: False, cores=2.0):
+        self.dies, self.opened, self.actors, self.killed = dies, [], 0, 0
+        self.machine = {"NodeID": "n0", "Alive": True, "Resources": {"CPU": cores}}
+
+    def nodes(self):
+        return [self.machine]
+
+    def remote(self, kind):
+        return SimpleNamespace(options=lambda **resources: SimpleNamespace(remote=self._actor))
+
+    def _actor(self, gpu):
+        self.actors += 1
+        actor, number = EpisodeActor(gpu=True), self.actors
+
+        def opening(options, folder, cores, made_of):
+            self.opened.append((number, folder))
+            return Answer(lambda: actor.open(options, folder, (0, 1 << 20), made_of))
+
+        playing = SimpleNamespace(remote=lambda part: map(lambda event: Answer(lambda: event), actor.play(part)))
+        return SimpleNamespace(
+            node=SimpleNamespace(remote=lambda: Answer(lambda: Node("n0", "host", number))),
+            open=SimpleNamespace(remote=opening),
+            play=SimpleNamespace(options=lambda num_returns: playing),
+        )
+
+    def wait(self, refs, timeout):
+        return refs, []
+
+    def get(self, ref):
+        if self.dies():
+            raise ActorDiedError
+        return ref.work()
+
+    def kill(self, actor):
+        self.killed += 1
+
+
+@pytest.fixture
+def inline(monkeypatch):
+    """Makes a stand-in for Ray of so many processes."""
+
+    def make(dies=lambda: False, cores=2.0):
+        found = InlineRay(dies, cores)
+        monkeypatch.setattr(ray_crew, "ray", found)
+        monkeypatch.setattr(ray_crew, "FIRST_PAUSE", 0.0)
+        for module in (ray_run, ray_suite):
+            monkeypatch.setattr(module, "in_cluster", lambda address: contextlib.nullcontext())
+        return found
+
+    return make
+
+
+@pytest.fixture
+def suite(tmp_path):
+    """Path of the suite file."""
+    path = tmp_path / "small.toml"
+    path.write_text(SUITE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Folder of the suite that was played without Ray."""
+    folder = tmp_path_factory.mktemp("alone")
+    (folder / "small.toml").write_text(SUITE)
+    assert main(["matrix", str(folder / "small.toml"), "--out", str(folder / "out")], factories()) == 0
+    return folder / "out"
+
+
+def call(suite, out, *flags, **changes):
+    """Exit code of `eval matrix --ray` with processes of one core."""
+    command = ["matrix", str(suite), "--out", str(out), "--ray", "--ray-cpus", "1", *flags]
+    return main(command, factories(**changes))
+
+
+def merged(out, target):
+    """All files of all cells but for the times, as `merge` writes each cell alone."""
+    found = {}
+    for cell in read_suite(out).cells:
+        merge([out / cell.folder], target / cell.folder)
+        found[cell.id] = contents(target / cell.folder)
+    return found
+
+
+def test_the_same_bytes_as_without(inline, suite, alone, tmp_path):
+    """Journals, tables and reports of all cells are those of one process, and suite.json says the same of them."""
+    inline()
+    assert call(suite, tmp_path / "out") == 0
+    assert merged(tmp_path / "out", tmp_path / "a") == merged(alone, tmp_path / "b")
+    found, wanted = read_suite(tmp_path / "out"), read_suite(alone)
+    for mine, its in zip(found.cells, wanted.cells, strict=True):
+        assert (mine.id, mine.config, mine.status, mine.finished, mine.successes, mine.device) == (
+            (its.id, its.config, "done", 4, its.successes, "cpu")
+        )
+        assert mine.wall_s > 0 and load_cell(found, mine).document["status"]["state"] == "success"
+
+
+def test_one_crew_for_all_cells(inline, suite, tmp_path):
+    """Processes are asked for once; a cell is opened by who plays it; who is free before the end helps another."""
+    fake = inline()
+    assert call(suite, tmp_path / "out") == 0
+    assert fake.actors == 2 and {number for number, _ in fake.opened} == {1, 2}
+    folders = [folder for _, folder in fake.opened]
+    assert len(set(folders)) == 6 and len(folders) < 12
+
+
+def test_environments_last_from_cell_to_cell(inline, suite, tmp_path):
+    """A process plays the cells of its environment first."""
+    fake = inline()
+    assert call(suite, tmp_path / "out") == 0
+    groups = {n: [folder.split("/")[-2:] for number, folder in fake.opened if number == n] for n in (1, 2)}
+    changes = sum(before != after for one in groups.values() for before, after in itertools.pairwise(one))
+    assert changes <= 4, groups
+
+
+@pytest.mark.parametrize("every", [5, 7, 11, 17])
+def test_losses_lose_nothing(inline, suite, alone, tmp_path, every):
+    """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
+    count = itertools.count(1)
+    fake = inline(lambda: next(count) % every == 0)
+    assert call(suite, tmp_path / "out", "--ray-attempts", "99") == 0
+    assert journals(tmp_path / "out") == journals(alone)
+    assert fake.killed > 2
+
+
+def test_interrupted_and_continued(inline, suite, alone, tmp_path, capsys):
+    """Ctrl-C ends with code 130 and prints the command; it, or one without Ray, continues to the same episodes."""
+    out, count = tmp_path / "out", itertools.count()
+
+    def interrupt():
+        if next(count) == 25:
+            raise KeyboardInterrupt
+        return False
+
+    inline(interrupt)
+    assert call(suite, out, "--ray-actors", "2") == 130
+    said = capsys.readouterr().out
+    assert re.search(r"interrupted; \d of 6 cells done; continue with: .*--ray --ray-actors 2 --ray-cpus 1\n", said)
+    states = {cell.status for cell in read_suite(out).cells}
+    assert "started" in states
+    inline()
+    assert call(suite, out, "--limit", "1") == 0
+    assert main(["matrix", str(suite), "--out", str(out)], factories()) == 0
+    assert journals(out) == journals(alone)
+    documents = [json.loads(path.read_text()) for path in out.glob("*/*/*/*/config.json")]
+    assert {document["status"]["state"] for document in documents} == {"success"} and len(documents) == 6
+
+
+class Ignorant(FakePolicy):
+    """Knows no football."""
+
+    def check_task(self, task, mode=None, seeds=()):
+        if task == "football" and self.name.startswith("remote"):
+            raise InputError("knows no football")
+
+
+def test_a_failing_cell_stops_or_is_passed(inline, suite, alone, tmp_path, capsys):
+    """Without --keep-going the suite stops with the cell's name and code 2, with it the others are played: code 1."""
+    suite.write_text(SUITE.replace('spec = "stand"', 'spec = "remote:http://127.0.0.1:9"'))
+    out = tmp_path / "out"
+    inline()
+    assert call(suite, out, policy=Ignorant) == 2
+    said = capsys.readouterr().err
+    assert "cell still/twist2/football/base: knows no football" in said and "--keep-going" in said
+    assert call(suite, out, "--keep-going", policy=Ignorant) == 1
+    assert "failed: still/twist2/football/base: knows no football" in capsys.readouterr().out
+    states = {cell.id: cell.status for cell in read_suite(out).cells}
+    assert [name for name, status in states.items() if status != "done"] == ["still/twist2/football/base"]
+    assert states["still/twist2/football/base"] == "failed"
+    assert call(suite, out) == 0
+
+
+class Plodding(FakeEnv):
+    """A world in which nothing happens."""
+
+    def step(self, action, worlds=None):
+        self.tick[self.active] += 1
+        return np.zeros(self.worlds, np.int32)
+
+
+class Hasty(FakeEnv):
+    """A world that breaks in every process."""
+
+    def __init__(self, task, **options):
+        if task == "boxing":
+            raise RuntimeError("no room for it")
+        super().__init__(task, **options)
+
+
+def test_a_cell_that_ends_every_process_is_passed(inline, suite, tmp_path, capsys, monkeypatch):
+    """Five processes one after the other that break on a cell fail this cell alone."""
+    monkeypatch.setattr(ray_crew, "LONGEST_PAUSE", 0.0)
+    inline(cores=1.0)
+    out = tmp_path / "out"
+    assert call(suite, out, "--keep-going", env=Hasty) == 1
+    failed = {cell.id: cell.error for cell in read_suite(out).cells if cell.status == "failed"}
+    assert {name.split("/")[2] for name in failed} == {"boxing"} and len(failed) == 3
+    assert all("5 processes on host ended one after the other: RuntimeError: no room" in e for e in failed.values())
+    assert {c.status for c in read_suite(out).cells if c.task == "football"} == {"done"}
+
+
+def test_an_estimate_measures_two_processes(inline, suite, tmp_path, capsys):
+    """With --ray one process and then two play rounds of the same work; without room for two something is assumed."""
+    suite.write_text(SUITE.replace('["boxing", "football"]', '"boxing"'))
+    for cores, said in ((2.0, "measured cells, two at once measured"), (1.0, "assumes that processes do not slow")):
+        fake = inline(cores=cores)
+        assert call(suite, tmp_path / "out", "--only", "policy=still", "--estimate", "2", env=Plodding) == 0
+        output = capsys.readouterr().out
+        assert said in output and ("two processes at once take" in output) == (cores == 2.0)
+        assert len({folder for _, folder in fake.opened}) == (8 if cores == 2.0 else 0)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--ray-actors", "2"], "--ray-actors: belongs to --ray, which is not given"),
+        (["--ray", "--ray-gpus", "2"], "--ray-gpus 2: expected more than 0 and at most 1"),
+        (["--ray", "nowhere"], "--ray nowhere: expected one address"),
+    ],
+)
+def test_wrong_flags_are_refused_first(suite, tmp_path, capsys, flags, said):
+    """Each is one line with exit code 2, and no folder is made."""
+    assert main(["matrix", str(suite), "--out", str(tmp_path / "out"), *flags], factories()) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {said}") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
