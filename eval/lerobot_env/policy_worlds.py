@@ -12,7 +12,6 @@ from lerobot.configs import parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
 
 __all__ = ["PolicyWorlds", "policy_worlds"]
 
@@ -58,7 +57,12 @@ def policy_worlds() -> PolicyWorlds:
         InputError: A file of the checkpoint is damaged.
     """
     given = parser.get_path_arg("policy")
-    if not given or not (Path(given) / CONFIG_FILE).is_file():
+    if not given:
+        return PolicyWorlds()
+    # Loads Warp: a help, or a check of the flags without a policy, does not wait for it.
+    from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
+
+    if not (Path(given) / CONFIG_FILE).is_file():
         return PolicyWorlds()
     path = Path(given) / CONFIG_FILE
     content = _config(path)
