@@ -66,9 +66,25 @@ def peer_figures(options: BenchOptions) -> Iterator[BenchFigure]:
 
 
 def _pair(
-    options: BenchOptions, pair: str, figure: BenchFigure, ours: float, peer: float, unit: str, device: str
+    options: BenchOptions,
+    pair: str,
+    figure: BenchFigure,
+    speeds: tuple[float, float, float],
+    unit: str,
+    device: str,
 ) -> BenchFigure:
-    """The figure, after its line was added to the history."""
+    """The figure, after its line was added to the history.
+
+    Args:
+        options: Flags.
+        pair: Name of the pair.
+        figure: Its figure.
+        speeds: Ours, the peer's, and the ratio that is judged: the median of the rounds' ratios, which is not the
+            ratio of the two medians.
+        unit: Unit of the two.
+        device: What it was measured on.
+    """
+    ours, peer, ratio = speeds
     if options.peers_history:
         line = {
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -80,7 +96,7 @@ def _pair(
             "ours": ours,
             "peer": peer,
             "unit": unit,
-            "ratio": ours / peer,
+            "ratio": ratio,
             "bar": figure.bar,
             "verdict": figure.verdict if figure.value is not None else "information",
         }
@@ -123,7 +139,7 @@ def _tick(options: BenchOptions) -> Iterator[BenchFigure]:
         note = f"{ours:.3f} ms / {peer:.3f} ms, median of {len(pairs)} ratios; {_versions('tick')}"
         name = f"tick with tracker / bare mj_step, one world, CPU, {rate}"
         figure = BenchFigure(name, TICK_BAR, "x", True, ratio, note)
-        yield _pair(options, "tick", figure, ours, peer, "ms", _processor())
+        yield _pair(options, "tick", figure, (ours, peer, ratio), "ms", _processor())
 
 
 def _world_ticks(options: BenchOptions) -> Iterator[BenchFigure]:
@@ -137,7 +153,7 @@ def _world_ticks(options: BenchOptions) -> Iterator[BenchFigure]:
     if not cuda:
         note = f"not measured here (needs CUDA); for information, on the CPU: {ratio:.2f} x, {note}"
     figure = BenchFigure(name, WORLD_TICKS_BAR, "x", False, ratio if cuda else None, note)
-    yield _pair(options, "world_ticks", figure, ours, peer, "world-ticks/s", _device())
+    yield _pair(options, "world_ticks", figure, (ours, peer, ratio), "world-ticks/s", _device())
 
 
 def training_speeds(text: str) -> tuple[float, float]:
@@ -173,4 +189,4 @@ def _act_training(options: BenchOptions) -> Iterator[BenchFigure]:
     ours, peer = training_speeds(done.stdout)
     note = f"{ours:.1f} / {peer:.1f} steps/s, paper's recipe; {_versions('act_training')}"
     figure = BenchFigure(name, bar, "x", False, ours / peer, note)
-    yield _pair(options, "act_training", figure, ours, peer, "steps/s", _device())
+    yield _pair(options, "act_training", figure, (ours, peer, ours / peer), "steps/s", _device())

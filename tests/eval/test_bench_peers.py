@@ -20,6 +20,7 @@ def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
     lines = [json.loads(line) for line in history.read_text().splitlines()]
     assert len(lines) == 2
     assert lines[0]["ours"] == pytest.approx(8.0) and lines[0]["peer"] == pytest.approx(3.0)
+    assert lines[0]["ratio"] == 2.0  # not 8 / 3, the ratio of the medians
     assert lines[0]["bar"] == 1.5 and lines[0]["device"] and lines[0]["versions"]["mujoco"]
 
 
