@@ -15,27 +15,25 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import torch
 import warp as wp
 
 import arena_newton
 from arena_newton import policies, trackers
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.bench_figure import BenchFigure
 from arena_newton.eval.bench_learned import learned_figures
+from arena_newton.eval.bench_peers import peer_figures
 from arena_newton.eval.bench_policy import policy_figures
 from arena_newton.eval.bench_recording import recording_figures
 from arena_newton.eval.bench_start import start_figures
+from arena_newton.eval.bench_tick import RATES, tick_times
 from arena_newton.eval.options import BenchOptions
-from arena_newton.interfaces import Physics
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.quiet import quiet_warp
-from arena_newton.robot import PhysicsRate
 from arena_newton.rollout import Rollout
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator
@@ -62,8 +60,11 @@ def run(options: BenchOptions) -> int:
     wanted = list(dict.fromkeys([*(_ITEMS if "all" in options.what else ()), *named]))
     quiet_warp()
     figures: list[BenchFigure] = []
-    for name in wanted:
-        for figure in _guarded(name, known[name](options)):
+    measured = ((name, known[name](options)) for name in wanted)
+    if options.peers:
+        measured = iter([("peers", peer_figures(options))])
+    for name, found in measured:
+        for figure in _guarded(name, found):
             figures.append(figure)
             if not options.json:
                 print(_line(figure), flush=True)
@@ -109,61 +110,16 @@ def _sync(env: ArenaEnv) -> None:
         wp.synchronize_device(env.device)
 
 
-@contextlib.contextmanager
-def _as_before(physics: Physics) -> Iterator[None]:
-    """Put the physics back into the state it had, so that the bare steps start where the full ticks do."""
-    kept = physics.snapshot()
-    yield
-    physics.restore(kept)
-
-
-RATES = {"1 ms x 20": PhysicsRate(dt=0.001, substeps=20), "5 ms x 4": PhysicsRate(dt=0.005, substeps=4)}
-"""The two rates of the physics at which ticks are measured, whatever rate the weights were trained at."""
-
-
-def _tick_times(options: BenchOptions, worlds: int, engine: str, rate: PhysicsRate) -> tuple[float, float]:
-    """Median seconds of a full tick and of its bare physics, taken in turn on the same worlds."""
-    tracker = trackers.get("twist2", options.checkpoint)
-    tracker.physics_rate = rate
-    env = ArenaEnv("football", worlds=worlds, tracker=tracker, engine=engine)
-    env.reset(list(range(worlds)))
-    action = torch.tensor(STAND_ACTION, device=env.torch_device).repeat(worlds, 1)
-    status = np.zeros(worlds, dtype=np.int32)
-
-    def ticks(count: int) -> None:
-        for _ in range(count):
-            env.observe()
-            status[:] = env.step(action)
-
-    def bare(count: int) -> None:
-        for _ in range(count):
-            env.physics.mj_step_only()
-
-    def timed(work: Callable[[int], None], count: int = 25) -> float:
-        _sync(env)
-        began = time.perf_counter()
-        work(count)
-        _sync(env)
-        return (time.perf_counter() - began) / count
-
-    ticks(env.startup_ticks + 10)
-    with _as_before(env.physics):
-        bare(2)
-    full, alone = [], []
-    for _ in range(options.rounds):
-        with _as_before(env.physics):
-            alone.append(timed(bare))
-        full.append(timed(ticks))
-        ended = np.flatnonzero(status)
-        if len(ended):  # as in an evaluation, a world that ended starts its next episode
-            env.reset([int(w) for w in ended], ended)
-    return statistics.median(full), statistics.median(alone)
+def _medians(options: BenchOptions, worlds: int, engine: str, rate: str) -> tuple[float, float]:
+    """Median seconds of a full tick and of its bare physics."""
+    pairs = tick_times(worlds, engine, RATES[rate], options.rounds, options.checkpoint)
+    return statistics.median(pair[0] for pair in pairs), statistics.median(pair[1] for pair in pairs)
 
 
 def _tick(options: BenchOptions) -> Iterator[BenchFigure]:
     for rate, bar in (("1 ms x 20", 1.3), ("5 ms x 4", 2.0)):
         name = f"tick / bare mj_step, engine mujoco, {options.worlds} worlds, {rate}"
-        full, alone = _tick_times(options, options.worlds, "mujoco", RATES[rate])
+        full, alone = _medians(options, options.worlds, "mujoco", rate)
         times = f"{1e3 * full:.2f} ms / {1e3 * alone:.2f} ms"
         yield BenchFigure(name, bar, "x", True, full / alone, times)
 
@@ -176,7 +132,7 @@ def _throughput(options: BenchOptions) -> Iterator[BenchFigure]:
         yield BenchFigure(rate + "5 ms x 4", 250_000, "world-ticks/s", False, None, NEEDS_CUDA)
         return
     for physics in ("5 ms x 4", "1 ms x 20"):
-        full, alone = _tick_times(options, options.cuda_worlds, "warp", RATES[physics])
+        full, alone = _medians(options, options.cuda_worlds, "warp", physics)
         times = f"{1e3 * full:.2f} ms / {1e3 * alone:.2f} ms"
         yield BenchFigure(ratio + physics, 1.4, "x", True, full / alone, times)
         if physics == "5 ms x 4":

@@ -30,8 +30,9 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
-_REPORTING = """__main__ action_map adversary bench bench_figure bench_learned bench_policy bench_recording
-    bench_start certify compare_command comparison comparison_page comparison_text config console contenders
+_REPORTING = """__main__ action_map adversary bench bench_figure bench_learned bench_peers bench_policy
+    bench_recording bench_start bench_tick certify compare_command comparison comparison_page comparison_text config
+    console contenders
     cost_table detectable document door_comparison door_options engines episode_signals evaluated_cells
     failure_counts failure_rules failure_text folder html_report identity journal learned_row learning_loop
     loop_report loop_requirements matrix_cells options original_format pack_command pack_options paper_claims

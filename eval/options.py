@@ -369,6 +369,12 @@ class BenchOptions:
     """Ticks of an episode of `policy` at most; 0: what the rules or the length of usual successes say."""
     learned_ticks: int = 300
     """Ticks of an episode of `learned`, and of the expert's beside it."""
+    peers: tuple[str, ...] = ()
+    """Measure beside other programs instead: tick world_ticks act_training, or `all`."""
+    peers_dataset: str | None = None
+    """Dataset of `act_training`, read by both sides."""
+    peers_history: str | None = None
+    """File to which each pair that was measured is appended as a JSON line."""
     json: bool = False
     """Print one JSON array instead of the table."""
 

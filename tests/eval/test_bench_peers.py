@@ -1,0 +1,53 @@
+"""bench --peers: ratios are medians of rounds, what was not measured says so, history names device and versions."""
+
+import json
+
+import pytest
+
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval import bench, bench_peers
+from arena_newton.eval.options import BenchOptions
+
+
+def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
+    """The ratio is formed within each round; every measured pair leaves one line with what it was measured on."""
+    rounds = [(0.003, 0.002), (0.008, 0.004), (0.009, 0.003)]
+    monkeypatch.setattr(bench_peers, "tick_times", lambda *given: rounds)
+    history = tmp_path / "history.jsonl"
+    figures = list(bench_peers.peer_figures(BenchOptions(peers=("tick",), peers_history=str(history))))
+    assert [figure.value for figure in figures] == [2.0, 2.0]
+    assert [figure.verdict for figure in figures] == ["MISS", "MISS"]
+    lines = [json.loads(line) for line in history.read_text().splitlines()]
+    assert len(lines) == 2
+    assert lines[0]["ours"] == pytest.approx(8.0) and lines[0]["peer"] == pytest.approx(3.0)
+    assert lines[0]["ratio"] == 2.0  # not 8 / 3, the ratio of the medians
+    assert lines[0]["bar"] == 1.5 and lines[0]["device"] and lines[0]["versions"]["mujoco"]
+
+
+def test_on_the_cpu_world_ticks_are_information(monkeypatch):
+    """Without CUDA no bar is judged, whatever the ratio is."""
+    monkeypatch.setattr(bench_peers.wp, "is_cuda_available", lambda: False)
+    monkeypatch.setattr(bench_peers, "tick_times", lambda *given: [(0.5, 0.4)])
+    (figure,) = bench_peers.peer_figures(BenchOptions(peers=("world_ticks",)))
+    assert figure.value is None and figure.verdict == "-" and "0.80 x" in figure.note
+
+
+@pytest.mark.parametrize("pair", ["tracker_training", "lerobot_eval", "pictures", "act_training"])
+def test_what_is_not_measured_is_not_reached(pair):
+    """A pair without a measurement, or without its dataset, says so and has no value."""
+    (figure,) = bench_peers.peer_figures(BenchOptions(peers=(pair,)))
+    assert figure.value is None and figure.note.startswith("not measured:")
+
+
+def test_unknown_pair():
+    """An unknown pair is an error that names the flag."""
+    with pytest.raises(InputError, match="--peers nonsense"):
+        bench.run(BenchOptions(peers=("nonsense",)))
+
+
+def test_training_speeds_are_read():
+    """Both speeds of the training's bench are found; where one is missing that is an error."""
+    text = "act/paper\nalone: 71.5 steps/s (one graph a step)\nLeRobot's loop, 4 workers: 31.0 steps/s; ours\n"
+    assert bench_peers.training_speeds(text) == (71.5, 31.0)
+    with pytest.raises(ArenaError, match="no two speeds"):
+        bench_peers.training_speeds("alone: 71.5 steps/s\n")
