@@ -60,7 +60,7 @@ def run(options: BenchOptions) -> int:
     wanted = list(dict.fromkeys([*(_ITEMS if "all" in options.what else ()), *named]))
     quiet_warp()
     figures: list[BenchFigure] = []
-    measured = ((name, known[name](options)) for name in wanted)
+    measured: Iterator[tuple[str, Iterator[BenchFigure]]] = ((name, known[name](options)) for name in wanted)
     if options.peers:
         measured = iter([("peers", peer_figures(options))])
     for name, found in measured:
