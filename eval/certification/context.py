@@ -55,6 +55,8 @@ class CertifyCell:
     """Draw film strips."""
     failures: bool = False
     """Keep the signals of failures."""
+    first_seed: int = 0
+    """The first of its group seeds; the protocol's is 0."""
 
     @property
     def folder(self) -> str:
@@ -62,6 +64,7 @@ class CertifyCell:
         ways = [self.tracker, self.rules, self.mode]
         ways += [self.body] * (self.body != "robot") + [self.label] * bool(self.label)
         ways += ["weights"] * (self.checkpoint is not None) + [f"engine-{self.engine}"] * (self.engine is not None)
+        ways += [f"from-{self.first_seed}"] * (self.first_seed != 0)
         return f"{self.task}/{'_'.join(ways)}"
 
 
@@ -93,10 +96,14 @@ class Context:
         """Trackers of checks that compare experts with themselves: under --quick the first one stands for all."""
         return self.trackers[:1] if self.options.quick else self.trackers
 
-    def plan(self) -> tuple[tuple[int, ...], int]:
-        """Group seeds and repeats: the protocol's 20 repeats of each seed where the episodes are a multiple of 20."""
+    def plan(self, first: int = 0) -> tuple[tuple[int, ...], int]:
+        """Group seeds and repeats: the protocol's 20 repeats of each seed where the episodes are a multiple of 20.
+
+        Args:
+            first: The first group seed.
+        """
         groups, rest = divmod(self.episodes, PROTOCOL_REPEATS)
-        return ((0,), self.episodes) if rest else (tuple(range(groups)), PROTOCOL_REPEATS)
+        return ((first,), self.episodes) if rest else (tuple(range(first, first + groups)), PROTOCOL_REPEATS)
 
     def seeds(self, task: str, count: int) -> list[int]:
         """Episode seeds of a task's first episodes in the protocol: 20 repeats of each group seed."""
@@ -114,7 +121,7 @@ class Context:
             InputError: A flag is wrong, or the folder was begun with another configuration.
             KeyboardInterrupt: The run was interrupted; what was played is kept.
         """
-        seeds, repeats = self.plan()
+        seeds, repeats = self.plan(cell.first_seed)
         options = RunOptions(
             task=(cell.task,),
             tracker=(cell.tracker,),

@@ -16,12 +16,18 @@ from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.wording import markdown_table
 from arena_newton.intervals import wilson
 
-__all__ = ["CHECKS", "LEAST", "Confusion", "confusion"]
+__all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 
 LEAST = 0.8
 """Least precision and recall of each stage."""
 ENOUGH = 20
 """From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
+
+
+TUNED: Mapping[str, tuple[int, ...]] = {"boxing": (0, 10), "vis_navi": (0, 10)}
+"""Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
+HELD_OUT = 700
+"""First group seed that the check plays: above all that were looked at."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ def failures(context: Context) -> CheckFinding:
             for name, sabotage in SABOTAGES.items():
                 if task in sabotage.without:
                     continue
-                cell = CertifyCell(task, tracker, body=name, failures=True)
+                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT)
                 records = context.evaluate(cell)
                 found = [(sabotage.stage, stage_of(record)) for record in records]
                 pairs.setdefault(task, []).extend(found)
@@ -76,6 +82,9 @@ def failures(context: Context) -> CheckFinding:
                 total += len(records)
                 if solved:
                     notes.append(f"{task} {tracker}, {name}: {solved} of {len(records)} episodes succeed all the same")
+    for task in tasks:
+        looked_at = " ".join(str(seed) for seed in TUNED[task])
+        notes.append(f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on {looked_at}")
     left_out = [task for task in context.tasks if task not in INTERACTIONS]
     notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
     matrices = {task: confusion(found) for task, found in pairs.items()}

@@ -15,7 +15,8 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval import report
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification.failures import LEAST, confusion
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion
 from arena_newton.eval.certification.failures import failures as check
 from arena_newton.eval.certification.sabotage import SABOTAGES, MisledSight, RelocatingEnv, WeakTracker
 from arena_newton.eval.certification.traces import StateTrace, first_difference
@@ -24,6 +25,7 @@ from arena_newton.eval.failure_rules import FALLING, sees_at_start, stage_of
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.results import load_run
 from arena_newton.eval.signal_recorder import SEEN, SignalRecorder
 from arena_newton.policies.experts import ExpertPolicy
@@ -186,6 +188,34 @@ def test_the_check_fails_below_the_bar(capsys):
         assert few.verdict == verdict and f"recall of approach is {3 * times} of {4 * times}" in few.notes[0]
         assert ("too few episodes" in few.notes[0]) is (verdict == "note")
     assert any("recall of perception" in note for note in bad.notes)
+
+
+def test_the_check_plays_episodes_that_nothing_was_set_on():
+    """Its group seeds lie above all that were looked at, whatever their number, and a note says both."""
+    cells = []
+
+    def evaluate(cell):
+        cells.append(cell)
+        return [judged(outcome, **changes) for outcome, changes in OF[cell.body] * 5]
+
+    found = check(SimpleNamespace(tasks=("boxing", "vis_navi"), sample=("twist2",), evaluate=evaluate))
+    assert set(TUNED) == set(INTERACTIONS) and len(cells) == 11
+    for task, looked_at in TUNED.items():
+        assert max(looked_at) < HELD_OUT
+        said = f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on "
+        assert said + " ".join(map(str, looked_at)) in found.notes
+    assert {cell.first_seed for cell in cells} == {HELD_OUT}
+
+
+@pytest.mark.parametrize(("count", "seeds"), [(4, 1), (20, 1), (60, 3)])
+def test_a_cell_may_begin_at_another_group_seed(tmp_path, count, seeds):
+    """As many seeds and repeats as from 0 on; the folder is another one, and the protocol's keeps its name."""
+    context = Context(CertifyOptions(episodes=count), tmp_path, ("boxing",), print)
+    (first, repeats), (later, same) = context.plan(), context.plan(HELD_OUT)
+    assert repeats == same and len(first) == seeds
+    assert later == tuple(HELD_OUT + seed for seed in first)
+    assert CertifyCell("boxing", "twist2", first_seed=HELD_OUT).folder == f"boxing/twist2_paper_base_from-{HELD_OUT}"
+    assert CertifyCell("boxing", "twist2").folder == "boxing/twist2_paper_base"
 
 
 def test_tasks_without_signals_are_refused(capsys):
