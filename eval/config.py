@@ -28,7 +28,7 @@ from arena_newton.eval.records import JsonObject
 from arena_newton.eval.sharding import Shard, dealt, parse_shard
 from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
-from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, video_sizes
+from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, robot_fit, video_sizes
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
@@ -498,7 +498,7 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
             raise InputError(f"{flag}cameras {plain_text(name)}: unknown, choose from {' '.join(CAMERAS)}")
         if name in found:
             raise InputError(f"{flag}cameras {name}: given twice")
-        fit: Fit = "native" if name == "world" or 3 * width == 4 * height else "pad"
+        fit: Fit = "native" if name == "world" else robot_fit(width, height)
         found[name] = CameraConfig(width=width, height=height, prim="ego" if name == "front" else name, fit=fit)
     return found
 

@@ -5,7 +5,17 @@ from typing import Literal
 
 from arena_newton.errors import InputError
 
-__all__ = ["MOST_PORT", "MOST_VIEWED", "SIZE_LIMITS", "STRIP_SIZES", "VIEWERS", "CameraConfig", "Fit", "video_sizes"]
+__all__ = [
+    "MOST_PORT",
+    "MOST_VIEWED",
+    "SIZE_LIMITS",
+    "STRIP_SIZES",
+    "VIEWERS",
+    "CameraConfig",
+    "Fit",
+    "robot_fit",
+    "video_sizes",
+]
 
 Fit = Literal["native", "pad"]
 STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
@@ -37,6 +47,11 @@ class CameraConfig:
     (4:3 for the robot's cameras) inside width × height, black around it, as the original prepares policy images."""
     samples: int = 1
     """Rays per pixel along each axis (2 is 4 rays per pixel: smooth edges for videos)."""
+
+
+def robot_fit(width: int, height: int) -> Fit:
+    """How a robot's camera fills a size [px] where nobody says: whole where the size is its own 4:3, else padded."""
+    return "native" if 3 * width == 4 * height else "pad"
 
 
 def video_sizes(size: tuple[int, int] | None) -> dict[str, tuple[int, int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
@@ -16,6 +16,7 @@ from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.eval.lerobot_env.policy_worlds import PolicyWorlds, policy_worlds
 from arena_newton.flags import user_path
+from arena_newton.pictures.settings import Fit
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -79,7 +80,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """Width of pictures [px]; the policy's, or 224."""
     image_height: int | None = None
     """Height of pictures [px]; the policy's, or 224."""
-    fit: Literal["native", "pad"] | None = None
+    fit: Fit | None = None
     """`pad` or `native`: how the camera's 4:3 picture goes into another size; the policy's, or `pad`."""
     episode_length: int | None = None
     """Cap on the step budget of the rule set [ticks]."""

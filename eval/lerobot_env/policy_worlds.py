@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from lerobot.configs import parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from arena_newton.errors import InputError
+from arena_newton.pictures.settings import Fit, robot_fit
 
 __all__ = ["PolicyWorlds", "policy_worlds"]
 
@@ -32,7 +32,7 @@ class PolicyWorlds:
     """Width of its pictures [px]."""
     height: int = 224
     """Height of its pictures [px]."""
-    fit: Literal["native", "pad"] = "pad"
+    fit: Fit = "pad"
     """How the camera's 4:3 picture goes into that size, as in `CameraConfig`."""
     source: Path | None = None
     """File that says so; None: these are the defaults of what says nothing."""
@@ -69,7 +69,7 @@ def policy_worlds() -> PolicyWorlds:
     facts, ticks = CheckpointFacts.read(path.parent), _look_ticks(path, content)
     if facts is None:
         width, height = _picture(path, content)
-        fit: Literal["native", "pad"] = "native" if 3 * width == 4 * height else "pad"  # as eval record takes them
+        fit = robot_fit(width, height)  # as eval record takes them
         return PolicyWorlds(look_ticks=ticks, width=width, height=height, fit=fit, source=path)
     camera = facts.camera
     return PolicyWorlds(

@@ -23,7 +23,7 @@ from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.foreign import check_size, read_bytes
-from arena_newton.pictures.settings import CameraConfig
+from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts, checkpoint_folder
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
 
@@ -280,4 +280,4 @@ def _foreign_camera(picture: tuple[int, int], preparation: PicturePreparation | 
     height, width = picture
     if not all(16 <= n <= 4096 for n in picture):
         raise InputError(f"pictures of {width}x{height} pixels, expected 16 to 4096 each")
-    return CameraConfig(width=width, height=height, fit="native" if 3 * width == 4 * height else "pad")
+    return CameraConfig(width=width, height=height, fit=robot_fit(width, height))

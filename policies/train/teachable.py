@@ -20,6 +20,7 @@ from arena_newton.intervals import wilson
 from arena_newton.policies.base import Chunk, Observation, Policy
 from arena_newton.policies.experts.base import Sight
 from arena_newton.policies.label_reader import read_by
+from arena_newton.policies.recipes.training_recipe import REALIGN
 from arena_newton.policies.train.teachable_network import PoseNetwork, fitted, pose_features, read_demonstrations
 from arena_newton.quiet import quiet_warp
 from arena_newton.rollout import Rollout
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PosePolicy", "teachable"]
 
-REALIGN = 0.002
-"""Fraction of the gap between commanded and measured heading that is closed each tick, as of recipe `fast`."""
 SERIES = 3
 """Group seeds over which episodes are spread, those of the protocol."""
 SAID_EVERY = 500

@@ -72,7 +72,7 @@ def test_kill_9_in_a_job_of_two_machines(alone, tmp_path):
     programs = {
         "python": f'[ "$1 $2" = "-m arena_newton.eval" ] && shift 2\nexec {sys.executable} {FAKES} "$@"',
         "ray": f'exec {RAY} "$@"',
-        "scontrol": 'echo one; sleep 0.5; echo two',
+        "scontrol": "echo one; sleep 0.5; echo two",
         "hostname": "echo 127.0.0.1",
         "srun": 'while [[ $1 == --* ]]; do shift; done\nexec "$@"',
     }
