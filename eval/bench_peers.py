@@ -20,7 +20,7 @@ from arena_newton.eval.peer_pairs import add_to_history, device_name, processor_
 from arena_newton.eval.peer_tracker_training import tracker_training_figures
 from arena_newton.own_processes import environment
 
-__all__ = ["peer_figures", "training_speeds"]
+__all__ = ["peer_items", "training_speeds"]
 
 TICK_BAR, WORLD_TICKS_BAR, TRAINING_BAR = 1.5, 0.7, 2.0
 """Bars of the ratios."""
@@ -28,8 +28,8 @@ CPU_WORLDS = 2
 """Worlds of `world_ticks` where there is no CUDA: for information, no bar is judged there."""
 
 
-def peer_figures(options: BenchOptions) -> Iterator[BenchFigure]:
-    """Measure the pairs that ``--peers`` names.
+def peer_items(options: BenchOptions) -> list[tuple[str, Iterator[BenchFigure]]]:
+    """Name and figures of each pair that ``--peers`` names; a pair is measured when its figures are asked for.
 
     Raises:
         InputError: An unknown pair.
@@ -46,8 +46,7 @@ def peer_figures(options: BenchOptions) -> Iterator[BenchFigure]:
         if name not in (*known, "all"):
             raise InputError(f"--peers {name}: known are {' '.join(known)} all")
     wanted = tuple(known) if "all" in options.peers else options.peers
-    for name in dict.fromkeys(wanted):
-        yield from known[name](options)
+    return [(name, known[name](options)) for name in dict.fromkeys(wanted)]
 
 
 def _tick(options: BenchOptions) -> Iterator[BenchFigure]:

@@ -82,8 +82,8 @@ def main(motion: str, worlds: int, device: str) -> None:
     env_cfg, agent_cfg = load_env_cfg(TASK), load_rl_cfg(TASK)
     with tempfile.TemporaryDirectory() as folder, np.load(motion) as given:
         file = Path(folder) / "motion.npz"
-        names = ("root_pos", "root_quat", "joint_pos")
-        np.savez(file, **motion_arrays(*(given[name] for name in names), float(given["fps"])))
+        arrays: dict = motion_arrays(given["root_pos"], given["root_quat"], given["joint_pos"], float(given["fps"]))
+        np.savez(file, **arrays)
         env_cfg.commands["motion"].motion_file = str(file)
         env_cfg.scene.num_envs, env_cfg.seed = worlds, agent_cfg.seed
         env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg=env_cfg, device=device), clip_actions=agent_cfg.clip_actions)

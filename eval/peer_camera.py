@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import newton
 import warp as wp
@@ -100,7 +101,7 @@ def camera_figures(options: BenchOptions) -> Iterator[BenchFigure]:
                 camera.lights.set(world, LIGHT if shadows else None)
             camera.render(state)  # the poses
             theirs = NewtonPictures(env.scene.model, camera, lens, shadows)
-            rounds = _rounds(lambda: camera.render(state), lambda theirs=theirs: theirs.render(state), worlds, options)
+            rounds = _rounds(partial(camera.render, state), partial(theirs.render, state), worlds, options)
             yield _figure(options, worlds, shadows, rounds, cuda)
     finally:
         env.close()

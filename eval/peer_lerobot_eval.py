@@ -15,7 +15,7 @@ from pathlib import Path
 
 import warp as wp
 
-from arena_newton.errors import ArenaError
+from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench_figure import BenchFigure
 from arena_newton.eval.options import BenchOptions
 from arena_newton.eval.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
@@ -57,7 +57,7 @@ class _Played:
 
 
 def lerobot_eval_figures(options: BenchOptions) -> Iterator[BenchFigure]:
-    """Episodes per second while they are played; start and end of the commands are named beside it and not judged."""
+    """Episodes per second of the whole commands: what one of them loads or compiles beforehand counts too."""
     cuda = bool(wp.is_cuda_available())
     episodes = options.peers_episodes or (CUDA_EPISODES if cuda else CPU_EPISODES)
     name = f"{episodes} VisNavi episodes, learned policy / lerobot-eval, episodes/s"
@@ -65,22 +65,26 @@ def lerobot_eval_figures(options: BenchOptions) -> Iterator[BenchFigure]:
         reason = "not measured: no policy comes with this package; name a checkpoint by --policy-checkpoint"
         yield BenchFigure(name, BAR, "x", False, None, reason)
         return
-    require("data", "eval bench --peers lerobot_eval")
+    try:
+        require("data", "eval bench --peers lerobot_eval")
+    except InputError as error:  # the other pairs of `all` need no such library
+        yield BenchFigure(name, BAR, "x", False, None, f"not measured: {error}")
+        return
     checkpoint = SHIPPED if options.policy_checkpoint is None else user_path(options.policy_checkpoint)
     checkpoint = checkpoint_folder(checkpoint, "--policy-checkpoint")
-    rounds, wholes, notes = [], [], []
+    rounds, plays, notes = [], [], []
     for _ in range(options.peers_rounds):
         with tempfile.TemporaryDirectory() as made:
             folder = Path(made)
             ours_play = _ours(options, checkpoint, episodes, cuda, folder / "ours")
             peer_play = _peer(options, checkpoint, episodes, cuda, folder / "peer")
-        rounds.append((episodes / ours_play.seconds, episodes / peer_play.seconds))
-        wholes.append(peer_play.command_seconds / ours_play.command_seconds)
+        rounds.append((episodes / ours_play.command_seconds, episodes / peer_play.command_seconds))
+        plays.append(peer_play.seconds / ours_play.seconds)
         notes.append(f"{ours_play.text} / {peer_play.text}")
     ours, peer, ratio = median_speeds(rounds)
     cap = f", {options.peers_steps} steps at most" if options.peers_steps else ""
     note = f"{ours:.3f} / {peer:.3f} episodes/s, median of {len(rounds)} ratios; "
-    note += f"whole commands {statistics.median(wholes):.2f} x; {'; '.join(notes)}"
+    note += f"without start and end {statistics.median(plays):.2f} x; {'; '.join(notes)}"
     note += f"; {versions('lerobot_eval')}"
     if not cuda:
         note = f"{NEEDS_CUDA}{ratio:.2f} x, {note}"

@@ -9,12 +9,17 @@ from arena_newton.eval import bench, bench_peers
 from arena_newton.eval.options import BenchOptions
 
 
+def figures_of(options):
+    """All figures of the pairs that are named."""
+    return [figure for _, found in bench_peers.peer_items(options) for figure in found]
+
+
 def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
     """The ratio is formed within each round; every measured pair leaves one line with what it was measured on."""
     rounds = [(0.003, 0.002), (0.008, 0.004), (0.009, 0.003)]
     monkeypatch.setattr(bench_peers, "tick_times", lambda *given: rounds)
     history = tmp_path / "history.jsonl"
-    figures = list(bench_peers.peer_figures(BenchOptions(peers=("tick",), peers_history=str(history))))
+    figures = figures_of(BenchOptions(peers=("tick",), peers_history=str(history)))
     assert [figure.value for figure in figures] == [2.0, 2.0]
     assert [figure.verdict for figure in figures] == ["MISS", "MISS"]
     lines = [json.loads(line) for line in history.read_text().splitlines()]
@@ -28,15 +33,29 @@ def test_on_the_cpu_world_ticks_are_information(monkeypatch):
     """Without CUDA no bar is judged, whatever the ratio is."""
     monkeypatch.setattr(bench_peers.wp, "is_cuda_available", lambda: False)
     monkeypatch.setattr(bench_peers, "tick_times", lambda *given: [(0.5, 0.4)])
-    (figure,) = bench_peers.peer_figures(BenchOptions(peers=("world_ticks",)))
+    (figure,) = figures_of(BenchOptions(peers=("world_ticks",)))
     assert figure.value is None and figure.verdict == "-" and "0.80 x" in figure.note
 
 
 @pytest.mark.parametrize("pair", ["tracker_training", "act_training"])
 def test_what_is_not_measured_is_not_reached(pair):
     """A pair without its dataset or its peer's interpreter says so and has no value."""
-    (figure,) = bench_peers.peer_figures(BenchOptions(peers=(pair,), peers_worlds=(4,)))
+    (figure,) = figures_of(BenchOptions(peers=(pair,), peers_worlds=(4,)))
     assert figure.value is None and figure.note.startswith("not measured:")
+
+
+def test_a_pair_that_breaks_does_not_stop_the_others(monkeypatch, capsys):
+    """It is a miss with its reason; the pairs after it are measured, and the exit code is 1."""
+
+    def broken(options):
+        raise ArenaError("mjlab ended with code 1: out of memory")
+        yield
+
+    monkeypatch.setattr(bench_peers, "tracker_training_figures", broken)
+    assert bench.run(BenchOptions(peers=("tracker_training", "act_training"))) == 1
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("MISS") and "tracker_training" in first and "out of memory" in first
+    assert "ACT training" in second
 
 
 def test_unknown_pair():

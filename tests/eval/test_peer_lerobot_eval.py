@@ -1,4 +1,4 @@
-"""bench --peers lerobot_eval: both programs are called for the same episodes; what is judged is the time of playing."""
+"""bench --peers lerobot_eval: both programs are called for the same episodes, and are judged whole."""
 
 import json
 from pathlib import Path
@@ -41,14 +41,14 @@ class _Programs:
         return self.seconds.pop(0)
 
 
-def test_the_time_of_playing_is_compared(tmp_path, monkeypatch):
-    """By turns, ratio per round; whole commands and successes are named, and the CPU's ratio is information."""
+def test_whole_commands_are_compared(tmp_path, monkeypatch):
+    """By turns, ratio per round; the time of playing and successes are named, and the CPU's ratio is information."""
     programs = _Programs(monkeypatch, [2.0, 8.0, 2.0, 12.0, 4.0, 12.0], [3.0, 4.0, 9.0])
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: False)
     history = tmp_path / "history.jsonl"
     (figure,) = lerobot_eval_figures(BenchOptions(peers_steps=30, peers_history=str(history)))
-    assert figure.value is None and "4.00 x, 2.000 / 0.500 episodes/s" in figure.note and "30 steps" in figure.name
-    assert "whole commands 4.00 x; 1.0 s of 2.0 s, 2 solved / 3.0 s of 8.0 s, 0 solved" in figure.note
+    assert figure.value is None and "4.00 x, 1.000 / 0.167 episodes/s" in figure.note and "30 steps" in figure.name
+    assert "without start and end 4.00 x; 1.0 s of 2.0 s, 2 solved / 3.0 s of 8.0 s, 0 solved" in figure.note
     assert json.loads(history.read_text())["ratio"] == 4.0
     ours, peer = programs.commands[:2]
     assert ours[ours.index("--max-steps") + 1] == "30" and "--env.episode_length=30" in peer
@@ -58,7 +58,7 @@ def test_the_time_of_playing_is_compared(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("flags", "value"), [({}, 6.0), ({"peers_episodes": 20}, None), ({"peers_steps": 9}, None)])
 def test_the_bar_is_for_the_whole_protocol(monkeypatch, flags, value):
     """With CUDA only the protocol's 60 whole episodes, three group seeds of 20, are judged."""
-    programs = _Programs(monkeypatch, [10.0, 20.0], [6.0])
+    programs = _Programs(monkeypatch, [10.0, 60.0], [7.0])
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: True)
     monkeypatch.setattr(peer_lerobot_eval, "device_name", lambda: "a GPU")
     (figure,) = lerobot_eval_figures(BenchOptions(peers_rounds=1, **flags))
