@@ -5,7 +5,7 @@ import json
 import pytest
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import bench, bench_peers
+from arena_newton.eval import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
 from arena_newton.eval.options import BenchOptions
 
 
@@ -42,6 +42,20 @@ def test_what_is_not_measured_is_not_reached(pair):
     """A pair without its dataset or its peer's interpreter says so and has no value."""
     (figure,) = figures_of(BenchOptions(peers=(pair,), peers_worlds=(4,)))
     assert figure.value is None and figure.note.startswith("not measured:")
+
+
+@pytest.mark.parametrize("module", [peer_tracker_training, peer_lerobot_eval])
+def test_a_missing_extra_is_one_line(module, monkeypatch):
+    """A pair whose libraries are not installed says so and has no value: it is not reached."""
+
+    def missing(extra, what):
+        raise InputError(f"{what} needs the extra {extra}")
+
+    monkeypatch.setattr(module, "require", missing)
+    pair = module.__name__.rsplit(".peer_")[-1]
+    (figure,) = figures_of(BenchOptions(peers=(pair,), mjlab_python="python", peers_worlds=(4,)))
+    assert figure.value is None and figure.verdict == "-"
+    assert figure.note.startswith(f"not measured: eval bench --peers {pair} needs the extra")
 
 
 def test_a_pair_that_breaks_does_not_stop_the_others(monkeypatch, capsys):

@@ -109,3 +109,103 @@ def test_a_training_that_hangs_is_ended(fake, motion, tmp_path, monkeypatch):
             mjlab.speed(1)
     finally:
         mjlab.close()
+
+
+STAND_INS = {
+    "__init__.py": "",
+    "tasks/__init__.py": "",
+    "tasks/registry.py": """
+import dataclasses
+from types import SimpleNamespace as Bag
+
+@dataclasses.dataclass
+class Agent:
+    num_steps_per_env: int = 24
+    seed: int = 7
+    clip_actions: float | None = None
+
+class Runner:
+    def __init__(self, env, agent, folder, device):
+        assert folder is None and agent["num_steps_per_env"] == 24
+        self.first = True
+    def learn(self, num_learning_iterations, init_at_random_ep_len):
+        print("iteration 1 of 1")
+        assert init_at_random_ep_len == self.first
+        self.first = False
+
+def load_env_cfg(task):
+    sim = Bag(mujoco=Bag(timestep=0.005))
+    return Bag(commands={"motion": Bag()}, scene=Bag(), sim=sim, decimation=4, seed=None)
+
+def load_rl_cfg(task):
+    return Agent()
+
+def load_runner_cls(task):
+    return Runner
+""",
+    "asset_zoo/__init__.py": "",
+    "asset_zoo/robots.py": """
+import mujoco
+from types import SimpleNamespace as Bag
+
+def g1():
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="pelvis")
+    body.add_freejoint()
+    for number in range(30):
+        body.add_geom(size=[0.1, 0, 0])
+        if number < 29:
+            body = body.add_body(name=f"link{number}", pos=[0, 0, 0.02])
+            body.add_joint(axis=[0, 1, 0])
+    return spec
+
+def get_g1_robot_cfg():
+    return Bag(spec_fn=g1)
+""",
+    "envs.py": """
+import numpy as np
+
+class ManagerBasedRlEnv:
+    def __init__(self, cfg, device):
+        assert cfg.scene.num_envs == 4 and cfg.seed == 7 and device == "cpu"
+        with np.load(cfg.commands["motion"].motion_file) as motion:
+            assert motion["fps"] == [50.0]
+            position, velocity = motion["body_pos_w"], motion["body_lin_vel_w"]
+            assert position.shape == velocity.shape == motion["body_ang_vel_w"].shape == (50, 30, 3)
+            assert motion["body_quat_w"].shape == (50, 30, 4)
+            assert motion["joint_pos"].shape == motion["joint_vel"].shape == (50, 29)
+            np.testing.assert_allclose(position[:, 0, 0], 0.01 * np.arange(50), atol=1e-5)
+            np.testing.assert_allclose(np.gradient(position, 0.02, axis=0)[1:-1], velocity[1:-1], atol=0.01)
+            np.testing.assert_allclose(motion["body_ang_vel_w"][1:-1, 1, 1], 0.5, atol=1e-3)
+    def close(self):
+        pass
+""",
+    "rl.py": "def RslRlVecEnvWrapper(env, clip_actions):\n    return env\n",
+    "utils/__init__.py": "",
+    "utils/torch.py": "def configure_torch_backends():\n    pass\n",
+    "../mjlab-1.6.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: mjlab\nVersion: 1.6.0\n",
+}
+"""What the script uses of mjlab, which is not installed beside this product."""
+
+
+def test_the_script_that_mjlab_is_handed(tmp_path):
+    """It makes a motion whose velocities are those of its poses, trains as asked, and answers in whole lines."""
+    for name, text in STAND_INS.items():
+        file = tmp_path / "mjlab" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\nPYTHONPATH="{tmp_path}" exec "{sys.executable}" "$@"\n')
+    python.chmod(0o755)
+    frames = np.arange(50.0)
+    root = np.stack([0.01 * frames, 0 * frames, 0.8 + 0 * frames], axis=1)
+    joints = np.zeros((50, 29))
+    joints[:, 0] = 0.01 * frames  # 0.5 rad/s
+    motion = tmp_path / "walk.npz"
+    np.savez(motion, fps=50.0, root_pos=root, root_quat=np.tile([1.0, 0, 0, 0], (50, 1)), joint_pos=joints)
+    mjlab = MjlabTraining(str(python), motion, 4, "cpu", tmp_path)
+    try:
+        assert mjlab.versions["mjlab"] == "1.6.0" and mjlab.versions["mujoco"] and mjlab.physics == "5 ms x 4"
+        assert mjlab.speed(2) > 0.0 and mjlab.speed(1) > 0.0
+    finally:
+        mjlab.close()
