@@ -52,9 +52,9 @@ INTERACTIONS: Mapping[str, Interaction] = {
     "boxing": Interaction(TARGET, BOUNDS, PALMS, touch=0.20, stance=0.60, bearing=0.8),
     # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
     "vis_navi": Interaction(SIGN, ZONE, FEET, touch=0.0, stance=0.30, level=True),
-    # The toe's distance is the one of the task's own `contact`. From a toe 0.12 m before the ankle, a foot swings half
-    # a step (0.2 m) without the other.
-    "football": Interaction(BALL, BALL, KICKING, touch=KICK, stance=0.30, bearing=0.8, slow=0.35, tip=TOE),
+    # The toe's distance is the one of the task's own `contact`. It is 0.12 m before the ankle and swings another 0.3 m
+    # ahead while the other foot stands. The expert walks through the ball, and turns and steps back below 0.35 m/s.
+    "football": Interaction(BALL, BALL, KICKING, touch=KICK, stance=0.40, bearing=0.8, slow=0.35, tip=TOE),
     # The origin of a pelvis that sits is 0.17 m above the box; a robot that comes down without weight stays some
     # centimetres higher. The expert goes down from 0.12 m in front of the edge.
     "sit_sofa": Interaction("/World/Sofa", SEAT, ("pelvis",), touch=0.25, stance=0.25, bearing=0.8, behind=True),
