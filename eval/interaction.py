@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 from arena_newton.errors import InputError
 from arena_newton.tasks.boxing import BOUNDS, PALMS, TARGET
+from arena_newton.tasks.football import BALL, KICK, TOE
+from arena_newton.tasks.football import FEET as KICKING
+from arena_newton.tasks.sit_sofa import SEAT
 from arena_newton.tasks.vis_navi import FEET, SIGN, ZONE
 
 __all__ = ["INTERACTIONS", "Interaction", "check_interactions"]
@@ -22,7 +25,7 @@ class Interaction:
     sight: str
     """Prim that the robot must find, with all below it; its pixels are counted in the head camera's picture."""
     box: str
-    """Marker whose box is to be touched."""
+    """Marker whose box is to be touched, or rigid body with the box around its collision geometry."""
     effectors: tuple[str, ...]
     """Links or frames of the robot that touch it."""
     touch: float
@@ -34,6 +37,13 @@ class Interaction:
     """The effectors' heights do not count."""
     bearing: float = 3.2
     """Largest angle between heading and box at which it can be touched [rad]; above pi: any."""
+    slow: float = 0.20
+    """Speed of the root, averaged over half a second, below which the robot stands or steps slowly [m/s]: the experts
+    strike and turn below it, and walk at 0.3 m/s and more."""
+    tip: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point of each effector that touches, in its frame [m]."""
+    behind: bool = False
+    """It is touched with the back: bearings are between the back and the nearest point of the box."""
 
 
 INTERACTIONS: Mapping[str, Interaction] = {
@@ -42,6 +52,12 @@ INTERACTIONS: Mapping[str, Interaction] = {
     "boxing": Interaction(TARGET, BOUNDS, PALMS, touch=0.20, stance=0.60, bearing=0.8),
     # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
     "vis_navi": Interaction(SIGN, ZONE, FEET, touch=0.0, stance=0.30, level=True),
+    # The toe's distance is the one of the task's own `contact`. It is 0.12 m before the ankle and swings another 0.3 m
+    # ahead while the other foot stands. The expert walks through the ball, and turns and steps back below 0.35 m/s.
+    "football": Interaction(BALL, BALL, KICKING, touch=KICK, stance=0.40, bearing=0.8, slow=0.35, tip=TOE),
+    # The origin of a pelvis that sits is 0.17 m above the box; a robot that comes down without weight stays some
+    # centimetres higher. The expert goes down from 0.12 m in front of the edge.
+    "sit_sofa": Interaction("/World/Sofa", SEAT, ("pelvis",), touch=0.25, stance=0.25, bearing=0.8, behind=True),
 }
 """Task name → its first contact; tasks that are not here have no failure signals."""
 

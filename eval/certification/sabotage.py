@@ -21,23 +21,30 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.bodies import Body, WithOtherLegs
 from arena_newton.eval.failure_stage import FailureStage
+from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.interaction_view import InteractionView
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Spawn, World
 from arena_newton.physics_mujoco import MujocoPhysics
 from arena_newton.policies.base import Mask
 from arena_newton.policies.experts import ExpertPolicy, Sight
+from arena_newton.policies.experts.base import Expert
+from arena_newton.policies.experts.style import Style
 from arena_newton.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
+from arena_newton.tasks.football import GOAL
 from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
+from arena_newton.trackers.motions.commands import MotionCommand
 
-__all__ = ["SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
+__all__ = ["HALTS", "PERCHED", "SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
 
 UNSEEN = (0.0, 0.0, 30.0)
 """Displacement of an object that nobody can see: in the sky, where no camera looks [m]."""
 ELSEWHERE = (2.4, 3.2)
-"""Distance of the place where a blind robot believes the object, drawn between these [m]."""
+"""Distance of the place where a blind robot believes the object, drawn between these [m] ..."""
+TOWARDS: Mapping[str, tuple[float, float]] = {"": (150, 190), "football": (-20, 20), "sit_sofa": (90, 150)}
+"""... and its direction from the object, drawn between these [degrees from the x-axis]: where there is free floor."""
 SHORT = (0.55, 0.80)
 """Distance that a robot that aims badly stops short of where it wants to stop, drawn between these [m] ..."""
 ASIDE = math.radians(35)
@@ -52,6 +59,25 @@ OFF_CENTRE = (0.18, 0.22)
 """Height by which a fist misses its target, drawn between these [m]: it is still on the bag."""
 AWAY = 1.5
 """Distance that an object is moved by when it is touched first [m]."""
+BEFORE_BALL = (1.05, 1.30)
+"""How far before the ball a robot that aims badly kicks the air, drawn between these [m]: it comes to stand up to 0.6 m
+past the place where it believes the ball."""
+BESIDE_GOAL = (4.5, 5.5)
+"""How far to a side of the goal's middle a robot that kicks badly believes it, drawn between these [m]: the posts are
+at 2.5 m, and it aims up to 0.8 m inwards."""
+BESIDE_SEAT = (0.90, 1.20)
+"""How far beyond its place on the sofa a robot that aims badly turns its back, drawn between these [m]: beside the
+armrest, which begins 0.5 m beyond that place."""
+HALTS = (0.36, 0.30)
+"""Distance to a ball at which a robot that does not kick halts, and over how many before that it slows down [m]."""
+SLOWEST = 0.25
+"""Fraction of its speed that is left when it halts."""
+PERCHED = (0.63, 0.66)
+"""Height at which a pelvis stays that comes down on the seat without weight, drawn between these [m] ..."""
+PERCHED_BACK = 0.18
+"""... and how far it goes back for that at most [m]."""
+PERCHES = 60
+"""Ticks after the first touch at which a robot that sat down badly falls over."""
 
 
 class MisledSight(Sight):
@@ -62,8 +88,10 @@ class MisledSight(Sight):
         super().__init__(env)
         self.view = InteractionView(env)
         worlds = env.worlds
-        self.robot_off, self.hands_off, self.object_off = (torch.zeros(worlds, 3, device=self.device) for _ in range(3))
-        """Where robot, hands and object are believed minus where they are [m], shape [worlds, 3]."""
+        self.robot_off, self.hands_off, self.object_off, self.goal_off = (
+            torch.zeros(worlds, 3, device=self.device) for _ in range(4)
+        )
+        """Where robot, hands, object and goal are believed minus where they are [m], shape [worlds, 3]."""
         self._robot = frozenset(int(body) for body in env.scene.robot.bodies)
         self._object = self.view.box.body_id
 
@@ -87,7 +115,26 @@ class MisledSight(Sight):
     def frame(self, name: str) -> Callable[[], Tensor]:
         """See `Sight.frame`."""
         read = super().frame(name)
+        if name == GOAL:
+            return lambda: read() + self.goal_off
         return (lambda: read() + self.hands_off) if name in PALMS else read
+
+
+class _Overruled(Expert):
+    """An expert whose commands are changed."""
+
+    def __init__(self, inner: Expert, change: Callable[[MotionCommand], MotionCommand]):
+        super().__init__(inner.sight)
+        self._inner, self._change = inner, change
+
+    def begin(self, mask: Tensor, style: Style) -> None:
+        self._inner.begin(mask, style)
+
+    def command(self, mask: Tensor, dt: float) -> MotionCommand:
+        return self._change(self._inner.command(mask, dt))
+
+    def phases(self) -> list[str] | None:
+        return self._inner.phases()
 
 
 class MisledExpert(ExpertPolicy):
@@ -104,18 +151,23 @@ class MisledExpert(ExpertPolicy):
         """See `Policy.attach`."""
         super().attach(env)
         self.env = env
+        assert self.expert is not None
+        self.expert = _Overruled(self.expert, self.overrule)
         self.since = torch.full((env.worlds,), -1.0, device=env.torch_device)
         """Ticks since the robot came close to the object, shape [worlds]; -1 before."""
         self.touched = torch.zeros(env.worlds, dtype=torch.bool, device=env.torch_device)
         """The object was touched in this episode, shape [worlds]."""
+        self.after = torch.zeros(env.worlds, device=env.torch_device)
+        """Ticks since then, shape [worlds]; 0 before."""
 
+    @torch.inference_mode()  # a world's next episode clears what `act` made
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """See `Policy.reset`."""
         super().reset(seeds, tasks, mask)
         begins = self._begins_now(mask, len(seeds))
-        for off in (self.sight.robot_off, self.sight.hands_off, self.sight.object_off):
+        for off in (self.sight.robot_off, self.sight.hands_off, self.sight.object_off, self.sight.goal_off):
             off[begins] = 0.0
-        self.since[begins], self.touched[begins] = -1.0, False
+        self.since[begins], self.touched[begins], self.after[begins] = -1.0, False, 0.0
 
     def _begins_now(self, mask: Mask, worlds: int) -> Tensor:
         every = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
@@ -129,12 +181,17 @@ class MisledExpert(ExpertPolicy):
         counts = asking & ((view.distance < CLOSE) | (self.since >= 0))
         self.since = torch.where(counts, self.since + 1.0, self.since)
         self.touched |= asking & (view.reach <= view.spec.touch)
+        self.after = self.after + (asking & self.touched)
         self.mislead()
         chunk = super().act(observation)
         return Chunk(self.spoil(chunk.actions), chunk.errors, chunk.phases)
 
     def mislead(self) -> None:
         """Displace what is believed, from the truth of this tick."""
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """What is commanded in place of the expert's command."""
+        return command
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """What is done in place of the expert's actions, shape [worlds, n, 40]."""
@@ -146,17 +203,38 @@ def _level(length: Tensor, turn: Tensor) -> Tensor:
     return torch.stack([length * torch.cos(turn), length * torch.sin(turn), torch.zeros_like(length)], dim=1)
 
 
+def _upright(command: MotionCommand) -> MotionCommand:
+    """The same without sitting down: where there is no seat, a robot that sits down falls."""
+    neutral = MotionCommand.neutral(len(command.height), command.height.device)
+    return dataclasses.replace(
+        command, height=neutral.height, pelvis_back=neutral.pelvis_back, pitch=neutral.pitch, waist=neutral.waist
+    )
+
+
+def _leaning(actions: Tensor | np.ndarray, lean: Tensor, side: Tensor) -> Tensor:
+    """Actions whose root leans over by an angle, forward and to a side [rad], both shape [worlds]."""
+    spoilt = torch.as_tensor(actions).clone()
+    turn = torch.stack([lean * torch.sin(side), lean * torch.cos(side), torch.zeros_like(lean)], dim=1)
+    own = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))
+    leaning = own @ matrix_from_quat(quat_from_euler(turn))
+    spoilt[:, :, ACTION["root_rot6d"]] = leaning[:, :, :2].reshape(-1, 1, 6)
+    return spoilt
+
+
 class BlindExpert(MisledExpert):
     """Knows nothing of the object: in every other episode it believes it elsewhere, in the others nowhere."""
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
-        far, turn = (
-            self.style.uniform("far", *ELSEWHERE),
-            self.style.uniform("to", math.radians(150), math.radians(190)),
-        )
-        aside = torch.stack([far * torch.cos(turn), far * torch.sin(turn), torch.zeros_like(far)], dim=1)
-        self.sight.object_off = self._elsewhere(aside)
+        least, most = TOWARDS.get(self.env.spec.name, TOWARDS[""])
+        turn = self.style.uniform("to", math.radians(least), math.radians(most))
+        if self.env.spec.name == "football":  # on the other half of the pitch
+            turn = torch.where(self.sight.view.centre[:, 0] > 0.0, math.pi - turn, turn)
+        self.sight.object_off = self._elsewhere(_level(self.style.uniform("far", *ELSEWHERE), turn))
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return _upright(command) if self.env.spec.name == "sit_sofa" else command
 
     def _elsewhere(self, aside: Tensor) -> Tensor:
         if self.env.spec.name != "boxing":
@@ -176,6 +254,12 @@ class MisaimedExpert(MisledExpert):
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
         view, far, aside = self.sight.view, self.style.uniform("short", *SHORT), self.style.uniform("to", -ASIDE, ASIDE)
+        if self.env.spec.name == "football":
+            self.sight.object_off = _level(self.style.uniform("short", *BEFORE_BALL), aside - 0.5 * math.pi)
+            return
+        if self.env.spec.name == "sit_sofa":
+            self.sight.object_off = _level(self.style.uniform("short", *BESIDE_SEAT), torch.zeros_like(far))
+            return
         if view.spec.level:  # a place is missed as a whole, on the side from which the robot comes
             self.sight.object_off = _level(far + 1.6 * view.box.half[0], aside - 0.5 * math.pi)
             return
@@ -183,41 +267,95 @@ class MisaimedExpert(MisledExpert):
         grown = (self.since / GROWS).clamp(0.0, 1.0)
         self.sight.robot_off = _level(grown * far, atan2(way[:, 1], way[:, 0]) + aside)
 
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return _upright(command) if self.env.spec.name == "sit_sofa" else command
+
 
 class UnbalancedExpert(MisledExpert):
     """Leans over more and more once it is close, until it falls."""
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """See `MisledExpert.spoil`."""
-        spoilt = torch.as_tensor(actions).clone()
         lean = LEAN * (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
-        side = self.style.uniform("side", -1.0, 1.0)
-        turn = torch.stack([lean * torch.sin(side), lean * torch.cos(side), torch.zeros_like(lean)], dim=1)
-        own = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))
-        leaning = own @ matrix_from_quat(quat_from_euler(turn))
-        spoilt[:, :, ACTION["root_rot6d"]] = leaning[:, :, :2].reshape(-1, 1, 6)
-        return spoilt
+        return _leaning(actions, lean, self.style.uniform("side", -1.0, 1.0))
+
+
+class ReluctantExpert(MisledExpert):
+    """Stands where it could touch the object, and does not: before a seat upright, behind a ball still."""
+
+    def attach(self, env: World) -> None:
+        """See `Policy.attach`."""
+        super().attach(env)
+        self.halted = torch.zeros(env.worlds, dtype=torch.bool, device=env.torch_device)
+        """It stopped behind the ball, shape [worlds]."""
+
+    @torch.inference_mode()
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
+        """See `Policy.reset`."""
+        super().reset(seeds, tasks, mask)
+        self.halted[self._begins_now(mask, len(seeds))] = False
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        if self.env.spec.name == "sit_sofa":
+            return _upright(command)
+        view, (halt, course) = self.sight.view, HALTS
+        before = view.bearing <= view.spec.bearing
+        self.halted |= (view.distance < halt) & before
+        slower = torch.where(before, ((view.distance - halt) / course).clamp(SLOWEST, 1.0), 1.0)
+        still = MotionCommand.neutral(len(self.halted), self.halted.device)
+        command = dataclasses.replace(command, velocity=command.velocity * slower[:, None])
+        return MotionCommand.unpack(torch.where(self.halted[:, None], still.pack(), command.pack()))
 
 
 class ClumsyExpert(MisledExpert):
-    """Touches without effect: its fist lands above or below the target."""
+    """Touches without effect.
+
+    Its fist lands above or below the target, its kick sends the ball beside the goal, and it comes down on a seat
+    without weight.
+    """
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.env.spec.name == "football":
+            far = self.style.uniform("beside", *BESIDE_GOAL)
+            side = torch.where(self.style.coin("left"), math.pi, 0.0)
+            self.sight.goal_off = _level(far, side.expand_as(far))
+        if self.env.spec.name != "boxing":
+            return
         size = self.style.uniform("off", *OFF_CENTRE)
         side = torch.where(self.style.coin("above"), 1.0, -1.0)
         zero = torch.zeros_like(size)
         self.sight.object_off = torch.stack([zero, zero, side * size], dim=1)
 
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return self._perched(command) if self.env.spec.name == "sit_sofa" else command
 
-class StubbornExpert(MisledExpert):
-    """Believes the object where it was when the episode began, in a world that moves it when it is touched."""
+    def _perched(self, command: MotionCommand) -> MotionCommand:
+        height = torch.maximum(command.height, self.style.uniform("perched", *PERCHED))
+        return dataclasses.replace(command, height=height, pelvis_back=command.pelvis_back.clamp_max(PERCHED_BACK))
+
+
+class StubbornExpert(ClumsyExpert):
+    """Believes the object where it was when the episode began, in a world that moves it when it is touched.
+
+    A seat cannot be moved: from that it falls after it came down on it without weight.
+    """
 
     env: RelocatingEnv
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
         self.sight.object_off = -self.env.relocated
+
+    def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
+        """See `MisledExpert.spoil`."""
+        if self.env.movable:
+            return actions
+        lean = LEAN * ((self.after - PERCHES) / GROWS).clamp(0.0, 1.0)
+        return _leaning(actions, lean, self.style.uniform("side", -1.0, 1.0))
 
 
 class RelocatingEnv(ArenaEnv):
@@ -235,6 +373,11 @@ class RelocatingEnv(ArenaEnv):
             raise InputError("--checks failures: an object is moved on engine mujoco alone; choose --engine mujoco")
         return torch.zeros(self.worlds, 3, device=self.torch_device)
 
+    @property
+    def movable(self) -> bool:
+        """Whether the object can be moved: what is a part of the room cannot."""
+        return self.view.box.body_id != 0
+
     def reset(
         self,
         seeds: Sequence[int],
@@ -250,6 +393,8 @@ class RelocatingEnv(ArenaEnv):
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
         """See `ArenaEnv.step`."""
         status = super().step(action, worlds)
+        if not self.movable:
+            return status
         moved = self.relocated.abs().sum(dim=1) > 0
         touched = (self.view.reach <= self.view.spec.touch) & ~moved
         for world in np.flatnonzero(touched.cpu().numpy() & self.active & (self.tick > 0)).tolist():
@@ -261,7 +406,13 @@ class RelocatingEnv(ArenaEnv):
         body = self.view.box.body_id
         mocap = int(self.scene.mj_model.body_mocapid[body])
         assert isinstance(self.physics, MujocoPhysics)
-        self.physics.data[world].mocap_pos[mocap] += way
+        data = self.physics.data[world]
+        if mocap < 0:  # a free body lies still where it is put
+            place, speed = self.scene.joint_qpos(self.view.spec.box), self.scene.joint_qvel(self.view.spec.box)
+            data.qpos[place : place + 3] += way
+            data.qvel[speed : speed + 6] = 0.0
+        else:
+            data.mocap_pos[mocap] += way
         self.relocated[world] = torch.from_numpy(way).float()
 
 
@@ -322,8 +473,15 @@ _MADE = (
     (FailureStage.RECOVERY, "stubborn", "object that moves away unnoticed", _expert(StubbornExpert, RelocatingEnv)),
     (FailureStage.TRACKER, "weakened", "tracker with weak legs", _weak),
 )
-SABOTAGES: Mapping[str, Sabotage] = {
+SABOTAGES: dict[str, Sabotage] = {
     name: Sabotage(stage, Body(name, title, equip), _NO_EFFECT if stage is FailureStage.CONTACT else ())
     for stage, name, title, equip in _MADE
+}
+SABOTAGES |= {
+    "reluctant": Sabotage(
+        FailureStage.POSTURE,
+        Body("reluctant", "expert that stands before the object", _expert(ReluctantExpert)),
+        tuple(task for task in INTERACTIONS if task not in ("football", "sit_sofa")),
+    )
 }
 """Scripted failures by name."""
