@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 from arena_newton.errors import InputError
 from arena_newton.tasks.boxing import BOUNDS, PALMS, TARGET
+from arena_newton.tasks.double_desk import HAMMER
+from arena_newton.tasks.open_door import HANDLE, LEAF_BODY
+from arena_newton.tasks.pp_box import BOX
 from arena_newton.tasks.vis_navi import FEET, SIGN, ZONE
 
 __all__ = ["INTERACTIONS", "Interaction", "check_interactions"]
@@ -22,7 +25,7 @@ class Interaction:
     sight: str
     """Prim that the robot must find, with all below it; its pixels are counted in the head camera's picture."""
     box: str
-    """Marker whose box is to be touched."""
+    """Marker whose box is to be touched, or rigid prim: then the box around its colliders."""
     effectors: tuple[str, ...]
     """Links or frames of the robot that touch it."""
     touch: float
@@ -34,6 +37,10 @@ class Interaction:
     """The effectors' heights do not count."""
     bearing: float = 3.2
     """Largest angle between heading and box at which it can be touched [rad]; above pi: any."""
+    near: float = 1.4
+    """Distance of the root to the object [m] within which it is near: `tasks.base.REACH`, 0.8 m, and a long step."""
+    carried: bool = False
+    """It moves with the effectors: how far it has moved is seen from above, from where they touched it last."""
 
 
 INTERACTIONS: Mapping[str, Interaction] = {
@@ -42,6 +49,15 @@ INTERACTIONS: Mapping[str, Interaction] = {
     "boxing": Interaction(TARGET, BOUNDS, PALMS, touch=0.20, stance=0.60, bearing=0.8),
     # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
     "vis_navi": Interaction(SIGN, ZONE, FEET, touch=0.0, stance=0.30, level=True),
+    # The leaf is what a robot can find, the lever what it must touch: 6 cm off the leaf. The expert presses it from
+    # 0.38 m with the lever 0.4 rad to its right, and a fist of 5 cm meets the leaf around it within 0.15 m.
+    "open_door": Interaction(LEAF_BODY, HANDLE, PALMS, touch=0.15, stance=0.60, bearing=0.8),
+    # A palm is 6 cm from the box when its fist squeezes it, and 0.16 m when it begins to close. The expert stands 0.22
+    # to 0.30 m before the box. Episodes begin 0.9 m and more before it, which is not near yet.
+    "pp_box": Interaction(BOX, BOX, PALMS, touch=0.12, stance=0.45, bearing=0.8, near=0.85, carried=True),
+    # The palm is 5 cm from the handle that it grasps and hovers 0.17 m above it. The expert stands 0.36 m from the
+    # handle with it 0.5 rad to its left.
+    "double_desk": Interaction(HAMMER, HAMMER, PALMS, touch=0.14, stance=0.60, bearing=1.0, carried=True),
 }
 """Task name → its first contact; tasks that are not here have no failure signals."""
 

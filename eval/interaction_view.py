@@ -11,6 +11,7 @@ from torch import Tensor
 from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.interfaces import World
 from arena_newton.rotations import atan2, heading, quat_apply, quat_conjugate, quat_multiply, wrap_angle
+from arena_newton.tasks.judge import bounding_box
 
 __all__ = ["InteractionView"]
 
@@ -26,7 +27,8 @@ class InteractionView:
         """
         self.spec = INTERACTIONS[env.spec.name]
         self.worlds, self._device, scene = env.worlds, env.torch_device, env.scene
-        self.box = scene.marker(self.spec.box)
+        rigid = scene.has_body(self.spec.box)
+        self.box = bounding_box(scene, self.spec.box) if rigid else scene.marker(self.spec.box)
         self._xpos, self._xquat = wp.to_torch(env.physics.xpos), wp.to_torch(env.physics.xquat)
         address = scene.robot.root_qpos
         self.root = wp.to_torch(env.physics.qpos)[:, address : address + 7]

@@ -24,7 +24,13 @@ ENOUGH = 20
 """From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
 
-TUNED: Mapping[str, tuple[int, ...]] = {"boxing": (0, 10), "vis_navi": (0, 10)}
+TUNED: Mapping[str, tuple[int, ...]] = {
+    "boxing": (0, 10),
+    "vis_navi": (0, 10),
+    "open_door": (500,),
+    "pp_box": (500,),
+    "double_desk": (500,),
+}
 """Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
 HELD_OUT = 700
 """First group seed that the check plays: above all that were looked at."""

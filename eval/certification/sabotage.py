@@ -20,6 +20,7 @@ from arena_newton.canonical import ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.bodies import Body, WithOtherLegs
+from arena_newton.eval.certification.handling import HANDLING
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction_view import InteractionView
 from arena_newton.eval.run import Factories
@@ -27,10 +28,13 @@ from arena_newton.interfaces import Chunk, Observation, Spawn, World
 from arena_newton.physics_mujoco import MujocoPhysics
 from arena_newton.policies.base import Mask
 from arena_newton.policies.experts import ExpertPolicy, Sight
+from arena_newton.policies.experts.base import Expert
+from arena_newton.policies.experts.style import Style
 from arena_newton.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
 from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
+from arena_newton.trackers.motions.commands import MotionCommand
 
 __all__ = ["SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
 
@@ -65,7 +69,7 @@ class MisledSight(Sight):
         self.robot_off, self.hands_off, self.object_off = (torch.zeros(worlds, 3, device=self.device) for _ in range(3))
         """Where robot, hands and object are believed minus where they are [m], shape [worlds, 3]."""
         self._robot = frozenset(int(body) for body in env.scene.robot.bodies)
-        self._object = self.view.box.body_id
+        self._object = _bodies_of(env, self.view.box.body_id)
 
     @property
     def pose(self) -> Tensor:
@@ -82,12 +86,40 @@ class MisledSight(Sight):
         position, quat = super().body(body)
         if body in self._robot:
             position = position + self.robot_off
-        return position + self.object_off if body == self._object else position, quat
+        return position + self.object_off if body in self._object else position, quat
 
     def frame(self, name: str) -> Callable[[], Tensor]:
         """See `Sight.frame`."""
         read = super().frame(name)
         return (lambda: read() + self.hands_off) if name in PALMS else read
+
+    def com(self, prim: str) -> Callable[[], Tensor]:
+        """See `Sight.com`."""
+        read = super().com(prim)
+        return (lambda: read() + self.object_off) if self.scene.body_id(prim) in self._object else read
+
+
+class _Overruled(Expert):
+    """An expert whose commands are changed."""
+
+    def __init__(self, inner: Expert, change: Callable[[MotionCommand], MotionCommand]):
+        super().__init__(inner.sight)
+        self._inner, self._change = inner, change
+
+    def begin(self, mask: Tensor, style: Style) -> None:
+        self._inner.begin(mask, style)
+
+    def command(self, mask: Tensor, dt: float) -> MotionCommand:
+        return self._change(self._inner.command(mask, dt))
+
+    def phases(self) -> list[str] | None:
+        return self._inner.phases()
+
+
+def _bodies_of(env: World, body: int) -> frozenset[int]:
+    """The bodies that are where an object is: those of the whole tree that hangs on the object's root."""
+    roots = env.scene.mj_model.body_rootid
+    return frozenset(int(number) for number in np.flatnonzero(roots == roots[body])) if body else frozenset({0})
 
 
 class MisledExpert(ExpertPolicy):
@@ -103,19 +135,24 @@ class MisledExpert(ExpertPolicy):
     def attach(self, env: World) -> None:
         """See `Policy.attach`."""
         super().attach(env)
-        self.env = env
+        self.env, self.handling = env, HANDLING.get(env.spec.name)
+        assert self.expert is not None
+        self.expert = _Overruled(self.expert, self.overrule)
         self.since = torch.full((env.worlds,), -1.0, device=env.torch_device)
         """Ticks since the robot came close to the object, shape [worlds]; -1 before."""
         self.touched = torch.zeros(env.worlds, dtype=torch.bool, device=env.torch_device)
         """The object was touched in this episode, shape [worlds]."""
+        self.after = torch.zeros(env.worlds, device=env.torch_device)
+        """Ticks since then, shape [worlds]; 0 before."""
 
+    @torch.inference_mode()  # a world's next episode clears what `act` made
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """See `Policy.reset`."""
         super().reset(seeds, tasks, mask)
         begins = self._begins_now(mask, len(seeds))
         for off in (self.sight.robot_off, self.sight.hands_off, self.sight.object_off):
             off[begins] = 0.0
-        self.since[begins], self.touched[begins] = -1.0, False
+        self.since[begins], self.touched[begins], self.after[begins] = -1.0, False, 0.0
 
     def _begins_now(self, mask: Mask, worlds: int) -> Tensor:
         every = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
@@ -129,12 +166,17 @@ class MisledExpert(ExpertPolicy):
         counts = asking & ((view.distance < CLOSE) | (self.since >= 0))
         self.since = torch.where(counts, self.since + 1.0, self.since)
         self.touched |= asking & (view.reach <= view.spec.touch)
+        self.after = self.after + (asking & self.touched)
         self.mislead()
         chunk = super().act(observation)
         return Chunk(self.spoil(chunk.actions), chunk.errors, chunk.phases)
 
     def mislead(self) -> None:
         """Displace what is believed, from the truth of this tick."""
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """What is commanded in place of the expert's command."""
+        return command
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """What is done in place of the expert's actions, shape [worlds, n, 40]."""
@@ -151,6 +193,9 @@ class BlindExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.handling:
+            self.sight.object_off = self.handling.elsewhere(self.style, ELSEWHERE)
+            return
         far, turn = (
             self.style.uniform("far", *ELSEWHERE),
             self.style.uniform("to", math.radians(150), math.radians(190)),
@@ -175,7 +220,8 @@ class MisaimedExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
-        view, far, aside = self.sight.view, self.style.uniform("short", *SHORT), self.style.uniform("to", -ASIDE, ASIDE)
+        view, short = self.sight.view, self.handling.short if self.handling else SHORT
+        far, aside = self.style.uniform("short", *short), self.style.uniform("to", -ASIDE, ASIDE)
         if view.spec.level:  # a place is missed as a whole, on the side from which the robot comes
             self.sight.object_off = _level(far + 1.6 * view.box.half[0], aside - 0.5 * math.pi)
             return
@@ -192,6 +238,8 @@ class UnbalancedExpert(MisledExpert):
         spoilt = torch.as_tensor(actions).clone()
         lean = LEAN * (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
         side = self.style.uniform("side", -1.0, 1.0)
+        if self.handling:  # away from door, table and desk, which would hold it
+            side = side + math.pi
         turn = torch.stack([lean * torch.sin(side), lean * torch.cos(side), torch.zeros_like(lean)], dim=1)
         own = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))
         leaning = own @ matrix_from_quat(quat_from_euler(turn))
@@ -204,10 +252,17 @@ class ClumsyExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.handling:
+            self.sight.object_off = self.handling.believed(self.style)
+            return
         size = self.style.uniform("off", *OFF_CENTRE)
         side = torch.where(self.style.coin("above"), 1.0, -1.0)
         zero = torch.zeros_like(size)
         self.sight.object_off = torch.stack([zero, zero, side * size], dim=1)
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return self.handling.let_go(command, self.style, self.after) if self.handling else command
 
 
 class StubbornExpert(MisledExpert):
@@ -217,6 +272,11 @@ class StubbornExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.env.free:  # it falls where it was put
+            kept = self.env.relocated.any(dim=1)[:, None]
+            self.env.left_at = torch.where(kept, self.env.left_at, self.sight.view.centre)
+            self.sight.object_off = self.env.left_at - self.sight.view.centre
+            return
         self.sight.object_off = -self.env.relocated
 
 
@@ -234,6 +294,21 @@ class RelocatingEnv(ArenaEnv):
         if not isinstance(self.physics, MujocoPhysics):
             raise InputError("--checks failures: an object is moved on engine mujoco alone; choose --engine mujoco")
         return torch.zeros(self.worlds, 3, device=self.torch_device)
+
+    @functools.cached_property
+    def root(self) -> int:
+        """The body that carries the object with all that hangs on it."""
+        return int(self.scene.mj_model.body_rootid[self.view.box.body_id])
+
+    @functools.cached_property
+    def free(self) -> bool:
+        """Whether the object is a free body."""
+        return int(self.scene.mj_model.body_mocapid[self.root]) < 0
+
+    @functools.cached_property
+    def left_at(self) -> Tensor:
+        """Where a free object was when it was moved [m], shape [worlds, 3]."""
+        return self.view.centre.clone()
 
     def reset(
         self,
@@ -258,10 +333,15 @@ class RelocatingEnv(ArenaEnv):
 
     def _relocate(self, world: int) -> None:
         way = np.array([-AWAY, 0.0, 0.0])
-        body = self.view.box.body_id
-        mocap = int(self.scene.mj_model.body_mocapid[body])
         assert isinstance(self.physics, MujocoPhysics)
-        self.physics.data[world].mocap_pos[mocap] += way
+        model, data = self.scene.mj_model, self.physics.data[world]
+        if self.free:
+            joint = int(model.body_jntadr[self.root])
+            place, speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            data.qpos[place : place + 3] += way
+            data.qvel[speed : speed + 6] = 0.0
+        else:
+            data.mocap_pos[int(model.body_mocapid[self.root])] += way
         self.relocated[world] = torch.from_numpy(way).float()
 
 
@@ -309,7 +389,12 @@ def _weak(factories: Factories) -> Factories:
     def tracker(spec: str, checkpoint: Path | None) -> Tracker:
         return WeakTracker(factories.tracker(spec, checkpoint), PART)
 
-    return dataclasses.replace(factories, tracker=tracker)
+    def env(task: str, *, tracker: Tracker, **options: object) -> World:
+        if task in HANDLING and isinstance(tracker, WeakTracker):
+            tracker.part = HANDLING[task].weak
+        return factories.env(task, tracker=tracker, **options)
+
+    return dataclasses.replace(factories, tracker=tracker, env=env)
 
 
 _NO_EFFECT = ("vis_navi",)
