@@ -19,8 +19,16 @@ class Judged(Protocol):
     """What the rules read of an episode's line (`journal.EpisodeRecord`)."""
 
     @property
+    def task(self) -> str:
+        """Name of its task."""
+
+    @property
     def outcome(self) -> str:
         """`success`, `fall`, `timeout` or `error`."""
+
+    @property
+    def reason(self) -> str | None:
+        """Finer cause of the outcome, such as `ball_out`."""
 
     @property
     def steps(self) -> int:
@@ -49,6 +57,16 @@ ALIGNED = 100
 """The same where the object can be touched without a step."""
 MOVED = 0.25
 """Distance from where it was touched first at which the object has moved away [m]."""
+CARRIED = ("pp_box", "double_desk")
+"""Tasks whose object moves with the hands; how far it has moved is measured from where they touched it last."""
+LEFT = 1.0
+"""Distance from there at which a carried object is left [m], seen from above: beyond `tasks.base.REACH`, 0.8 m. One
+that is dropped or put down wrongly is nearer: a box that falls from walking hands rolls up to 0.8 m."""
+REACHED_ONLY = ("vis_navi",)
+"""Tasks in which the object is only to be reached. A touch has no effect that could fail to come: a robot that set a
+foot on the area and does not stand in it with both has not come into the pose that is wanted."""
+ENDING = ("ball_out",)
+"""Causes that end an episode: after these there was nothing to recover."""
 FALLING = 50
 """A touch within so many ticks before a fall is a part of the fall: it takes about a second."""
 
@@ -64,8 +82,11 @@ def stage_of(episode: Judged) -> FailureStage | None:
     if signals.tracking_error > TRACKING and signals.reference_tilt < LEANING:
         return FailureStage.TRACKER
     if signals.first_touch is not None and not (fell and episode.steps - signals.first_touch < FALLING):
-        lost = signals.moved > MOVED and not signals.touches_moved
-        return FailureStage.RECOVERY if fell or lost else FailureStage.CONTACT
+        away = LEFT if episode.task in CARRIED else MOVED
+        lost = signals.moved > away and not signals.touches_moved and episode.reason not in ENDING
+        if fell or lost:
+            return FailureStage.RECOVERY
+        return FailureStage.APPROACH if episode.task in REACHED_ONLY else FailureStage.CONTACT
     if fell or signals.aligned_ticks >= ALIGNED:
         return FailureStage.POSTURE
     return FailureStage.APPROACH if signals.engaged_ticks >= ENGAGED else FailureStage.PERCEPTION

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from arena_newton.errors import InputError
 from arena_newton.tasks.boxing import BOUNDS, PALMS, TARGET
 from arena_newton.tasks.double_desk import HAMMER
+from arena_newton.tasks.football import BALL, KICK, TOE
+from arena_newton.tasks.football import FEET as KICKING
 from arena_newton.tasks.open_door import HANDLE, LEAF_BODY
 from arena_newton.tasks.pp_box import BOX
+from arena_newton.tasks.sit_sofa import SEAT
 from arena_newton.tasks.vis_navi import FEET, SIGN, ZONE
 
 __all__ = ["INTERACTIONS", "Interaction", "check_interactions"]
@@ -25,7 +28,7 @@ class Interaction:
     sight: str
     """Prim that the robot must find, with all below it; its pixels are counted in the head camera's picture."""
     box: str
-    """Marker whose box is to be touched, or rigid prim: then the box around its colliders."""
+    """Marker whose box is to be touched, or rigid body with the box around its collision geometry."""
     effectors: tuple[str, ...]
     """Links or frames of the robot that touch it."""
     touch: float
@@ -41,6 +44,13 @@ class Interaction:
     """Distance of the root to the object [m] within which it is near: `tasks.base.REACH`, 0.8 m, and a long step."""
     carried: bool = False
     """It moves with the effectors: how far it has moved is seen from above, from where they touched it last."""
+    slow: float = 0.20
+    """Speed of the root, averaged over half a second, below which the robot stands or steps slowly [m/s]: the experts
+    strike and turn below it, and walk at 0.3 m/s and more."""
+    tip: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point of each effector that touches, in its frame [m]."""
+    behind: bool = False
+    """It is touched with the back: bearings are between the back and the nearest point of the box."""
 
 
 INTERACTIONS: Mapping[str, Interaction] = {
@@ -49,6 +59,12 @@ INTERACTIONS: Mapping[str, Interaction] = {
     "boxing": Interaction(TARGET, BOUNDS, PALMS, touch=0.20, stance=0.60, bearing=0.8),
     # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
     "vis_navi": Interaction(SIGN, ZONE, FEET, touch=0.0, stance=0.30, level=True),
+    # The toe's distance is the one of the task's own `contact`. From a toe 0.12 m before the ankle, a foot swings half
+    # a step (0.2 m) without the other.
+    "football": Interaction(BALL, BALL, KICKING, touch=KICK, stance=0.30, bearing=0.8, slow=0.35, tip=TOE),
+    # The origin of a pelvis that sits is 0.17 m above the box; a robot that comes down without weight stays some
+    # centimetres higher. The expert goes down from 0.12 m in front of the edge.
+    "sit_sofa": Interaction("/World/Sofa", SEAT, ("pelvis",), touch=0.25, stance=0.25, bearing=0.8, behind=True),
     # The leaf is what a robot can find, the lever what it must touch: 6 cm off the leaf. The expert presses it from
     # 0.38 m with the lever 0.4 rad to its right, and a fist of 5 cm meets the leaf around it within 0.15 m.
     "open_door": Interaction(LEAF_BODY, HANDLE, PALMS, touch=0.15, stance=0.60, bearing=0.8),

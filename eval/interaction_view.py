@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -27,15 +28,23 @@ class InteractionView:
         """
         self.spec = INTERACTIONS[env.spec.name]
         self.worlds, self._device, scene = env.worlds, env.torch_device, env.scene
-        rigid = scene.has_body(self.spec.box)
-        self.box = bounding_box(scene, self.spec.box) if rigid else scene.marker(self.spec.box)
+        box = self.spec.box
+        self.box = bounding_box(scene, box) if scene.has_body(box) else scene.marker(box)
         self._xpos, self._xquat = wp.to_torch(env.physics.xpos), wp.to_torch(env.physics.xquat)
         address = scene.robot.root_qpos
         self.root = wp.to_torch(env.physics.qpos)[:, address : address + 7]
         """The robot's root: position [m] and orientation wxyz, a live view, shape [worlds, 7]."""
         frames = [scene.frame(name) for name in self.spec.effectors]
         self._bodies = torch.tensor([frame.body_id for frame in frames], device=self._device)
-        self._offsets = torch.tensor([frame.pos for frame in frames], dtype=torch.float32, device=self._device)
+        origins, turns, tips = (
+            torch.tensor(rows, dtype=torch.float32, device=self._device)
+            for rows in (
+                [frame.pos for frame in frames],
+                [frame.quat for frame in frames],
+                [self.spec.tip] * len(frames),
+            )
+        )
+        self._offsets = origins + quat_apply(turns, tips)
 
     @property
     def centre(self) -> Tensor:
@@ -51,9 +60,13 @@ class InteractionView:
 
     @property
     def bearing(self) -> Tensor:
-        """Angle between the robot's heading and the box's centre [rad], at least 0, shape [worlds]."""
-        way = self.centre[:, :2] - self.root[:, :2]
-        return wrap_angle(atan2(way[:, 1], way[:, 0]) - heading(self.root[:, 3:7])).abs()
+        """Angle between the robot's heading and the box's centre [rad], at least 0, shape [worlds].
+
+        Where the box is touched with the back: between the back and the nearest point of the box, which may be wide.
+        """
+        way = (self._nearest() if self.spec.behind else self.centre[:, :2]) - self.root[:, :2]
+        angle = wrap_angle(atan2(way[:, 1], way[:, 0]) - heading(self.root[:, 3:7])).abs()
+        return math.pi - angle if self.spec.behind else angle
 
     @property
     def reach(self) -> Tensor:
@@ -61,6 +74,13 @@ class InteractionView:
         carried = self._offsets.expand(self.worlds, -1, 3)
         points = self._xpos[:, self._bodies] + quat_apply(self._xquat[:, self._bodies], carried)
         return self._to_box(points, level=self.spec.level).amin(dim=1)
+
+    def _nearest(self) -> Tensor:
+        """The point of the box that is nearest to the root, seen from above [m], shape [worlds, 2]."""
+        turn = quat_multiply(self._xquat[:, self.box.body_id], self._rows(self.box.quat))
+        local = quat_apply(quat_conjugate(turn), self.root[:, :3] - self.centre)
+        half = self._rows(self.box.half)
+        return (self.centre + quat_apply(turn, torch.minimum(torch.maximum(local, -half), half)))[:, :2]
 
     def _rows(self, values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=self._device).expand(self.worlds, len(values))

@@ -20,7 +20,7 @@ from arena_newton.robot import LEGS
 from arena_newton.rotations import quat_apply
 from arena_newton.rules import FallRule
 
-__all__ = ["EVERY", "SEEN", "SLOW", "SignalRecorder"]
+__all__ = ["EVERY", "SEEN", "SignalRecorder"]
 
 EVERY = 25
 """Ticks between two looks: half a second, in which the head turns by half its field of view at most."""
@@ -28,9 +28,6 @@ SEEN = 10
 """The object is seen from so many pixels on, as in the check `visible`, of ..."""
 SIZE = (224, 168)
 """... width and height of a policy's picture without its black bars [px]."""
-SLOW = 0.20
-"""Speed of the root, averaged over half a second, below which the robot stands or steps slowly [m/s]: the experts
-strike and turn below it, and walk at 0.3 m/s and more."""
 SMOOTH = 25
 """Time constant of averages [ticks]: half a second, the period of a step."""
 LEAD = 50
@@ -121,7 +118,7 @@ class SignalRecorder(Recorder):
         bearing = torch.where(distance > 0.0, view.bearing, 0.0)  # over it every heading is right
         change = (self._root_velocity - self._velocity) / SMOOTH
         self._velocity = torch.where(mask[:, None], self._velocity + change, 0.0)
-        slow = torch.linalg.vector_norm(self._velocity, dim=1) < SLOW
+        slow = torch.linalg.vector_norm(self._velocity, dim=1) < spec.slow
         slow &= tick > 2 * SMOOTH  # the average begins at rest
 
         def keep(name: str, value: Tensor, where: Tensor) -> None:

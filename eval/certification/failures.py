@@ -16,7 +16,7 @@ from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.wording import markdown_table
 from arena_newton.intervals import wilson
 
-__all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
+__all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion", "held_out"]
 
 LEAST = 0.8
 """Least precision and recall of each stage."""
@@ -26,14 +26,18 @@ ENOUGH = 20
 
 TUNED: Mapping[str, tuple[int, ...]] = {
     "boxing": (0, 10),
-    "vis_navi": (0, 10),
+    "vis_navi": (0, 10, 500, 501, 502, 503, 504, 505, 700),
+    "football": (500, 501),
+    "sit_sofa": (500, 501),
     "open_door": (500,),
     "pp_box": (500,),
     "double_desk": (500,),
 }
 """Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
 HELD_OUT = 700
-"""First group seed that the check plays: above all that were looked at."""
+"""First group seed that the check plays: above all that were looked at ..."""
+HELD_OUT_OF: Mapping[str, int] = {"vis_navi": 900}
+"""... and the one of tasks in which a rule was changed after episodes from there on had been seen."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,11 @@ def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Conf
     return Confusion(Counter((scripted, said) for scripted, said in pairs if said is not None))
 
 
+def held_out(task: str) -> int:
+    """First group seed that the check plays in a task."""
+    return HELD_OUT_OF.get(task, HELD_OUT)
+
+
 def failures(context: Context) -> CheckFinding:
     """Let saboteurs fail, and compare what was scripted with what is said."""
     tasks = [task for task in context.tasks if task in INTERACTIONS]
@@ -80,7 +89,7 @@ def failures(context: Context) -> CheckFinding:
             for name, sabotage in SABOTAGES.items():
                 if task in sabotage.without:
                     continue
-                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT)
+                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=held_out(task))
                 records = context.evaluate(cell)
                 found = [(sabotage.stage, stage_of(record)) for record in records]
                 pairs.setdefault(task, []).extend(found)
@@ -90,7 +99,9 @@ def failures(context: Context) -> CheckFinding:
                     notes.append(f"{task} {tracker}, {name}: {solved} of {len(records)} episodes succeed all the same")
     for task in tasks:
         looked_at = " ".join(str(seed) for seed in TUNED[task])
-        notes.append(f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on {looked_at}")
+        notes.append(
+            f"{task}: played from group seed {held_out(task)} on; thresholds and saboteurs were set on {looked_at}"
+        )
     left_out = [task for task in context.tasks if task not in INTERACTIONS]
     notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
     matrices = {task: confusion(found) for task, found in pairs.items()}

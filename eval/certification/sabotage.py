@@ -32,16 +32,19 @@ from arena_newton.policies.experts.base import Expert
 from arena_newton.policies.experts.style import Style
 from arena_newton.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
+from arena_newton.tasks.football import GOAL
 from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.motions.commands import MotionCommand
 
-__all__ = ["SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
+__all__ = ["PERCHED", "SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
 
 UNSEEN = (0.0, 0.0, 30.0)
 """Displacement of an object that nobody can see: in the sky, where no camera looks [m]."""
 ELSEWHERE = (2.4, 3.2)
-"""Distance of the place where a blind robot believes the object, drawn between these [m]."""
+"""Distance of the place where a blind robot believes the object, drawn between these [m] ..."""
+TOWARDS: Mapping[str, tuple[float, float]] = {"": (150, 190), "football": (-20, 20), "sit_sofa": (90, 150)}
+"""... and its direction from the object, drawn between these [degrees from the x-axis]: where there is free floor."""
 SHORT = (0.55, 0.80)
 """Distance that a robot that aims badly stops short of where it wants to stop, drawn between these [m] ..."""
 ASIDE = math.radians(35)
@@ -56,6 +59,21 @@ OFF_CENTRE = (0.18, 0.22)
 """Height by which a fist misses its target, drawn between these [m]: it is still on the bag."""
 AWAY = 1.5
 """Distance that an object is moved by when it is touched first [m]."""
+BEFORE_BALL = (1.05, 1.30)
+"""How far before the ball a robot that aims badly kicks the air, drawn between these [m]: it comes to stand up to 0.6 m
+past the place where it believes the ball."""
+BESIDE_GOAL = (4.5, 5.5)
+"""How far to a side of the goal's middle a robot that kicks badly believes it, drawn between these [m]: the posts are
+at 2.5 m, and it aims up to 0.8 m inwards."""
+BESIDE_SEAT = (0.90, 1.20)
+"""How far beyond its place on the sofa a robot that aims badly turns its back, drawn between these [m]: beside the
+armrest, which begins 0.5 m beyond that place."""
+PERCHED = (0.63, 0.66)
+"""Height at which a pelvis stays that comes down on the seat without weight, drawn between these [m] ..."""
+PERCHED_BACK = 0.18
+"""... and how far it goes back for that at most [m]."""
+PERCHES = 60
+"""Ticks after the first touch at which a robot that sat down badly falls over."""
 
 
 class MisledSight(Sight):
@@ -66,8 +84,10 @@ class MisledSight(Sight):
         super().__init__(env)
         self.view = InteractionView(env)
         worlds = env.worlds
-        self.robot_off, self.hands_off, self.object_off = (torch.zeros(worlds, 3, device=self.device) for _ in range(3))
-        """Where robot, hands and object are believed minus where they are [m], shape [worlds, 3]."""
+        self.robot_off, self.hands_off, self.object_off, self.goal_off = (
+            torch.zeros(worlds, 3, device=self.device) for _ in range(4)
+        )
+        """Where robot, hands, object and goal are believed minus where they are [m], shape [worlds, 3]."""
         self._robot = frozenset(int(body) for body in env.scene.robot.bodies)
         self._object = _bodies_of(env, self.view.box.body_id)
 
@@ -91,12 +111,20 @@ class MisledSight(Sight):
     def frame(self, name: str) -> Callable[[], Tensor]:
         """See `Sight.frame`."""
         read = super().frame(name)
+        if name == GOAL:
+            return lambda: read() + self.goal_off
         return (lambda: read() + self.hands_off) if name in PALMS else read
 
     def com(self, prim: str) -> Callable[[], Tensor]:
         """See `Sight.com`."""
         read = super().com(prim)
         return (lambda: read() + self.object_off) if self.scene.body_id(prim) in self._object else read
+
+
+def _bodies_of(env: World, body: int) -> frozenset[int]:
+    """The bodies that are where an object is: those of the whole tree that hangs on the object's root."""
+    roots = env.scene.mj_model.body_rootid
+    return frozenset(int(number) for number in np.flatnonzero(roots == roots[body])) if body else frozenset({0})
 
 
 class _Overruled(Expert):
@@ -114,12 +142,6 @@ class _Overruled(Expert):
 
     def phases(self) -> list[str] | None:
         return self._inner.phases()
-
-
-def _bodies_of(env: World, body: int) -> frozenset[int]:
-    """The bodies that are where an object is: those of the whole tree that hangs on the object's root."""
-    roots = env.scene.mj_model.body_rootid
-    return frozenset(int(number) for number in np.flatnonzero(roots == roots[body])) if body else frozenset({0})
 
 
 class MisledExpert(ExpertPolicy):
@@ -150,7 +172,7 @@ class MisledExpert(ExpertPolicy):
         """See `Policy.reset`."""
         super().reset(seeds, tasks, mask)
         begins = self._begins_now(mask, len(seeds))
-        for off in (self.sight.robot_off, self.sight.hands_off, self.sight.object_off):
+        for off in (self.sight.robot_off, self.sight.hands_off, self.sight.object_off, self.sight.goal_off):
             off[begins] = 0.0
         self.since[begins], self.touched[begins], self.after[begins] = -1.0, False, 0.0
 
@@ -188,6 +210,24 @@ def _level(length: Tensor, turn: Tensor) -> Tensor:
     return torch.stack([length * torch.cos(turn), length * torch.sin(turn), torch.zeros_like(length)], dim=1)
 
 
+def _upright(command: MotionCommand) -> MotionCommand:
+    """The same without sitting down: where there is no seat, a robot that sits down falls."""
+    neutral = MotionCommand.neutral(len(command.height), command.height.device)
+    return dataclasses.replace(
+        command, height=neutral.height, pelvis_back=neutral.pelvis_back, pitch=neutral.pitch, waist=neutral.waist
+    )
+
+
+def _leaning(actions: Tensor | np.ndarray, lean: Tensor, side: Tensor) -> Tensor:
+    """Actions whose root leans over by an angle, forward and to a side [rad], both shape [worlds]."""
+    spoilt = torch.as_tensor(actions).clone()
+    turn = torch.stack([lean * torch.sin(side), lean * torch.cos(side), torch.zeros_like(lean)], dim=1)
+    own = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))
+    leaning = own @ matrix_from_quat(quat_from_euler(turn))
+    spoilt[:, :, ACTION["root_rot6d"]] = leaning[:, :, :2].reshape(-1, 1, 6)
+    return spoilt
+
+
 class BlindExpert(MisledExpert):
     """Knows nothing of the object: in every other episode it believes it elsewhere, in the others nowhere."""
 
@@ -196,12 +236,15 @@ class BlindExpert(MisledExpert):
         if self.handling:
             self.sight.object_off = self.handling.elsewhere(self.style, ELSEWHERE)
             return
-        far, turn = (
-            self.style.uniform("far", *ELSEWHERE),
-            self.style.uniform("to", math.radians(150), math.radians(190)),
-        )
-        aside = torch.stack([far * torch.cos(turn), far * torch.sin(turn), torch.zeros_like(far)], dim=1)
-        self.sight.object_off = self._elsewhere(aside)
+        least, most = TOWARDS.get(self.env.spec.name, TOWARDS[""])
+        turn = self.style.uniform("to", math.radians(least), math.radians(most))
+        if self.env.spec.name == "football":  # on the other half of the pitch
+            turn = torch.where(self.sight.view.centre[:, 0] > 0.0, math.pi - turn, turn)
+        self.sight.object_off = self._elsewhere(_level(self.style.uniform("far", *ELSEWHERE), turn))
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return _upright(command) if self.env.spec.name == "sit_sofa" else command
 
     def _elsewhere(self, aside: Tensor) -> Tensor:
         if self.env.spec.name != "boxing":
@@ -222,6 +265,12 @@ class MisaimedExpert(MisledExpert):
         """See `MisledExpert.mislead`."""
         view, short = self.sight.view, self.handling.short if self.handling else SHORT
         far, aside = self.style.uniform("short", *short), self.style.uniform("to", -ASIDE, ASIDE)
+        if self.env.spec.name == "football":
+            self.sight.object_off = _level(self.style.uniform("short", *BEFORE_BALL), aside - 0.5 * math.pi)
+            return
+        if self.env.spec.name == "sit_sofa":
+            self.sight.object_off = _level(self.style.uniform("short", *BESIDE_SEAT), torch.zeros_like(far))
+            return
         if view.spec.level:  # a place is missed as a whole, on the side from which the robot comes
             self.sight.object_off = _level(far + 1.6 * view.box.half[0], aside - 0.5 * math.pi)
             return
@@ -229,31 +278,38 @@ class MisaimedExpert(MisledExpert):
         grown = (self.since / GROWS).clamp(0.0, 1.0)
         self.sight.robot_off = _level(grown * far, atan2(way[:, 1], way[:, 0]) + aside)
 
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return _upright(command) if self.env.spec.name == "sit_sofa" else command
+
 
 class UnbalancedExpert(MisledExpert):
     """Leans over more and more once it is close, until it falls."""
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """See `MisledExpert.spoil`."""
-        spoilt = torch.as_tensor(actions).clone()
         lean = LEAN * (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
         side = self.style.uniform("side", -1.0, 1.0)
-        if self.handling:  # away from door, table and desk, which would hold it
-            side = side + math.pi
-        turn = torch.stack([lean * torch.sin(side), lean * torch.cos(side), torch.zeros_like(lean)], dim=1)
-        own = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))
-        leaning = own @ matrix_from_quat(quat_from_euler(turn))
-        spoilt[:, :, ACTION["root_rot6d"]] = leaning[:, :, :2].reshape(-1, 1, 6)
-        return spoilt
+        # Away from door, table and desk, which would hold it.
+        return _leaning(actions, lean, side + math.pi if self.handling else side)
 
 
 class ClumsyExpert(MisledExpert):
-    """Touches without effect: its fist lands above or below the target."""
+    """Touches without effect.
+
+    Its fist lands above or below the target, its kick sends the ball beside the goal, and it comes down on a seat
+    without weight.
+    """
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
         if self.handling:
             self.sight.object_off = self.handling.believed(self.style)
+        if self.env.spec.name == "football":
+            far = self.style.uniform("beside", *BESIDE_GOAL)
+            side = torch.where(self.style.coin("left"), math.pi, 0.0)
+            self.sight.goal_off = _level(far, side.expand_as(far))
+        if self.env.spec.name != "boxing":
             return
         size = self.style.uniform("off", *OFF_CENTRE)
         side = torch.where(self.style.coin("above"), 1.0, -1.0)
@@ -262,22 +318,42 @@ class ClumsyExpert(MisledExpert):
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
         """See `MisledExpert.overrule`."""
-        return self.handling.let_go(command, self.style, self.after) if self.handling else command
+        if self.handling:
+            return self.handling.let_go(command, self.style, self.after)
+        return self._perched(command) if self.env.spec.name == "sit_sofa" else command
+
+    def _perched(self, command: MotionCommand) -> MotionCommand:
+        height = torch.maximum(command.height, self.style.uniform("perched", *PERCHED))
+        return dataclasses.replace(command, height=height, pelvis_back=command.pelvis_back.clamp_max(PERCHED_BACK))
 
 
-class StubbornExpert(MisledExpert):
-    """Believes the object where it was when the episode began, in a world that moves it when it is touched."""
+class StubbornExpert(ClumsyExpert):
+    """Believes the object where it was when the episode began, in a world that moves it when it is touched.
+
+    A seat cannot be moved: from that it falls after it came down on it without weight.
+    """
 
     env: RelocatingEnv
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
-        if self.env.free:  # it falls where it was put
+        if self.handling and self.env.free:  # it falls where it was put
             kept = self.env.relocated.any(dim=1)[:, None]
             self.env.left_at = torch.where(kept, self.env.left_at, self.sight.view.centre)
             self.sight.object_off = self.env.left_at - self.sight.view.centre
             return
         self.sight.object_off = -self.env.relocated
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return command if self.handling else super().overrule(command)
+
+    def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
+        """See `MisledExpert.spoil`."""
+        if self.env.movable:
+            return actions
+        lean = LEAN * ((self.after - PERCHES) / GROWS).clamp(0.0, 1.0)
+        return _leaning(actions, lean, self.style.uniform("side", -1.0, 1.0))
 
 
 class RelocatingEnv(ArenaEnv):
@@ -294,6 +370,11 @@ class RelocatingEnv(ArenaEnv):
         if not isinstance(self.physics, MujocoPhysics):
             raise InputError("--checks failures: an object is moved on engine mujoco alone; choose --engine mujoco")
         return torch.zeros(self.worlds, 3, device=self.torch_device)
+
+    @property
+    def movable(self) -> bool:
+        """Whether the object can be moved: what is a part of the room cannot."""
+        return self.view.box.body_id != 0
 
     @functools.cached_property
     def root(self) -> int:
@@ -325,6 +406,8 @@ class RelocatingEnv(ArenaEnv):
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
         """See `ArenaEnv.step`."""
         status = super().step(action, worlds)
+        if not self.movable:
+            return status
         moved = self.relocated.abs().sum(dim=1) > 0
         touched = (self.view.reach <= self.view.spec.touch) & ~moved
         for world in np.flatnonzero(touched.cpu().numpy() & self.active & (self.tick > 0)).tolist():
@@ -335,7 +418,7 @@ class RelocatingEnv(ArenaEnv):
         way = np.array([-AWAY, 0.0, 0.0])
         assert isinstance(self.physics, MujocoPhysics)
         model, data = self.scene.mj_model, self.physics.data[world]
-        if self.free:
+        if self.free:  # it lies still where it is put
             joint = int(model.body_jntadr[self.root])
             place, speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             data.qpos[place : place + 3] += way

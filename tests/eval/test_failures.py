@@ -16,29 +16,34 @@ from arena_newton.errors import InputError
 from arena_newton.eval import report
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion
+from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion, held_out
 from arena_newton.eval.certification.failures import failures as check
-from arena_newton.eval.certification.sabotage import SABOTAGES, MisledSight, RelocatingEnv, WeakTracker
+from arena_newton.eval.certification.sabotage import PERCHED, SABOTAGES, MisledSight, RelocatingEnv, WeakTracker
 from arena_newton.eval.certification.traces import StateTrace, first_difference
 from arena_newton.eval.failure_counts import failure_cells
 from arena_newton.eval.failure_rules import FALLING, sees_at_start, stage_of
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction import INTERACTIONS
+from arena_newton.eval.interaction_view import InteractionView
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.results import load_run
+from arena_newton.eval.run import Factories
 from arena_newton.eval.signal_recorder import SEEN, SignalRecorder
 from arena_newton.policies.experts import ExpertPolicy
 from arena_newton.robot import DEFAULT_POSE, LEGS
 from arena_newton.rollout import Rollout
+from arena_newton.tasks.football import BALL, TOE
+from arena_newton.trackers.motions.commands import MotionCommand
 
 NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}
 BESIDE = UNTOUCHED | {"aligned_ticks": 0}
 
 
-def judged(outcome="timeout", startup_fall=False, steps=900, **changes):
+def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reason="", **changes):
     """An ended episode."""
-    return SimpleNamespace(outcome=outcome, steps=steps, startup_fall=startup_fall, signals=signals(**changes))
+    ended = {"task": task, "outcome": outcome, "reason": reason, "steps": steps, "startup_fall": startup_fall}
+    return SimpleNamespace(**ended, signals=signals(**changes))
 
 
 @pytest.mark.parametrize(
@@ -55,6 +60,15 @@ def judged(outcome="timeout", startup_fall=False, steps=900, **changes):
         ("contact", "timeout", {"touches": 3, "moved": 0.4, "touches_moved": 1}),
         ("recovery", "fall", {}),
         ("recovery", "timeout", {"moved": 0.4}),
+        ("contact", "timeout", {"moved": 4.0, "task": "football", "reason": "ball_out"}),
+        ("recovery", "timeout", {"moved": 4.0, "task": "football"}),
+        ("recovery", "fall", {"moved": 4.0, "task": "football"}),
+        ("contact", "timeout", {"moved": 0.9, "task": "pp_box"}),
+        ("recovery", "timeout", {"moved": 1.1, "task": "pp_box"}),
+        ("contact", "timeout", {"moved": 0.9, "task": "double_desk"}),
+        ("recovery", "timeout", {"moved": 0.9, "task": "open_door"}),
+        ("approach", "timeout", {"task": "vis_navi"}),
+        ("recovery", "timeout", {"moved": 0.4, "task": "vis_navi"}),
         ("tracker", "timeout", NOT_NEAR | {"tracking_error": 0.4, "tracking_worst": 0.6}),
         ("tracker", "fall", UNTOUCHED | {"tracking_error": 0.4, "tracking_worst": 0.6}),
     ],
@@ -170,8 +184,9 @@ OF = {
 }
 
 
-def test_the_check_fails_below_the_bar(capsys):
+def test_the_check_fails_below_the_bar(capsys, monkeypatch):
     """Scripted failures with their stages pass; one kind that is mostly said to be another fails and is named."""
+    monkeypatch.delitem(INTERACTIONS, "football")
     assert set(OF) == set(SABOTAGES)
     assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
     good = check(played(lambda body: OF[body] * 5))
@@ -198,14 +213,14 @@ def test_the_check_plays_episodes_that_nothing_was_set_on():
         cells.append(cell)
         return [judged(outcome, **changes) for outcome, changes in OF[cell.body] * 5]
 
-    found = check(SimpleNamespace(tasks=("boxing", "vis_navi"), sample=("twist2",), evaluate=evaluate))
-    assert set(TUNED) == set(INTERACTIONS) and len(cells) == 11
-    assert all(max(looked_at) < HELD_OUT for looked_at in TUNED.values())
-    for task in ("boxing", "vis_navi"):
-        looked_at = TUNED[task]
-        said = f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on "
+    found = check(SimpleNamespace(tasks=tuple(INTERACTIONS), sample=("twist2",), evaluate=evaluate))
+    scripted = [(task, name) for task in INTERACTIONS for name, one in SABOTAGES.items() if task not in one.without]
+    assert set(TUNED) == set(INTERACTIONS) and [(cell.task, cell.body) for cell in cells] == scripted
+    for task, looked_at in TUNED.items():
+        assert max(looked_at) < held_out(task)
+        said = f"{task}: played from group seed {held_out(task)} on; thresholds and saboteurs were set on "
         assert said + " ".join(map(str, looked_at)) in found.notes
-    assert {cell.first_seed for cell in cells} == {HELD_OUT}
+    assert {(cell.task, cell.first_seed) for cell in cells} == {(task, held_out(task)) for task in TUNED}
 
 
 @pytest.mark.parametrize(("count", "seeds"), [(4, 1), (20, 1), (60, 3)])
@@ -219,8 +234,9 @@ def test_a_cell_may_begin_at_another_group_seed(tmp_path, count, seeds):
     assert CertifyCell("boxing", "twist2").folder == "boxing/twist2_paper_base"
 
 
-def test_tasks_without_signals_are_refused(capsys):
+def test_tasks_without_signals_are_refused(capsys, monkeypatch):
     """--failures says of which tasks there are none, and plays nothing."""
+    monkeypatch.delitem(INTERACTIONS, "football")
     assert main(["run", "--failures", "--task", "football", "boxing", "--out", "nowhere"]) == 2
     error = capsys.readouterr().err
     assert "--failures: no signals are defined for football" in error and error.count("\n") == 1
@@ -270,6 +286,78 @@ def test_a_misled_sight_displaces_what_it_says(boxing):
     assert (readers[1][1]() - readers[0][1]()).numpy() == pytest.approx(np.tile(2 * off, (2, 1)), abs=1e-6)
     pose = (misled.sight.pose - truth.sight.pose).numpy()
     assert pose == pytest.approx(np.tile([0.1, 0.2, 0.0], (2, 1)), abs=1e-6)
+
+
+def test_a_ball_is_touched_with_the_toe_and_moved_as_a_free_body():
+    """Reach is from the tip of the shoe to the ball's box; a ball that is put elsewhere lies still there."""
+    env = RelocatingEnv("football", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
+    env.reset([SEEDS[0]])
+    view, ball = env.view, env.scene.joint_qpos(BALL)
+    data, gaps = env.physics.data[0], []
+    for link in INTERACTIONS["football"].effectors:
+        body = env.scene.link(link)
+        toe = data.xpos[body] + data.xmat[body].reshape(3, 3) @ TOE
+        gaps.append(np.linalg.norm((np.abs(toe - view.centre[0].numpy()) - view.box.half).clip(0.0)))
+    assert env.movable and len(gaps) == 2
+    assert float(view.reach[0]) == pytest.approx(min(gaps), abs=1e-4)
+    stand = env.loop.action.numpy().copy()
+    stand[:, 2], stand[:, 3], stand[:, 6] = 0.8, 1.0, 1.0
+    while env.tick.min() < 1:
+        env.step(stand)
+    view.spec = dataclasses.replace(view.spec, touch=10.0)
+    before = data.qpos[ball : ball + 3].copy()
+    for _ in range(3):
+        env.step(stand)
+    gone = data.qpos[ball : ball + 3] - before
+    assert gone == pytest.approx(env.relocated[0].numpy(), abs=1e-3) and np.linalg.norm(gone) > 1.0
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def sofa():
+    """One world of sit_sofa."""
+    return ArenaEnv("sit_sofa", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
+
+
+def test_a_seat_lies_behind_who_turns_the_back_to_it(sofa):
+    """The bearing is the angle between the back and the nearest point of the seat, however wide it is."""
+    sofa.reset([SEEDS[0]])
+    view = InteractionView(sofa)
+    middle, half = view.centre[0], view.box.half
+    for aside, turned, expected in ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (-0.6, 0.4, 0.4), (0.0, np.pi, np.pi)):
+        yaw = 0.5 * np.pi + turned
+        view.root[0] = view.root.new_tensor(
+            [middle[0] + aside, middle[1] + half[1] + 0.3, 0.8, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+        )
+        assert float(view.bearing[0]) == pytest.approx(expected, abs=1e-4)
+        assert float(view.distance[0]) == pytest.approx(0.3, abs=1e-4)
+
+
+def test_a_misled_expert_sits_down_nowhere_or_without_weight(sofa):
+    """Beside the seat it does not sit down, on it not all the way; a goal is believed where the displacement says."""
+    sofa.reset([SEEDS[0]])
+    command = MotionCommand.neutral(1, sofa.torch_device)
+    sitting = dataclasses.replace(command, height=command.height * 0.0 + 0.51, pelvis_back=command.height * 0.0 + 0.34)
+    heights = {}
+    for name in ("blinded", "misaimed", "clumsy", "stubborn", "unbalanced"):
+        policy = SABOTAGES[name].body.equip(Factories()).policy("expert")
+        policy.attach(sofa)
+        policy.reset([SEEDS[0]], ["sit_sofa"])
+        heights[name] = float(policy.overrule(sitting).height[0])
+    neutral = float(command.height[0])
+    assert heights["blinded"] == heights["misaimed"] == neutral and heights["unbalanced"] == pytest.approx(0.51)
+    assert PERCHED[0] <= heights["clumsy"] == heights["stubborn"] <= PERCHED[1]
+
+
+def test_saboteurs_play_more_episodes_than_worlds():
+    """What a saboteur changed in a world's episode is forgotten in its next one."""
+    env = ArenaEnv("boxing", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
+    planned = [SimpleNamespace(index=n, episode_seed=seed) for n, seed in enumerate(SEEDS)]
+    expert = SABOTAGES["misaimed"].body.equip(Factories()).policy("expert")
+    kept = SignalRecorder(env)
+    Rollout(env, expert, planned, recorder=kept, max_steps=30).run()
+    assert kept.taken(0) is not None and kept.taken(1) is not None
+    env.close()
 
 
 def test_a_weak_tracker_does_a_part_of_its_legs():

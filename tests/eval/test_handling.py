@@ -69,7 +69,7 @@ def style():
 
 @pytest.mark.parametrize("task", HANDLING)
 def test_hands_believe_the_object_where_the_table_says(task, style):
-    """Clumsy hands are off by the table's lengths in its direction, or not at all where they let go; blind robots far away."""
+    """Clumsy hands are off by the table's lengths, or not at all where they let go; blind robots are far off."""
     handling = HANDLING[task]
     off = handling.believed(style)
     length = off.norm(dim=1)
@@ -87,7 +87,7 @@ def test_hands_believe_the_object_where_the_table_says(task, style):
 
 
 def test_hands_let_go_in_every_other_episode(style):
-    """Long after the touch fingers are open and palms apart where the coin says so; before it, and elsewhere, nothing changes."""
+    """Long after the touch fingers are open and palms apart where the coin says so; else nothing changes."""
     handling = HANDLING["pp_box"]
     command = dataclasses.replace(MotionCommand.neutral(8), hands=torch.ones(8, 2))
     opens, late = style.coin("opens"), torch.full((8,), handling.opens[1] + 1.0)
