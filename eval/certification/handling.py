@@ -78,10 +78,10 @@ HANDLING: Mapping[str, Handling] = {
         opens=(300, 450),
         apart=0.30,
     ),
-    # To the robot's right the floor is free beside the desk. A hand 6 cm above the handle closes over it; others grasp
+    # To the robot's right the floor is free beside the desk. A hand 11 cm above the handle closes over it; others grasp
     # the hammer and open on the way to the crate.
     "double_desk": Handling(
-        blind=(180, 180), clumsy=(0.0, 0.0, 1.0), off=(0.06, 0.08), weak=0.5, short=(0.55, 0.80), opens=(400, 600)
+        blind=(180, 180), clumsy=(0.0, 0.0, 1.0), off=(0.11, 0.13), weak=0.5, short=(0.42, 0.55), opens=(400, 600)
     ),
 }
 """Task name → what its saboteurs do."""
