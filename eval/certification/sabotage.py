@@ -22,6 +22,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification.bodies import Body, WithOtherLegs
 from arena_newton.eval.certification.handling import HANDLING
 from arena_newton.eval.failure_stage import FailureStage
+from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.interaction_view import InteractionView
 from arena_newton.eval.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Spawn, World
@@ -37,7 +38,7 @@ from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.motions.commands import MotionCommand
 
-__all__ = ["PERCHED", "SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
+__all__ = ["HALTS", "PERCHED", "SABOTAGES", "MisledExpert", "MisledSight", "RelocatingEnv", "Sabotage", "WeakTracker"]
 
 UNSEEN = (0.0, 0.0, 30.0)
 """Displacement of an object that nobody can see: in the sky, where no camera looks [m]."""
@@ -68,6 +69,10 @@ at 2.5 m, and it aims up to 0.8 m inwards."""
 BESIDE_SEAT = (0.90, 1.20)
 """How far beyond its place on the sofa a robot that aims badly turns its back, drawn between these [m]: beside the
 armrest, which begins 0.5 m beyond that place."""
+HALTS = (0.36, 0.30)
+"""Distance to a ball at which a robot that does not kick halts, and over how many before that it slows down [m]."""
+SLOWEST = 0.25
+"""Fraction of its speed that is left when it halts."""
 PERCHED = (0.63, 0.66)
 """Height at which a pelvis stays that comes down on the seat without weight, drawn between these [m] ..."""
 PERCHED_BACK = 0.18
@@ -294,6 +299,34 @@ class UnbalancedExpert(MisledExpert):
         return _leaning(actions, lean, side + math.pi if self.handling else side)
 
 
+class ReluctantExpert(MisledExpert):
+    """Stands where it could touch the object, and does not: before a seat upright, behind a ball still."""
+
+    def attach(self, env: World) -> None:
+        """See `Policy.attach`."""
+        super().attach(env)
+        self.halted = torch.zeros(env.worlds, dtype=torch.bool, device=env.torch_device)
+        """It stopped behind the ball, shape [worlds]."""
+
+    @torch.inference_mode()
+    def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
+        """See `Policy.reset`."""
+        super().reset(seeds, tasks, mask)
+        self.halted[self._begins_now(mask, len(seeds))] = False
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        if self.env.spec.name == "sit_sofa":
+            return _upright(command)
+        view, (halt, course) = self.sight.view, HALTS
+        before = view.bearing <= view.spec.bearing
+        self.halted |= (view.distance < halt) & before
+        slower = torch.where(before, ((view.distance - halt) / course).clamp(SLOWEST, 1.0), 1.0)
+        still = MotionCommand.neutral(len(self.halted), self.halted.device)
+        command = dataclasses.replace(command, velocity=command.velocity * slower[:, None])
+        return MotionCommand.unpack(torch.where(self.halted[:, None], still.pack(), command.pack()))
+
+
 class ClumsyExpert(MisledExpert):
     """Touches without effect.
 
@@ -490,8 +523,15 @@ _MADE = (
     (FailureStage.RECOVERY, "stubborn", "object that moves away unnoticed", _expert(StubbornExpert, RelocatingEnv)),
     (FailureStage.TRACKER, "weakened", "tracker with weak legs", _weak),
 )
-SABOTAGES: Mapping[str, Sabotage] = {
+SABOTAGES: dict[str, Sabotage] = {
     name: Sabotage(stage, Body(name, title, equip), _NO_EFFECT if stage is FailureStage.CONTACT else ())
     for stage, name, title, equip in _MADE
+}
+SABOTAGES |= {
+    "reluctant": Sabotage(
+        FailureStage.POSTURE,
+        Body("reluctant", "expert that stands before the object", _expert(ReluctantExpert)),
+        tuple(task for task in INTERACTIONS if task not in ("football", "sit_sofa")),
+    )
 }
 """Scripted failures by name."""

@@ -18,7 +18,14 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion, held_out
 from arena_newton.eval.certification.failures import failures as check
-from arena_newton.eval.certification.sabotage import PERCHED, SABOTAGES, MisledSight, RelocatingEnv, WeakTracker
+from arena_newton.eval.certification.sabotage import (
+    HALTS,
+    PERCHED,
+    SABOTAGES,
+    MisledSight,
+    RelocatingEnv,
+    WeakTracker,
+)
 from arena_newton.eval.certification.traces import StateTrace, first_difference
 from arena_newton.eval.failure_counts import failure_cells
 from arena_newton.eval.failure_rules import FALLING, sees_at_start, stage_of
@@ -30,10 +37,10 @@ from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.results import load_run
 from arena_newton.eval.run import Factories
 from arena_newton.eval.signal_recorder import SEEN, SignalRecorder
-from arena_newton.policies.experts import ExpertPolicy
+from arena_newton.policies.experts import ExpertPolicy, Sight
 from arena_newton.robot import DEFAULT_POSE, LEGS
 from arena_newton.rollout import Rollout
-from arena_newton.tasks.football import BALL, TOE
+from arena_newton.tasks.football import BALL, GOAL, TOE
 from arena_newton.trackers.motions.commands import MotionCommand
 
 NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}
@@ -178,6 +185,7 @@ OF = {
     "blinded": [("timeout", NOT_NEAR)],
     "misaimed": [("timeout", BESIDE)],
     "unbalanced": [("fall", UNTOUCHED)],
+    "reluctant": [("timeout", UNTOUCHED)],
     "clumsy": [("timeout", {})],
     "stubborn": [("timeout", {"moved": 1.5})],
     "weakened": [("timeout", NOT_NEAR | {"tracking_error": 0.5, "tracking_worst": 0.7})],
@@ -313,6 +321,28 @@ def test_a_ball_is_touched_with_the_toe_and_moved_as_a_free_body():
     env.close()
 
 
+def test_a_reluctant_expert_halts_behind_the_ball():
+    """It slows down towards the ball and stands from then on, also where it drifts back; a new episode walks again."""
+    env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
+    env.reset([SEEDS[0]])
+    policy = SABOTAGES["reluctant"].body.equip(Factories()).policy("expert")
+    policy.attach(env)
+    walking = MotionCommand.neutral(1, env.torch_device)
+    walking.velocity[:, 0] = 0.5
+    view, speeds = policy.sight.view, []
+    for gap in (2.0, HALTS[0] + 0.5 * HALTS[1], HALTS[0] - 0.01, HALTS[0] + 0.2):
+        x, y = view.centre[0, 0], view.centre[0, 1] - view.box.half[1] - gap
+        view.root[0] = view.root.new_tensor([x, y, 0.8, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+        speeds.append(float(policy.overrule(walking).velocity[0, 0]))
+    assert speeds == pytest.approx([0.5, 0.25, 0.0, 0.0], abs=0.02)
+    policy.reset([SEEDS[1]], ["football"])
+    assert float(policy.overrule(walking).velocity[0, 0]) > 0.1
+    policy.sight.goal_off += policy.sight.goal_off.new_tensor([5.0, 0.0, 0.0])
+    believed, true = policy.sight.frame(GOAL)(), Sight(env).frame(GOAL)()
+    assert (believed - true).numpy() == pytest.approx(np.array([[5.0, 0.0, 0.0]]), abs=1e-6)
+    env.close()
+
+
 @pytest.fixture(scope="module")
 def sofa():
     """One world of sit_sofa."""
@@ -334,18 +364,20 @@ def test_a_seat_lies_behind_who_turns_the_back_to_it(sofa):
 
 
 def test_a_misled_expert_sits_down_nowhere_or_without_weight(sofa):
-    """Beside the seat it does not sit down, on it not all the way; a goal is believed where the displacement says."""
+    """Beside the seat, or reluctant before it, it does not sit down; without weight, it does not go all the way."""
     sofa.reset([SEEDS[0]])
     command = MotionCommand.neutral(1, sofa.torch_device)
     sitting = dataclasses.replace(command, height=command.height * 0.0 + 0.51, pelvis_back=command.height * 0.0 + 0.34)
     heights = {}
-    for name in ("blinded", "misaimed", "clumsy", "stubborn", "unbalanced"):
+    for name in ("blinded", "misaimed", "reluctant", "clumsy", "stubborn", "unbalanced"):
         policy = SABOTAGES[name].body.equip(Factories()).policy("expert")
         policy.attach(sofa)
         policy.reset([SEEDS[0]], ["sit_sofa"])
         heights[name] = float(policy.overrule(sitting).height[0])
     neutral = float(command.height[0])
-    assert heights["blinded"] == heights["misaimed"] == neutral and heights["unbalanced"] == pytest.approx(0.51)
+    assert {heights[name] for name in ("blinded", "misaimed", "reluctant")} == {neutral} and heights[
+        "unbalanced"
+    ] == pytest.approx(0.51)
     assert PERCHED[0] <= heights["clumsy"] == heights["stubborn"] <= PERCHED[1]
 
 
