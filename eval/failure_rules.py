@@ -57,6 +57,11 @@ ALIGNED = 100
 """The same where the object can be touched without a step."""
 MOVED = 0.25
 """Distance from where it was touched first at which the object has moved away [m]."""
+CARRIED = ("pp_box", "double_desk")
+"""Tasks whose object moves with the hands; how far it has moved is measured from where they touched it last."""
+LEFT = 1.0
+"""Distance from there at which a carried object is left [m], seen from above: beyond `tasks.base.REACH`, 0.8 m. One
+that is dropped or put down wrongly is nearer: a box that falls from walking hands rolls up to 0.8 m."""
 REACHED_ONLY = ("vis_navi",)
 """Tasks in which the object is only to be reached. A touch has no effect that could fail to come: a robot that set a
 foot on the area and does not stand in it with both has not come into the pose that is wanted."""
@@ -77,7 +82,8 @@ def stage_of(episode: Judged) -> FailureStage | None:
     if signals.tracking_error > TRACKING and signals.reference_tilt < LEANING:
         return FailureStage.TRACKER
     if signals.first_touch is not None and not (fell and episode.steps - signals.first_touch < FALLING):
-        lost = signals.moved > MOVED and not signals.touches_moved and episode.reason not in ENDING
+        away = LEFT if episode.task in CARRIED else MOVED
+        lost = signals.moved > away and not signals.touches_moved and episode.reason not in ENDING
         if fell or lost:
             return FailureStage.RECOVERY
         return FailureStage.APPROACH if episode.task in REACHED_ONLY else FailureStage.CONTACT

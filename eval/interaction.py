@@ -10,8 +10,11 @@ from dataclasses import dataclass
 
 from arena_newton.errors import InputError
 from arena_newton.tasks.boxing import BOUNDS, PALMS, TARGET
+from arena_newton.tasks.double_desk import HAMMER
 from arena_newton.tasks.football import BALL, KICK, TOE
 from arena_newton.tasks.football import FEET as KICKING
+from arena_newton.tasks.open_door import HANDLE, LEAF_BODY
+from arena_newton.tasks.pp_box import BOX
 from arena_newton.tasks.sit_sofa import SEAT
 from arena_newton.tasks.vis_navi import FEET, SIGN, ZONE
 
@@ -37,6 +40,10 @@ class Interaction:
     """The effectors' heights do not count."""
     bearing: float = 3.2
     """Largest angle between heading and box at which it can be touched [rad]; above pi: any."""
+    near: float = 1.4
+    """Distance of the root to the object [m] within which it is near: `tasks.base.REACH`, 0.8 m, and a long step."""
+    carried: bool = False
+    """It moves with the effectors: how far it has moved is seen from above, from where they touched it last."""
     slow: float = 0.20
     """Speed of the root, averaged over half a second, below which the robot stands or steps slowly [m/s]: the experts
     strike and turn below it, and walk at 0.3 m/s and more."""
@@ -58,6 +65,15 @@ INTERACTIONS: Mapping[str, Interaction] = {
     # The origin of a pelvis that sits is 0.17 m above the box; a robot that comes down without weight stays some
     # centimetres higher. The expert goes down from 0.12 m in front of the edge.
     "sit_sofa": Interaction("/World/Sofa", SEAT, ("pelvis",), touch=0.25, stance=0.25, bearing=0.8, behind=True),
+    # The leaf is what a robot can find, the lever what it must touch: 6 cm off the leaf. The expert presses it from
+    # 0.38 m with the lever 0.4 rad to its right, and a fist of 5 cm meets the leaf around it within 0.15 m.
+    "open_door": Interaction(LEAF_BODY, HANDLE, PALMS, touch=0.15, stance=0.60, bearing=0.8),
+    # A palm is 6 cm from the box when its fist squeezes it, and 0.16 m when it begins to close. The expert stands 0.22
+    # to 0.30 m before the box. Episodes begin 0.9 m and more before it, which is not near yet.
+    "pp_box": Interaction(BOX, BOX, PALMS, touch=0.12, stance=0.45, bearing=0.8, near=0.85, carried=True),
+    # The palm is 5 cm from the handle that it grasps and hovers 0.17 m above it. The expert stands 0.23 to 0.40 m from
+    # the hammer. Episodes begin 0.82 m and more from it, which is not near yet.
+    "double_desk": Interaction(HAMMER, HAMMER, PALMS, touch=0.19, stance=0.40, bearing=1.0, near=0.80, carried=True),
 }
 """Task name → its first contact; tasks that are not here have no failure signals."""
 

@@ -20,7 +20,7 @@ from arena_newton.robot import LEGS
 from arena_newton.rotations import quat_apply
 from arena_newton.rules import FallRule
 
-__all__ = ["EVERY", "NEAR", "SEEN", "SignalRecorder"]
+__all__ = ["EVERY", "SEEN", "SignalRecorder"]
 
 EVERY = 25
 """Ticks between two looks: half a second, in which the head turns by half its field of view at most."""
@@ -28,8 +28,6 @@ SEEN = 10
 """The object is seen from so many pixels on, as in the check `visible`, of ..."""
 SIZE = (224, 168)
 """... width and height of a policy's picture without its black bars [px]."""
-NEAR = 1.4
-"""Distance of the root to the object [m] within which it is near: `tasks.base.REACH`, 0.8 m, and a long step."""
 SMOOTH = 25
 """Time constant of averages [ticks]: half a second, the period of a step."""
 LEAD = 50
@@ -131,7 +129,7 @@ class SignalRecorder(Recorder):
         keep("nearest_distance", torch.minimum(distance, now["nearest_distance"]), every)
         keep("reach_distance", torch.minimum(reach, now["reach_distance"]), every)
 
-        engaged = slow & (distance <= NEAR)
+        engaged = slow & (distance <= spec.near)
         aligned = slow & (distance <= spec.stance) & (bearing <= spec.bearing)
         keep("stop_bearing", bearing, engaged & (distance < now["stop_distance"]))
         keep("stop_distance", torch.minimum(distance, now["stop_distance"]), engaged)
@@ -146,10 +144,13 @@ class SignalRecorder(Recorder):
         keep("touch_bearing", bearing, first)
         self._touch_at = torch.where((mask & first)[:, None], centre, self._touch_at)
         keep("first_touch", tick, first)
-        moved = torch.linalg.vector_norm(centre - self._touch_at, dim=1) * (now["first_touch"] >= 0)
-        keep("moved", moved, every)
+        way = (centre - self._touch_at)[:, : 2 if spec.carried else 3]
+        moved = torch.linalg.vector_norm(way, dim=1) * (now["first_touch"] >= 0)
+        keep("moved", moved * ~touching if spec.carried else moved, every)
         keep("touches", now["touches"] + 1.0, begins)
         keep("touches_moved", now["touches_moved"] + 1.0, begins & (moved > MOVED))
+        if spec.carried:
+            self._touch_at = torch.where((mask & touching)[:, None], centre, self._touch_at)
         # An object that jumps away while it is touched is let go too.
         keep("touching", touching, begins | (reach > spec.touch + APART))
         self._follow(mask, tick, root)

@@ -19,6 +19,7 @@ __all__ = ["TASK", "DoorOpenRule", "DoorPassedRule", "OpenDoorJudge"]
 
 DOOR = "/World/Door"
 DOORWAY, LEAF, HANDLE = f"{DOOR}/Frame/Doorway", f"{DOOR}/LeafHinge", f"{DOOR}/Handle"
+LEAF_BODY = f"{DOOR}/Leaf"
 
 OPEN_DEG = 60.0
 """Angle of an open leaf [deg]: what the original's code asks for."""
@@ -122,7 +123,7 @@ TASK = TaskSpec(
     requires=(
         Required(DOOR, "fixture"),
         Required(DOORWAY, "marker"),
-        Required(f"{DOOR}/Leaf", "body"),
+        Required(LEAF_BODY, "body"),
         Required(HANDLE, "body"),
         Required(LEAF, "latch"),
         Required(f"{DOOR}/HandleHinge", "hinge"),

@@ -29,6 +29,9 @@ TUNED: Mapping[str, tuple[int, ...]] = {
     "vis_navi": (0, 10, 500, 501, 502, 503, 504, 505, 700),
     "football": (500, 501, 502, 503, 700, 701),
     "sit_sofa": (500, 501, 502),
+    "open_door": (500,),
+    "pp_box": (500,),
+    "double_desk": (500,),
 }
 """Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
 HELD_OUT = 700

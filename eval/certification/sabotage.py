@@ -20,6 +20,7 @@ from arena_newton.canonical import ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.bodies import Body, WithOtherLegs
+from arena_newton.eval.certification.handling import HANDLING
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.interaction_view import InteractionView
@@ -93,7 +94,7 @@ class MisledSight(Sight):
         )
         """Where robot, hands, object and goal are believed minus where they are [m], shape [worlds, 3]."""
         self._robot = frozenset(int(body) for body in env.scene.robot.bodies)
-        self._object = self.view.box.body_id
+        self._object = _bodies_of(env, self.view.box.body_id)
 
     @property
     def pose(self) -> Tensor:
@@ -110,7 +111,7 @@ class MisledSight(Sight):
         position, quat = super().body(body)
         if body in self._robot:
             position = position + self.robot_off
-        return position + self.object_off if body == self._object else position, quat
+        return position + self.object_off if body in self._object else position, quat
 
     def frame(self, name: str) -> Callable[[], Tensor]:
         """See `Sight.frame`."""
@@ -118,6 +119,17 @@ class MisledSight(Sight):
         if name == GOAL:
             return lambda: read() + self.goal_off
         return (lambda: read() + self.hands_off) if name in PALMS else read
+
+    def com(self, prim: str) -> Callable[[], Tensor]:
+        """See `Sight.com`."""
+        read = super().com(prim)
+        return (lambda: read() + self.object_off) if self.scene.body_id(prim) in self._object else read
+
+
+def _bodies_of(env: World, body: int) -> frozenset[int]:
+    """The bodies that are where an object is: those of the whole tree that hangs on the object's root."""
+    roots = env.scene.mj_model.body_rootid
+    return frozenset(int(number) for number in np.flatnonzero(roots == roots[body])) if body else frozenset({0})
 
 
 class _Overruled(Expert):
@@ -150,7 +162,7 @@ class MisledExpert(ExpertPolicy):
     def attach(self, env: World) -> None:
         """See `Policy.attach`."""
         super().attach(env)
-        self.env = env
+        self.env, self.handling = env, HANDLING.get(env.spec.name)
         assert self.expert is not None
         self.expert = _Overruled(self.expert, self.overrule)
         self.since = torch.full((env.worlds,), -1.0, device=env.torch_device)
@@ -226,6 +238,9 @@ class BlindExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.handling:
+            self.sight.object_off = self.handling.elsewhere(self.style, ELSEWHERE)
+            return
         least, most = TOWARDS.get(self.env.spec.name, TOWARDS[""])
         turn = self.style.uniform("to", math.radians(least), math.radians(most))
         if self.env.spec.name == "football":  # on the other half of the pitch
@@ -253,7 +268,8 @@ class MisaimedExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
-        view, far, aside = self.sight.view, self.style.uniform("short", *SHORT), self.style.uniform("to", -ASIDE, ASIDE)
+        view, short = self.sight.view, self.handling.short if self.handling else SHORT
+        far, aside = self.style.uniform("short", *short), self.style.uniform("to", -ASIDE, ASIDE)
         if self.env.spec.name == "football":
             self.sight.object_off = _level(self.style.uniform("short", *BEFORE_BALL), aside - 0.5 * math.pi)
             return
@@ -278,7 +294,9 @@ class UnbalancedExpert(MisledExpert):
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """See `MisledExpert.spoil`."""
         lean = LEAN * (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
-        return _leaning(actions, lean, self.style.uniform("side", -1.0, 1.0))
+        side = self.style.uniform("side", -1.0, 1.0)
+        # Away from door, table and desk, which would hold it.
+        return _leaning(actions, lean, side + math.pi if self.handling else side)
 
 
 class ReluctantExpert(MisledExpert):
@@ -318,6 +336,8 @@ class ClumsyExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.handling:
+            self.sight.object_off = self.handling.believed(self.style)
         if self.env.spec.name == "football":
             far = self.style.uniform("beside", *BESIDE_GOAL)
             side = torch.where(self.style.coin("left"), math.pi, 0.0)
@@ -331,6 +351,8 @@ class ClumsyExpert(MisledExpert):
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
         """See `MisledExpert.overrule`."""
+        if self.handling:
+            return self.handling.let_go(command, self.style, self.after)
         return self._perched(command) if self.env.spec.name == "sit_sofa" else command
 
     def _perched(self, command: MotionCommand) -> MotionCommand:
@@ -348,7 +370,16 @@ class StubbornExpert(ClumsyExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
+        if self.handling and self.env.free:  # it falls where it was put
+            kept = self.env.relocated.any(dim=1)[:, None]
+            self.env.left_at = torch.where(kept, self.env.left_at, self.sight.view.centre)
+            self.sight.object_off = self.env.left_at - self.sight.view.centre
+            return
         self.sight.object_off = -self.env.relocated
+
+    def overrule(self, command: MotionCommand) -> MotionCommand:
+        """See `MisledExpert.overrule`."""
+        return command if self.handling else super().overrule(command)
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """See `MisledExpert.spoil`."""
@@ -378,6 +409,21 @@ class RelocatingEnv(ArenaEnv):
         """Whether the object can be moved: what is a part of the room cannot."""
         return self.view.box.body_id != 0
 
+    @functools.cached_property
+    def root(self) -> int:
+        """The body that carries the object with all that hangs on it."""
+        return int(self.scene.mj_model.body_rootid[self.view.box.body_id])
+
+    @functools.cached_property
+    def free(self) -> bool:
+        """Whether the object is a free body."""
+        return int(self.scene.mj_model.body_mocapid[self.root]) < 0
+
+    @functools.cached_property
+    def left_at(self) -> Tensor:
+        """Where a free object was when it was moved [m], shape [worlds, 3]."""
+        return self.view.centre.clone()
+
     def reset(
         self,
         seeds: Sequence[int],
@@ -403,16 +449,15 @@ class RelocatingEnv(ArenaEnv):
 
     def _relocate(self, world: int) -> None:
         way = np.array([-AWAY, 0.0, 0.0])
-        body = self.view.box.body_id
-        mocap = int(self.scene.mj_model.body_mocapid[body])
         assert isinstance(self.physics, MujocoPhysics)
-        data = self.physics.data[world]
-        if mocap < 0:  # a free body lies still where it is put
-            place, speed = self.scene.joint_qpos(self.view.spec.box), self.scene.joint_qvel(self.view.spec.box)
+        model, data = self.scene.mj_model, self.physics.data[world]
+        if self.free:  # it lies still where it is put
+            joint = int(model.body_jntadr[self.root])
+            place, speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             data.qpos[place : place + 3] += way
             data.qvel[speed : speed + 6] = 0.0
         else:
-            data.mocap_pos[mocap] += way
+            data.mocap_pos[int(model.body_mocapid[self.root])] += way
         self.relocated[world] = torch.from_numpy(way).float()
 
 
@@ -460,7 +505,12 @@ def _weak(factories: Factories) -> Factories:
     def tracker(spec: str, checkpoint: Path | None) -> Tracker:
         return WeakTracker(factories.tracker(spec, checkpoint), PART)
 
-    return dataclasses.replace(factories, tracker=tracker)
+    def env(task: str, *, tracker: Tracker, **options: object) -> World:
+        if task in HANDLING and isinstance(tracker, WeakTracker):
+            tracker.part = HANDLING[task].weak
+        return factories.env(task, tracker=tracker, **options)
+
+    return dataclasses.replace(factories, tracker=tracker, env=env)
 
 
 _NO_EFFECT = ("vis_navi",)
