@@ -25,7 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import plan
 from arena_newton.eval.bench_figure import BenchFigure
 from arena_newton.eval.bench_learned import learned_figures
-from arena_newton.eval.bench_peers import peer_figures
+from arena_newton.eval.bench_peers import peer_items
 from arena_newton.eval.bench_policy import policy_figures
 from arena_newton.eval.bench_recording import recording_figures
 from arena_newton.eval.bench_start import start_figures
@@ -62,7 +62,7 @@ def run(options: BenchOptions) -> int:
     figures: list[BenchFigure] = []
     measured: Iterator[tuple[str, Iterator[BenchFigure]]] = ((name, known[name](options)) for name in wanted)
     if options.peers:
-        measured = iter([("peers", peer_figures(options))])
+        measured = iter(peer_items(options))
     for name, found in measured:
         for figure in _guarded(name, found):
             figures.append(figure)

@@ -370,9 +370,25 @@ class BenchOptions:
     learned_ticks: int = 300
     """Ticks of an episode of `learned`, and of the expert's beside it."""
     peers: tuple[str, ...] = ()
-    """Measure beside other programs instead: tick world_ticks act_training, or `all`."""
+    """Measure beside other programs instead: tick world_ticks act_training tracker_training lerobot_eval camera, or
+    `all`."""
     peers_dataset: str | None = None
     """Dataset of `act_training`, read by both sides."""
+    mjlab_python: str | None = None
+    """Interpreter that has mjlab, for `tracker_training`."""
+    peers_worlds: tuple[int, ...] = ()
+    """Worlds of `tracker_training`; 4096 and 8192 on CUDA, 4 on the CPU when none are named."""
+    peers_iterations: int = 10
+    """Iterations of PPO in a round of `tracker_training`."""
+    peers_rounds: int = 3
+    """Rounds of `tracker_training` and `lerobot_eval`."""
+    peers_episodes: int = 0
+    """Episodes of `lerobot_eval`, all at once, by `--policy-checkpoint` or the policy of the package; 0: 60 on CUDA, 2
+    on the CPU."""
+    peers_steps: int = 0
+    """Cap on the ticks of an episode of `lerobot_eval`; 0: what the rules say."""
+    peers_size: int = 224
+    """Width and height of the pictures of `camera` [px]."""
     peers_history: str | None = None
     """File to which each pair that was measured is appended as a JSON line."""
     json: bool = False

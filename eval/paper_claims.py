@@ -429,7 +429,7 @@ def _merged(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
                     for s in cells.single
                     if m.family == s.family == family and m.trained_on == trackers and m.task in suites()[suite]
                     if (m.mode, m.tracker, m.task, m.labels) == (s.mode, s.tracker, s.task, s.labels)
-                    if m.mode == "base" and s.matched
+                    if m.mode == "base" and m.tracker in m.trained_on and s.matched
                 ]
                 for m, s in pairs:
                     terms += [(m.task, 1 / len(pairs), m.held()), (s.task, -1 / len(pairs), s.held())]

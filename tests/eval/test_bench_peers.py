@@ -5,8 +5,13 @@ import json
 import pytest
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import bench, bench_peers
+from arena_newton.eval import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
 from arena_newton.eval.options import BenchOptions
+
+
+def figures_of(options):
+    """All figures of the pairs that are named."""
+    return [figure for _, found in bench_peers.peer_items(options) for figure in found]
 
 
 def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
@@ -14,7 +19,7 @@ def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
     rounds = [(0.003, 0.002), (0.008, 0.004), (0.009, 0.003)]
     monkeypatch.setattr(bench_peers, "tick_times", lambda *given: rounds)
     history = tmp_path / "history.jsonl"
-    figures = list(bench_peers.peer_figures(BenchOptions(peers=("tick",), peers_history=str(history))))
+    figures = figures_of(BenchOptions(peers=("tick",), peers_history=str(history)))
     assert [figure.value for figure in figures] == [2.0, 2.0]
     assert [figure.verdict for figure in figures] == ["MISS", "MISS"]
     lines = [json.loads(line) for line in history.read_text().splitlines()]
@@ -28,15 +33,43 @@ def test_on_the_cpu_world_ticks_are_information(monkeypatch):
     """Without CUDA no bar is judged, whatever the ratio is."""
     monkeypatch.setattr(bench_peers.wp, "is_cuda_available", lambda: False)
     monkeypatch.setattr(bench_peers, "tick_times", lambda *given: [(0.5, 0.4)])
-    (figure,) = bench_peers.peer_figures(BenchOptions(peers=("world_ticks",)))
+    (figure,) = figures_of(BenchOptions(peers=("world_ticks",)))
     assert figure.value is None and figure.verdict == "-" and "0.80 x" in figure.note
 
 
-@pytest.mark.parametrize("pair", ["tracker_training", "lerobot_eval", "pictures", "act_training"])
+@pytest.mark.parametrize("pair", ["tracker_training", "act_training"])
 def test_what_is_not_measured_is_not_reached(pair):
-    """A pair without a measurement, or without its dataset, says so and has no value."""
-    (figure,) = bench_peers.peer_figures(BenchOptions(peers=(pair,)))
+    """A pair without its dataset or its peer's interpreter says so and has no value."""
+    (figure,) = figures_of(BenchOptions(peers=(pair,), peers_worlds=(4,)))
     assert figure.value is None and figure.note.startswith("not measured:")
+
+
+@pytest.mark.parametrize("module", [peer_tracker_training, peer_lerobot_eval])
+def test_a_missing_extra_is_one_line(module, monkeypatch):
+    """A pair whose libraries are not installed says so and has no value: it is not reached."""
+
+    def missing(extra, what):
+        raise InputError(f"{what} needs the extra {extra}")
+
+    monkeypatch.setattr(module, "require", missing)
+    pair = module.__name__.rsplit(".peer_")[-1]
+    (figure,) = figures_of(BenchOptions(peers=(pair,), mjlab_python="python", peers_worlds=(4,)))
+    assert figure.value is None and figure.verdict == "-"
+    assert figure.note.startswith(f"not measured: eval bench --peers {pair} needs the extra")
+
+
+def test_a_pair_that_breaks_does_not_stop_the_others(monkeypatch, capsys):
+    """It is a miss with its reason; the pairs after it are measured, and the exit code is 1."""
+
+    def broken(options):
+        raise ArenaError("mjlab ended with code 1: out of memory")
+        yield
+
+    monkeypatch.setattr(bench_peers, "tracker_training_figures", broken)
+    assert bench.run(BenchOptions(peers=("tracker_training", "act_training"))) == 1
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("MISS") and "tracker_training" in first and "out of memory" in first
+    assert "ACT training" in second
 
 
 def test_unknown_pair():

@@ -411,6 +411,21 @@ def test_a_claim_that_fails_does_not_reproduce(tmp_path, monkeypatch):
     assert said["SR and AFR disagree: sonic"] == "not measured"
 
 
+def test_merged_training_is_judged_by_its_own_trackers(tmp_path, monkeypatch):
+    """A merged policy of one tracker that another one executes is a swap, no effect of merging."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+    plan = []
+    for task in HOI:
+        plan += [(cell_of("act", "act", tracker, task), outcomes(45)) for tracker in ("twist2", "sonic")]
+        for tracker, won in (("twist2", 45), ("sonic", 0)):
+            both = cell_of("all", "act", tracker, task, trained_on=("twist2",), tasks_of=HOI + HSI)
+            plan.append((both, outcomes(won)))
+    found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
+    one = {one.name: one for one in found}["merged training: TWIST2x7 HOI"]
+    assert one.ours.startswith("act: 0.0 points (")
+    assert one.verdict == "does not"
+
+
 def test_damaged_suites_are_refused(suite, tmp_path):
     """A suite whose file names another cell's folder, or is no JSON, is one error."""
     copy = tmp_path / "suite"
