@@ -38,6 +38,9 @@ class Handling:
     for the object where it is then. None: they never do."""
     apart: float = 0.0
     """How far each hand goes outwards for that [m]; fingers open in any case."""
+    halts: float = 0.0
+    """Distance at which a robot that does not reach for the object halts before it, its arms hanging [m]; 0 where no
+    such robot is played."""
 
     def believed(self, style: Style) -> Tensor:
         """Where clumsy hands believe the object minus where it is [m], shape [worlds, 3]."""
@@ -66,7 +69,9 @@ HANDLING: Mapping[str, Handling] = {
     # Along the partition, for behind it there is no floor. A fist that comes down beyond the lever's free end, which is
     # 3 cm beyond the pressed point, misses it by 4 cm and more. With half of the legs' excursions nine of ten episodes
     # succeed: the walk is short, and whoever walks badly pushes no worse.
-    "open_door": Handling(blind=(180, 180), clumsy=(-1.0, 0.0, 0.0), off=(0.12, 0.16), weak=0.45, short=(0.55, 0.80)),
+    "open_door": Handling(
+        blind=(180, 180), clumsy=(-1.0, 0.0, 0.0), off=(0.12, 0.16), weak=0.45, short=(0.55, 0.80), halts=0.50
+    ),
     # Behind the robot is free floor. Fists 0.18 m above the box's middle close over it; others squeeze and lift it, and
     # open on the way to the shelf.
     "pp_box": Handling(
@@ -75,13 +80,19 @@ HANDLING: Mapping[str, Handling] = {
         off=(0.18, 0.20),
         weak=0.5,
         short=(0.50, 0.62),
+        halts=0.38,
         opens=(300, 450),
         apart=0.30,
     ),
     # To the robot's right the floor is free beside the desk. A hand 11 cm above the handle closes over it; others grasp
     # the hammer and open on the way to the crate.
     "double_desk": Handling(
-        blind=(180, 180), clumsy=(0.0, 0.0, 1.0), off=(0.11, 0.13), weak=0.5, short=(0.42, 0.55), opens=(400, 600)
+        blind=(180, 180),
+        clumsy=(0.0, 0.0, 1.0),
+        off=(0.11, 0.13),
+        weak=0.5,
+        short=(0.42, 0.55),
+        opens=(400, 600),
     ),
 }
 """Task name → what its saboteurs do."""

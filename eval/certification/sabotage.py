@@ -318,12 +318,14 @@ class ReluctantExpert(MisledExpert):
         """See `MisledExpert.overrule`."""
         if self.env.spec.name == "sit_sofa":
             return _upright(command)
-        view, (halt, course) = self.sight.view, HALTS
+        view, (halt, course) = self.sight.view, (self.handling.halts, HALTS[1]) if self.handling else HALTS
         before = view.bearing <= view.spec.bearing
         self.halted |= (view.distance < halt) & before
         slower = torch.where(before, ((view.distance - halt) / course).clamp(SLOWEST, 1.0), 1.0)
         still = MotionCommand.neutral(len(self.halted), self.halted.device)
         command = dataclasses.replace(command, velocity=command.velocity * slower[:, None])
+        if self.handling:  # hands that are raised already would touch it on their way down
+            command = dataclasses.replace(command, reach=still.reach, arms=still.arms, hand_point=still.hand_point)
         return MotionCommand.unpack(torch.where(self.halted[:, None], still.pack(), command.pack()))
 
 
@@ -531,7 +533,7 @@ SABOTAGES |= {
     "reluctant": Sabotage(
         FailureStage.POSTURE,
         Body("reluctant", "expert that stands before the object", _expert(ReluctantExpert)),
-        tuple(task for task in INTERACTIONS if task not in ("football", "sit_sofa")),
+        tuple(task for task in INTERACTIONS if task in ("boxing", "vis_navi", "double_desk")),
     )
 }
 """Scripted failures by name."""

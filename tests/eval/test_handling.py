@@ -176,6 +176,23 @@ def test_a_carried_object_has_moved_from_where_hands_left_it(envs):
     assert moved(0.0, (0.0, 0.5, 0.0)) == pytest.approx(0.5, abs=0.03)
 
 
+def test_a_reluctant_robot_stands_before_a_door(envs):
+    """From the distance of the table on it stands still, and its arms hang all the time."""
+    env = envs("open_door")
+    acting(env)
+    policy = SABOTAGES["reluctant"].body.equip(Factories()).policy("expert")
+    policy.attach(env)
+    policy.reset([1, 2], ["open_door"] * WORLDS)
+    command, still = MotionCommand.neutral(WORLDS), MotionCommand.neutral(WORLDS)
+    walking = dataclasses.replace(command, velocity=torch.ones(WORLDS, 3), reach=torch.ones(WORLDS, 2))
+    policy.sight.view.spec = dataclasses.replace(policy.sight.view.spec, bearing=9.0)
+    far = policy.overrule(walking)
+    assert torch.equal(far.reach, still.reach) and far.velocity.any() and not policy.halted.any()
+    policy.handling = dataclasses.replace(policy.handling, halts=9.0)
+    near = policy.overrule(walking)
+    assert policy.halted.all() and not near.velocity.any() and not near.reach.any()
+
+
 def test_legs_are_weakened_as_the_task_says():
     """Each task of the table has its part; the others keep the common one."""
     built = {}
