@@ -3,10 +3,12 @@
 import json
 
 import pytest
+import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
 from arena_newton.eval.options import BenchOptions
+from arena_newton.policies.train.resnet_weights import find_resnet
 
 
 def figures_of(options):
@@ -84,3 +86,16 @@ def test_training_speeds_are_read():
     assert bench_peers.training_speeds(text) == (71.5, 31.0)
     with pytest.raises(ArenaError, match="no two speeds"):
         bench_peers.training_speeds("alone: 71.5 steps/s\n")
+
+
+def test_training_needs_no_download(tmp_path):
+    """The paper's recipe takes vision weights that are made on the spot."""
+    path = bench_peers.new_vision_weights(tmp_path)
+    assert find_resnet("resnet18", path) == path
+    assert torch.load(path, weights_only=True)["conv1.weight"].shape == (64, 3, 7, 7)
+
+
+def test_vision_weights_that_cannot_be_made(tmp_path):
+    """A folder that is not there is one error."""
+    with pytest.raises(ArenaError, match="vision encoder's weights"):
+        bench_peers.new_vision_weights(tmp_path / "missing")
