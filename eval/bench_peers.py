@@ -125,6 +125,6 @@ def _act_training(options: BenchOptions) -> Iterator[BenchFigure]:
     if done.returncode:
         raise ArenaError(f"policies.train bench ended with code {done.returncode}: {done.stderr[-200:]}")
     ours, peer = training_speeds(done.stdout)
-    note = f"{ours:.1f} / {peer:.1f} steps/s, paper's recipe, vision weights that nobody trained; {versions('act_training')}"
+    note = f"{ours:.1f} / {peer:.1f} steps/s, paper's recipe, new vision weights; {versions('act_training')}"
     figure = BenchFigure(name, bar, "x", False, ours / peer, note)
     yield add_to_history(options, "act_training", figure, (ours, peer, ours / peer), "steps/s", device_name())

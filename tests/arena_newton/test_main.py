@@ -20,6 +20,7 @@ def test_every_program_of_the_package_has_a_command():
         "arena_newton/__main__.py",
         "arena_newton/probe.py",
         "arena_newton/data/film_process.py",
+        "eval/mjlab_training.py",
         "policies/train/decoder_process.py",
         "policies/train/measured_training.py",
         "trackers/__main__.py",
