@@ -16,7 +16,7 @@ from arena_newton.eval.placement_options import AdversaryOptions
 from arena_newton.eval.plan import Episode
 from arena_newton.eval.progress import Progress
 from arena_newton.eval.run import Factories
-from arena_newton.eval.worst_placement import Point, score_of, search
+from arena_newton.eval.worst_placement import Point, score_of, search, worst_of
 from arena_newton.interfaces import EpisodeResult
 from arena_newton.intervals import wilson
 from arena_newton.robot import TICK
@@ -48,9 +48,8 @@ def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
             points, scores = search(
                 axes, study.scores, batches=options.batches, size=options.batch, seed=options.search_seed
             )
-            judged = [(score, k) for k, score in enumerate(scores) if not math.isnan(score)]
-            worst = points[min(judged)[1]] if judged else None
-            fresh = study.play([worst], confirming.episodes) if worst is not None else []
+            number = worst_of(axes, points, scores)
+            fresh = study.play([points[number]], confirming.episodes) if number is not None else []
         finally:
             study.close()
     searched = tallies(study.results)[: len(points)]
@@ -58,7 +57,7 @@ def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
     found = _Found(
         axes,
         mean=(sum(one.successes for one in first), sum(one.judged for one in first)),
-        worst=None if worst is None else searched[min(judged)[1]],
+        worst=None if number is None else searched[number],
         confirmed=tallies(fresh)[0] if fresh else None,
         episodes=len(study.results),
     )
@@ -127,7 +126,7 @@ class _Found:
     mean: tuple[int, int]
     """Successes and judged episodes of the first batch, which is drawn from the whole range."""
     worst: PointTally | None
-    """The placement with the lowest score; None where all ended with errors."""
+    """The placement around which most failed; None where all ended with errors."""
     confirmed: PointTally | None
     """The same placement with new seeds."""
     episodes: int

@@ -14,7 +14,7 @@ import warp as wp
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench_figure import BenchFigure
-from arena_newton.eval.bench_tick import RATES, tick_times
+from arena_newton.eval.bench_tick import RATES, network_seconds, tick_times
 from arena_newton.eval.options import BenchOptions
 from arena_newton.eval.peer_camera import camera_figures
 from arena_newton.eval.peer_lerobot_eval import lerobot_eval_figures
@@ -52,11 +52,13 @@ def peer_items(options: BenchOptions) -> list[tuple[str, Iterator[BenchFigure]]]
 
 
 def _tick(options: BenchOptions) -> Iterator[BenchFigure]:
+    network = 1e3 * network_seconds(options.checkpoint, options.rounds)
     for rate in RATES:
         pairs = tick_times(1, "mujoco", RATES[rate], options.rounds, options.checkpoint)
         ratio = statistics.median(full / alone for full, alone in pairs)
         ours, peer = (1e3 * statistics.median(column) for column in zip(*pairs, strict=True))
-        note = f"{ours:.3f} ms / {peer:.3f} ms, median of {len(pairs)} ratios; {versions('tick')}"
+        floor = f"the tracker's network alone {network:.3f} ms, so no tick can have less than {1 + network / peer:.2f} x"
+        note = f"{ours:.3f} ms / {peer:.3f} ms, median of {len(pairs)} ratios; {floor}; {versions('tick')}"
         name = f"tick with tracker / bare mj_step, one world, CPU, {rate}"
         figure = BenchFigure(name, TICK_BAR, "x", True, ratio, note)
         yield add_to_history(options, "tick", figure, (ours, peer, ratio), "ms", processor_name())

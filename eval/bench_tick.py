@@ -1,8 +1,9 @@
-"""Seconds of a tick with tracker and of its bare physics, taken in turn on the same worlds."""
+"""Seconds of a tick with tracker, of its bare physics, and of the tracker's network alone."""
 
 from __future__ import annotations
 
 import contextlib
+import statistics
 import time
 from collections.abc import Callable, Iterator
 
@@ -15,8 +16,10 @@ from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.interfaces import Physics
 from arena_newton.robot import PhysicsRate
+from arena_newton.trackers.front_end import NetworkTracker
+from arena_newton.trackers.inference.blocks import BlockRunner
 
-__all__ = ["RATES", "tick_times"]
+__all__ = ["RATES", "network_seconds", "tick_times"]
 
 RATES = {"1 ms x 20": PhysicsRate(dt=0.001, substeps=20), "5 ms x 4": PhysicsRate(dt=0.005, substeps=4)}
 """The two rates of the physics at which ticks are measured, whatever rate the weights were trained at."""
@@ -85,3 +88,28 @@ def tick_times(
         if len(ended):  # as in an evaluation, a world that ended starts its next episode
             env.reset([int(w) for w in ended], ended)
     return pairs
+
+
+def network_seconds(checkpoint: str | None = None, rounds: int = 20, count: int = 100) -> float:
+    """Median time of TWIST2's network for one world on the CPU, as it runs in a tick, without its observation [s].
+
+    No tick takes less than this and its physics.
+
+    Args:
+        checkpoint: Weights of TWIST2; those of the package when None.
+        rounds: Rounds, of which the median is taken.
+        count: Runs of a round.
+    """
+    tracker = trackers.get("twist2", checkpoint)
+    assert isinstance(tracker, NetworkTracker)
+    runner = BlockRunner(tracker.network, tracker.front_end.obs_width, 1)
+    runner.input.normal_(generator=torch.Generator().manual_seed(0))
+    for _ in range(count):  # the first run compiles
+        runner.run()
+    measured = []
+    for _ in range(rounds):
+        began = time.perf_counter()
+        for _ in range(count):
+            runner.run()
+        measured.append((time.perf_counter() - began) / count)
+    return statistics.median(measured)

@@ -433,6 +433,8 @@ def _check_chunks(options: RunOptions) -> None:
         raise InputError(f"--latency-ticks {late}: expected at least 0")
     if replan is not None and 0 < replan <= late:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
+    if options.ensemble and replan is None and late:
+        raise InputError(f"--latency-ticks {late}: --ensemble looks every tick; name more ticks than {late} by --replan")
 
 
 def _check_viewer(options: RunOptions) -> None:

@@ -253,8 +253,8 @@ def _check_chunk(where: str, cell: SuiteCell, executed: int | None, predicted: i
     """Refuse more actions than a checkpoint predicts, and a latency that leaves nothing of what is executed."""
     if cell.replan is not None and predicted is not None and cell.replan > predicted:
         raise InputError(f"{where}: replan is {cell.replan}, the checkpoint predicts {predicted} actions")
-    length = cell.replan or executed
-    if length is not None and not cell.ensemble and cell.latency >= length:
+    length = cell.replan or (1 if cell.ensemble else executed)
+    if length is not None and cell.latency >= length:
         raise InputError(
             f"{where}: latency is {cell.latency} ticks, {length} actions of each chunk are executed; expected fewer"
         )

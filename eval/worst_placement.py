@@ -12,11 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from arena_newton.eval.placement_axes import Axis
 from arena_newton.interfaces import EpisodeResult
 
-__all__ = ["ELITE", "EXPLORING", "CrossEntropy", "score_of", "search"]
+__all__ = ["ELITE", "EXPLORING", "CrossEntropy", "score_of", "search", "worst_of"]
 
 ELITE = 0.2
 """The distributions move to as many of the worst placements so far as this part of a batch."""
@@ -24,6 +25,10 @@ EXPLORING = 0.25
 """Part of a batch that is drawn from the whole range."""
 SMOOTHING = 0.7
 """How far the distributions move to the elite's mean and spread."""
+NEIGHBOURS = 10
+"""Most placements, itself among them, whose outcomes a placement is named the worst by."""
+PER_NEIGHBOUR = 50
+"""Placements that were played for each of them: of fewer than 100 one stands for itself."""
 LEAST_SPREAD = 0.03
 """Smallest standard deviation, as a part of the range: a search that has settled still looks around."""
 
@@ -132,3 +137,21 @@ def search(
             batch = found.draw(size)
             points = points + batch
     return points, scores
+
+
+def worst_of(axes: Sequence[Axis], points: Sequence[Point], scores: Sequence[float]) -> int | None:
+    """Number of the worst placement; None where none has a score.
+
+    The lowest of thousands of scores is the outlier of a policy whose outcomes are partly chance, not its worst
+    placement. So a placement counts by those that were played nearest to it, itself among them, distances in parts of
+    the ranges: by the share of failures, then by the mean score, then by its own.
+    """
+    judged = [k for k, score in enumerate(scores) if not math.isnan(score)]
+    if not judged:
+        return None
+    unit = np.array([[axis.part(value) for axis, value in zip(axes, points[k], strict=True)] for k in judged])
+    own = np.array([scores[k] for k in judged])
+    near = min(NEIGHBOURS, max(1, len(judged) // PER_NEIGHBOUR))
+    around = cKDTree(unit).query(unit, [*range(1, near + 1)])[1]
+    share, mean = (own[around] <= 0.0).mean(axis=1), own[around].mean(axis=1)
+    return judged[int(np.lexsort((own, mean, -share))[0])]

@@ -16,6 +16,7 @@ from lerobot.processor import AbsoluteActionsProcessorStep
 from safetensors.torch import load_model
 
 from arena_newton.errors import InputError
+from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE
 from arena_newton.policies.lerobot.checkpoint_reader import WEIGHTS, PolicyCheckpoint, lerobot_silent
 from arena_newton.policies.lerobot.network_noise import Draw, generators, normal
 
@@ -120,8 +121,9 @@ def _loaded(checkpoint: PolicyCheckpoint) -> PreTrainedPolicy:
                 policy = build(checkpoint.config)
             else:
                 policy = get_policy_class(checkpoint.type)(checkpoint.config)
-    except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{checkpoint.folder}: its network cannot be built: {_first(error)}") from None
+    except Exception as error:  # what a configuration asks for fails anywhere in LeRobot, torch and transformers
+        where = checkpoint.folder / CONFIG_FILE
+        raise InputError(f"{where}: its network cannot be built: {_first(error)}") from None
     try:
         # Not LeRobot's own loading, which goes on with random weights where names are missing.
         load_model(policy, str(path), strict=True, device="cpu")

@@ -72,6 +72,8 @@ STEPS = frozenset(
     }
 )
 """Processor steps that a checkpoint may name; all are LeRobot's own and run no code of the checkpoint."""
+DEVICE_STEP = "device_processor"
+"""Step that every processor of LeRobot's policies has."""
 NATIVE = (640, 480)
 """Width and height of the head camera's picture in the original [px]."""
 
@@ -193,12 +195,19 @@ def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tupl
             config = draccus.parse(chosen, str(copy), args=[])
             config.validate_features()
         except (Exception, SystemExit) as error:  # draccus has errors of many kinds
-            raise InputError(f"{path}: {' '.join(str(error).split())[:300]}") from None
+            raise InputError(f"{path}: {_reason(error)}") from None
     for name, most in (("n_obs_steps", 16), ("n_action_steps", 4096), ("chunk_size", 4096)):
         value = getattr(config, name, 1)
         if not isinstance(value, int) or not 1 <= value <= most:
             raise InputError(f"{path}: {name} is {value!r:.40}, expected 1 to {most}")
     return config, tuple(sorted(set(content) - known))
+
+
+def _reason(error: BaseException) -> str:
+    """What an error says, and the one behind it, which draccus leaves out."""
+    said = " ".join(str(error).split())[:300]
+    behind = " ".join(str(error.__cause__ or error.__context__ or "").split())[:200]
+    return said if not behind or behind in said else f"{said} ({behind})"
 
 
 def _processors(folder: Path) -> dict[str, str]:
@@ -230,6 +239,8 @@ def _processors(folder: Path) -> dict[str, str]:
             if not isinstance(names, dict) or not all(isinstance(value, str) for value in names.values()):
                 raise InputError(f"{where}.config.rename_map is not an object of names")
             renamed |= names
+        if DEVICE_STEP not in (step["registry_name"] for step in steps):
+            raise InputError(f"{path}: steps hold no {DEVICE_STEP}, by which its numbers come to the network's device")
     return renamed
 
 

@@ -11,7 +11,7 @@ from eval_fakes import FakeEnv, factories
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.placement_axes import Axis
-from arena_newton.eval.worst_placement import score_of, search
+from arena_newton.eval.worst_placement import score_of, search, worst_of
 from arena_newton.interfaces import EpisodeResult, Verdict
 from arena_newton.kernels import tick as codes
 
@@ -92,6 +92,26 @@ def test_placements_without_a_score_are_left_out():
     """A batch of errors moves nothing, and the search goes on."""
     points, scores = search(AXES, lambda points: [math.nan] * len(points), batches=3, size=10, seed=1)
     assert len(points) == 30 and all(math.isnan(score) for score in scores)
+
+
+def test_one_unlucky_placement_is_not_the_worst():
+    """Of 1,000 the corner where all fail is named, not the one failure among successes, however far it failed."""
+    rng = np.random.default_rng(0)
+    points = [(float(x), float(y), 1.0) for x, y in rng.uniform(-1.2, 1.2, (1000, 2))]
+    scores = [-0.5 - x if x > 0.8 and y > 0.8 else 0.5 for x, y, _ in points]
+    unlucky = min(range(1000), key=lambda k: math.hypot(points[k][0] + 0.5, points[k][1]))
+    scores[unlucky] = -9.0
+    x, y, _ = points[worst_of(AXES, points, scores)]
+    assert x > 0.8 and y > 0.8
+    few = [unlucky, *(k for k in range(90) if k != unlucky)]
+    assert worst_of(AXES, [points[k] for k in few], [scores[k] for k in few]) == 0
+
+
+def test_the_worst_of_errors_is_none():
+    """Placements that ended with errors are nobody's neighbours."""
+    points = [(0.1 * k, 0.0, 1.0) for k in range(-5, 6)]
+    assert worst_of(AXES, points, [math.nan] * 11) is None
+    assert worst_of(AXES, points, [math.nan, 0.2, 0.1, *[math.nan] * 8]) == 2
 
 
 def test_the_command_finds_the_hole(tmp_path, capsys):

@@ -7,6 +7,7 @@ import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
+from arena_newton.eval.bench_tick import network_seconds
 from arena_newton.eval.options import BenchOptions
 from arena_newton.policies.train.resnet_weights import find_resnet
 
@@ -20,15 +21,22 @@ def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
     """The ratio is formed within each round; every measured pair leaves one line with what it was measured on."""
     rounds = [(0.003, 0.002), (0.008, 0.004), (0.009, 0.003)]
     monkeypatch.setattr(bench_peers, "tick_times", lambda *given: rounds)
+    monkeypatch.setattr(bench_peers, "network_seconds", lambda *given: 0.0006)
     history = tmp_path / "history.jsonl"
     figures = figures_of(BenchOptions(peers=("tick",), peers_history=str(history)))
     assert [figure.value for figure in figures] == [2.0, 2.0]
     assert [figure.verdict for figure in figures] == ["MISS", "MISS"]
+    assert all("0.600 ms, so no tick can have less than 1.20 x" in figure.note for figure in figures)
     lines = [json.loads(line) for line in history.read_text().splitlines()]
     assert len(lines) == 2
     assert lines[0]["ours"] == pytest.approx(8.0) and lines[0]["peer"] == pytest.approx(3.0)
     assert lines[0]["ratio"] == 2.0  # not 8 / 3, the ratio of the medians
     assert lines[0]["bar"] == 1.5 and lines[0]["device"] and lines[0]["versions"]["mujoco"]
+
+
+def test_the_network_alone_is_timed():
+    """One row of TWIST2's network takes more than a microsecond and less than a whole tick of 20 ms."""
+    assert 1e-6 < network_seconds(rounds=3, count=5) < 0.02
 
 
 def test_on_the_cpu_world_ticks_are_information(monkeypatch):
