@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 
 from arena_newton.errors import InputError
 
@@ -22,8 +23,20 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 """Extra → modules by which it is known to be installed."""
 
 
+_LEROBOT = frozenset({"data", "policies", "train"})
+"""Extras that LeRobot belongs to."""
+
+
+def _no_torchcodec(record: logging.LogRecord) -> bool:
+    """Whether a warning of LeRobot's imports is kept: all but pages of tracebacks on a machine without FFmpeg.
+
+    Videos are read and written by PyAV here, which brings its own.
+    """
+    return not record.getMessage().startswith("Could not load libtorchcodec")
+
+
 def require(extra: str, purpose: str, modules: tuple[str, ...] = ()) -> None:
-    """Check that an extra is installed; nothing is imported.
+    """Check that an extra is installed; nothing is imported. LeRobot's complaint of a missing torchcodec is silenced.
 
     Args:
         extra: Its name, a key of `EXTRAS`.
@@ -39,3 +52,5 @@ def require(extra: str, purpose: str, modules: tuple[str, ...] = ()) -> None:
                 f"{purpose}: needs the extra [{extra}] ({module} is not installed): "
                 f"uv sync --extra {extra}, or pip install 'arena-newton[{extra}]'"
             )
+    if extra in _LEROBOT:
+        logging.getLogger("lerobot.utils.import_utils").addFilter(_no_torchcodec)

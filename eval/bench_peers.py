@@ -57,7 +57,8 @@ def _tick(options: BenchOptions) -> Iterator[BenchFigure]:
         pairs = tick_times(1, "mujoco", RATES[rate], options.rounds, options.checkpoint)
         ratio = statistics.median(full / alone for full, alone in pairs)
         ours, peer = (1e3 * statistics.median(column) for column in zip(*pairs, strict=True))
-        floor = f"the tracker's network alone {network:.3f} ms, so no tick can have less than {1 + network / peer:.2f} x"
+        least = 1 + network / peer
+        floor = f"the tracker's network alone {network:.3f} ms, so no tick can have less than {least:.2f} x"
         note = f"{ours:.3f} ms / {peer:.3f} ms, median of {len(pairs)} ratios; {floor}; {versions('tick')}"
         name = f"tick with tracker / bare mj_step, one world, CPU, {rate}"
         figure = BenchFigure(name, TICK_BAR, "x", True, ratio, note)

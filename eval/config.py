@@ -434,7 +434,9 @@ def _check_chunks(options: RunOptions) -> None:
     if replan is not None and 0 < replan <= late:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
     if options.ensemble and replan is None and late:
-        raise InputError(f"--latency-ticks {late}: --ensemble looks every tick; name more ticks than {late} by --replan")
+        raise InputError(
+            f"--latency-ticks {late}: --ensemble looks every tick; name more than {late} ticks by --replan"
+        )
 
 
 def _check_viewer(options: RunOptions) -> None:

@@ -43,7 +43,8 @@ def _train(arguments: list[str]) -> None:
     _require(options.policy)
     from arena_newton.policies.train.training import train
 
-    train(options)
+    flags = (one.partition("=")[0] for one in arguments if one.startswith("--"))
+    train(options, named={flag[2:].replace("-", "_").removeprefix("no_") for flag in flags})
 
 
 def _bench(arguments: list[str]) -> None:

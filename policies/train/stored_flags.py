@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from arena_newton.errors import InputError
@@ -18,8 +18,16 @@ FREE_ON_RESUME = frozenset(
 """Flags that may differ when a training goes on; datasets must have the content that they had."""
 
 
-def resumed(options: PolicyTrainOptions, content: Mapping[str, object], where: Path) -> PolicyTrainOptions:
+def resumed(
+    options: PolicyTrainOptions, content: Mapping[str, object], where: Path, named: Collection[str] = ()
+) -> PolicyTrainOptions:
     """Flags of a training that goes on.
+
+    Args:
+        options: Flags that were given with `--resume`.
+        content: Stored flags.
+        where: Checkpoint that they are of.
+        named: Fields that were given though they have their default's value.
 
     Raises:
         InputError: A flag contradicts the training, or its stored flags are damaged.
@@ -30,7 +38,7 @@ def resumed(options: PolicyTrainOptions, content: Mapping[str, object], where: P
     changes: dict[str, object] = {"resume": options.resume, "out": options.resume, "compile": options.compile}
     for one in dataclasses.fields(PolicyTrainOptions):
         given = getattr(options, one.name)
-        if one.name in changes or given == getattr(empty, one.name):
+        if one.name in changes or (given == getattr(empty, one.name) and one.name not in named):
             continue
         if one.name not in FREE_ON_RESUME and given != getattr(stored, one.name):
             flag = "--" + one.name.replace("_", "-")

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -40,12 +40,13 @@ TOKEN_ROWS = 4096
 """Rows whose prompts are made at once."""
 
 
-def train(options: PolicyTrainOptions) -> Path:
+def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
     """Train to the end of the steps or of the time.
 
     Args:
         options: Flags. With `resume` those of the interrupted training hold; of those that may differ, what is not
             at its default is taken.
+        named: With `resume`, fields that count though they are at their default.
 
     Returns:
         Folder of the last checkpoint, which `--policy lerobot:` and LeRobot load.
@@ -62,7 +63,7 @@ def train(options: PolicyTrainOptions) -> Path:
         checkpoint = last_checkpoint(options.resume)
         progress = TrainingProgress.read(checkpoint)
         quiet, before = options.quiet, progress.options.get("minutes")
-        options = resumed(options, progress.options, checkpoint)
+        options = resumed(options, progress.options, checkpoint, named)
         check_numbers(options)
         if options.minutes and options.minutes != before:  # another time: the number of steps is fixed again
             progress = dataclasses.replace(progress, steps=0)

@@ -1,6 +1,7 @@
 """The package imports the same from a checkout and from a wheel, and shadows nobody."""
 
 import ast
+import logging
 import subprocess
 import sys
 import tomllib
@@ -9,6 +10,8 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+
+from arena_newton.extras import require
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = ("kernels", "trackers", "policies", "eval", "usd_scenes")
@@ -112,3 +115,12 @@ def test_the_package_says_what_it_is():
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"version: {project['version']}" in citation and "2606.17833" in citation
     assert project["scripts"] == {"arena-newton": "arena_newton.__main__:main"}
+
+
+def test_a_missing_torchcodec_is_no_page_of_tracebacks(caplog):
+    """LeRobot's warning of it is silenced by what needs LeRobot; its other warnings are not."""
+    require("data", "a test")
+    logger = logging.getLogger("lerobot.utils.import_utils")
+    logger.warning("Could not load libtorchcodec. Likely causes:\n" + 40 * "line\n")
+    logger.warning("another matter")
+    assert [record.getMessage() for record in caplog.records] == ["another matter"]

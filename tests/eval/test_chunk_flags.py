@@ -37,6 +37,7 @@ def run(out, *flags, **parts):
         (["--replan", "5"], "--replan: belongs to --policy lerobot:<checkpoint>, not expert"),
         (["--ensemble"], "--ensemble: belongs to --policy lerobot:<checkpoint>, not expert"),
         (["--replan", "5", "--latency-ticks", "5"], "--latency-ticks 5: expected fewer ticks than --replan 5"),
+        (["--ensemble", "--latency-ticks", "2"], "--latency-ticks 2: --ensemble looks every tick"),
         (["--replan", "5", "--policy", "remote:http://h:1"], "--replan: belongs to --policy lerobot:"),
     ],
 )

@@ -200,6 +200,7 @@ def test_one_entry_names_a_checkpoint_per_task_and_tracker(checkpoints):
         (lambda s: s.replace("{task}_", "boxing_"), r"trained on boxing, cell act.twist2/twist2/vis_navi/base plays"),
         (lambda s: s + "latency = 20", "cell both.*latency20: latency is 20 ticks, 20 actions of each chunk"),
         (lambda s: s + "replan = 41", "replan is 41, the checkpoint predicts 40 actions"),
+        (lambda s: s + "ensemble = true\nlatency = 5", "latency is 5 ticks, 1 actions of each chunk are executed"),
         (lambda s: s + "replan = 5\nlatency = 5", "latency is 5 ticks, 5 actions of each chunk are executed"),
         (
             lambda s: s[: s.rindex("trained_on")] + 'trained_on = "sonic"',

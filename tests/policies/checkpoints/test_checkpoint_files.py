@@ -113,6 +113,13 @@ def step(path, **changes):
     path.write_text(json.dumps(content))
 
 
+def without_device(path):
+    """Take the step out that brings numbers to the network's device."""
+    content = json.loads(path.read_text())
+    content["steps"] = [one for one in content["steps"] if one["registry_name"] != "device_processor"]
+    path.write_text(json.dumps(content))
+
+
 WRONG = {
     "no network of LeRobot": (
         lambda f: edit(f / "config.json", type="magic"),
@@ -141,6 +148,15 @@ WRONG = {
     "a path": (
         lambda f: step(f / "policy_preprocessor.json", state_file="../x.safetensors"),
         "state_file is '../x",
+    ),
+    "no device": (lambda f: without_device(f / "policy_preprocessor.json"), "steps hold no device_processor"),
+    "a network that LeRobot does not build": (
+        lambda f: edit(f / "config.json", dim_feedforward=-4),
+        "config.json: its network cannot be built: ",
+    ),
+    "a hidden reason": (
+        lambda f: edit(f / "config.json", n_action_steps=500),
+        "config.json: .*Got 500 for `n_action_steps`",
     ),
     "no processor": (lambda f: (f / "policy_preprocessor.json").unlink(), "holds no policy_preprocessor.json"),
     "no weights": (lambda f: (f / "model.safetensors").rename(f / "pytorch_model.bin"), "holds no model.safetensors"),

@@ -508,6 +508,7 @@ def test_a_folder_is_not_overwritten_nor_mixed(dataset, whole, tmp_path, capsys)
     for flags, words in (
         (given, f"--out {whole}: holds a training already; --resume {whole} goes on with it"),
         (["--resume", str(whole), "--seed", "3"], f"--seed 3: the training in {whole} has None"),
+        (["--resume", str(whole), "--recipe", "fast"], f"--recipe fast: the training in {whole} has small"),
         (["--resume", str(whole), "--policy", "flow"], f"--policy flow: the training in {whole} has act"),
         (["--resume", str(tmp_path)], f"--resume {tmp_path}: holds no checkpoint of a training"),
     ):
