@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -87,17 +88,23 @@ class LearnedPolicy(Policy):
         actions = filler.to(state.device).repeat(worlds, self.chunk_size, 1)
         vector = self._task_vector(observation.task, device)
         size = CPU_ROWS if device.type == "cpu" else CUDA_ROWS
-        for first in range(0, len(serving), size):
-            some = serving[first : first + size]
+
+        @torch.inference_mode()
+        def look(some: list[int]) -> torch.Tensor:
+            """Chunks of some worlds, filled up to the size of a forward pass."""
             filled = [*some, *([some[0]] * (size - len(some)))]
-            with torch.inference_mode(), _one_thread(device):
-                seen = pictures[filled].to(device).permute(0, 3, 1, 2).float() / 255.0
-                given = state[filled].to(device, torch.float32)
-                tasks = None if vector is None else self._normalised(TASK_VECTOR, vector.expand(size, -1))
-                chunk = network(self._normalised(FRONT, seen), self._normalised(STATE, given), tasks)
-                spread = self._spreads.get("action")
-                chunk = chunk if spread is None else spread.restored(chunk)
-            actions[some] = chunk[: len(some), : self.chunk_size].to(state.device)
+            seen = pictures[filled].to(device).permute(0, 3, 1, 2).float() / 255.0
+            given = state[filled].to(device, torch.float32)
+            tasks = None if vector is None else self._normalised(TASK_VECTOR, vector.expand(size, -1))
+            chunk = network(self._normalised(FRONT, seen), self._normalised(STATE, given), tasks)
+            spread = self._spreads.get("action")
+            chunk = chunk if spread is None else spread.restored(chunk)
+            return chunk[: len(some), : self.chunk_size]
+
+        parts = [serving[first : first + size] for first in range(0, len(serving), size)]
+        with _looking(device, len(parts)) as each:
+            for some, chunk in zip(parts, each(look, parts), strict=True):
+                actions[some] = chunk.to(state.device)
         usable = torch.isfinite(actions[serving]).all(dim=2).all(dim=1).tolist()
         errors |= {w: "the network's answer is not finite" for w, ok in zip(serving, usable, strict=True) if not ok}
         return Chunk(actions, errors)
@@ -134,6 +141,10 @@ class LearnedPolicy(Policy):
             self._network, self._at = self.checkpoint.network(), None
         if self._at != device:
             self._network = self._network.to(device)
+            if device.type == "cpu":
+                self._network.on_host(self.checkpoint.facts.height, self.checkpoint.facts.width)
+            else:
+                self._network.on_device()
             self._spreads = {name: one.to(device) for name, one in self.checkpoint.spreads.items()}
             self._at = device
         return self._network
@@ -158,22 +169,29 @@ class LearnedPolicy(Policy):
         return torch.tensor([float(name == task) for name in known], device=device) if known else None
 
 
-@contextlib.contextmanager
-def _one_thread(device: torch.device) -> Iterator[None]:
-    """Computes on one core of the CPU.
+Looks = Callable[[Callable[[list[int]], torch.Tensor], list[list[int]]], Iterable[torch.Tensor]]
 
-    A look is too small for two: where the machine is busy they lose more by waiting for each other. And an answer then
-    has the same bits on machines with another number of cores.
+
+@contextlib.contextmanager
+def _looking(device: torch.device, count: int) -> Iterator[Looks]:
+    """How looks are computed: on the CPU each on one core, as many at once as torch may have threads.
+
+    A look is too small for two cores: where the machine is busy they lose more by waiting for each other. And an
+    answer then has the same bits on machines with another number of cores.
     """
-    before = torch.get_num_threads()
-    alone = device.type == "cpu" and before != 1
+    threads = torch.get_num_threads()
+    if device.type == "cpu" and min(threads, count) > 1:
+        with ThreadPoolExecutor(min(threads, count), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield pool.map
+        return
+    alone = device.type == "cpu" and threads != 1
     if alone:
         torch.set_num_threads(1)
     try:
-        yield
+        yield map
     finally:
         if alone:
-            torch.set_num_threads(before)
+            torch.set_num_threads(threads)
 
 
 def from_spec(argument: str | None, *, device: str | torch.device | None = None) -> LearnedPolicy:

@@ -24,7 +24,7 @@ import torch
 
 from arena_newton.errors import InputError
 
-__all__ = ["BlockRunner"]
+__all__ = ["BlockRunner", "compiled"]
 
 _BLOCK_SIZES = (1, 2, 4)
 """Block sizes tried, in this order."""
@@ -46,13 +46,19 @@ def session_options() -> onnxruntime.SessionOptions:
     return options
 
 
-def _compiled(network: torch.nn.Module, in_width: int) -> Network:
-    """The network in ONNX Runtime, on one thread.
+def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-4, atol: float = 1e-5) -> Network:
+    """The network in ONNX Runtime, on one thread of the CPU.
+
+    Args:
+        network: Maps a tensor to a tensor, rows first.
+        shape: Of an input; any number of rows may be given later.
+        rtol: Relative difference from what torch computes that is allowed.
+        atol: Absolute one.
 
     Raises:
         InputError: It cannot be exported, or ONNX Runtime computes something else.
     """
-    probe = torch.randn(8, in_width, generator=torch.Generator().manual_seed(8))
+    probe = torch.randn(shape, generator=torch.Generator().manual_seed(8))
     file: Any = io.BytesIO()  # the exporter takes buffers, its types do not say so
     try:
         with warnings.catch_warnings(), torch.no_grad():
@@ -70,7 +76,7 @@ def _compiled(network: torch.nn.Module, in_width: int) -> Network:
             def run(rows: torch.Tensor) -> torch.Tensor:
                 return torch.from_numpy(session.run(None, {"obs": rows.numpy()})[0])
 
-            torch.testing.assert_close(run(probe), network(probe), rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(run(probe), network(probe), rtol=rtol, atol=atol)
     except Exception as error:  # exporter and runtime raise classes of their own
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"the network cannot run in ONNX Runtime ({type(error).__name__}: {reason})") from error
@@ -134,7 +140,7 @@ class BlockRunner:
 
     def _compile(self) -> Network:
         if self._product is None:
-            self._product = _compiled(self.network, self._buffer.shape[1])
+            self._product = compiled(self.network, (8, self._buffer.shape[1]))
         return self._product
 
     @torch.inference_mode()
