@@ -25,10 +25,12 @@ EXPLORING = 0.25
 """Part of a batch that is drawn from the whole range."""
 SMOOTHING = 0.7
 """How far the distributions move to the elite's mean and spread."""
+LEAST_FAILURE = 1e-9
+"""How far below 0 the score of a failure is whose margin says success, as of a fall behind the goal."""
 NEIGHBOURS = 10
 """Most placements, itself among them, whose outcomes a placement is named the worst by."""
 PER_NEIGHBOUR = 50
-"""Placements that were played for each of them: of fewer than 100 one stands for itself."""
+"""Different placements that were played for each of them: of fewer than 100 one stands for itself."""
 LEAST_SPREAD = 0.03
 """Smallest standard deviation, as a part of the range: a search that has settled still looks around."""
 
@@ -38,16 +40,16 @@ Point = tuple[float, ...]
 def score_of(results: Sequence[EpisodeResult], budget: int) -> float:
     """How well the episodes at one placement went; the search looks for the lowest.
 
-    A failure counts its margin [m], at most 0, and success the part of the budget that was left, 0 to 1: an order in
-    which every failure is worse than every success, far failures are worse than near ones, and slow successes than
-    fast ones. NaN where every episode ended with an error.
+    A failure counts its margin [m], a little below 0 at most, and success the part of the budget that was left, 0 to
+    1: an order in which every failure is worse than every success, far failures are worse than near ones, and slow
+    successes than fast ones. NaN where every episode ended with an error.
 
     Args:
         results: Of one placement.
         budget: Step budget [ticks].
     """
     told = [
-        1.0 - result.steps / budget if result.outcome == "success" else min(result.margin, 0.0)
+        1.0 - result.steps / budget if result.outcome == "success" else min(result.margin, -LEAST_FAILURE)
         for result in results
         if result.outcome != "error" and (result.outcome == "success" or math.isfinite(result.margin))
     ]
@@ -144,14 +146,29 @@ def worst_of(axes: Sequence[Axis], points: Sequence[Point], scores: Sequence[flo
 
     The lowest of thousands of scores is the outlier of a policy whose outcomes are partly chance, not its worst
     placement. So a placement counts by those that were played nearest to it, itself among them, distances in parts of
-    the ranges: by the share of failures, then by the mean score, then by its own.
+    the ranges: by the share of failures, then by the mean score, then by its own. What was played at one placement
+    more than once is counted together.
     """
     judged = [k for k, score in enumerate(scores) if not math.isnan(score)]
     if not judged:
         return None
-    unit = np.array([[axis.part(value) for axis, value in zip(axes, points[k], strict=True)] for k in judged])
     own = np.array([scores[k] for k in judged])
-    near = min(NEIGHBOURS, max(1, len(judged) // PER_NEIGHBOUR))
-    around = cKDTree(unit).query(unit, [*range(1, near + 1)])[1]
-    share, mean = (own[around] <= 0.0).mean(axis=1), own[around].mean(axis=1)
-    return judged[int(np.lexsort((own, mean, -share))[0])]
+    places, which, count = np.unique(
+        [_place(axes, points[k]) for k in judged], axis=0, return_inverse=True, return_counts=True
+    )
+    failed, total = (np.bincount(which, weights=one, minlength=len(places)) for one in (own < 0.0, own))
+    near = min(NEIGHBOURS, max(1, len(places) // PER_NEIGHBOUR))
+    around = cKDTree(places).query(places, [*range(1, near + 1)])[1]
+    played = count[around].sum(axis=1)
+    share, mean = failed[around].sum(axis=1) / played, total[around].sum(axis=1) / played
+    return judged[int(np.lexsort((own, mean[which], -share[which]))[0])]
+
+
+def _place(axes: Sequence[Axis], point: Point) -> list[float]:
+    """A placement in parts of the ranges; the ends of a full circle are one place."""
+    found: list[float] = []
+    for axis, value in zip(axes, point, strict=True):
+        part = axis.part(value)
+        angle = 2.0 * math.pi * part
+        found += [math.cos(angle) / (2.0 * math.pi), math.sin(angle) / (2.0 * math.pi)] if axis.turns else [part]
+    return found

@@ -173,8 +173,11 @@ def read_act_checkpoint(folder: Path) -> ActCheckpoint:
     spreads, files = _spreads(folder, sizes)
     weights = folder / WEIGHTS_NAME
     check_size(weights, MOST_WEIGHTS)
-    with weights.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    try:
+        with weights.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    except OSError as error:
+        raise InputError(f"{weights}: cannot be read ({error.strerror})") from None
     names = (WEIGHTS_NAME, CONFIG_FILE, FACTS_FILE, *PROCESSOR_FILES, *files)
     return ActCheckpoint(folder, sizes, executed, facts, spreads, digest, names, config.get("use_vae") is True)
 

@@ -97,6 +97,8 @@ class CheckpointFacts:
             if one.name in content:
                 values[one.name] = _checked(path, one.name, one.default, content[one.name])
         facts = cls(**values)  # type: ignore[arg-type]  # each is of its default's kind
+        if len(set(facts.task_vector)) < len(facts.task_vector):
+            raise InputError(f"{path}: task_vector names a task twice")
         if facts.fit not in ("pad", "native"):
             raise InputError(f"{path}: fit is {facts.fit!r}, expected pad or native")
         if not 0.0 <= facts.realign <= 1.0:

@@ -60,8 +60,26 @@ class PolicyNetwork:
             raise
         except Exception as error:  # LeRobot has errors of many kinds, transformers too
             raise InputError(f"{self.checkpoint.folder}: its processors do not load: {_first(error)}") from None
+        try:
+            self._rehearse()
+        except Exception as error:  # a step computes with what its files say
+            where = f"{self.checkpoint.folder}: its processors or their statistics do not fit its observations"
+            raise InputError(f"{where}: {_first(error)}") from None
         # Only these read the state of a look, whose shape they expect in every action.
         self._per_tick = any(isinstance(one, AbsoluteActionsProcessorStep) and one.enabled for one in self.after.steps)
+
+    def _rehearse(self) -> None:
+        """Pass an empty look and an empty action through the processors."""
+        config = self.checkpoint.config
+        ticks = (self.checkpoint.observations,) if self.checkpoint.observations > 1 else ()
+        seen = {
+            name: torch.zeros(1, *ticks, *feature.shape, device=self.device)
+            for name, feature in (config.input_features or {}).items()
+            if "empty_camera" not in name  # the network fills it itself
+        }
+        with torch.inference_mode():
+            self.before({**seen, "task": [""]})
+            self.after(torch.zeros(1, config.action_feature.shape[0], device=self.device))
 
     def predict(self, seen: Mapping[str, torch.Tensor], instruction: str, draws: Sequence[Draw]) -> torch.Tensor:
         """Actions of a look.

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -72,6 +73,8 @@ STEPS = frozenset(
     }
 )
 """Processor steps that a checkpoint may name; all are LeRobot's own and run no code of the checkpoint."""
+NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
+"""Steps with statistics."""
 DEVICE_STEP = "device_processor"
 """Step that every processor of LeRobot's policies has."""
 NATIVE = (640, 480)
@@ -158,7 +161,7 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     config, ignored = _configuration(folder / CONFIG_FILE, kind, content)
     own = CheckpointFacts.read(folder)
     facts = own or CheckpointFacts(family=FAMILY_TYPES[kind])
-    renamed = _processors(folder)
+    renamed = _processors(folder, config)
     picture = _features(folder, config, facts, own is not None, renamed)
     camera, preparation = None, None
     if picture is not None:
@@ -196,6 +199,10 @@ def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tupl
             config.validate_features()
         except (Exception, SystemExit) as error:  # draccus has errors of many kinds
             raise InputError(f"{path}: {_reason(error)}") from None
+    for one in dataclasses.fields(config):
+        value = getattr(config, one.name)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{path}: {one.name} is {value}, expected a finite number")
     for name, most in (("n_obs_steps", 16), ("n_action_steps", 4096), ("chunk_size", 4096)):
         value = getattr(config, name, 1)
         if not isinstance(value, int) or not 1 <= value <= most:
@@ -210,7 +217,7 @@ def _reason(error: BaseException) -> str:
     return said if not behind or behind in said else f"{said} ({behind})"
 
 
-def _processors(folder: Path) -> dict[str, str]:
+def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
     """Check the processors' files; returns how observations are renamed, from our name to the network's."""
     renamed: dict[str, str] = {}
     for name in PROCESSORS:
@@ -225,12 +232,14 @@ def _processors(folder: Path) -> dict[str, str]:
         for index, step in enumerate(steps):
             where = f"{path}: steps[{index}]"
             registered = step.get("registry_name") if isinstance(step, dict) else None
-            if registered not in STEPS or "class" in step:
+            if not isinstance(registered, str) or registered not in STEPS or "class" in step:
                 raise InputError(f"{where} is {registered!r:.60}, expected one of {', '.join(sorted(STEPS))}")
             options = step.get("config") or {}
             if not isinstance(options, dict) or options.get("trust_remote_code"):
                 raise InputError(f"{where}.config is not an object of plain options")
             state = step.get("state_file")
+            if registered in NORMALISERS:
+                _check_normaliser(where, options, state, config)
             if state is not None:
                 if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):
                     raise InputError(f"{where}.state_file is {state!r:.60}, expected a name of a safetensors file")
@@ -242,6 +251,19 @@ def _processors(folder: Path) -> dict[str, str]:
         if DEVICE_STEP not in (step["registry_name"] for step in steps):
             raise InputError(f"{path}: steps hold no {DEVICE_STEP}, by which its numbers come to the network's device")
     return renamed
+
+
+def _check_normaliser(where: str, options: Mapping[str, object], state: object, config: PreTrainedConfig) -> None:
+    """Refuse a step that would take its numbers for what they are not, or leave them as they are."""
+    eps = options.get("eps", 0.0)
+    if isinstance(eps, bool) or not isinstance(eps, int | float) or not 0.0 <= eps < math.inf:
+        raise InputError(f"{where}.config.eps is {eps!r:.40}, expected a number of at least 0")
+    said = {kind: mode.value for kind, mode in config.normalization_mapping.items()}
+    if options.get("norm_map") != said:
+        given = f"{options.get('norm_map')!r:.120}"
+        raise InputError(f"{where}.config.norm_map is {given}, but {CONFIG_FILE} has normalization_mapping {said}")
+    if state is None and set(said.values()) != {"IDENTITY"}:
+        raise InputError(f"{where} names no state_file, the statistics by which it is to normalise")
 
 
 def _features(

@@ -26,6 +26,9 @@ __all__ = ["make_policy", "open_door", "serve_policy"]
 
 type Say = Callable[[str], None]
 
+USUAL_TASK = "boxing"
+"""Task of the first look, where neither the flags nor the policy ask for another."""
+
 SPARE_CONNECTIONS = 8
 """Connections beyond the sessions: for questions, and for those that come before an old one has ended."""
 
@@ -47,17 +50,19 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
     say = say or (lambda line: print(line, flush=True))
     guard = DoorGuard(options.max_sessions + SPARE_CONNECTIONS)
     tls = _tls(options)
-    tasks.get(options.task)
+    if options.task is not None:
+        tasks.get(options.task)
     device = _device(options.device)
+    policy = make_policy(options, device)
     server = PolicyServer(
-        make_policy(options, device),
+        policy,
         max_batch_size=options.max_batch_size,
         max_wait=options.max_wait,
         max_sessions=options.max_sessions,
         device=device,
     )
     try:
-        server.start(options.task)
+        server.start(_first_task(policy) if options.task is None else options.task)
         door = open_door(server, options, guard, tls)
         try:
             with contextlib.suppress(KeyboardInterrupt):
@@ -71,6 +76,15 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
     for line in server.counts.summary():
         say(line)
     return 0
+
+
+def _first_task(policy: Policy) -> str:
+    """A task that the policy does, Boxing where it may be."""
+    for task in sorted(tasks.names(), key=lambda name: name != USUAL_TASK):
+        with contextlib.suppress(InputError):
+            policy.check_task(task)
+            return task
+    return USUAL_TASK
 
 
 def make_policy(options: ServeOptions, device: torch.device) -> Policy:
@@ -137,7 +151,7 @@ def _tls(options: ServeOptions) -> ssl.SSLContext | None:
         certificate, key = (Path(name).expanduser() for name in (options.tls_cert, options.tls_key))
         context.load_cert_chain(certificate, key, asked)
     except (OSError, ssl.SSLError) as error:
-        reason = getattr(error, "strerror", None) or "not a certificate with its key"
+        reason = "not a certificate with its key" if isinstance(error, ssl.SSLError) else error.strerror
         raise InputError(f"--tls-cert {options.tls_cert}, --tls-key {options.tls_key}: {reason}") from None
     return context
 
@@ -147,19 +161,20 @@ def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, por
     facts = server.facts
     kind = "http" if options.protocol == "arena" else "ws"
     scheme = kind + ("s" if options.tls_cert else "")
+    address = f"[{options.host}]:{port}" if ":" in options.host else f"{options.host}:{port}"
     picture = "no picture"
     if facts.picture is not None:
         picture = f"pictures of {facts.picture.width}x{facts.picture.height} ({facts.picture.fit})"
     lines = [
         f"policy {facts.policy}: chunks of {facts.chunk_length} actions of {facts.labels} at {facts.rate_hz:g} Hz, "
         f"{picture}",
-        f"{options.protocol} at {scheme}://{options.host}:{port}, up to {options.max_sessions} episodes at once on "
+        f"{options.protocol} at {scheme}://{address}, up to {options.max_sessions} episodes at once on "
         f"{server.device}; Ctrl-C ends",
     ]
     asked = f"{options.protocol}+wss" if options.tls_cert else options.protocol
-    lines.append(f"eval asks it by --policy remote:{scheme if kind == 'http' else asked}://{options.host}:{port}")
+    lines.append(f"eval asks it by --policy remote:{scheme if kind == 'http' else asked}://{address}")
     if not guard.wants_token and not _local(options.host):
-        lines.append(f"warning: whoever reaches {options.host}:{port} can ask; set {ACCESS_TOKEN_VARIABLE} to a token")
+        lines.append(f"warning: whoever reaches {address} can ask; set {ACCESS_TOKEN_VARIABLE} to a token")
     return lines
 
 

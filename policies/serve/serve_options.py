@@ -20,7 +20,7 @@ class ServeOptions:
     """What is served, where, and to how many."""
 
     policy: str = ""
-    """Policy: stand, lerobot:<checkpoint>, replay:<file>, another package's, or remote:<url> to pass on."""
+    """Policy: stand, learned, lerobot:<checkpoint>, replay:<file>, another package's, or remote:<url> to pass on."""
     protocol: str = "openpi"
     """What clients speak: openpi roboarena vla-eval arena (the original's HTTP)."""
     host: str = "127.0.0.1"
@@ -35,8 +35,9 @@ class ServeOptions:
     """Most episodes at once: rows of the policy. Eight connections more are taken."""
     device: str | None = None
     """Torch device of the policy: cpu, cuda, cuda:1; the best there is when none is named."""
-    task: str = "boxing"
-    """Task of the look before the first one, by which everything is loaded and compiled."""
+    task: str | None = None
+    """Task of the look before the first one, by which everything is loaded and compiled; one that the policy does when
+    none is named."""
     replan: int | None = None
     """Actions of a chunk that are executed before the next look, of a checkpoint; its own number by default."""
     ensemble: bool = False
@@ -60,6 +61,8 @@ class ServeOptions:
             raise InputError("--policy: name a policy, such as lerobot:<checkpoint> or stand")
         if self.protocol not in PROTOCOLS:
             raise InputError(f"--protocol {self.protocol}: unknown, choose from {', '.join(PROTOCOLS)}")
+        if not self.host:
+            raise InputError("--host: is empty, expected an address of this machine; 0.0.0.0 is all of them")
         if not 0 <= self.port <= 65535:
             raise InputError(f"--port {self.port}: expected 0 to 65535")
         if not 1 <= self.max_sessions <= MOST_SESSIONS:

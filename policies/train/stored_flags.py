@@ -34,11 +34,12 @@ def resumed(
     """
     stored = read_options(content, where)
     empty = PolicyTrainOptions()
+    chosen = set(named) - {"steps", "minutes"}  # 0 of them is what the training has
     # A machine without a compiler goes on with what another one has begun.
     changes: dict[str, object] = {"resume": options.resume, "out": options.resume, "compile": options.compile}
     for one in dataclasses.fields(PolicyTrainOptions):
         given = getattr(options, one.name)
-        if one.name in changes or (given == getattr(empty, one.name) and one.name not in named):
+        if one.name in changes or (given == getattr(empty, one.name) and one.name not in chosen):
             continue
         if one.name not in FREE_ON_RESUME and given != getattr(stored, one.name):
             flag = "--" + one.name.replace("_", "-")

@@ -69,7 +69,8 @@ def test_scores_order_failures_and_successes():
         [result("success", steps=20), result("error", margin=math.nan)],
     ]
     scores = [score_of(one, 100) for one in order]
-    assert scores == sorted(scores) and scores == pytest.approx([-2.0, -0.1, 0.0, 0.1, 0.8])
+    assert scores == sorted(scores) and scores == pytest.approx([-2.0, -0.1, 0.0, 0.1, 0.8], abs=1e-6)
+    assert scores[2] < 0.0 == score_of([result("success", steps=100)], 100)
     assert math.isnan(score_of([result("error", margin=math.nan)], 100))
 
 
@@ -105,6 +106,26 @@ def test_one_unlucky_placement_is_not_the_worst():
     assert x > 0.8 and y > 0.8
     few = [unlucky, *(k for k in range(90) if k != unlucky)]
     assert worst_of(AXES, [points[k] for k in few], [scores[k] for k in few]) == 0
+
+
+def test_a_circle_has_no_ends():
+    """A place where all fail and which lies across the end of a full circle is found, though each half is small."""
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-math.pi, math.pi, 2000)
+    points = [(float(angle),) for angle in angles]
+    scores = [-1.0 if abs(angle) > 3.1 or (abs(angle) < 0.02 and k % 2) else 0.5 for k, angle in enumerate(angles)]
+    worst = worst_of([Axis("target", "azimuth", -math.pi, math.pi)], points, scores)
+    assert abs(points[worst][0]) > 3.1
+
+
+def test_one_placement_that_was_played_often_counts_whole():
+    """Of two bags the one is named at which more failed, though ten of the other failed in a row."""
+    points = [(float(1 + k % 2),) for k in range(1000)]
+    scores = [-1.0 if (k % 2 and k % 10 < 3) or (not k % 2 and k < 200) else 0.5 for k in range(1000)]
+    shares = [
+        np.mean([score < 0.0 for (bag,), score in zip(points, scores, strict=True) if bag == one]) for one in (1, 2)
+    ]
+    assert points[worst_of([Axis("target", "bag", 1.0, 2.0)], points, scores)][0] == 1.0 + int(np.argmax(shares))
 
 
 def test_the_worst_of_errors_is_none():

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from made_checkpoints import FRONT, SIDE, STATE, edit, facts, follow, save, seen
+from safetensors.torch import load_file, save_file
 
 from arena_newton import policies
 from arena_newton.errors import InputError
@@ -113,6 +114,22 @@ def step(path, **changes):
     path.write_text(json.dumps(content))
 
 
+def normaliser(path, *, drop=(), **changes):
+    """Change the step of a processor that has statistics, and its options."""
+    content = json.loads(path.read_text())
+    (one,) = (one for one in content["steps"] if one["registry_name"].endswith("normalizer_processor"))
+    one["config"] |= changes
+    for name in drop:
+        del one[name]
+    path.write_text(json.dumps(content))
+
+
+def other_statistics(folder):
+    """Statistics of a picture with five colours."""
+    (path,) = folder.glob("policy_preprocessor_step_*_normalizer_processor.safetensors")
+    save_file(load_file(path) | {f"{FRONT}.mean": torch.zeros(5, 1, 1)}, path)
+
+
 def without_device(path):
     """Take the step out that brings numbers to the network's device."""
     content = json.loads(path.read_text())
@@ -149,6 +166,30 @@ WRONG = {
         lambda f: step(f / "policy_preprocessor.json", state_file="../x.safetensors"),
         "state_file is '../x",
     ),
+    "a step that is a list": (
+        lambda f: step(f / "policy_preprocessor.json", registry_name=["a"]),
+        r"steps\[0\] is \['a'\], expected one of",
+    ),
+    "eps": (lambda f: normaliser(f / "policy_preprocessor.json", eps="x"), r"steps\[\d\].config.eps is 'x'"),
+    "eps below 0": (lambda f: normaliser(f / "policy_postprocessor.json", eps=-1.0), r"config.eps is -1.0"),
+    "no map": (
+        lambda f: normaliser(f / "policy_preprocessor.json", norm_map=None),
+        "norm_map is None, but config.json",
+    ),
+    "another map": (
+        lambda f: normaliser(f / "policy_postprocessor.json", norm_map={"ACTION": "MIN_MAX"}),
+        "norm_map is {'ACTION': 'MIN_MAX'}, but config.json has normalization_mapping",
+    ),
+    "no statistics": (
+        lambda f: normaliser(f / "policy_preprocessor.json", drop=["state_file"]),
+        "names no state_file",
+    ),
+    "no number": (lambda f: edit(f / "config.json", dropout=float("nan")), "config.json: dropout is nan"),
+    "a task twice": (
+        lambda f: edit(f / "arena_policy.json", task_vector=["boxing", "boxing"]),
+        "task_vector names a task twice",
+    ),
+    "statistics of another shape": (other_statistics, "its processors or their statistics do not fit"),
     "no device": (lambda f: without_device(f / "policy_preprocessor.json"), "steps hold no device_processor"),
     "a network that LeRobot does not build": (
         lambda f: edit(f / "config.json", dim_feedforward=-4),

@@ -9,6 +9,8 @@ import socket
 import ssl
 import subprocess
 import sys
+import threading
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -18,12 +20,13 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
 from arena_newton.canonical import STAND_ACTION
+from arena_newton.errors import InputError
 from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.remote import RemotePolicy
 from arena_newton.policies.serve import openpi_codec
 from arena_newton.policies.serve.__main__ import main
-from arena_newton.policies.serve.serve_command import make_policy
+from arena_newton.policies.serve.serve_command import _first_task, make_policy, serve_policy
 from arena_newton.policies.serve.serve_options import ServeOptions
 
 
@@ -36,6 +39,8 @@ from arena_newton.policies.serve.serve_options import ServeOptions
         (["--policy", "stand", "--port", "70000"], "--port 70000: expected 0 to 65535"),
         (["--policy", "stand", "--host", "999.1.1.1", "--port", "0"], "--host 999.1.1.1: no address of this machine"),
         (["--policy", "stand", "--host", "192.0.2.1", "--port", "0"], "--host 192.0.2.1: no address of this machine"),
+        (["--policy", "stand", "--host", "é" * 70, "--port", "0"], "no address of this machine"),
+        (["--policy", "stand", "--host", "", "--port", "0"], "--host: is empty, expected an address of this machine"),
         (["--policy", "stand", "--max-sessions", "0"], "--max-sessions 0: expected 1 to"),
         (["--policy", "stand", "--max-batch-size", "0"], "--max-batch-size 0: expected 1 to"),
         (["--policy", "stand", "--max-wait", "-1"], "--max-wait -1: expected seconds"),
@@ -59,6 +64,30 @@ def test_bad_flags(capsys, flags, message):
     assert main(flags) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
+
+
+def test_the_first_look_is_of_a_task_that_the_policy_does():
+    """Nobody has to name a task: Boxing where the policy does not say which it does, otherwise one of its own."""
+
+    class Sofas(Remembers):
+        def check_task(self, task, mode=None, seeds=()):
+            if task != "sit_sofa":
+                raise InputError(f"does sit_sofa, not {task}")
+
+    assert (_first_task(Remembers()), _first_task(Sofas())) == ("boxing", "sit_sofa")
+
+
+def test_an_address_of_the_sixth_version_can_be_used():
+    """It is printed as a client takes it."""
+    stop, lines = threading.Event(), []
+    stop.set()
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    serve_policy(ServeOptions(policy="stand", host="::1", port=0), lines.append, stop)
+    asked = next(line for line in lines if line.startswith("eval asks it by")).rpartition(" ")[2]
+    assert urlsplit(asked.removeprefix("remote:")).hostname == "::1"
 
 
 def test_a_taken_port(capsys):
