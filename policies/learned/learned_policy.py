@@ -180,18 +180,18 @@ def _looking(device: torch.device, count: int) -> Iterator[Looks]:
     answer then has the same bits on machines with another number of cores.
     """
     threads = torch.get_num_threads()
-    if device.type == "cpu" and min(threads, count) > 1:
-        with ThreadPoolExecutor(min(threads, count), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield pool.map
-        return
-    alone = device.type == "cpu" and threads != 1
-    if alone:
-        torch.set_num_threads(1)
-    try:
+    if device.type != "cpu" or threads == 1:
         yield map
+        return
+    torch.set_num_threads(1)
+    try:
+        if count > 1:
+            with ThreadPoolExecutor(min(threads, count), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+                yield pool.map
+        else:
+            yield map
     finally:
-        if alone:
-            torch.set_num_threads(threads)
+        torch.set_num_threads(threads)  # of this thread, and of those that begin later
 
 
 def from_spec(argument: str | None, *, device: str | torch.device | None = None) -> LearnedPolicy:

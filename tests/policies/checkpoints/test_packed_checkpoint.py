@@ -6,6 +6,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -153,7 +154,10 @@ def test_the_number_of_cores_changes_nothing(packed):
         alone = follow(LearnedPolicy(packed), [4], 1)[4]
         torch.set_num_threads(3)
         assert torch.equal(follow(LearnedPolicy(packed), [4], 1)[4], alone)
+        assert torch.equal(follow(LearnedPolicy(packed), [*range(4, 9)], 1)[4], alone)  # five looks side by side
         assert torch.get_num_threads() == 3
+        with ThreadPoolExecutor(1) as later:
+            assert later.submit(torch.get_num_threads).result() == 3
     finally:
         torch.set_num_threads(before)
 
