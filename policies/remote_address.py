@@ -66,10 +66,15 @@ class ServerAddress:
         return self.transport in ("https", "wss")
 
     @property
+    def place(self) -> str:
+        """Host and port as they stand in an address."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}"
+
+    @property
     def url(self) -> str:
         """The address as a library of the transport reads it."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.transport}://{host}:{self.port}{self.path}"
+        return f"{self.transport}://{self.place}{self.path}"
 
 
 def read_address(url: str) -> ServerAddress:

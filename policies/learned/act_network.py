@@ -229,11 +229,8 @@ class ActNetwork(nn.Module):
         Raises:
             InputError: It computes something else than torch.
         """
-        self._on_host = compiled(self.backbone, (1, 3, height, width), rtol=1e-3, atol=1e-3)
-
-    def on_device(self) -> None:
-        """Have torch compute the vision encoder, where the weights are."""
-        self._on_host = None
+        if self._on_host is None:
+            self._on_host = compiled(self.backbone, (1, 3, height, width), rtol=1e-3, atol=1e-3)
 
     def load(self, weights: dict[str, torch.Tensor]) -> None:
         """Take weights by their names in LeRobot's file, `model.` in front, widened to float32, ready to compute.
@@ -266,7 +263,8 @@ class ActNetwork(nn.Module):
         tokens.append(self.encoder_robot_state_input_proj(state))
         if task is not None:
             tokens.append(self.encoder_env_state_input_proj(task))
-        features = (self._on_host or self.backbone)(picture)
+        on_host = self._on_host if picture.device.type == "cpu" else None
+        features = (on_host or self.backbone)(picture)
         where = _picture_positions(features, self.sizes.dim_model // 2)
         features = self.encoder_img_feat_input_proj(features)
         seen = torch.cat([torch.stack(tokens), features.flatten(2).permute(2, 0, 1)])

@@ -78,6 +78,8 @@ class LearnedPolicy(Policy):
         state = observation.state
         worlds, device = len(state), self._device or state.device
         network = self._on(device)
+        if device.type == "cpu":  # not in `check`, which does not know where the looks will be
+            network.on_host(self.checkpoint.facts.height, self.checkpoint.facts.width)
         pictures = self._pictures(observation)
         asking = np.flatnonzero(world_mask(observation.mask, worlds)).tolist()
         finite = torch.isfinite(state[asking]).all(dim=1).tolist()
@@ -141,10 +143,6 @@ class LearnedPolicy(Policy):
             self._network, self._at = self.checkpoint.network(), None
         if self._at != device:
             self._network = self._network.to(device)
-            if device.type == "cpu":
-                self._network.on_host(self.checkpoint.facts.height, self.checkpoint.facts.width)
-            else:
-                self._network.on_device()
             self._spreads = {name: one.to(device) for name, one in self.checkpoint.spreads.items()}
             self._at = device
         return self._network

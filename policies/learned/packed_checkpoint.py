@@ -19,7 +19,7 @@ from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.foreign import check_size, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
-from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
+from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
 
 __all__ = [
     "PROCESSOR_FILES",
@@ -45,8 +45,6 @@ STEPS = {
     "policy_postprocessor.json": ("unnormalizer_processor", "device_processor"),
 }
 """Steps of ACT's processors in LeRobot 0.6; others would change a look."""
-NORMALISES = ("normalizer_processor", "unnormalizer_processor")
-"""Steps with statistics."""
 FRONT, STATE, TASK_VECTOR = "observation.images.front", "observation.state", "observation.environment_state"
 """Keys of the observations."""
 KINDS = {FRONT: "VISUAL", STATE: "STATE", TASK_VECTOR: "ENV", "action": "ACTION"}

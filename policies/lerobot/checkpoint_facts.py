@@ -16,12 +16,14 @@ from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
 from arena_newton.pictures.settings import CameraConfig
 
-__all__ = ["CONFIG_FILE", "FACTS_FILE", "CheckpointFacts", "checkpoint_folder"]
+__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder"]
 
 FACTS_FILE = "arena_policy.json"
 """File of a checkpoint that holds its `CheckpointFacts`."""
 CONFIG_FILE = "config.json"
 """File by which a folder is known to be a checkpoint of LeRobot."""
+NORMALISES = ("normalizer_processor", "unnormalizer_processor")
+"""Steps of LeRobot's processors with statistics."""
 FORMAT = 1
 """Version of the file."""
 INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model", "last/pretrained_model")

@@ -25,7 +25,13 @@ from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.foreign import check_size, read_bytes
 from arena_newton.pictures.settings import CameraConfig, robot_fit
-from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts, checkpoint_folder
+from arena_newton.policies.lerobot.checkpoint_facts import (
+    CONFIG_FILE,
+    FACTS_FILE,
+    NORMALISES,
+    CheckpointFacts,
+    checkpoint_folder,
+)
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
 
 __all__ = [
@@ -73,8 +79,6 @@ STEPS = frozenset(
     }
 )
 """Processor steps that a checkpoint may name; all are LeRobot's own and run no code of the checkpoint."""
-NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
-"""Steps with statistics."""
 DEVICE_STEP = "device_processor"
 """Step that every processor of LeRobot's policies has."""
 NATIVE = (640, 480)
@@ -238,7 +242,7 @@ def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
             if not isinstance(options, dict) or options.get("trust_remote_code"):
                 raise InputError(f"{where}.config is not an object of plain options")
             state = step.get("state_file")
-            if registered in NORMALISERS:
+            if registered in NORMALISES:
                 _check_normaliser(where, options, state, config)
             if state is not None:
                 if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):

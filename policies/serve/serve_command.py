@@ -15,6 +15,7 @@ from arena_newton import tasks
 from arena_newton.errors import InputError, naming
 from arena_newton.policies.base import Policy, get
 from arena_newton.policies.label_reader import read_by
+from arena_newton.policies.remote_address import ServerAddress
 from arena_newton.policies.serve.door_guard import ACCESS_TOKEN_VARIABLE, DoorGuard
 from arena_newton.policies.serve.http_door import HttpDoor
 from arena_newton.policies.serve.policy_server import PolicyServer
@@ -161,7 +162,7 @@ def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, por
     facts = server.facts
     kind = "http" if options.protocol == "arena" else "ws"
     scheme = kind + ("s" if options.tls_cert else "")
-    address = f"[{options.host}]:{port}" if ":" in options.host else f"{options.host}:{port}"
+    address = ServerAddress(options.protocol, scheme, options.host, port, "").place
     picture = "no picture"
     if facts.picture is not None:
         picture = f"pictures of {facts.picture.width}x{facts.picture.height} ({facts.picture.fit})"

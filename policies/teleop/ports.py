@@ -27,11 +27,10 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, port), family=family)
-    except (TypeError, UnicodeError):  # a name that no address can have
-        raise InputError(f"--host {host}: no address of this machine") from None
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, TypeError, UnicodeError) as error:
         number = error.errno if isinstance(error, OSError) else None
-        if number == errno.EADDRNOTAVAIL or (number is not None and number < 0):  # below 0: of the search for names
+        unnamed = isinstance(error, TypeError | UnicodeError)  # a name that no address can have
+        if unnamed or number == errno.EADDRNOTAVAIL or (number is not None and number < 0):  # below 0: looking it up
             raise InputError(f"--host {host}: no address of this machine") from None
         reason = error.strerror if isinstance(error, OSError) else "no such port"
         raise InputError(f"{flag} {port}: cannot be served at {host} ({reason}); name another port") from None
