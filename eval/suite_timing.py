@@ -51,8 +51,8 @@ CPU_WORLDS = 2
 """Worlds without CUDA, where a tick of a batch costs as much as its worlds one after the other."""
 ROUNDS = 3
 """Rounds of one process and of two, after one that is not counted."""
-STAND_INS = ("act", "diffusion")
-"""Families of which random weights are made where a checkpoint is absent; the others begin with weights of a hub."""
+STAND_INS = ("act", "diffusion", "flow")
+"""Families of which random weights are made where a checkpoint is absent; π0.5 begins with weights of a hub."""
 
 
 def run(call: SuiteCall, factories: Factories | None = None) -> int:

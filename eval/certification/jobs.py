@@ -1,4 +1,7 @@
-"""Certification by several processes: each plays one check of one task into the folder that the page is made from."""
+"""Certification by several processes, which play into the folder that the page is made from.
+
+Each plays one check of one task, through one tracker where the check measures trackers apart.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +16,43 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from arena_newton.devices import resolve_engine
 from arena_newton.eval.options import CertifyOptions
 
-__all__ = ["command_line", "flags", "play_ahead"]
+__all__ = ["Piece", "command_line", "flags", "play_ahead"]
 
-Piece = tuple[str, str, tuple[str, ...]]
-"""Check, task and trackers."""
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """What one process plays."""
+
+    checks: tuple[str, ...]
+    tasks: tuple[str, ...]
+    trackers: tuple[str, ...]
+    cores: bool = True
+    """Whether it keeps to cores of its own."""
+
+    def __str__(self) -> str:
+        """Names of checks, tasks and trackers."""
+        return " ".join((*self.checks, *self.tasks, *self.trackers))
+
 
 FIRST = "solvable"
 """The check whose evaluations others compare with: it is played before them."""
 COMPARING = (FIRST, "frozen-legs", "gliding-base", "semantic", "engines", "official", "swap")
 """It, and the checks that compare with its evaluations."""
 BY_NAME = "engines"
-"""The check that means more when it is named: a process that plays it for others would name it."""
-
-UNDIVIDED = ("statistics", "shards", "ray")
-"""Checks that play nothing, or one plan of all tasks."""
+"""The check that without CUDA is skipped unless it is named: a process that plays it for others would name it."""
+BY_FIRST = ("visual", "execution", "visible")
+"""Checks that play through the first tracker alone."""
+BY_ALL = ("official", "swap")
+"""Checks whose measurements of a task are not apart by tracker."""
+ONE_PLAN = ("shards", "ray")
+"""Checks that play the same plan of all tasks, by processes of their own."""
+LONGEST = ("shards", "ray", "failures", "swap")
+"""Checks that take longest: they are begun before others, so that none is left when the others have ended."""
+PLAYS_NOTHING = ("statistics",)
+"""Checks that are left to the end."""
 
 
 def play_ahead(
@@ -44,17 +68,29 @@ def play_ahead(
         checks: Names of the checks that will run.
         say: Prints a line about what is going on.
     """
-    trackers = [options.tracker] if options.quick else [(tracker,) for tracker in options.tracker]
-    recorded = [(FIRST, task, some) for task in tasks for some in trackers]
+    apart = [options.tracker] if options.quick else [(tracker,) for tracker in options.tracker]
+    recorded = [Piece((FIRST,), (task,), some) for task in tasks for some in apart]
     if set(checks) & set(COMPARING):
         _work(options, recorded, say)
-    rest = [check for check in checks if check not in (FIRST, *UNDIVIDED)]
-    rest = [check for check in rest if check != BY_NAME or check in options.checks]
-    _work(options, [(check, task, options.tracker) for check in rest for task in tasks], say)
+    pieces, cuda = [], resolve_engine("warp", None)[1] != "cpu"
+    together = tuple(check for check in checks if check in ONE_PLAN)
+    if together:
+        pieces.append(Piece(together, tuple(tasks), options.tracker, cores=False))
+    for check in checks:
+        if check in (FIRST, *ONE_PLAN, *PLAYS_NOTHING) or (check == BY_NAME and not (cuda or check in options.checks)):
+            continue
+        through = apart
+        if options.quick or check in BY_ALL:
+            through = [options.tracker]
+        elif check in BY_FIRST:
+            through = apart[:1]
+        pieces += [Piece((check,), (task,), some) for task in tasks for some in through]
+    pieces.sort(key=lambda piece: piece.checks[0] not in LONGEST)
+    _work(options, pieces, say)
 
 
 def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str], None]) -> None:
-    """Play pieces (check, task, trackers) until none is left."""
+    """Play pieces until none is left."""
     waiting: queue.SimpleQueue[Piece] = queue.SimpleQueue()
     for piece in pieces:
         waiting.put(piece)
@@ -67,20 +103,21 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
         environment = {**os.environ, "OMP_NUM_THREADS": str(len(own))}
         while not stopped.is_set():
             try:
-                check, task, trackers = waiting.get_nowait()
+                piece = waiting.get_nowait()
             except queue.Empty:
                 return
-            command = [sys.executable, "-m", "arena_newton.eval", "certify", *flags(options, check, task, trackers)]
+            command = [sys.executable, "-m", "arena_newton.eval", "certify", *flags(options, piece)]
             process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
             running.add(process)
-            with contextlib.suppress(ProcessLookupError):
-                os.sched_setaffinity(process.pid, own)
+            if piece.cores:
+                with contextlib.suppress(ProcessLookupError):
+                    os.sched_setaffinity(process.pid, own)
             _, complaint = process.communicate()
             running.discard(process)
             last = complaint.decode(errors="replace").strip().splitlines()[-1:]
             ended = "played" if process.returncode in (0, 1) else f"left to the end: {''.join(last)}"
             if not stopped.is_set():
-                say(f"{check} {task} {' '.join(trackers)}: {ended}")
+                say(f"{piece}: {ended}")
 
     threads = [threading.Thread(target=work, args=(slot,)) for slot in range(min(options.jobs, len(pieces)))]
     for thread in threads:
@@ -98,10 +135,11 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
         raise
 
 
-def flags(options: CertifyOptions, check: str, task: str, trackers: Sequence[str]) -> list[str]:
+def flags(options: CertifyOptions, piece: Piece) -> list[str]:
     """Command line of a process that plays one piece."""
-    piece = dataclasses.replace(options, resume=True, jobs=0, checks=(check,), task=(task,), tracker=tuple(trackers))
-    return _written(piece)
+    return _written(
+        dataclasses.replace(options, resume=True, jobs=0, checks=piece.checks, task=piece.tasks, tracker=piece.trackers)
+    )
 
 
 def command_line(options: CertifyOptions) -> str:

@@ -30,6 +30,7 @@ from transformers import (
     PreTrainedTokenizerBase,
     PreTrainedTokenizerFast,
 )
+from transformers.utils import logging as transformers_logging
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
@@ -218,7 +219,13 @@ def write_clip(folder: Path, shape: ClipShape, vision: torch.nn.Module | None, t
     model = CLIPModel(shape.whole())
     tensors = {**vision.state_dict(), **text.state_dict()}
     model.load_state_dict({name: value.cpu() for name, value in tensors.items()}, strict=False)
-    model.save_pretrained(folder)
+    shown = transformers_logging.is_progress_bar_enabled()
+    transformers_logging.disable_progress_bar()  # of a training that shows one of its own
+    try:
+        model.save_pretrained(folder)
+    finally:
+        if shown:
+            transformers_logging.enable_progress_bar()
 
 
 @contextlib.contextmanager

@@ -21,21 +21,26 @@ def stand_in(tmp_path, monkeypatch, code=0):
 
 
 def test_each_process_plays_one_check_of_one_task(tmp_path, monkeypatch):
-    """Recordings come first, one process per task and tracker; every other check has one per task; flags are kept."""
+    """Recordings come first, by task and tracker; then the others, longest first, in as many parts as they have."""
     log, said = stand_in(tmp_path, monkeypatch), []
     options = CertifyOptions(out=str(tmp_path / "out"), jobs=2, episodes=7, worlds=3, twist2_checkpoint="a b.onnx")
-    jobs.play_ahead(options, ["football", "boxing"], ["solvable", "swap", "visible"], said.append)
+    jobs.play_ahead(options, ["football", "boxing"], ["solvable", "visible", "semantic", "swap"], said.append)
     lines = log.read_text().splitlines()
-    asked = [(line.split("--checks ")[1].split()[0], line.split("--task ")[1].split()[0]) for line in lines]
+    asked = [tuple(line.split(f"--{flag} ")[1].split(" --")[0] for flag in ("checks", "task")) for line in lines]
     assert sorted(asked[:4]) == sorted([("solvable", "football"), ("solvable", "boxing")] * 2)
-    assert sorted(asked[4:]) == [
-        ("swap", "boxing"),
-        ("swap", "football"),
+    assert sorted(asked[4:6]) == [("swap", "boxing"), ("swap", "football")]
+    assert sorted(asked[6:]) == [
+        *[("semantic", "boxing")] * 2,
+        *[("semantic", "football")] * 2,
         ("visible", "boxing"),
         ("visible", "football"),
     ]
+    of_semantic = [line.split("--tracker ")[1].split(" --")[0] for line in lines if "--checks semantic" in line]
+    assert sorted(of_semantic) == ["sonic", "sonic", "twist2", "twist2"]
+    assert all("--tracker" not in line for line in lines if "--checks swap" in line)  # both, as by default
+    assert all("--tracker twist2" in line for line in lines if "--checks visible" in line)
     assert all("--jobs 0" in line and "--episodes 7" in line and "--resume" in line for line in lines)
-    assert len(said) == 8 and all(text.endswith("played") for text in said)
+    assert len(said) == 12 and all(text.endswith("played") for text in said)
 
 
 def test_a_broken_process_is_named_and_the_others_go_on(tmp_path, monkeypatch):
@@ -49,7 +54,7 @@ def test_a_broken_process_is_named_and_the_others_go_on(tmp_path, monkeypatch):
 def test_a_process_understands_its_flags():
     """The command line of a piece is one that the command reads back as the same options."""
     options = CertifyOptions(out="some folder", jobs=4, quick=True, engine="warp", device="cuda", episodes=2)
-    flags = jobs.flags(options, "swap", "boxing", ("sonic",))
+    flags = jobs.flags(options, jobs.Piece(("swap",), ("boxing",), ("sonic",)))
     read = tyro.cli(CertifyOptions, args=flags)
     assert (read.task, read.tracker, read.checks, read.jobs) == (("boxing",), ("sonic",), ("swap",), 0)
     assert (read.out, read.quick, read.engine, read.device, read.episodes) == ("some folder", True, "warp", "cuda", 2)
@@ -70,22 +75,28 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     assert time.monotonic() - began < 30.0 and len(log.read_text().splitlines()) == 2
 
 
-def test_engines_is_left_to_the_check_unless_it_was_named(tmp_path, monkeypatch):
+def test_engines_is_left_to_the_check_without_cuda_unless_it_was_named(tmp_path, monkeypatch):
     """Without a CUDA device it is skipped unless a user names it; a process of --jobs must not name it for him."""
     log = stand_in(tmp_path, monkeypatch)
-    for named in ((), ("engines",)):
+    for named, device in (((), "cpu"), (("engines",), "cpu"), ((), "cuda:0")):
+        log.unlink(missing_ok=True)
+        monkeypatch.setattr(jobs, "resolve_engine", lambda engine, given, device=device: (engine, device))
         options = CertifyOptions(out="x", jobs=2, quick=True, checks=named)
         jobs.play_ahead(options, ["boxing"], ["engines", "execution"], lambda text: None)
-    asked = [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()]
-    assert sorted(asked) == ["engines", "execution", "execution", "solvable", "solvable"]
+        asked = [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()]
+        played = ["engines"] if named or device != "cpu" else []
+        assert sorted(asked) == [*played, "execution", "solvable"]
 
 
 def test_one_plan_is_not_divided(tmp_path, monkeypatch):
-    """What plays one plan of all tasks, or nothing, is left to the checks themselves."""
+    """What plays one plan of all tasks is one piece, and what plays nothing is left to the check itself."""
     log = stand_in(tmp_path, monkeypatch)
     checks = ["statistics", "shards", "ray", "gradients"]
     jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing", "football"], checks, lambda text: None)
-    assert [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()] == ["gradients"] * 2
+    lines = log.read_text().splitlines()
+    asked = [line.split("--checks ")[1].split(" --")[0] for line in lines]
+    assert sorted(asked) == [*["gradients"] * 4, "shards ray"]
+    assert all(("--task boxing football" in line) == ("shards ray" in line) for line in lines)
 
 
 def test_the_command_line_on_the_page():

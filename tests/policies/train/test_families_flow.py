@@ -102,15 +102,17 @@ def chunk(policy, before, after, seed=11):
         return after(policy._generate_actions(seen))
 
 
-def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
-    """A trained checkpoint gives a stock LeRobot the same actions, with encoders and tokenizer in the checkpoint."""
+def test_checkpoint_in_a_stock_lerobot(model, tmp_path, capsys):
+    """A trained checkpoint, saved silently, gives a stock LeRobot the same actions, with its encoders and tokenizer."""
     optimizer = torch.optim.Adam(model.groups(), lr=1e-3)
     for _ in range(2):
         optimizer.zero_grad()
         model.loss(made_batch(model)).backward()
         optimizer.step()
     folder = tmp_path / "first"
+    capsys.readouterr()
     model.save(folder, CheckpointFacts())
+    assert not capsys.readouterr().err, "no progress bar of transformers"
     model.policy.eval()
     ours = chunk(model.policy, model.preprocess, model.postprocess)
     assert ours.shape == (2, 20, 40)
