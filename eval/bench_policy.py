@@ -70,7 +70,7 @@ def random_checkpoint(folder: Path, name: str = "fast", tasks: tuple[str, ...] =
         stats["observation.environment_state"] = around(torch.zeros(len(tasks)), 1.0)
     assert stats["action"]["mean"].shape == (ACTION_WIDTH,)
     facts = CheckpointFacts(task_vector=tasks if settings.use_task_vector else ())
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):  # made on the CPU; with several GPUs torch would warn and start them all
         torch.manual_seed(0)
         families.build(settings, stats, "cpu").save(folder, facts)
     return folder

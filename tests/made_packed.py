@@ -19,7 +19,7 @@ def checkpoint(folder, tasks=("boxing", "vis_navi"), *, size=(48, 64), trackers=
     folder.mkdir(parents=True)
     facts = {"width": size[1], "height": size[0], "labels": "v4", "family": "act", "recipe": "compact"} | said
     CheckpointFacts(task_vector=tasks, tasks=tasks, trackers=trackers, **facts).write(folder)
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         small = {"dim_model": WIDTH, "n_heads": 2, "dim_feedforward": WIDTH, "n_encoder_layers": 1, "latent_dim": 4}
         network = ActNetwork(ActSizes(state=64, tasks=len(tasks), actions=40, chunk_size=CHUNK, **small))

@@ -30,6 +30,16 @@ def small(folder):
     return folder
 
 
+@pytest.mark.parametrize("family", ["act", "flow"])
+def test_random_weights_are_made_without_a_gpu(tmp_path, monkeypatch, family):
+    """Where there are several GPUs none of them is started, and the generator of whoever asks stays where it was."""
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    before = torch.random.get_rng_state()
+    bench_policy.random_checkpoint(tmp_path / family, "small", family=family)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert (tmp_path / family / "model.safetensors").is_file()
+
+
 def test_parts_of_a_tick_are_measured(tmp_path, monkeypatch):
     """Every part takes time, together no more than the whole; the environment keeps its own methods afterwards."""
     monkeypatch.setattr(bench_policy, "WARM_UP", 2)
