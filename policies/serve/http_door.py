@@ -45,6 +45,9 @@ IDLE_CONNECTION = 600.0
 """Time without a request after which a connection is closed [s]."""
 BODY_SECONDS = 60.0
 """Time that a client has to send the body of a request [s]."""
+DRAIN_SECONDS, DRAIN_FRAMES = 5.0, 4
+"""Time [s] and largest bodies' worth of bytes that are read and dropped so that a client whose body is too long, which
+looks for an answer only when it has sent all of it, gets one."""
 POLL = 0.05
 """Time after which a door notices that it is closed [s]."""
 _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "closing": 503}
@@ -140,6 +143,7 @@ class _Handler(BaseHTTPRequestHandler):
         left = int(lengths[0])
         if left > MAX_FRAME:
             self._hang_up(413, f"a body of {left} bytes, expected at most {MAX_FRAME}")
+            self._drain(min(left, DRAIN_FRAMES * MAX_FRAME))
             return None
         end, pieces = time.monotonic() + BODY_SECONDS, []
         while left:
@@ -152,6 +156,17 @@ class _Handler(BaseHTTPRequestHandler):
             left -= len(piece)
         self.connection.settimeout(IDLE_CONNECTION)
         return b"".join(pieces)
+
+    def _drain(self, left: int) -> None:
+        """Read and drop what a client goes on sending."""
+        end = time.monotonic() + DRAIN_SECONDS
+        with suppress(OSError):
+            while left > 0 and (time_left := end - time.monotonic()) > 0:
+                self.connection.settimeout(time_left)
+                piece = self.rfile.read1(min(left, 1 << 16))
+                if not piece:
+                    return
+                left -= len(piece)
 
     def _hang_up(self, status: int, sentence: str) -> None:
         self.close_connection = True

@@ -135,6 +135,8 @@ def _device(name: str | None) -> torch.device:
             raise InputError("no such device, expected cpu, cuda or cuda:<number>") from None
         if device.type not in ("cpu", "cuda"):
             raise InputError("expected cpu, cuda or cuda:<number>")
+        if device.type == "cpu" and device.index:  # torch knows one, and takes any number
+            raise InputError("there is one CPU device, --device cpu")
         if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
             raise InputError(f"there are {torch.cuda.device_count()} CUDA devices")
     return device

@@ -16,6 +16,7 @@ from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.serve import arena_codec, openpi_codec, policy_server, vla_eval_codec
 from arena_newton.policies.serve.policy_messages import Begin, End
 from arena_newton.policies.serve.policy_server import Refused
+from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -467,6 +468,14 @@ def test_unfit_http(served, head, status):
             reply += piece
     assert reply.startswith(b"HTTP/1.1 %d " % status), reply[:200]
     assert b"Traceback" not in reply and b"<html" not in reply.lower() and b'{"error": "' in reply
+    assert one.http("GET", "/health")[0] == 200
+
+
+def test_body_too_long_is_told(served):
+    """A client that sends all of a body before it reads hears why it is refused, not of a broken pipe."""
+    one = served(Remembers(), "arena")
+    status, reply = one.http("POST", "/infer", b"a" * (MAX_FRAME + (1 << 20)))
+    assert status == 413 and "expected at most" in reply["error"]
     assert one.http("GET", "/health")[0] == 200
 
 

@@ -53,6 +53,7 @@ from arena_newton.policies.serve.serve_options import ServeOptions
             "--tls-key b.pem: No such file",
         ),
         (["--policy", "stand", "--device", "tpu", "--port", "0"], "--device tpu: no such device"),
+        (["--policy", "stand", "--device", "cpu:7", "--port", "0"], "--device cpu:7: there is one CPU device"),
         (["--policy", "stand", "--task", "dance", "--port", "0"], "--task dance: unknown"),
         (["--policy", "stand", "--labels", "v9", "--port", "0"], "--labels v9: unknown"),
         (["--policy", "expert", "--port", "0"], "sees the world itself; run it in this process"),
