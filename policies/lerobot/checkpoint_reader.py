@@ -7,7 +7,6 @@ are steps of LeRobot by their registered names, of those that a policy of our fa
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import logging
 import math
@@ -23,7 +22,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.extras import require
-from arena_newton.foreign import check_size, read_bytes
+from arena_newton.foreign import check_size, file_digest, read_bytes
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
@@ -171,8 +170,7 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     if picture is not None:
         preparation = PicturePreparation.read(folder) if own is None else None
         camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
-    with (folder / WEIGHTS).open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
     return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
 
 
