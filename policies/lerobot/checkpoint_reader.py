@@ -31,6 +31,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import (
     CheckpointFacts,
     checkpoint_folder,
 )
+from arena_newton.policies.lerobot.checkpoint_tensors import check_family
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
 
 __all__ = [
@@ -170,6 +171,7 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     if picture is not None:
         preparation = PicturePreparation.read(folder) if own is None else None
         camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
+    check_family(folder / WEIGHTS, kind)
     digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
     return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
 

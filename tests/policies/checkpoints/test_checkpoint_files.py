@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.policies.lerobot import checkpoint_network
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.lerobot.picture_preparation import PicturePreparation, PictureStep
 
@@ -130,6 +131,13 @@ def other_statistics(folder):
     save_file(load_file(path) | {f"{FRONT}.mean": torch.zeros(5, 1, 1)}, path)
 
 
+def other_weights(folder, *, add="", drop="-"):
+    """Leave out the weights whose names begin like this, and add one."""
+    path = folder / "model.safetensors"
+    kept = {name: value for name, value in load_file(path).items() if not name.startswith(drop)}
+    save_file(kept | ({add: torch.zeros(1)} if add else {}), path)
+
+
 def without_device(path):
     """Take the step out that brings numbers to the network's device."""
     content = json.loads(path.read_text())
@@ -204,7 +212,19 @@ WRONG = {
     "other weights": (lambda f: edit(f / "config.json", dim_model=64), "does not hold the weights of this network"),
     "cut weights": (
         lambda f: (f / "model.safetensors").write_bytes((f / "model.safetensors").read_bytes()[:-9]),
-        "model.safetensors: does not hold",
+        "model.safetensors: not readable as safetensors",
+    ),
+    "weights of another family": (
+        lambda f: edit(f / "config.json", type="pi05"),
+        r"model.safetensors: holds the tensor model.action_head.bias of act, but config.json says type pi05, which has",
+    ),
+    "weights of no family": (
+        lambda f: other_weights(f, add="normalize_inputs.buffer"),
+        r"model.safetensors: holds the tensor normalize_inputs.buffer, but config.json says type act",
+    ),
+    "weights that are a part": (
+        lambda f: other_weights(f, drop="model.decoder."),
+        r"model.safetensors: holds no tensor model.decoder.\*, but config.json says type act, which needs it",
     ),
 }
 
@@ -216,6 +236,15 @@ def test_what_cannot_be_run_is_one_clear_error(folder, kind):
     damage(folder)
     with pytest.raises(InputError, match=message):
         LeRobotPolicy(folder).check()
+
+
+def test_no_network_is_built_for_weights_of_another_family(folder, monkeypatch):
+    """pi0.5's takes minutes; the weights' header says at once that they are an ACT's."""
+    monkeypatch.setattr(checkpoint_network, "get_policy_class", lambda kind: pytest.fail("built"))
+    for kind in ("pi05", "diffusion", "multi_task_dit"):
+        edit(folder / "config.json", type=kind)
+        with pytest.raises(InputError, match=f"{folder}.*(type {kind}|config.json: )"):
+            LeRobotPolicy(folder).check()
 
 
 def test_transforms_at_random_are_refused(tmp_path):
