@@ -19,6 +19,7 @@ from arena_newton.errors import InputError
 from arena_newton.foreign import check_size, file_digest, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
+from arena_newton.policies.lerobot.checkpoint_tensors import check_spread
 
 __all__ = [
     "PROCESSOR_FILES",
@@ -293,5 +294,6 @@ def _statistics(
                 raise InputError(f"{path}: {where} takes {feature} for {kind!r:.40}, expected {KINDS[feature]}")
         if mean is None or std is None or mean.shape != shape or std.shape != shape:
             raise InputError(f"{path.parent / state}: {feature} has no mean and std of shape {list(shape)}")
+        check_spread(path.parent / state, feature, {"std": std})
         found[feature] = Spread(mean.float(), std.float(), float(eps))
     return state, found

@@ -11,12 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 
 from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE
 
-__all__ = ["check_family"]
+__all__ = ["check_family", "check_spread", "check_statistics"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,13 @@ _FAMILIES: Mapping[str, _Names] = {
     ),
 }
 """LeRobot's type of policy → names of its tensors."""
+_SPREADS: Mapping[str, tuple[str, ...]] = {
+    "MEAN_STD": ("std",),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""LeRobot's `NormalizationMode` → the statistics by whose value, or difference, it divides."""
 
 
 def check_family(path: Path, kind: str) -> None:
@@ -71,6 +79,47 @@ def check_family(path: Path, kind: str) -> None:
     for start in _FAMILIES[kind].always:
         if not any(name.startswith(start) for name in found):
             raise InputError(f"{path}: holds no tensor {start}*, {said}, which needs it")
+
+
+def check_statistics(path: Path, modes: Mapping[str, str]) -> None:
+    """Refuse a processor's statistics that say of all numbers of a feature that they never change.
+
+    Args:
+        path: A file of a normalising step.
+        modes: Feature that it normalises, by its name in the file → LeRobot's `NormalizationMode`.
+
+    Raises:
+        InputError: The file is damaged, or has such statistics; the message names the feature.
+    """
+    with _opened(path) as file:
+        held = set(file.keys())
+        for feature, mode in modes.items():
+            wanted = {name: f"{feature}.{name}" for name in _SPREADS.get(mode, ())}
+            if wanted and held.issuperset(wanted.values()):  # others are refused where the processors are tried
+                check_spread(path, feature, {name: file.get_tensor(key) for name, key in wanted.items()})
+
+
+def check_spread(path: Path, feature: str, stats: Mapping[str, torch.Tensor]) -> None:
+    """Refuse a feature of several numbers whose spread is zero in each; single numbers may well be constant.
+
+    Args:
+        path: File of the statistics.
+        feature: Its name in the file.
+        stats: The standard deviation, or lower and upper end, by name.
+
+    Raises:
+        InputError: All numbers are constant.
+    """
+    ends = list(stats.values())
+    if ends[0].numel() < 2:
+        return
+    constant = torch.equal(*ends) if len(ends) > 1 else not bool(ends[0].any())
+    if constant:
+        said = " equals ".join(stats) if len(ends) > 1 else f"{next(iter(stats))} is 0"
+        raise InputError(
+            f"{path}: {feature}: {said} in all {ends[0].numel()} numbers, by which nothing can be normalised; "
+            "compute the statistics of its dataset again"
+        )
 
 
 @contextmanager

@@ -247,6 +247,51 @@ def test_no_network_is_built_for_weights_of_another_family(folder, monkeypatch):
             LeRobotPolicy(folder).check()
 
 
+WIDTHS = {STATE: 64, "action": 40}
+CONSTANT = {
+    "MEAN_STD": ({"std": torch.zeros}, "std is 0"),
+    "MIN_MAX": ({"min": torch.ones, "max": torch.ones}, "min equals max"),
+    "QUANTILES": ({"q01": torch.zeros, "q99": torch.zeros}, "q01 equals q99"),
+}
+"""Mode → statistics that say that nothing ever changes, and how they are called."""
+
+
+@pytest.mark.parametrize("mode", CONSTANT)
+@pytest.mark.parametrize(("feature", "part"), [(STATE, "pre"), ("action", "post")])
+def test_statistics_of_a_feature_that_never_changes_are_refused(folder, mode, feature, part):
+    """They make noise of every look, or one action of every answer; a feature of which one number changes is taken."""
+    made, said = CONSTANT[mode]
+    modes = {kind: mode for kind in ("VISUAL", "STATE", "ACTION", "ENV")} | {"VISUAL": "MEAN_STD"}
+    edit(folder / "config.json", normalization_mapping=modes)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        normaliser(folder / name, norm_map=modes)
+    for path in folder.glob("*normalizer_processor.safetensors"):
+        ends = {"min": -1.0, "max": 1.0, "q01": -1.0, "q99": 1.0}
+        ranges = {f"{one}.{name}": torch.full((n,), end) for one, n in WIDTHS.items() for name, end in ends.items()}
+        save_file(load_file(path) | ranges, path)
+    LeRobotPolicy(folder).check()
+    (path,) = folder.glob(f"policy_{part}processor_step_*normalizer_processor.safetensors")
+    constant = {f"{feature}.{name}": make(WIDTHS[feature]) for name, make in made.items()}
+    save_file(load_file(path) | constant, path)
+    with pytest.raises(InputError, match=f"{path}: {feature}: {said} in all {WIDTHS[feature]} numbers"):
+        LeRobotPolicy(folder)
+    constant[f"{feature}.{list(made)[-1]}"][3] += 1.0
+    save_file(load_file(path) | constant, path)
+    LeRobotPolicy(folder).check()
+
+
+def test_statistics_that_nothing_uses_may_be_anything(folder):
+    """Of a feature that goes in as it is, and the actions' for an input, which only a training normalises."""
+    modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD", "ENV": "MEAN_STD"}
+    edit(folder / "config.json", normalization_mapping=modes)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        normaliser(folder / name, norm_map=modes)
+    (path,) = folder.glob("policy_preprocessor_step_*_normalizer_processor.safetensors")
+    unused = {f"{FRONT}.std": torch.zeros(3, 1, 1), "action.std": torch.zeros(40), "index.std": torch.zeros(2)}
+    save_file(load_file(path) | unused, path)
+    LeRobotPolicy(folder).check()
+
+
 def test_transforms_at_random_are_refused(tmp_path):
     """As the original's server refuses them; a size or a colour that cannot be is named."""
     for changes, message in (

@@ -384,6 +384,9 @@ def test_damaged_files_are_one_error(packed, tmp_path):
     steps["steps"][0] = {"registry_name": "tokenizer_processor", "config": {}}
     (folder / "policy_preprocessor.json").write_text(json.dumps(steps))
     refused("policy_preprocessor.json: steps are", whole)
+    (path,) = folder.glob("policy_postprocessor_step_*.safetensors")
+    save_file(load_file(path) | {"action.std": torch.zeros(40)}, path)
+    refused(f"{path.name}: action: std is 0 in all 40 numbers", whole)
     edit(folder / CARD_FILE, tasks=["football"])
     refused("card.json: tasks names football, which its task vector lacks", whole)
 
