@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import stat
@@ -15,7 +16,7 @@ import numpy as np
 from arena_newton import limits
 from arena_newton.errors import InputError
 
-__all__ = ["check_size", "create", "numbers", "read_arrays", "read_bytes"]
+__all__ = ["check_size", "create", "file_digest", "numbers", "read_arrays", "read_bytes"]
 _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dtype[Any]]]] = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -68,6 +69,24 @@ def read_bytes(path: str | Path, most: int, *, where: str = "") -> bytes:
         return Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+
+
+def file_digest(path: Path, most: int) -> str:
+    """First 12 hex digits of the SHA-256 of a regular file of any size, by which weights are known.
+
+    Args:
+        path: The file; never all of it is in memory.
+        most: Largest size that is read [bytes].
+
+    Raises:
+        InputError: The file is absent, not a regular file, unreadable or larger.
+    """
+    check_size(path, most)
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where: str = "") -> dict[str, np.ndarray]:

@@ -104,6 +104,8 @@ def run(options: LoopOptions, factories: Factories | None = None, parts: LoopPar
     if new:  # one that cannot end leaves no folder
         _check_out(out)
         loop.check()
+    else:  # one that cannot go on leaves no lock; what another process writes meanwhile is read again below
+        loop.read()
     with held(out):
         return loop.play(checked=new)
 
@@ -114,6 +116,8 @@ def resolved(options: LoopOptions) -> LoopOptions:
     Raises:
         InputError: A flag is wrong, or two contradict each other.
     """
+    if options.out is not None and not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
     engine, device = resolve_engine(options.engine, options.device)
     defaults = (SMALL if options.small else FULL) | {"engine": engine, "device": device}
     if options.minutes is not None:
@@ -253,7 +257,7 @@ class _Loop:
 
     def play(self, *, checked: bool = True) -> int:
         """Play what is left, after a check of what it needs."""
-        self._read()
+        self.read()
         if not checked:
             self.check()
         stages: Mapping[str, Callable[[], int]] = {
@@ -301,8 +305,12 @@ class _Loop:
     def _record_of_loop(self) -> LoopRecord:
         return LoopRecord(dataclasses.asdict(self.options), self.stages)
 
-    def _read(self) -> None:
-        """Take over the stages of an earlier call; one with other flags is refused."""
+    def read(self) -> None:
+        """Take over the stages of an earlier call.
+
+        Raises:
+            InputError: `loop.json` is damaged, or was begun with other flags.
+        """
         path = self.out / LOOP_FILE
         if not path.is_file():
             return

@@ -42,7 +42,13 @@ def run(given: Path, options: PackOptions) -> int:
     trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.task_vector or facts.tasks))))
     chosen = options.tasks or (_solved(found, trained, facts.trackers) if found else trained)
     for task in chosen:
-        tasks.get(task)
+        if task not in tasks.names():
+            known = f"choose from {', '.join(tasks.names())}"
+            if options.tasks:
+                raise InputError(f"--tasks {task}: unknown, {known}")
+            raise InputError(
+                f"{folder}: was trained on {task}, a task that is not known; --tasks takes others, {known}"
+            )
     if not chosen:
         why = f"none is solved at {100 * ENOUGH:.0f} %" if found else "the checkpoint names none"
         raise InputError(f"--tasks: {why}; name those that it is offered for")

@@ -21,6 +21,7 @@ from safetensors.torch import save
 from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
 from arena_newton.foreign import create
+from arena_newton.policies.learned.card_check import training_entries
 from arena_newton.policies.learned.learned_card import CARD_FILE, CARD_PAGE, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import (
     PROCESSOR_FILES,
@@ -108,16 +109,9 @@ def pack(folder: Path, out: Path, card: PolicyCard) -> PolicyCard:
     files = _small_files(checkpoint) | {WEIGHTS_NAME: weights}
     card = dataclasses.replace(
         card,
-        trackers=facts.trackers,
-        family=facts.family or "act",
-        recipe=facts.recipe,
-        steps=facts.steps,
-        seed=facts.seed,
-        gpu_minutes=facts.minutes,
-        device=facts.device,
-        datasets=facts.datasets,
         weights=_digest(weights),
         bytes=sum(map(len, files.values())),
+        **training_entries(facts),  # type: ignore[arg-type]  # each is of its field's kind
     )
     files |= {CARD_PAGE: card.to_markdown().encode(), CARD_FILE: card.to_json().encode()}
     size = sum(map(len, files.values()))

@@ -15,6 +15,7 @@ from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Observation, Policy, world_mask
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.learned.act_network import ActNetwork
+from arena_newton.policies.learned.card_check import check_facts, check_weights
 from arena_newton.policies.learned.packed_checkpoint import FRONT, STATE, TASK_VECTOR, Spread, read_act_checkpoint
 
 __all__ = ["LearnedPolicy", "from_spec"]
@@ -40,14 +41,12 @@ class LearnedPolicy(Policy):
             device: Torch device of the network; that of the observations by default.
 
         Raises:
-            InputError: The folder holds no packed policy, or a damaged one.
+            InputError: The folder holds no packed policy, a damaged one, or the card of another one.
         """
         self.card = learned_card.read_card(folder)
         self.checkpoint = read_act_checkpoint(folder)
+        check_facts(self.card, self.checkpoint)
         facts = self.checkpoint.facts
-        stray = [task for task in self.card.tasks if facts.task_vector and task not in facts.task_vector]
-        if stray:
-            raise InputError(f"{folder / learned_card.CARD_FILE}: tasks names {stray[0]}, which its task vector lacks")
         self.camera = facts.camera
         self.labels = facts.labels
         self.realign = facts.realign
@@ -61,7 +60,7 @@ class LearnedPolicy(Policy):
         """Load the weights.
 
         Raises:
-            InputError: They do not fit.
+            InputError: They do not fit, or are not those of the card.
         """
         self._on(self._device or torch.device("cpu"))
 
@@ -140,7 +139,9 @@ class LearnedPolicy(Policy):
     def _on(self, device: torch.device) -> ActNetwork:
         """The network on a device; its weights are loaded once."""
         if self._network is None:
-            self._network, self._at = self.checkpoint.network(), None
+            network = self.checkpoint.network()  # says itself what is wrong with damaged weights
+            check_weights(self.card, self.checkpoint)
+            self._network, self._at = network, None
         if self._at != device:
             self._network = self._network.to(device)
             self._spreads = {name: one.to(device) for name, one in self.checkpoint.spreads.items()}

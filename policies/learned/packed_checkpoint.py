@@ -6,7 +6,6 @@ only. Whatever a look would be computed differently by is refused, so that a pac
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -17,9 +16,10 @@ from safetensors import SafetensorError, safe_open
 
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
-from arena_newton.foreign import check_size, read_bytes
+from arena_newton.foreign import check_size, file_digest, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
+from arena_newton.policies.lerobot.checkpoint_tensors import check_spread
 
 __all__ = [
     "PROCESSOR_FILES",
@@ -169,13 +169,7 @@ def read_act_checkpoint(folder: Path) -> ActCheckpoint:
     sizes = _sizes(folder / CONFIG_FILE, config, facts)
     executed = _count(folder / CONFIG_FILE, config, "n_action_steps", sizes.chunk_size)
     spreads, files = _spreads(folder, sizes)
-    weights = folder / WEIGHTS_NAME
-    check_size(weights, MOST_WEIGHTS)
-    try:
-        with weights.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
-    except OSError as error:
-        raise InputError(f"{weights}: cannot be read ({error.strerror})") from None
+    digest = file_digest(folder / WEIGHTS_NAME, MOST_WEIGHTS)
     names = (WEIGHTS_NAME, CONFIG_FILE, FACTS_FILE, *PROCESSOR_FILES, *files)
     return ActCheckpoint(folder, sizes, executed, facts, spreads, digest, names, config.get("use_vae") is True)
 
@@ -300,5 +294,6 @@ def _statistics(
                 raise InputError(f"{path}: {where} takes {feature} for {kind!r:.40}, expected {KINDS[feature]}")
         if mean is None or std is None or mean.shape != shape or std.shape != shape:
             raise InputError(f"{path.parent / state}: {feature} has no mean and std of shape {list(shape)}")
+        check_spread(path.parent / state, feature, {"std": std})
         found[feature] = Spread(mean.float(), std.float(), float(eps))
     return state, found

@@ -7,7 +7,6 @@ are steps of LeRobot by their registered names, of those that a policy of our fa
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import logging
 import math
@@ -23,7 +22,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.extras import require
-from arena_newton.foreign import check_size, read_bytes
+from arena_newton.foreign import check_size, file_digest, read_bytes
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
@@ -32,6 +31,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import (
     CheckpointFacts,
     checkpoint_folder,
 )
+from arena_newton.policies.lerobot.checkpoint_tensors import check_family, check_statistics
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
 
 __all__ = [
@@ -171,8 +171,8 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     if picture is not None:
         preparation = PicturePreparation.read(folder) if own is None else None
         camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
-    with (folder / WEIGHTS).open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    check_family(folder / WEIGHTS, kind)
+    digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
     return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
 
 
@@ -248,6 +248,8 @@ def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
                 if not isinstance(state, str) or Path(state).name != state or not state.endswith(".safetensors"):
                     raise InputError(f"{where}.state_file is {state!r:.60}, expected a name of a safetensors file")
                 check_size(folder / state, MOST_JSON)
+                if registered in NORMALISES and (folder / state).is_file():
+                    check_statistics(folder / state, _modes(registered, config))
             names = options.get("rename_map") or {} if registered == "rename_observations_processor" else {}
             if not isinstance(names, dict) or not all(isinstance(value, str) for value in names.values()):
                 raise InputError(f"{where}.config.rename_map is not an object of names")
@@ -268,6 +270,13 @@ def _check_normaliser(where: str, options: Mapping[str, object], state: object, 
         raise InputError(f"{where}.config.norm_map is {given}, but {CONFIG_FILE} has normalization_mapping {said}")
     if state is None and set(said.values()) != {"IDENTITY"}:
         raise InputError(f"{where} names no state_file, the statistics by which it is to normalise")
+
+
+def _modes(registered: str, config: PreTrainedConfig) -> dict[str, str]:
+    """What a normalising step is used on: feature → LeRobot's mode of its kind."""
+    features = (config.input_features if registered == NORMALISES[0] else config.output_features) or {}
+    modes = {str(kind): mode.value for kind, mode in config.normalization_mapping.items()}
+    return {name: modes.get(feature.type.value, "IDENTITY") for name, feature in features.items()}
 
 
 def _features(

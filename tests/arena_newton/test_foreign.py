@@ -1,5 +1,6 @@
 """Archives of arrays are checked by their headers: what a small file promises is not taken before it is known."""
 
+import hashlib
 import io
 import os
 import resource
@@ -10,7 +11,7 @@ import pytest
 
 from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.foreign import read_arrays, read_bytes
+from arena_newton.foreign import file_digest, read_arrays, read_bytes
 
 
 def member(shape, dtype="<f8", data=b"") -> bytes:
@@ -99,3 +100,14 @@ def test_only_regular_files_are_read(tmp_path):
         read_bytes(tmp_path / "big", 2 * 2**20)
     with pytest.raises(InputError, match="none: cannot be read"):
         read_bytes(tmp_path / "none", 10)
+
+
+def test_a_file_is_known_by_its_digest(tmp_path):
+    """The first 12 digits of SHA-256, within the size that is allowed; what cannot be read is one error."""
+    path = tmp_path / "weights"
+    path.write_bytes(bytes(range(256)) * 20)
+    assert file_digest(path, 5120) == hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    faults = {path: "expected at most 0", tmp_path: "Is a directory", tmp_path / "no": "No such file"}
+    for refused, said in faults.items():
+        with pytest.raises(InputError, match=f"{refused}: .*{said}"):
+            file_digest(refused, 5119)

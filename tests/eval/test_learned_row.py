@@ -187,6 +187,17 @@ def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
     assert "no cell of this checkpoint" in capsys.readouterr().err and not (tmp_path / "p").exists()
 
 
+def test_pack_names_the_flag_or_the_checkpoint_of_an_unknown_task(tmp_path, capsys):
+    """An unknown task is `--tasks`, as it was typed, or else the checkpoint's own; nothing is written."""
+    made, foreign = checkpoint(tmp_path / "made"), checkpoint(tmp_path / "foreign", tasks=("chess",))
+    out = ["--out", str(tmp_path / "packed")]
+    assert main(["pack", str(made), *out, "--tasks", "nope"]) == 2
+    assert "error: --tasks nope: unknown, choose from football, " in capsys.readouterr().err
+    assert main(["pack", str(foreign), *out]) == 2
+    assert f"error: {foreign}: was trained on chess, a task that is not known" in capsys.readouterr().err
+    assert not (tmp_path / "packed").exists()
+
+
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory):
     """A checkpoint of two trackers, `made`, and runs of its packed form through one of them."""

@@ -303,3 +303,25 @@ def test_a_damaged_file_is_one_error(tmp_path):
             assert str(path) in str(error)
             refused += 1
     assert refused > 50
+
+
+def test_a_folder_that_is_refused_stays_as_it_was(tmp_path, capsys):
+    """A damaged loop.json, or one of other flags, leaves no lock behind."""
+    path, out = tmp_path / LOOP_FILE, ["--out", str(tmp_path)]
+    path.write_text("{")
+    assert main(["loop", *FLAGS, *out]) == 2
+    assert f"error: {path}: not readable as JSON" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == [LOOP_FILE] and path.read_text() == "{"
+    path.write_text(json.dumps({"format": 1, "options": {"task": ["football"]}, "stages": {}}))
+    assert main(["loop", *FLAGS, *out]) == 2
+    assert "was begun with --task football" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == [LOOP_FILE]
+
+
+@pytest.mark.parametrize("given", ["", " "])
+def test_an_empty_out_is_refused(tmp_path, capsys, monkeypatch, given):
+    """It would be the folder in which the command was typed."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["loop", *FLAGS, "--out", given]) == 2
+    assert capsys.readouterr().err == "error: --out: is empty, name a folder\n"
+    assert not list(tmp_path.iterdir())

@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.policies.lerobot import checkpoint_network
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.lerobot.picture_preparation import PicturePreparation, PictureStep
 
@@ -130,6 +131,13 @@ def other_statistics(folder):
     save_file(load_file(path) | {f"{FRONT}.mean": torch.zeros(5, 1, 1)}, path)
 
 
+def other_weights(folder, *, add="", drop="-"):
+    """Leave out the weights whose names begin like this, and add one."""
+    path = folder / "model.safetensors"
+    kept = {name: value for name, value in load_file(path).items() if not name.startswith(drop)}
+    save_file(kept | ({add: torch.zeros(1)} if add else {}), path)
+
+
 def without_device(path):
     """Take the step out that brings numbers to the network's device."""
     content = json.loads(path.read_text())
@@ -204,7 +212,19 @@ WRONG = {
     "other weights": (lambda f: edit(f / "config.json", dim_model=64), "does not hold the weights of this network"),
     "cut weights": (
         lambda f: (f / "model.safetensors").write_bytes((f / "model.safetensors").read_bytes()[:-9]),
-        "model.safetensors: does not hold",
+        "model.safetensors: not readable as safetensors",
+    ),
+    "weights of another family": (
+        lambda f: edit(f / "config.json", type="pi05"),
+        r"model.safetensors: holds the tensor model.action_head.bias of act, but config.json says type pi05, which has",
+    ),
+    "weights of no family": (
+        lambda f: other_weights(f, add="normalize_inputs.buffer"),
+        r"model.safetensors: holds the tensor normalize_inputs.buffer, but config.json says type act",
+    ),
+    "weights that are a part": (
+        lambda f: other_weights(f, drop="model.decoder."),
+        r"model.safetensors: holds no tensor model.decoder.\*, but config.json says type act, which needs it",
     ),
 }
 
@@ -216,6 +236,60 @@ def test_what_cannot_be_run_is_one_clear_error(folder, kind):
     damage(folder)
     with pytest.raises(InputError, match=message):
         LeRobotPolicy(folder).check()
+
+
+def test_no_network_is_built_for_weights_of_another_family(folder, monkeypatch):
+    """pi0.5's takes minutes; the weights' header says at once that they are an ACT's."""
+    monkeypatch.setattr(checkpoint_network, "get_policy_class", lambda kind: pytest.fail("built"))
+    for kind in ("pi05", "diffusion", "multi_task_dit"):
+        edit(folder / "config.json", type=kind)
+        with pytest.raises(InputError, match=f"{folder}.*(type {kind}|config.json: )"):
+            LeRobotPolicy(folder).check()
+
+
+WIDTHS = {STATE: 64, "action": 40}
+CONSTANT = {
+    "MEAN_STD": ({"std": torch.zeros}, "std is 0"),
+    "MIN_MAX": ({"min": torch.ones, "max": torch.ones}, "min equals max"),
+    "QUANTILES": ({"q01": torch.zeros, "q99": torch.zeros}, "q01 equals q99"),
+}
+"""Mode → statistics that say that nothing ever changes, and how they are called."""
+
+
+@pytest.mark.parametrize("mode", CONSTANT)
+@pytest.mark.parametrize(("feature", "part"), [(STATE, "pre"), ("action", "post")])
+def test_statistics_of_a_feature_that_never_changes_are_refused(folder, mode, feature, part):
+    """They make noise of every look, or one action of every answer; a feature of which one number changes is taken."""
+    made, said = CONSTANT[mode]
+    modes = {kind: mode for kind in ("VISUAL", "STATE", "ACTION", "ENV")} | {"VISUAL": "MEAN_STD"}
+    edit(folder / "config.json", normalization_mapping=modes)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        normaliser(folder / name, norm_map=modes)
+    for path in folder.glob("*normalizer_processor.safetensors"):
+        ends = {"min": -1.0, "max": 1.0, "q01": -1.0, "q99": 1.0}
+        ranges = {f"{one}.{name}": torch.full((n,), end) for one, n in WIDTHS.items() for name, end in ends.items()}
+        save_file(load_file(path) | ranges, path)
+    LeRobotPolicy(folder).check()
+    (path,) = folder.glob(f"policy_{part}processor_step_*normalizer_processor.safetensors")
+    constant = {f"{feature}.{name}": make(WIDTHS[feature]) for name, make in made.items()}
+    save_file(load_file(path) | constant, path)
+    with pytest.raises(InputError, match=f"{path}: {feature}: {said} in all {WIDTHS[feature]} numbers"):
+        LeRobotPolicy(folder)
+    constant[f"{feature}.{list(made)[-1]}"][3] += 1.0
+    save_file(load_file(path) | constant, path)
+    LeRobotPolicy(folder).check()
+
+
+def test_statistics_that_nothing_uses_may_be_anything(folder):
+    """Of a feature that goes in as it is, and the actions' for an input, which only a training normalises."""
+    modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD", "ENV": "MEAN_STD"}
+    edit(folder / "config.json", normalization_mapping=modes)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        normaliser(folder / name, norm_map=modes)
+    (path,) = folder.glob("policy_preprocessor_step_*_normalizer_processor.safetensors")
+    unused = {f"{FRONT}.std": torch.zeros(3, 1, 1), "action.std": torch.zeros(40), "index.std": torch.zeros(2)}
+    save_file(load_file(path) | unused, path)
+    LeRobotPolicy(folder).check()
 
 
 def test_transforms_at_random_are_refused(tmp_path):

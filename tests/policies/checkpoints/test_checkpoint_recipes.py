@@ -7,8 +7,11 @@ import pytest
 import torch
 from made_checkpoints import follow
 
+from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from arena_newton.policies.lerobot.checkpoint_reader import FAMILY_TYPES
+from arena_newton.policies.lerobot.checkpoint_tensors import check_family
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.families import build
 
@@ -18,10 +21,17 @@ from made_stats import made_stats
 
 @pytest.mark.parametrize("family", ["act", "diffusion", "flow", "pi05"])
 def test_what_is_trained_is_run(family, tmp_path):
-    """Saved, opened and asked: the recipe's facts, and the same actions for 1, 3 and 20 worlds, bit for bit."""
+    """Saved, opened and asked: the recipe's facts, and the same actions for 1, 3 and 20 worlds, bit for bit.
+
+    What LeRobot saves of a family is taken for no other one.
+    """
     torch.manual_seed(3)
     model = build(recipe(family, "small"), made_stats(), "cpu")
     model.save(tmp_path, CheckpointFacts(tasks=("boxing",), steps=1))
+    weights = tmp_path / "model.safetensors"
+    for kind in {kind for kind, name in FAMILY_TYPES.items() if name != family}:
+        with pytest.raises(InputError, match=f"{weights}: holds the tensor .*, but config.json says type {kind}"):
+            check_family(weights, kind)
     policy = LeRobotPolicy(tmp_path)
     about = policy.describe()
     assert (about["family"], about["recipe"], about["tasks"]) == (family, "small", ["boxing"])

@@ -1,5 +1,6 @@
 """Packed policies: the same answers as LeRobot's, in half the size, and clear refusals."""
 
+import dataclasses
 import json
 import random
 import resource
@@ -100,7 +101,7 @@ def test_lerobot_is_not_imported(packed):
 def test_a_task_vector_decides(packed):
     """The task is an input: another one changes the answer."""
     policy = LearnedPolicy(packed)
-    policy.card = PolicyCard(tasks=TASKS)
+    policy.card = dataclasses.replace(policy.card, tasks=TASKS)
     answers = [policy.act(seen([5], [0], task=task)).actions for task in TASKS]
     assert not torch.equal(*answers)
 
@@ -383,5 +384,39 @@ def test_damaged_files_are_one_error(packed, tmp_path):
     steps["steps"][0] = {"registry_name": "tokenizer_processor", "config": {}}
     (folder / "policy_preprocessor.json").write_text(json.dumps(steps))
     refused("policy_preprocessor.json: steps are", whole)
+    (path,) = folder.glob("policy_postprocessor_step_*.safetensors")
+    save_file(load_file(path) | {"action.std": torch.zeros(40)}, path)
+    refused(f"{path.name}: action: std is 0 in all 40 numbers", whole)
     edit(folder / CARD_FILE, tasks=["football"])
     refused("card.json: tasks names football, which its task vector lacks", whole)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("weights", "0123456789ab", "'0123456789ab', but model.safetensors has '"),
+        ("bytes", 5, "5, but the files next to it have "),
+        ("trackers", ["sonic"], r"\('sonic',\), but arena_policy.json has \('twist2',\)"),
+        ("recipe", "paper", "'paper', but arena_policy.json has ''"),
+        ("steps", 9, "9, but arena_policy.json has 4"),
+        ("datasets", [{"name": "other"}], r"\({'name': 'other'},\), but arena_policy.json has \(\)"),
+    ],
+)
+def test_a_card_of_another_policy_is_refused(packed, tmp_path, field, value, said):
+    """What the card repeats of the files next to it is compared with them; the message names card and field."""
+    folder = copy(packed, tmp_path)
+    edit(folder / CARD_FILE, **{field: value})
+    with pytest.raises(InputError, match=f"card.json: {field} is {said}.*; take all files of one policy"):
+        LearnedPolicy(folder).check()
+
+
+def test_other_weights_under_a_card_are_refused(packed, tmp_path):
+    """Weights that fit the network but are not those that were packed are not played under their results."""
+    folder = copy(packed, tmp_path)
+    weights = load_file(folder / "model.safetensors")
+    weights["model.action_head.bias"] += 1.0
+    save_file(weights, folder / "model.safetensors")
+    with pytest.raises(InputError, match="card.json: weights is '.*', but model.safetensors has '"):
+        LearnedPolicy(folder).check()
+    pack(folder, folder, CARD)  # as the message says
+    LearnedPolicy(folder).check()
