@@ -14,6 +14,10 @@ from arena_newton.text import plain_text
 
 __all__ = ["INTERRUPTED", "exit_code"]
 
+COLLECTED = (50_000, 10, 10)
+"""Thresholds of the garbage collector. Imports and kernels make a million objects that stay; with Python's own first
+threshold, 700, it looks through them again and again while they are made: a fourth of a command's start."""
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 NO_HOME = "Could not determine home directory."
@@ -30,6 +34,7 @@ def exit_code(work: Callable[[], int | None]) -> int:
         What the work returned: 0 done, or a code of its own; after an error its `exit_code`: 1 failed, 2 bad input; 130
         interrupted. Whoever closes the output has seen enough: 0.
     """
+    gc.set_threshold(*COLLECTED)
     # An interpreter that ends looks for garbage three times among the millions of objects that compiled kernels leave,
     # which takes seconds after the last line is printed; what is frozen is not looked at. Once, however often called.
     atexit.unregister(gc.freeze)

@@ -29,14 +29,14 @@ TUNED: Mapping[str, tuple[int, ...]] = {
     "vis_navi": (0, 10, 500, 501, 502, 503, 504, 505, 700),
     "football": (500, 501, 502, 503, 700, 701),
     "sit_sofa": (500, 501, 502),
-    "open_door": (500,),
-    "pp_box": (500,),
-    "double_desk": (500,),
+    "open_door": (500, 700, 701),
+    "pp_box": (500, 700, 701),
+    "double_desk": (500, 700, 701),
 }
 """Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
 HELD_OUT = 700
 """First group seed that the check plays: above all that were looked at ..."""
-HELD_OUT_OF: Mapping[str, int] = {"vis_navi": 900, "football": 900}
+HELD_OUT_OF: Mapping[str, int] = {"vis_navi": 900, "football": 900, "open_door": 900, "pp_box": 900, "double_desk": 900}
 """... and the one of tasks in which a rule or threshold was changed after episodes from there on had been seen."""
 
 

@@ -31,6 +31,7 @@ from arena_newton.policies.base import Mask
 from arena_newton.policies.experts import ExpertPolicy, Sight
 from arena_newton.policies.experts.base import Expert
 from arena_newton.policies.experts.style import Style
+from arena_newton.robot import CANONICAL_JOINTS
 from arena_newton.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
 from arena_newton.tasks.football import GOAL
@@ -52,8 +53,12 @@ ASIDE = math.radians(35)
 """... and how far to either side of the straight way that is at most [rad]."""
 CLOSE = 1.6
 """Distance to the object at which what goes wrong on the approach begins [m]."""
+KNEES = tuple(ACTION["joint_pos"].start + CANONICAL_JOINTS.index(f"{side}_knee_joint") for side in ("left", "right"))
+"""Columns of the action that bend the knees, left and right."""
 LEAN = math.radians(80)
 """Lean of the reference of a robot that loses its balance [rad]; trackers stay on their feet up to about 60 degrees."""
+BENT = 2.2
+"""Knee of the leg that it takes off the floor for that where hands are needed [rad]; its foot goes up behind it."""
 GROWS = 40
 """Ticks in which what goes wrong on the approach grows to its size."""
 OFF_CENTRE = (0.18, 0.22)
@@ -289,14 +294,24 @@ class MisaimedExpert(MisledExpert):
 
 
 class UnbalancedExpert(MisledExpert):
-    """Leans over more and more once it is close, until it falls."""
+    """Leans over more and more once it is close, until it falls.
+
+    Before door, table and desk it leans backwards, for these would hold it, and takes one foot off the floor: SONIC
+    stays up on two, whichever way its reference leans.
+    """
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """See `MisledExpert.spoil`."""
-        lean = LEAN * (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
+        grown = (self.since / GROWS).clamp(0.0, 1.0) * ~self.touched
         side = self.style.uniform("side", -1.0, 1.0)
-        # Away from door, table and desk, which would hold it.
-        return _leaning(actions, lean, side + math.pi if self.handling else side)
+        if not self.handling:
+            return _leaning(actions, LEAN * grown, side)
+        spoilt = _leaning(actions, LEAN * grown, side + math.pi)
+        lifted = torch.stack([side > 0.0, side <= 0.0], dim=1) * grown[:, None]
+        for column, part in zip(KNEES, lifted.unbind(dim=1), strict=True):
+            knee = spoilt[:, :, column]
+            spoilt[:, :, column] = knee + part[:, None] * (BENT - knee)
+        return spoilt
 
 
 class ReluctantExpert(MisledExpert):

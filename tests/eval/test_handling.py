@@ -9,14 +9,20 @@ import pytest
 import torch
 
 from arena_newton import seeding, tasks, trackers
+from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.certification.handling import HANDLING
 from arena_newton.eval.certification.sabotage import (
+    BENT,
+    GROWS,
+    KNEES,
+    LEAN,
     SABOTAGES,
     ClumsyExpert,
     MisledSight,
     RelocatingEnv,
     StubbornExpert,
+    UnbalancedExpert,
     WeakTracker,
 )
 from arena_newton.eval.interaction import INTERACTIONS
@@ -24,6 +30,7 @@ from arena_newton.eval.run import Factories
 from arena_newton.eval.signal_recorder import SignalRecorder
 from arena_newton.policies.experts import Sight
 from arena_newton.policies.experts.style import Style
+from arena_newton.rotations import matrix_from_quat, quat_from_rot6d
 from arena_newton.trackers.motions.commands import MotionCommand
 
 WORLDS = 2
@@ -191,6 +198,24 @@ def test_a_reluctant_robot_stands_before_a_door(envs):
     policy.handling = dataclasses.replace(policy.handling, halts=9.0)
     near = policy.overrule(walking)
     assert policy.halted.all() and not near.velocity.any() and not near.reach.any()
+
+
+def test_an_unbalanced_robot_leans_back_on_one_foot(envs):
+    """It leans backwards and bends the knee of one side more and more; once it touched the object, neither."""
+    policy = UnbalancedExpert()
+    policy.attach(envs("pp_box"))
+    policy.reset(range(WORLDS), ["pp_box"] * WORLDS)
+    standing = torch.from_numpy(STAND_ACTION).repeat(WORLDS, 1, 1)
+    assert torch.allclose(torch.as_tensor(policy.spoil(standing)), standing, atol=1e-6)
+    policy.since[:] = GROWS
+    spoilt = torch.as_tensor(policy.spoil(standing))
+    tilt = matrix_from_quat(quat_from_rot6d(spoilt[:, 0, ACTION["root_rot6d"]]))[:, :, 2]
+    assert (tilt[:, 2] < math.cos(LEAN - math.radians(10))).all() and (tilt[:, 0] < 0).all()
+    knees = spoilt[:, 0, list(KNEES)]
+    assert torch.allclose(knees.max(dim=1).values, torch.full((WORLDS,), BENT))
+    assert torch.equal(knees.min(dim=1).values, standing[:, 0, KNEES[0]])
+    policy.touched[0] = True
+    assert torch.allclose(torch.as_tensor(policy.spoil(standing))[0], standing[0], atol=1e-6)
 
 
 def test_legs_are_weakened_as_the_task_says():
