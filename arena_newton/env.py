@@ -367,7 +367,7 @@ class ArenaEnv:
         self.physics.set_active(stepping)
         self.physics.step()
         self._stepping.choose(stepping)
-        if np.array_equal(stepping, self.active):
+        if worlds is None or np.array_equal(stepping, self.active):
             self.judge.evaluate(self.physics)
             self._rule()
         else:

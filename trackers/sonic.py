@@ -23,7 +23,7 @@ from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, co
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, PartialNetwork, TrackerNetwork, folded, mlp, shrink_last
 from arena_newton.trackers.inference.onnx_session import OnnxSession
-from arena_newton.trackers.inference.quadratic import Quadratic, products
+from arena_newton.trackers.inference.quadratic import Quadratic
 from arena_newton.trackers.interface import JOINTS, ActionForm, Interface, slices
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
 
@@ -94,6 +94,8 @@ _R10, _R11 = ((6, 2), (3, 2)), ((5, -2), (15, -2))
 _R20, _R21 = ((7, 2), (2, -2)), ((11, 2), (1, 2))
 ROT6D = (_R00, _R01, _R10, _R11, _R20, _R21)
 """Two columns of the rotation matrix, row by row, minus the identity's: from a_i a_j (index 4 i + j)."""
+IDENTITY_6D = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+"""The identity's."""
 RELATIVE_AND_DOWN = (
     ((4, 1), (13, 1), (22, 1), (31, 1)),
     ((5, 1), (12, -1), (23, -1), (30, 1)),
@@ -105,6 +107,8 @@ RELATIVE_AND_DOWN = (
 )
 """conj(a) b; then the negative last row of a's rotation matrix without the identity's, the direction down seen from the
 body. From a_i (a, b)_j (index 8 i + j)."""
+DOWN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+"""What these lack: nothing, and the identity's negative last row."""
 
 
 _MIRROR = (
@@ -218,8 +222,8 @@ class SonicFrontEnd(FrontEnd):
         four = [JOINTS * part + joint for part in range(4) for joint in CANONICAL_TO_MUJOCO]
         self._four_to_canonical = torch.tensor(four, device=self.device)
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
-        self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), self.device)
-        self._rot6d = Quadratic(ROT6D, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0), self.device)
+        self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, DOWN, rows=worlds, width=8, device=self.device)
+        self._rot6d = Quadratic(ROT6D, IDENTITY_6D, rows=worlds, device=self.device)
 
         def frames(name: str) -> torch.Tensor:
             return self.obs[:, AT[name]].view(worlds, FRAMES, -1)
@@ -278,9 +282,9 @@ class SonicFrontEnd(FrontEnd):
         ref_pos, ref_vel, pos, vel = joints.index_select(1, self._four_to_canonical).view(-1, 4, 1, JOINTS).unbind(1)
         self._ref_pos.copy_(ref_pos.expand_as(self._ref_pos))
         self._ref_vel.copy_(ref_vel.expand_as(self._ref_vel))
-        quats = products(state.quat, torch.cat((state.quat, command.quat), 1))
-        relative, down = self._relative_and_down(quats).split((4, 3), 1)
-        anchor = self._rot6d(products(relative, relative))[:, None]
+        quats = torch.cat((state.quat, command.quat), 1)
+        relative, down = self._relative_and_down(state.quat, quats).split((4, 3), 1)
+        anchor = self._rot6d(relative, relative)[:, None]
         self._anchor.copy_(anchor)
         self._anchors.copy_(anchor.expand_as(self._anchors))
         self._now_gravity.copy_(down)

@@ -2,8 +2,8 @@
 
 Facts of its observation are those of its own simulation script, as the original benchmark uses them: 127 numbers a
 frame, ten past frames, and the command once more, 1432 in all. All elementwise arithmetic on the observation is either
-exactly rounded or done on rows padded to whole vectors, because the vector and scalar versions of `atan2` and `asin`
-differ in their last bit.
+exactly rounded, or done on rows padded to whole vectors (`asin`) or one by one (`atan2`), because the vector and scalar
+versions of these differ in their last bit.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, co
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, folded, mlp, shrink_last
 from arena_newton.trackers.inference.onnx_session import OnnxSession
-from arena_newton.trackers.inference.quadratic import Quadratic, products
+from arena_newton.trackers.inference.quadratic import Quadratic
 from arena_newton.trackers.interface import JOINTS, ActionForm, Interface, slices
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS
 
@@ -44,10 +44,12 @@ OFFICIAL_FORM = ActionForm("default", (0.5,) * JOINTS, clip=10.0)
 """Action form of the official checkpoints."""
 OBSERVATION_CLIP = 100.0
 TILT_TERMS = (((1, 2), (11, 2)), ((5, -2), (10, -2)), ((2, 2), (7, -2)))
-"""2(wx + yz), -2(x² + y²), 2(wy - zx) from the products of a quaternion with itself (`Quadratic`)."""
+"""2(wx + yz), -2(x² + y²), 2(wy - zx) from the products of a quaternion with itself (`Quadratic`) ..."""
+UPRIGHT = (0.0, 1.0, 0.0)
+"""... to which these are added."""
 _VECTOR = 64
-"""Rows are padded to a multiple of this for `atan2` and `asin`. Measured with AVX-512: a multiple of 32 rows goes
-through torch's vector code whole; of 15 or 48 rows two have other last bits in `atan2`."""
+"""Rows are padded to a multiple of this for `asin`. Measured with AVX-512: a multiple of 32 rows goes through torch's
+vector code whole."""
 
 
 class Twist2Net(TrackerNetwork):
@@ -104,11 +106,10 @@ class Twist2FrontEnd(FrontEnd):
         self._newest = self._past[:, -FRAME:]
         self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
-        self._tilt_terms = Quadratic(TILT_TERMS, (0.0, 1.0, 0.0), self.device)
-        terms, angles = torch.zeros(3, padded, device=self.device), torch.zeros(2, padded, device=self.device)
-        self._roll_sine, self._roll_cosine, self._pitch_sine = terms
-        self._roll, self._pitch = angles
-        self._terms, self._angles = terms[:, :worlds].t(), angles[:, :worlds].t()
+        self._tilt_terms = Quadratic(TILT_TERMS, UPRIGHT, rows=worlds, device=self.device)
+        self._roll, self._pitch = self._tilt.unbind(1)
+        self._padded = torch.zeros(padded, device=self.device)
+        self._pitch_sine = self._padded[:worlds]
         self._joint_vel_scale = torch.full((JOINTS,), JOINT_VEL_SCALE, device=self.device)
         self._joint_vel_scale[[i for i, name in enumerate(MUJOCO_JOINTS) if "ankle" in name]] = 0.0
 
@@ -140,19 +141,20 @@ class Twist2FrontEnd(FrontEnd):
         """Write the current frame and the command's second copy."""
         self._mimic.copy_(command.mimic)
         torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=self._ang_vel)
-        self._tilt.copy_(self._roll_pitch(state.quat))
+        self._write_roll_pitch(state.quat)
         torch.sub(state.joint_pos, self._default, out=self._joints)
         torch.mul(state.joint_vel, self._joint_vel_scale, out=self._joint_vel)
         self._past_action.copy_(self.last_action)
         self._frame.clamp_(-OBSERVATION_CLIP, OBSERVATION_CLIP)
         self._future.copy_(self._mimic)
 
-    def _roll_pitch(self, quat: torch.Tensor) -> torch.Tensor:
-        """Roll atan2(2(wx + yz), 1 - 2(x² + y²)) and pitch asin(clamp(2(wy - zx))); shape [worlds, 2] [rad]."""
-        self._terms.copy_(self._tilt_terms(products(quat, quat)))
-        atan2(self._roll_sine, self._roll_cosine, out=self._roll)
-        torch.asin(self._pitch_sine.clamp_(-1.0, 1.0), out=self._pitch)
-        return self._angles
+    def _write_roll_pitch(self, quat: torch.Tensor) -> None:
+        """Write roll atan2(2(wx + yz), 1 - 2(x² + y²)) and pitch asin(clamp(2(wy - zx))) [rad]."""
+        roll_sine, roll_cosine, pitch_sine = self._tilt_terms(quat, quat).unbind(1)
+        atan2(roll_sine, roll_cosine, out=self._roll)
+        self._pitch_sine.copy_(pitch_sine)
+        torch.asin(self._padded.clamp_(-1.0, 1.0), out=self._padded)
+        self._pitch.copy_(self._pitch_sine)
 
 
 class Twist2Tracker(NetworkTracker):

@@ -44,6 +44,49 @@ def test_launches_keep_their_order(device):
     assert c.numpy().tolist() == [15.0, 15.0]
 
 
+@wp.struct
+class _Pair:
+    factor: float
+    offset: float
+
+
+@wp.kernel
+def _affine(a: wp.array2d[float], pair: _Pair, shift: wp.vec3, flag: bool, out: wp.array2d[float]):
+    i, j = wp.tid()
+    if flag:
+        out[i, j] = pair.factor * a[i, j] + pair.offset + shift[j]
+
+
+def test_arguments_of_every_kind_are_packed_once():
+    """On the CPU a recorded launch calls the machine code itself, with arrays, structs, vectors, numbers and flags."""
+    a, pair = wp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], dtype=float, device="cpu"), _Pair()
+    pair.factor, pair.offset = 2.0, 1.0
+    plain, again = (wp.zeros((2, 3), dtype=float, device="cpu") for _ in range(2))
+
+    def affine(out):
+        launching.launch(_affine, dim=a.shape, inputs=[a, pair, wp.vec3(1.0, 2.0, 3.0), True], outputs=[out])
+
+    affine(plain)
+    recorded = launching.record(affine, again)
+    (command,) = recorded.commands
+    command.launch = None  # Warp's own launch is not used
+    recorded()
+    assert again.numpy().tolist() == plain.numpy().tolist() == [[4.0, 7.0, 10.0], [10.0, 13.0, 16.0]]
+    pair.factor = 0.0  # a struct stays as it was at the recording
+    recorded()
+    assert again.numpy().tolist() == plain.numpy().tolist()
+
+
+def test_another_kind_of_launch_is_left_to_warp():
+    """Where Warp's recorded launch does not look as it is known, Warp launches."""
+    a, out = wp.array([1.0, 2.0], dtype=float, device="cpu"), wp.zeros(2, dtype=float, device="cpu")
+    command = launching.record(_launch, a, 2.0, out).commands[0]
+    command.block_dim = 2
+    assert launching._prepared(command) is None
+    del command.block_dim
+    assert launching._prepared(command) is None
+
+
 def test_tape_sees_a_plain_launch():
     """Outside a recording a tape records every launch, also after one with the same arrays was recorded."""
     a = wp.array([1.0, 2.0], dtype=float, device="cpu", requires_grad=True)

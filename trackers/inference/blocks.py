@@ -113,30 +113,38 @@ class BlockRunner:
         padding = max(_BLOCK_SIZES) if self.fixed else 1
         self._buffer = torch.zeros(-(-worlds // padding) * padding, in_width, device=self.device)
         self.input = self._buffer[:worlds]
-        self._product: Network | None = network if on_host or not self.fixed else None
+        self._product: Network | None = torch.inference_mode()(network) if on_host or not self.fixed else None
         self._plan: tuple[int, bool] | None = None
+        self._planned: Callable[[], torch.Tensor] | None = None
         threads = min(torch.get_num_threads(), worlds // _ROWS_PER_THREAD)
         self._pool = ThreadPoolExecutor(threads) if self.fixed and threads > 1 else None
         self._threads = threads
 
-    @torch.inference_mode()
     def run(self) -> torch.Tensor:
         """Outputs of the rows in `input`, shape [worlds, out_width]; a new tensor.
 
         Raises:
             InputError: On the first call, if ONNX Runtime cannot run the network.
         """
-        if not self.fixed:
-            return self.network(self.input)
-        product = self._compile()
+        if self._planned is None:
+            self._planned = self._as_planned() if self.fixed else torch.inference_mode()(self._whole)
+        return self._planned()
+
+    def _whole(self) -> torch.Tensor:
+        return self.network(self.input)
+
+    def _as_planned(self) -> Callable[[], torch.Tensor]:
+        """A run with everything that is the same each time done beforehand."""
+        product, worlds = self._compile(), self.worlds
         block, merged = self.plan()
-        rows = self._buffer[: -(-self.worlds // block) * block]
+        rows = self._buffer[: -(-worlds // block) * block]
         if not merged:
-            return torch.cat([product(part.clone()) for part in rows.split(block)])[: self.worlds]
-        if self._pool is not None:
-            part = -(-len(rows) // (block * self._threads)) * block
-            return torch.cat(list(self._pool.map(product, rows.split(part))))[: self.worlds]
-        return product(rows)[: self.worlds]
+            parts = rows.split(block)
+            return lambda: torch.cat([product(part.clone()) for part in parts])[:worlds]
+        if (pool := self._pool) is not None:
+            parts = rows.split(-(-len(rows) // (block * self._threads)) * block)
+            return lambda: torch.cat(list(pool.map(product, parts)))[:worlds]
+        return (lambda: product(rows)) if len(rows) == worlds else (lambda: product(rows)[:worlds])
 
     def _compile(self) -> Network:
         if self._product is None:
