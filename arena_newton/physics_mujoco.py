@@ -65,6 +65,8 @@ class MujocoPhysics(Physics):
         self.xpos = self._shared("xpos", m.nbody, 3)
         self.xquat = self._shared("xquat", m.nbody, 4)
         self.xipos = self._shared("xipos", m.nbody, 3)
+        quat = scene.robot.root_qpos + 3
+        self._root_xy = self._host["qpos"][:, quat + 1], self._host["qpos"][:, quat + 2]
         self._force: wp.array | None = None
         # Views made once: a property of MjData costs about as much as the copy behind it.
         names = ("qpos", "qvel", "xpos", "xquat", "xipos")
@@ -149,11 +151,13 @@ class MujocoPhysics(Physics):
 
     def _read_contacts(self) -> None:
         """Contact forces of the last physics step."""
-        root = self.scene.robot.root_qpos
-        q = self._host["qpos"][:, root + 3 : root + 7]
-        tilted = 1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2) < 0.5
-        for w in np.flatnonzero(self._active if self.want_forces else self._active & tilted):
-            self._host["contact_force"][w] = self._body_forces(self._data[w])
+        asked = self._active
+        if not self.want_forces:
+            x, y = self._root_xy
+            asked = asked & (1.0 - 2.0 * (x**2 + y**2) < 0.5)
+        if asked.any():
+            for w in np.flatnonzero(asked):
+                self._host["contact_force"][w] = self._body_forces(self._data[w])
         if self._pair is not None:
             for w in np.flatnonzero(self._active & self._pair[2]):
                 self._host["pair_force"][w] = self._pair_normal(self._data[w], *self._pair[:2])
