@@ -21,6 +21,7 @@ from arena_newton.eval.options import BenchOptions
 from arena_newton.extras import require
 from arena_newton.interfaces import Policy
 from arena_newton.policies.label_reader import read_by
+from arena_newton.policies.recipes.training_recipe import FAMILIES
 from arena_newton.rollout import Rollout
 
 __all__ = ["PARTS", "policy_figures", "random_checkpoint", "timed_parts"]
@@ -55,7 +56,9 @@ def random_checkpoint(folder: Path, name: str = "fast", tasks: tuple[str, ...] =
     from arena_newton.policies.recipes.training_recipe import recipe
     from arena_newton.policies.train import families
 
-    settings = recipe(family, name, labels="v3.1", realign=0.0)
+    # The fast recipe of pi0.5 begins with weights of a hub: without their name, with new ones of the same size.
+    network = {"pretrained_path": ""} if family == "pi05" and name == "fast" else {}
+    settings = recipe(family, name, labels="v3.1", realign=0.0, network=network)
 
     def around(mean: torch.Tensor, deviation: float) -> dict[str, torch.Tensor]:
         spread = torch.full_like(mean, deviation)
@@ -79,6 +82,8 @@ def random_checkpoint(folder: Path, name: str = "fast", tasks: tuple[str, ...] =
 def policy_figures(options: BenchOptions) -> Iterator[BenchFigure]:
     """Seconds for the episodes of each task, and in the note the fractions of a tick."""
     cuda = bool(wp.is_cuda_available())
+    if options.policy_family not in FAMILIES:
+        raise InputError(f"--policy-family {options.policy_family}: unknown, choose from {', '.join(FAMILIES)}")
     if options.policy_checkpoint is None:
         try:
             require("policies", "policy")
@@ -87,7 +92,7 @@ def policy_figures(options: BenchOptions) -> Iterator[BenchFigure]:
             return
     with tempfile.TemporaryDirectory() as folder:
         given = options.policy_checkpoint
-        spec = f"lerobot:{given or random_checkpoint(Path(folder))}"
+        spec = f"lerobot:{given or random_checkpoint(Path(folder), family=options.policy_family)}"
         for task in options.policy_tasks:
             yield _figure(options, task, spec, cuda, given is None)
 
@@ -121,10 +126,13 @@ def _figure(options: BenchOptions, task: str, spec: str, cuda: bool, random: boo
         policy.close()
         env.close()
     ticks, won = sum(result.steps for result in results), sum(result.outcome == "success" for result in results)
-    shown = ", ".join(f"{name} {100 * parts[name] / timed:.0f} %" for name in PARTS)
+    ticks_s = max(result.steps for result in results) / seconds
+    shown = f"{ticks_s:.1f} ticks/s of the batch, "
+    shown += ", ".join(f"{name} {100 * parts[name] / timed:.0f} %" for name in PARTS)
     rest = 100 * (1 - sum(parts.values()) / timed)
     note = f"{shown}, rest {rest:.0f} %; {ticks:,} ticks, {won} successes, {'random weights' if random else spec}"
-    whole = cuda and count == EPISODES and task in BARS and not options.policy_steps
+    act = options.policy_family == "act" or options.policy_checkpoint is not None
+    whole = cuda and count == EPISODES and task in BARS and not options.policy_steps and act
     where = "CUDA" if cuda else "CPU"
     name = f"{count} {task} episodes, policy that sees, {where}"
     if whole:

@@ -360,7 +360,9 @@ class BenchOptions:
     recording_task: str = "vis_navi"
     """Task that is recorded."""
     policy_checkpoint: str | None = None
-    """Checkpoint of `policy`; an ACT of full size with random weights when none is named."""
+    """Checkpoint of `policy`; one of `--policy-family` of full size with random weights when none is named."""
+    policy_family: str = "act"
+    """Family of those random weights: act, diffusion, flow or pi05 (4 billion, which takes minutes to make)."""
     policy_tasks: tuple[str, ...] = ("vis_navi", "boxing")
     """Tasks of `policy`."""
     policy_episodes: int = 0

@@ -7,6 +7,7 @@ what the base has not is zero, so that the policy begins as the base.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -232,8 +233,8 @@ def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
 
 
 def _base(recipe: TrainingRecipe, weights: str | Path | None) -> Path | None:
-    """Folder of the base weights; none where a recipe has new ones."""
-    if weights is None and isinstance(recipe.network.get("gemma"), Mapping):
+    """Folder of the base weights; none where a recipe has new ones: of other sizes, or without a name of weights."""
+    if weights is None and (isinstance(recipe.network.get("gemma"), Mapping) or not recipe.network["pretrained_path"]):
         return None
     name = str(weights if weights is not None else recipe.network["pretrained_path"])
     folder = weights_folder(name, "pi0.5 base weights", BASE_FILES)
@@ -255,13 +256,11 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
         )
     sizes = recipe.network.get("gemma")
     folder = _base(recipe, weights)
-    if isinstance(sizes, Mapping):
-        tokenizer, name = _tokenizer(folder) if folder and _holds_tokenizer(folder) else (made_tokenizer(), "")
-        with gemma_of(sizes):
-            policy = new_policy(config)
+    if folder is None or (isinstance(sizes, Mapping) and not _holds_tokenizer(folder)):
+        tokenizer, name = made_tokenizer(), ""
     else:
-        assert folder is not None
         tokenizer, name = _tokenizer(folder)
+    with gemma_of(sizes) if isinstance(sizes, Mapping) else contextlib.nullcontext():
         policy = new_policy(config)
     loaded = load_base(policy, folder / WEIGHTS_FILE) if folder else ""
     policy.to(device).train()

@@ -13,7 +13,7 @@ from arena_newton.eval.options import BenchOptions
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import families
+from arena_newton.policies.train import families, pi05_family
 from tests.made_packed import packed
 
 
@@ -30,7 +30,7 @@ def small(folder):
     return folder
 
 
-@pytest.mark.parametrize("family", ["act", "flow"])
+@pytest.mark.parametrize("family", ["act", "flow", "pi05"])
 def test_random_weights_are_made_without_a_gpu(tmp_path, monkeypatch, family):
     """Where there are several GPUs none of them is started, and the generator of whoever asks stays where it was."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
@@ -38,6 +38,23 @@ def test_random_weights_are_made_without_a_gpu(tmp_path, monkeypatch, family):
     bench_policy.random_checkpoint(tmp_path / family, "small", family=family)
     assert torch.equal(torch.random.get_rng_state(), before)
     assert (tmp_path / family / "model.safetensors").is_file()
+
+
+def test_weights_of_full_size_need_no_download(tmp_path, monkeypatch):
+    """Random weights of pi0.5 have the recipe's sizes and a tokenizer of this package; no hub is asked."""
+    wanted = []
+
+    def stopped(config):
+        wanted.append((config.paligemma_variant, config.action_expert_variant, config.pretrained_path))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pi05_family, "new_policy", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        bench_policy.random_checkpoint(tmp_path / "pi05", family="pi05")
+    ((*sizes, path),) = wanted
+    assert sizes == ["gemma_2b", "gemma_300m"] and not path
+    with pytest.raises(InputError, match="--policy-family cat: unknown, choose from act, diffusion, flow, pi05"):
+        next(bench_policy.policy_figures(BenchOptions(policy_family="cat")))
 
 
 def test_parts_of_a_tick_are_measured(tmp_path, monkeypatch):
