@@ -152,13 +152,18 @@ def _loaded(checkpoint: PolicyCheckpoint) -> PreTrainedPolicy:
 
 @contextmanager
 def _own_encoders(checkpoint: PolicyCheckpoint) -> Iterator[None]:
-    """Lets LeRobot build with the architecture and the tokenizer that a checkpoint of ours brings."""
+    """Lets LeRobot build with the architecture and the tokenizer that a checkpoint of ours brings.
+
+    Weights are not drawn first: those of the checkpoint are loaded over them, and to draw pi0.5's takes minutes.
+    """
     if checkpoint.type not in ("multi_task_dit", "pi05"):
         yield
         return
+    from transformers.initialization import no_init_weights
+
     from arena_newton.policies.train.encoder_sources import checkpoint_encoders  # imports transformers
 
-    with checkpoint_encoders(checkpoint.folder):
+    with checkpoint_encoders(checkpoint.folder), no_init_weights():
         yield
 
 
