@@ -382,7 +382,8 @@ class ArenaEnv:
 
     def _statuses(self) -> np.ndarray:
         """Status codes of the last tick, int32, shape [worlds]."""
-        return self._status.numpy() if self._status_view is None else self._status_view
+        codes: np.ndarray = self._status.numpy() if self._status_view is None else self._status_view
+        return codes
 
     def _judge_some(self) -> None:
         """Judge the tick, but leave counters and verdicts of the worlds that did not step as they were."""

@@ -11,6 +11,7 @@ Everything runs on any torch device without waiting for it, so a CUDA graph can 
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -40,6 +41,19 @@ def store(target: torch.Tensor, value: torch.Tensor, rows: torch.Tensor | None) 
         rows = rows.view(-1, *[1] * (target.dim() - 1))
         value = torch.where(rows, value, target)
     target.copy_(value)
+
+
+def without_gradients[**P, R](work: Callable[P, R]) -> Callable[P, R]:
+    """`torch.no_grad`, which takes 3 µs a call, only where gradients are recorded."""
+
+    @functools.wraps(work)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not torch.is_grad_enabled():
+            return work(*args, **kwargs)
+        with torch.no_grad():
+            return work(*args, **kwargs)
+
+    return call
 
 
 class Mirror:
@@ -110,7 +124,7 @@ class FrontEnd(abc.ABC):
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the observation history of the masked worlds with the current frame."""
 
-    @torch.no_grad()
+    @without_gradients
     def observe(self, command: TrackerCommand, state: RobotState) -> torch.Tensor:
         """Observation of this tick, shape [worlds, obs_width]: the buffer itself, which `act` changes.
 
@@ -121,7 +135,7 @@ class FrontEnd(abc.ABC):
         self.write(command, state)
         return self.obs
 
-    @torch.no_grad()
+    @without_gradients
     def act(self, raw: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Joint targets [rad], MuJoCo order, shape [worlds, 29]; ends the tick. The buffer is reused by the next call.
 

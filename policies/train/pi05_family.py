@@ -257,14 +257,14 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
     sizes = recipe.network.get("gemma")
     folder = _base(recipe, weights)
     if folder is None or (isinstance(sizes, Mapping) and not _holds_tokenizer(folder)):
-        tokenizer, name = made_tokenizer(), ""
+        found: tuple[PreTrainedTokenizerBase, str] = made_tokenizer(), ""
     else:
-        tokenizer, name = _tokenizer(folder)
+        found = _tokenizer(folder)
     with gemma_of(sizes) if isinstance(sizes, Mapping) else contextlib.nullcontext():
         policy = new_policy(config)
     loaded = load_base(policy, folder / WEIGHTS_FILE) if folder else ""
     policy.to(device).train()
-    model = Pi05Model(recipe, usable, device, policy, tokenizer, name)
+    model = Pi05Model(recipe, usable, device, policy, *found)
     model.weights_checksum = loaded
     return model
 

@@ -43,6 +43,15 @@ def test_bit_identity(shape):
         torch.set_num_threads(before)
 
 
+def test_a_run_reads_the_rows_as_they_are():
+    """Every run reads what the input holds then, and gives the bits of a run that was never made before."""
+    network, rows = mlp(451, 64, 29), torch.randn(3, 451, generator=torch.Generator().manual_seed(2))
+    runner = BlockRunner(network, 451, 3)
+    for step in range(3):
+        runner.input.copy_(rows + step)
+        assert torch.equal(runner.run(), outputs(network, rows + step))
+
+
 def test_modules_run_in_onnx_runtime():
     """A network of modules is compiled, and its plan is a block size that was tried."""
     runner = BlockRunner(mlp(451, 64, 29), 451, 20)
