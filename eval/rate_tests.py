@@ -161,13 +161,15 @@ def _distribution(ratios: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def excess(strata: Sequence[Counts]) -> float:
-    """Successes of the first beyond what `stratified_test` expects of equal rates: its sign is the test's direction."""
+    """Successes of the first beyond what `stratified_test` expects of equal rates: its sign is the test's direction.
+
+    0 without episodes.
+    """
     found = Fraction()
     for counts in strata:
         if isinstance(counts, PairedCounts):
             found += Fraction(counts.only_first - counts.only_second, 2)
-        else:
-            episodes = counts.first_episodes + counts.second_episodes
+        elif episodes := counts.first_episodes + counts.second_episodes:
             found += counts.first - Fraction((counts.first + counts.second) * counts.first_episodes, episodes)
     return float(found)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import (
@@ -17,19 +18,27 @@ from arena_newton.eval.certification.finding import (
     skipped,
 )
 from arena_newton.eval.certification.solvable import recorded
-from arena_newton.eval.engines import fisher
+from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.stats import mcnemar
 
-__all__ = ["CHECKS", "retention"]
+__all__ = ["CHECKS", "discordant", "retention"]
 
 ENOUGH = 60
 """With fewer episodes of all tasks together a loss that is not shown says nothing."""
 SHOWN_BY = 0.05
-"""Largest p-value of Fisher's test, all tasks together, at which the loss through the other tracker counts as shown."""
+"""Largest p-value of McNemar's exact test, all tasks together, at which the loss counts as shown."""
 
 
 def retention(own: Score, other: Score) -> str:
     """Ret, the fraction of the success rate that the other tracker keeps (paper, cross-GMT)."""
     return percent(other.rate / own.rate) if own.successes else "-"
+
+
+def discordant(first: Sequence[EpisodeRecord], second: Sequence[EpisodeRecord]) -> tuple[int, int]:
+    """Episodes that succeeded the first time alone, and the second time alone, paired by their seeds."""
+    won = {record.episode_seed: record.outcome == "success" for record in second}
+    pairs = [(record.outcome == "success", won[record.episode_seed]) for record in first]
+    return pairs.count((True, False)), pairs.count((False, True))
 
 
 def swap(context: Context) -> CheckFinding:
@@ -40,7 +49,7 @@ def swap(context: Context) -> CheckFinding:
     for source, target in itertools.product(context.trackers, repeat=2):
         if source == target and context.options.quick:
             continue
-        own, other = [], []
+        own, other, gained, lost = [], [], 0, 0
         for task in context.tasks:
             episodes = recorded(context, task, source)
             records = context.evaluate(episodes)
@@ -49,14 +58,17 @@ def swap(context: Context) -> CheckFinding:
                 continue
             actions = context.path(episodes) / "actions"
             replay = CertifyCell(task, target, policy=f"replay:{actions}", label=f"replay-of-{source}")
+            replayed = context.evaluate(replay)
             own.append(score(records))
-            other.append(score(context.evaluate(replay)))
-            falls = sum(record.outcome == "fall" for record in context.evaluate(replay))
+            other.append(score(replayed))
+            only_first, only_second = discordant(records, replayed)
+            lost, gained = lost + only_first, gained + only_second
+            falls = sum(record.outcome == "fall" for record in replayed)
             delta = 100.0 * (other[-1].rate - own[-1].rate)
             counts = (own[-1].cells()[0], *other[-1].cells(), str(falls))
             rows.append((task, source, target, *counts, f"{delta:+.0f}", retention(own[-1], other[-1])))
         a, b = pooled_score(own), pooled_score(other)
-        p = fisher(a.successes, a.episodes, b.successes, b.episodes) if a.episodes else 1.0
+        p = mcnemar(lost, gained)  # a replay meets the episode that was recorded
         delta = 100.0 * (b.rate - a.rate)
         rows.append(("all", source, target, a.cells()[0], *b.cells(), "", f"{delta:+.0f}", retention(a, b)))
         if source == target:
@@ -72,7 +84,8 @@ def swap(context: Context) -> CheckFinding:
     sheet = Sheet("The swap", (*head, "Delta [points]", "Ret"), tuple(rows))
     notes.append(
         "No policy is in the loop of the replay: the same 40 numbers per tick meet the same episodes, and only what "
-        "executes them differs. Delta is the difference of the success rates, Ret their quotient."
+        "executes them differs. Delta is the difference of the success rates, Ret their quotient, p that of McNemar's "
+        "exact test of all episodes."
     )
     if few and not all(shown):
         notes.append(

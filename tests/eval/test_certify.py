@@ -16,6 +16,7 @@ from arena_newton.eval.certification import certificate, claims, legs, solvable,
 from arena_newton.eval.certification.bodies import Body
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.options import CertifyOptions
+from arena_newton.eval.stats import mcnemar
 from arena_newton.kernels import tick as codes
 
 
@@ -96,6 +97,7 @@ def test_a_sound_benchmark_passes(tmp_path, capsys):
     ]
     swapped = {tuple(row[:3]): row[3:] for row in checks["swap"]["tables"][0]["rows"]}
     assert swapped["all", "twist2", "sonic"] == ["60/60", "0/60", "0 % to 6 %", "", "-100", "0 %"]
+    assert f"twist2 to sonic keeps 0 % (p = {mcnemar(60, 0):.2g})" in checks["swap"]["summary"]
     for name in ("certify.html", "certify.md"):
         assert "gliding-base" in (tmp_path / "o" / name).read_text()
 

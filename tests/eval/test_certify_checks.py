@@ -13,7 +13,7 @@ from arena_newton.eval import certify
 from arena_newton.eval.certification import axes, visible
 from arena_newton.eval.certification.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
 from arena_newton.eval.certification.finding import Score
-from arena_newton.eval.certification.swap import retention
+from arena_newton.eval.certification.swap import discordant, retention
 from arena_newton.eval.certification.traces import first_difference, play
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.run import Factories
@@ -195,6 +195,13 @@ def test_numbers_of_the_protocol():
     """Semantic mode may cost 3 of 60; the swap's Ret is the quotient of the rates."""
     assert [axes.allowed_difference(n) for n in (4, 20, 40, 60)] == [1, 1, 2, 3]
     assert retention(Score(40, 60), Score(10, 60)) == "25 %" and retention(Score(0, 60), Score(0, 60)) == "-"
+
+
+def test_replays_are_paired_with_their_recordings():
+    """A replay meets the episode that was recorded: what counts is the episodes that ended otherwise, in any order."""
+    recorded = [SimpleNamespace(episode_seed=seed, outcome=outcome) for seed, outcome in enumerate(("success",) * 5)]
+    replayed = [SimpleNamespace(episode_seed=seed, outcome="fall" if seed in (1, 3) else "success") for seed in range(5)]
+    assert discordant(recorded, replayed[::-1]) == (2, 0) and discordant(replayed, recorded) == (0, 2)
 
 
 def test_a_tiny_real_certification(tmp_path, capsys):

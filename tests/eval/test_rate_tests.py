@@ -214,6 +214,14 @@ def test_the_difference_lies_in_its_interval_and_is_exact():
     assert mean_difference(lot).value == 0.0
 
 
+def test_a_stratum_without_episodes_says_nothing():
+    """Nothing out of nothing is no difference and has no direction, and changes nothing beside other strata."""
+    nothing, some = UnpairedCounts(0, 0, 0, 0), UnpairedCounts(9, 10, 3, 10)
+    assert stratified_test([nothing]) == 1.0 and excess([nothing]) == excess([]) == 0.0
+    assert stratified_test([nothing, some]) == stratified_test([some]) and excess([nothing, some]) == excess([some]) == 3
+    assert mean_difference([nothing]) is None and rate_test(nothing).p == 1.0
+
+
 def test_many_episodes_take_no_time():
     """Thousands of episodes a task are tested in a blink, precisely to the last digit that is shown."""
     began = time.perf_counter()
