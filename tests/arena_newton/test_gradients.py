@@ -111,7 +111,7 @@ def test_a_rolled_ball_goes_where_the_engines_goes(pitch, velocity, apart):
 
 
 def test_a_landing_does_not_move_with_the_vertical_speed():
-    """What the documentation warns of, with its numbers: behind a bounce the gradient to the vertical speed is wrong."""
+    """What the documentation warns of, with its numbers: behind a bounce one gradient is wrong."""
     velocity = torch.tensor([0.0, 5.0, 2.0], requires_grad=True)
     end = flown(velocity, 50)[-1, 1]
     (grad,) = torch.autograd.grad(end, velocity)
