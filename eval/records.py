@@ -85,10 +85,11 @@ def read_regular(path: Path, limit: int) -> bytes:
     except OSError as error:
         link = error.errno == errno.ELOOP
         raise InputError(f"{path}: {'is a link' if link else f'cannot be read ({error.strerror})'}") from None
+    about = os.fstat(handle)
+    if not stat.S_ISREG(about.st_mode):  # before it becomes a file object, which a folder cannot
+        os.close(handle)
+        raise InputError(f"{path}: is not a regular file")
     with os.fdopen(handle, "rb") as file:
-        about = os.fstat(file.fileno())
-        if not stat.S_ISREG(about.st_mode):
-            raise InputError(f"{path}: is not a regular file")
         if about.st_size > limit:
             raise InputError(f"{path}: {about.st_size:,} bytes, expected at most {limit:,}")
         try:

@@ -146,6 +146,13 @@ def test_a_pipe_is_no_journal(tmp_path):
             read(tmp_path / "episodes.jsonl")
 
 
+def test_a_folder_is_no_file_of_a_run(tmp_path):
+    """A folder in the place of a journal or configuration is refused in one line that names it, as a pipe is."""
+    (tmp_path / "episodes.jsonl").mkdir()
+    with pytest.raises(InputError, match=r"episodes\.jsonl: is not a regular file"):
+        read_journal(tmp_path / "episodes.jsonl")
+
+
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
