@@ -325,6 +325,7 @@ def resolve(options: RunOptions) -> RunConfig:
         repeats=repeats,
         max_steps=flags.max_steps,
         seed_range=seeding.EVALUATION if flags.series is None else seeding.DEMONSTRATION,
+        most=flags.max,
     )
     shard = None if options.shard is None else parse_shard(options.shard)
     if shard is not None and shard.count > len(episodes):

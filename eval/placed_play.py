@@ -55,6 +55,10 @@ def placement_run(options: PlacementOptions) -> tuple[RunConfig, tuple[Axis, ...
     """
     if not options.task:
         raise InputError("--task: name the task whose placements are moved")
+    if options.task == "all":
+        raise InputError("--task all: name one task; each has axes of its own")
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected at least 0")
     if options.repeats < 1:
         raise InputError(f"--repeats {options.repeats}: expected at least 1")
     if not 1 <= options.worlds <= MOST_WORLDS:

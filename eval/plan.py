@@ -60,12 +60,13 @@ def expand(
     repeats: int = PROTOCOL_REPEATS,
     max_steps: int | None = None,
     seed_range: str = seeding.EVALUATION,
+    most: int | None = None,
 ) -> list[Episode]:
     """Episodes of a run: tasks × trackers × modes × group seeds × repeats, in this order.
 
     `task_names` may be `all` alone; `repeats` are the episodes per group seed; `max_steps` caps the rule set's step
     budgets; trackers, policy, rules and engine are the names that results carry. Of another `seed_range` than the
-    evaluation's, `seeds` are numbers of series.
+    evaluation's, `seeds` are numbers of series. `most` is the `--max` from which repeats were made, if one was.
 
     Raises:
         InputError: Unknown task, mode or rule set, something named twice, or nothing to run.
@@ -95,7 +96,8 @@ def expand(
     total = len(names) * len(trackers) * len(modes) * len(seeds) * repeats
     if total > MAX_EPISODES:
         made = f"{total:,} episodes" if total < 10**12 else "too many episodes"
-        given = "--episodes" if recorded else f"--repeats {_cut(repeats)}"
+        counted = f"--repeats {_cut(repeats)}" if most is None else f"--max {_cut(most)}"
+        given = "--episodes" if recorded else counted
         raise InputError(f"{given}: makes {made}, at most {MAX_EPISODES:,} are planned at once")
     episodes: list[Episode] = []
     for name in names:

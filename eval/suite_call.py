@@ -22,6 +22,9 @@ from arena_newton.text import counted
 
 __all__ = ["SuiteCall", "plan_call"]
 
+MOST_PROCESSES = 9_999
+"""Processes of one estimate, as many as a plan has shards; each is a place in a queue."""
+
 
 @dataclass(frozen=True)
 class SuiteCall:
@@ -61,6 +64,8 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     options = dataclasses.replace(options, shard=str(shard))
     if options.estimate and min(options.estimate) < 1:
         raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
+    if options.estimate and max(options.estimate) > MOST_PROCESSES:
+        raise InputError(f"--estimate {max(options.estimate)}: expected at most {MOST_PROCESSES:,}")
     check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit {options.limit}: expected at least 1")

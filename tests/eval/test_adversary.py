@@ -171,6 +171,8 @@ def test_the_search_does_not_depend_on_the_number_of_worlds(tmp_path):
         (["--search-seed", "-1"], "--search-seed -1"),
         (["--batch", "100000", "--batches", "3"], "make 300,010 episodes, at most 200,000"),
         (["--axes", "ball.x"], "--axes ball.x: task football draws football.x, football.y"),
+        (["--task", "all"], "--task all: name one task"),
+        (["--seed", "-1"], "--seed -1: expected at least 0"),
     ],
 )
 def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):

@@ -150,6 +150,8 @@ def test_one_axis_is_a_map_of_one_row(tmp_path):
         (["--grid", "1000", "--repeats", "1"], "make 1,000,000 episodes, at most 200,000"),
         (["--repeats", "0"], "--repeats 0: expected at least 1"),
         (["--worlds", "0"], "--worlds 0: expected 1 to"),
+        (["--task", "all"], "--task all: name one task"),
+        (["--seed", "-1"], "--seed -1: expected at least 0"),
         (["--mode", "wild"], "wild"),
         (["--task", "chess"], "chess"),
     ],

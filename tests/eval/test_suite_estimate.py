@@ -124,7 +124,8 @@ def test_the_command_says_what_it_measured(suite, tmp_path, capsys, monkeypatch)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_number_of_devices_is_checked(suite, tmp_path, capsys):
-    """No devices are refused."""
-    assert main(["matrix", str(suite), "--out", str(tmp_path / "out"), "--estimate", "0"], factories()) == 2
-    assert capsys.readouterr().err == "error: --estimate 0: expected at least 1\n"
+@pytest.mark.parametrize(("number", "expected"), [("0", "at least 1"), ("10000", "at most 9,999")])
+def test_a_number_of_devices_is_checked(suite, tmp_path, capsys, number, expected):
+    """No devices are refused, and more than memory has room for, before a cell is measured."""
+    assert main(["matrix", str(suite), "--out", str(tmp_path / "out"), "--estimate", "1", number], factories()) == 2
+    assert capsys.readouterr().err == f"error: --estimate {number}: expected {expected}\n"

@@ -91,6 +91,7 @@ def test_a_run_stops_each_row_by_itself(tmp_path, capsys):
         (["--until-width", "0"], "--until-width 0: expected more than 0 and less than 1"),
         (["--until-width", "nan"], "--until-width nan: expected more than 0 and less than 1"),
         (["--until-width", "0.1", "--max", "0"], "--max 0: expected at least 1"),
+        (["--until-width", "0.1", "--max", "300000"], "--max 300000: makes "),
         (["--until-width", "0.1", "--repeats", "5"], "--repeats 5: --until-width decides it, up to --max"),
         (["--until-width", "0.1", "--shard", "1/2"], "--shard: does not go with --until-width"),
     ],
