@@ -12,8 +12,8 @@ import torch
 
 from arena_newton import ArenaEnv, differentiable, trackers
 from arena_newton.kernels import success
-
-BALL, UPRIGHT = "/World/Ball", (1.0, 0.0, 0.0, 0.0)
+from arena_newton.physics_mujoco import MujocoPhysics
+from arena_newton.tasks.football import BALL, FootballJudge
 
 
 def main() -> None:
@@ -24,12 +24,13 @@ def main() -> None:
     args = parser.parse_args()
 
     env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=1, engine="mujoco")
-    env.reset([7], spawn=lambda seed: ((0.0, -5.0, 0.8), UPRIGHT))  # the robot looks on from behind
-    judge, data, ball = env.judge, env.physics.data[0], differentiable.RollingBall.of(env.scene)
+    env.reset([7], spawn=lambda seed: ((0.0, -5.0, 0.8), (1.0, 0.0, 0.0, 0.0)))  # the robot looks on from behind
+    judge, physics, ball = env.judge, env.physics, differentiable.RollingBall.of(env.scene)
+    assert isinstance(judge, FootballJudge) and isinstance(physics, MujocoPhysics)
     address, speed = env.scene.joint_qpos(BALL), env.scene.joint_qvel(BALL)
-    start = torch.tensor(data.qpos[address : address + 3]).float()[None]
-    poses = torch.tensor(env.physics.xpos.numpy()).repeat(args.max_steps + 1, 1, 1)  # one row per tick of the flight
-    quats = torch.tensor(env.physics.xquat.numpy()).repeat(args.max_steps + 1, 1, 1)
+    start = torch.tensor(physics.data[0].qpos[address : address + 3]).float()[None]
+    poses = torch.tensor(physics.xpos.numpy()).repeat(args.max_steps + 1, 1, 1)  # one row per tick of the flight
+    quats = torch.tensor(physics.xquat.numpy()).repeat(args.max_steps + 1, 1, 1)
     rule = {"goal": judge.goal, "pitch": judge.pitch, "rear_bound": True, "judge_out": False, "min_z": -0.5}
 
     kick = torch.tensor([[*args.kick, 0.0]], requires_grad=True)
@@ -44,14 +45,13 @@ def main() -> None:
         (grad,) = torch.autograd.grad(best, kick)
         kick = (kick + 0.3 * grad * torch.tensor([1.0, 1.0, 0.0])).detach().requires_grad_()
 
-    data.qvel[speed : speed + 3] = kick[0].detach().numpy()
+    physics.data[0].qvel[speed : speed + 3] = kick[0].detach().numpy()
     reached, apart = -torch.inf, 0.0
     for tick in range(1, args.max_steps + 1):
-        env.physics.step()
-        judge.evaluate(env.physics)
+        physics.step()
+        judge.evaluate(physics)
         reached = max(reached, float(judge.margin.numpy()[0]))
-        where = torch.tensor(env.physics.xpos.numpy()[0, judge.ball])
-        apart = max(apart, float((where - path[tick, 0].detach()).norm()))
+        apart = max(apart, float((torch.tensor(physics.xpos.numpy()[0, judge.ball]) - path[tick, 0].detach()).norm()))
     print(f"in the engine: margin {reached:+.3f} m, flights at most {100 * apart:.1f} cm apart")
     env.close()
 

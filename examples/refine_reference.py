@@ -29,8 +29,8 @@ def main() -> None:
     env = ArenaEnv("boxing", tracker=trackers.get("sonic"), worlds=1, engine="mujoco")
     plan = expand(["boxing"], trackers=["sonic"], policy="expert", seeds=[0], repeats=20)
     kept: list[torch.Tensor] = []
-    looking_on = lambda env, action: kept.append(action.clone()) or action  # noqa: E731
-    Rollout(env, policies.get("expert"), plan[args.shown :][:1], disturbance=looking_on, max_steps=args.max_steps).run()
+    keep = lambda env, action: kept.append(action.clone()) or action  # type: ignore[func-returns-value]  # noqa: E731
+    Rollout(env, policies.get("expert"), plan[args.shown :][:1], disturbance=keep, max_steps=args.max_steps).run()
     actions = torch.cat(kept[env.startup_ticks :] + kept[-1:] * 15)
     rule = {name: getattr(env.judge, name) for name in ("palm_body", "palm_offset", "target")}
     bodies = torch.tensor([env.scene.link(name) for name in WRISTS])

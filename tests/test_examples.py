@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -66,6 +67,14 @@ def test_example_says_what_it_shows(path):
     assert text.count("\n") <= MOST_LINES
     assert "Shows: " in said and f"python examples/{path.name}" in said
     assert not re.search(r"\b(?!self)\w+\._[a-z]|import _[a-z]", text)
+
+
+def test_examples_have_the_types_that_they_say():
+    """The examples pass mypy, as CONTRIBUTING asks: a reader who copies one begins without errors."""
+    pytest.importorskip("mypy")
+    command = [sys.executable, "-m", "mypy", *map(str, EXAMPLES)]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
