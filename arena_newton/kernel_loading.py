@@ -32,6 +32,7 @@ __all__ = [
     "ENGINE_MODULES",
     "FORWARD_MODULES",
     "TICK_MODULES",
+    "begin_device",
     "forward_only",
     "kernel_modules",
     "loading",
@@ -104,6 +105,16 @@ def forward_only() -> None:
             wp.set_module_options({"enable_backward": False}, module=module)
 
 
+def begin_device(device: wp.Device) -> None:
+    """Give a CUDA device its context and stream now, by this thread alone.
+
+    Warp does so at the first use and without a lock: threads that ask at once make a stream each, in a table that is
+    not made for it, and a graph is later captured on one that the table has lost ("unknown stream").
+    """
+    if device.is_cuda:
+        wp.get_stream(device)
+
+
 @contextlib.contextmanager
 def loading(engine: str, device: str, *, camera: bool, suite: str | None = None) -> Iterator[None]:
     """Load the modules of an environment while the block builds it; all of them are loaded at its end.
@@ -125,6 +136,7 @@ def loading(engine: str, device: str, *, camera: bool, suite: str | None = None)
         yield
         return
     try:
+        begin_device(wp.get_device(device))
         _loaded.update((device, name) for name in names)
         with _Loader(threads) as loader:
             for name in names:

@@ -39,6 +39,23 @@ for _ in range(2):
 bits = b"".join(a.numpy().tobytes() for a in (env.physics.qpos, env.physics.qvel, env.physics.contact_force))
 print(json.dumps([built, loaded(), hashlib.sha256(bits + picture.numpy().tobytes()).hexdigest()]))
 """
+BEGINNING = """
+import json, threading
+import warp as wp
+from arena_newton import kernel_loading
+from arena_newton.quiet import quiet_warp
+quiet_warp()
+begun, plain = [], wp.Device._init_streams
+def counted(device):
+    begun.append(threading.current_thread() is threading.main_thread())
+    plain(device)
+wp.Device._init_streams = counted
+with kernel_loading.loading("warp", "cuda:0", camera=True, suite="HSI"):
+    pass
+with wp.ScopedDevice("cuda:0"), wp.ScopedCapture("cuda:0"):
+    pass
+print(json.dumps(begun))
+"""
 LIBRARIES = ("newton._src.", "mujoco_warp._src.")
 PICTURE = "_shade_kernel"
 """Beginning of the one module that is made for a picture and loaded with the first one."""
@@ -280,3 +297,25 @@ def test_a_module_that_cannot_be_built_fails_where_it_is_launched(tmp_path, monk
     x = wp.zeros(1, dtype=float, device="cpu")
     with pytest.raises(Exception, match="no_such_thing"):
         wp.launch(broken_kernels.broken, dim=1, inputs=[x], device="cpu")
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
+def test_cuda_begins_once_however_many_threads_load():
+    """A new process makes one stream of a GPU, by its main thread; threads that asked at once would make one each."""
+    done = subprocess.run([sys.executable, "-c", BEGINNING], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1]) == [True]
+
+
+def test_a_device_begins_before_its_first_thread(monkeypatch):
+    """The stream of a GPU is asked for by the thread that builds, before a thread that loads is started."""
+    gpu, asked = SimpleNamespace(is_cuda=True, is_cpu=False), []
+    monkeypatch.setattr(kernel_loading, "MOST_THREADS", 2)
+    monkeypatch.setattr(kernel_loading, "_loaded", set())
+    monkeypatch.setattr(kernel_loading.os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(wp, "get_device", lambda _: gpu)
+    monkeypatch.setattr(wp, "get_stream", lambda device: asked.append((device, threading.current_thread())))
+    monkeypatch.setattr(kernel_loading._Loader, "start", lambda *_: asked.append("thread"))
+    with kernel_loading.loading("mujoco", "cuda:0", camera=False):
+        pass
+    assert asked[0] == (gpu, threading.main_thread()) and asked[1] == "thread"
