@@ -56,7 +56,7 @@ def check_ray(options: RunOptions) -> None:
     if gpus is not None and not 0 < gpus <= 1:
         raise InputError(f"--ray-gpus {gpus:g}: expected more than 0 and at most 1; an environment is on one GPU")
     if not 0 < minutes < math.inf:
-        raise InputError(f"--ray-minutes {minutes:g}: expected more than 0")
+        raise InputError(f"--ray-minutes {minutes:g}: expected more than 0, and finite")
     if options.viewer is not None:
         raise InputError("--viewer: shows worlds of this process, and with --ray none are; drop one of both")
     require("ray", "--ray")

@@ -244,7 +244,8 @@ class Crew:
         fit = [node for node in nodes if node.get("GPU", 0.0) >= self._gpus] or nodes
         self._cpus = flags.ray_cpus or min([USUAL_CPUS, *(max(1, int(node.get("CPU", 1.0))) for node in fit)])
         if not flags.ray and not any(map(self._room, nodes)):
-            raise InputError(f"--ray: a process asks for {self._asked()}, {_shown(nodes)}")
+            flag = "--ray-cpus" if flags.ray_cpus else "--ray"
+            raise InputError(f"{flag}: a process asks for {self._asked()}, {_shown(nodes)}")
         self.members: list[Member] = []
         self.shown: Progress | None = None
         """Where losses are told of."""

@@ -51,8 +51,9 @@ CPU_WORLDS = 2
 """Worlds without CUDA, where a tick of a batch costs as much as its worlds one after the other."""
 ROUNDS = 3
 """Rounds of one process and of two, after one that is not counted."""
-STAND_INS = ("act", "diffusion", "flow")
-"""Families of which random weights are made where a checkpoint is absent; π0.5 begins with weights of a hub."""
+STAND_INS = {True: ("act", "diffusion", "flow", "pi05"), False: ("act", "diffusion", "flow")}
+"""Families of which random weights are made where a checkpoint is absent, with CUDA and without: π0.5's are 7 GB, and a
+look of it takes minutes on a CPU."""
 
 
 def run(call: SuiteCall, factories: Factories | None = None) -> int:
@@ -87,11 +88,12 @@ class _Timing:
         self.left_out: dict[str, str] = {}
         """Families, or policies without one, that were not measured, and why."""
         self.plays = 0
+        self.cuda = False
 
     def lines(self) -> list[str]:
         """Measure, and say what came of it."""
         first = next(iter(self.cells.values()))
-        cuda = self._config(first, "stand", 1, 1).device.startswith("cuda")
+        self.cuda = cuda = self._config(first, "stand", 1, 1).device.startswith("cuda")
         worlds = {name: self._worlds(cell, cuda) for name, cell in self.cells.items()}
         sizes = [self._size(cell, worlds[name]) for name, cell in self.cells.items()]
         measured = self._measured(drawn(sizes, EACH), worlds, TICKS[cuda])
@@ -144,7 +146,7 @@ class _Timing:
 
     def _made(self, family: str) -> str:
         """A checkpoint of random weights; an empty text where none can be made."""
-        if family not in STAND_INS:
+        if family not in STAND_INS[self.cuda]:
             return ""
         with contextlib.suppress(ArenaError):
             return f"lerobot:{random_checkpoint(self.folder / family, family=family)}"

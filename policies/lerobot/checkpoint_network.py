@@ -116,7 +116,10 @@ class PolicyNetwork:
                 model = policy.diffusion
                 # LeRobot passes the noise on, but not the generator from which DDPM draws at every step.
                 model.conditional_sample = functools.partial(type(model).conditional_sample, model, generator=drawn)
-                return policy.predict_action_chunk(batch, noise=noise)
+                try:
+                    return policy.predict_action_chunk(batch, noise=noise)
+                finally:  # the network would hold itself, and a closed policy its gigabytes
+                    del model.conditional_sample
             case "multi_task_dit":
                 policy.objective.drawn = generators(draws)
                 pictures = torch.stack([batch[key] for key in config.image_features], dim=-4)

@@ -2,6 +2,7 @@
 
 import random
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,6 +108,19 @@ class TimedEnv(FakeEnv):
         Clock.now += 0.01 * self.worlds
         self.tick[self.active] += 1
         return np.zeros(self.worlds, np.int32)
+
+
+@pytest.mark.parametrize("cuda", [False, True])
+def test_random_weights_stand_in_for_absent_ones(cuda, monkeypatch):
+    """All four families with CUDA; pi0.5, of 7 GB, not without."""
+    made = []
+    monkeypatch.setattr(suite_timing, "random_checkpoint", lambda folder, family: made.append(family) or folder)
+    timing = suite_timing._Timing.__new__(suite_timing._Timing)
+    timing.cuda, timing.folder = cuda, Path("made")
+    specs = {family: timing._made(family) for family in ("act", "diffusion", "flow", "pi05", "other")}
+    kept = ["act", "diffusion", "flow", *(["pi05"] if cuda else [])]
+    assert made == kept and [name for name, spec in specs.items() if spec] == kept
+    assert specs["act"] == "lerobot:made/act"
 
 
 def test_the_command_says_what_it_measured(suite, tmp_path, capsys, monkeypatch):

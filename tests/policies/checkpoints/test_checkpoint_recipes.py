@@ -1,6 +1,8 @@
 """Checkpoints as our own trainer saves them, of every family at its smallest: they run without a hub."""
 
+import gc
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -43,3 +45,11 @@ def test_what_is_trained_is_run(family, tmp_path):
     assert torch.equal(follow(policy, [12], 2, side=side)[12], few[12])
     assert not torch.equal(few[11], few[12])
     assert torch.isfinite(few[11]).all()
+    # A suite opens one policy after the other: what is closed frees its memory at once, not when garbage is collected.
+    weights_held = [weakref.ref(one) for one in policy._on(torch.device("cpu")).policy.parameters()]
+    gc.disable()
+    try:
+        policy.close()
+        assert weights_held and not any(one() is not None for one in weights_held)
+    finally:
+        gc.enable()
