@@ -103,7 +103,8 @@ class _Timing:
         kinds = {one.size.kind for one in measured}
         known = [size for size in sizes if size.kind in kinds]
         slowdown = None if self.options.ray is None else self._slowdown(measured[0], worlds, TICKS[cuda][1])
-        found = suite_time(known, measured, self.options.estimate or (1, 2, 8), slowdown)
+        processes = tuple(dict.fromkeys(self.options.estimate or (1, 2, 8)))
+        found = suite_time(known, measured, processes, slowdown)
         device = device_name("cuda:0" if cuda else "cpu")
         return self._told(sizes, known, measured, found, slowdown, device, TICKS[cuda], worlds)
 
