@@ -94,7 +94,8 @@ def test_a_rehearsal_finds_all_modules_and_no_other_one():
 def solver():
     """Newton's solver of a scene for engine `warp`, after one step."""
     made = load_scene("boxing", device="cpu").solver
-    mujoco_warp.step(made.mjw_model, made.mjw_data)
+    with wp.ScopedDevice("cpu"):  # on a machine with a GPU that is the default
+        mujoco_warp.step(made.mjw_model, made.mjw_data)
     return made
 
 
@@ -121,7 +122,8 @@ def test_a_rehearsal_changes_nothing(solver):
     assert [name for name in before if before[name] != after[name]] == []
     assert wp.Module.load is load and m.opt.disableflags == flags
     assert len({name for name, _, _ in told}) > 40
-    mujoco_warp.step(m, d)
+    with wp.ScopedDevice("cpu"):
+        mujoco_warp.step(m, d)
     assert contents(d)["Data.qpos"] != before["Data.qpos"], "a real step does change them"
 
 
@@ -172,7 +174,8 @@ def test_a_failing_rehearsal_stops_nothing(monkeypatch):
     monkeypatch.setattr(kernel_loading, "walk_solver", broken)
     with kernel_loading.loading("warp", "cpu", camera=False):
         made = load_scene("boxing", device="cpu").solver
-    mujoco_warp.step(made.mjw_model, made.mjw_data)
+    with wp.ScopedDevice("cpu"):
+        mujoco_warp.step(made.mjw_model, made.mjw_data)
     assert calls == [1]
     assert np.isfinite(made.mjw_data.qpos.numpy()).all() and made.mjw_model.body_subtreemass.numpy().any()
     assert (wp.Module.load, wp.copy, wp.array.zero_, mujoco_warp.set_const_fixed) == before

@@ -245,8 +245,8 @@ def test_actions_integrate_to_the_frames():
     qpos[:, :2], qpos[:, 2] = start, kinematics.neutral_stance().height
     qpos[:, 3], qpos[:, 6] = np.cos(0.5 * yaw), np.sin(0.5 * yaw)
     reference = ReferencePose.allocate(worlds, "cpu", canonical_to_mujoco=CANONICAL_TO_MUJOCO, tick=TICK)
-    ones = wp.array(np.ones(worlds, np.int32), dtype=wp.int32)
-    launch_reset_reference(reference, wp.array(qpos, dtype=wp.float32), 0, ones)
+    ones = wp.array(np.ones(worlds, np.int32), dtype=wp.int32, device="cpu")
+    launch_reset_reference(reference, wp.array(qpos, dtype=wp.float32, device="cpu"), 0, ones)
     command = constant(
         worlds,
         velocity=rng.uniform(-0.5, 0.5, (worlds, 3)),
@@ -257,7 +257,7 @@ def test_actions_integrate_to_the_frames():
     )
     for _ in range(200):
         frames = g.step(command)
-        launch_integrate(reference, wp.array(g.action().numpy(), dtype=wp.float32), ones)
+        launch_integrate(reference, wp.array(g.action().numpy(), dtype=wp.float32, device="cpu"), ones)
     np.testing.assert_allclose(reference.position.numpy(), frames.root_pos, atol=2e-3)
     agree = np.abs((reference.quat.numpy() * frames.root_quat.numpy()).sum(1))
     np.testing.assert_allclose(agree, 1.0, atol=1e-5)
