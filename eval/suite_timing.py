@@ -1,8 +1,8 @@
 """``eval matrix --estimate``: measure a few cells of each kind on this machine, and say how long the suite takes.
 
 Each measured cell is played as `eval run` plays it, in a folder that is removed: with one batch of worlds at two short
-step budgets, whose difference is the time of a tick. With --ray one process and then two play the same work, to see
-what a second GPU costs the first.
+step budgets, whose difference is the time of a tick. With --ray two processes and then one play as much each, to
+see what a second GPU costs the first.
 """
 
 from __future__ import annotations

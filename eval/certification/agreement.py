@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from arena_newton.devices import resolve_engine
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, pooled_score, score, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, discordant, pooled_score, score, skipped
 from arena_newton.eval.certification.solvable import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
-from arena_newton.eval.engines import fisher
 from arena_newton.eval.records import JsonObject
+from arena_newton.eval.slice_player import device_name
+from arena_newton.eval.stats import mcnemar
 
 __all__ = ["CHECKS"]
 
@@ -23,7 +24,7 @@ BATCHED_TASKS = 2
 
 
 def engines(context: Context) -> CheckFinding:
-    """Play the experts on the other engine and compare success and falls by Fisher's exact test."""
+    """Play the experts on the other engine and compare success and falls, episode by episode, by McNemar's."""
     other = "warp" if context.options.engine == "mujoco" else "mujoco"
     _, device = resolve_engine(other, None if other == "warp" else "cpu")
     if other == "warp" and device == "cpu" and "engines" not in context.options.checks:
@@ -31,34 +32,34 @@ def engines(context: Context) -> CheckFinding:
     rows, pairs = [], []
     for tracker in context.trackers:
         for task in context.tasks:
-            records = [
-                context.evaluate(recorded(context, task, tracker)),
-                context.evaluate(CertifyCell(task, tracker, engine=other)),
-            ]
-            a, b = map(score, records)
-            falls = [sum(record.outcome == "fall" for record in found) for found in records]
-            p = fisher(a.successes, a.episodes, b.successes, b.episodes)
-            q = fisher(falls[0], a.episodes, falls[1], b.episodes)
+            first = context.evaluate(recorded(context, task, tracker))
+            second = context.evaluate(CertifyCell(task, tracker, engine=other))
+            a, b = score(first), score(second)
+            falls = [sum(record.outcome == "fall" for record in found) for found in (first, second)]
+            p, q = (mcnemar(*discordant(first, second, outcome)) for outcome in ("success", "fall"))
             pairs.append((task, tracker, p, q))
             rows.append((task, tracker, *a.cells(), *b.cells(), f"{p:.3f}", f"{falls[0]} and {falls[1]}", f"{q:.3f}"))
     level = DIFFERENT / max(2 * len(pairs), 1)
     apart = [f"{task} through {tracker}" for task, tracker, p, q in pairs if min(p, q) < level]
     least = min((min(p, q) for _, _, p, q in pairs), default=1.0)
-    this = context.options.engine
+    this, where = context.options.engine, device_name(device)
     head = (
         "task",
         "tracker",
         this,
         "95 % interval",
-        f"{other} on {device}",
+        f"{other} on {where}",
         "95 % interval",
         "p",
         "falls",
         "p of falls",
     )
-    notes: tuple[str, ...] = (f"Engines differ where p is below {level:.2g}: {DIFFERENT} over {2 * len(pairs)} tests.",)
+    notes: tuple[str, ...] = (
+        f"Engines differ where p, that of McNemar's exact test of the same episodes, is below {level:.2g}: "
+        f"{DIFFERENT} over {2 * len(pairs)} tests.",
+    )
     notes += tuple(f"{which}: the engines differ" for which in apart)
-    summary = f"{this} and {other} on {device}: smallest p of {2 * len(pairs)} tests is {least:.3f}"
+    summary = f"{this} and {other} on {where}: smallest p of {2 * len(pairs)} tests is {least:.3f}"
     return CheckFinding(
         "fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes
     )
@@ -107,22 +108,30 @@ def official(context: Context) -> CheckFinding:
     given = context.options.twist2_checkpoint
     if given is None:
         return skipped("name the official checkpoint: --twist2-checkpoint twist2_1017_20k.onnx")
-    rows, ours, theirs = [], [], []
+    rows, ours, theirs, gained, lost = [], [], [], 0, 0
     for task in context.tasks:
-        ours.append(score(context.evaluate(recorded(context, task, "twist2"))))
-        theirs.append(score(context.evaluate(CertifyCell(task, "twist2", checkpoint=given))))
-        p = fisher(ours[-1].successes, ours[-1].episodes, theirs[-1].successes, theirs[-1].episodes)
-        rows.append((task, *ours[-1].cells(), *theirs[-1].cells(), f"{p:.3f}"))
-    a, b = pooled_score(ours), pooled_score(theirs)
-    p = fisher(a.successes, a.episodes, b.successes, b.episodes)
-    rows.append(("all", *a.cells(), *b.cells(), f"{p:.3f}"))
+        own = context.evaluate(recorded(context, task, "twist2"))
+        official = context.evaluate(CertifyCell(task, "twist2", checkpoint=given))
+        ours.append(score(own))
+        theirs.append(score(official))
+        only_ours, only_official = discordant(own, official)
+        gained, lost = gained + only_ours, lost + only_official
+        rows.append((task, *ours[-1].cells(), *theirs[-1].cells(), f"{mcnemar(only_ours, only_official):.2g}"))
+    a, b, p = pooled_score(ours), pooled_score(theirs), mcnemar(gained, lost)
+    rows.append(("all", *a.cells(), *b.cells(), f"{p:.2g}"))
     head = ("task", "our weights", "95 % interval", "official weights", "95 % interval", "p")
     sheet = Sheet("Experts through our TWIST2 weights and through the official ones", head, tuple(rows))
     summary = f"experts succeed in {a.successes} of {a.episodes} episodes with our weights, "
     summary += f"in {b.successes} with the official ones (p = {p:.2g})"
     worse = p < DIFFERENT and a.rate < b.rate
     better = p < DIFFERENT and a.rate > b.rate
-    return CheckFinding("fail" if worse else "note" if better else "pass", summary, (sheet,))
+    notes = ["Both play the same episodes; p is that of McNemar's exact test."]
+    if better:
+        notes.append(
+            "The experts' references are tuned on our weights, so that this says nothing of which weights are better "
+            "for others."
+        )
+    return CheckFinding("fail" if worse else "note" if better else "pass", summary, (sheet,), tuple(notes))
 
 
 CHECKS = (

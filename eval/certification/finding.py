@@ -20,6 +20,7 @@ __all__ = [
     "Score",
     "Sheet",
     "Verdict",
+    "discordant",
     "percent",
     "pooled_score",
     "score",
@@ -112,6 +113,15 @@ def pooled_score(scores: Sequence[Score]) -> Score:
     return Score(
         sum(one.successes for one in scores), sum(one.episodes for one in scores), sum(one.errors for one in scores)
     )
+
+
+def discordant(
+    first: Sequence[EpisodeRecord], second: Sequence[EpisodeRecord], outcome: str = "success"
+) -> tuple[int, int]:
+    """Episodes with an outcome the first time alone, and the second time alone, paired by their seeds."""
+    had = {record.episode_seed: record.outcome == outcome for record in second}
+    pairs = [(record.outcome == outcome, had[record.episode_seed]) for record in first]
+    return pairs.count((True, False)), pairs.count((False, True))
 
 
 def skipped(reason: str) -> CheckFinding:

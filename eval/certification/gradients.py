@@ -126,7 +126,8 @@ def gradients(context: Context) -> CheckFinding:
                 elif not one.holds:
                     wrong.append(f"{which}: only {one.compared} of {one.total} slopes can be compared")
     head = ("task", "tracker", "slope of", "compared", "at a kink", "largest difference [%]")
-    summary = f"{sum(int(row[3]) for row in rows):,} exact slopes are at most {100 * worst:.2f} % from the estimates"
+    compared, kinks = (sum(int(row[number]) for row in rows) for number in (3, 4))
+    summary = f"{compared:,} exact slopes are at most {100 * worst:.2f} % from the estimates, {kinks:,} are at a kink"
     notes = (
         f"The tolerance is {100 * TOLERANCE:g} % of the estimate, or of the root mean square of all of the same kind. "
         "Estimates are central differences; those of the conversion are played through the closed loop.",

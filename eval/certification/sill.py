@@ -66,7 +66,7 @@ def sill(context: Context) -> CheckFinding:
         ticks, force = np.array(found["ticks"]), np.array(found["force"])
         free, trod = int((ticks == 0).sum()), int((ticks > TREAD).sum())
         touched = ticks[ticks > 0]
-        middle = f"{np.median(touched):.0f}, {touched.max()}" if len(touched) else "-"
+        middle = f"{np.median(touched):g}, {touched.max()}" if len(touched) else "-"
         rows.append((tracker, f"{free}/{len(ticks)}", f"{trod}/{len(ticks)}", middle, f"{force.max():.0f}"))
         said.append(f"{tracker} crosses without a touch in {percent(free / len(ticks))}")
     head = (
@@ -76,7 +76,8 @@ def sill(context: Context) -> CheckFinding:
         "ticks of the others: median, most",
         "most force [N]",
     )
-    return CheckFinding("note", "; ".join(said), (Sheet("Touches of the sill in an episode", head, tuple(rows)),))
+    sheet = Sheet("Touches of the sill in an episode", head, tuple(rows))
+    return CheckFinding("note", "; ".join(said), (sheet,), ("An episode that touches the sill counts as it ends.",))
 
 
 def _count(context: Context, tracker: str) -> JsonObject:

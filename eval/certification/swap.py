@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import (
@@ -12,16 +11,16 @@ from arena_newton.eval.certification.finding import (
     Score,
     Sheet,
     Verdict,
+    discordant,
     percent,
     pooled_score,
     score,
     skipped,
 )
 from arena_newton.eval.certification.solvable import recorded
-from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.stats import mcnemar
 
-__all__ = ["CHECKS", "discordant", "retention"]
+__all__ = ["CHECKS", "retention"]
 
 ENOUGH = 60
 """With fewer episodes of all tasks together a loss that is not shown says nothing."""
@@ -32,13 +31,6 @@ SHOWN_BY = 0.05
 def retention(own: Score, other: Score) -> str:
     """Ret, the fraction of the success rate that the other tracker keeps (paper, cross-GMT)."""
     return percent(other.rate / own.rate) if own.successes else "-"
-
-
-def discordant(first: Sequence[EpisodeRecord], second: Sequence[EpisodeRecord]) -> tuple[int, int]:
-    """Episodes that succeeded the first time alone, and the second time alone, paired by their seeds."""
-    won = {record.episode_seed: record.outcome == "success" for record in second}
-    pairs = [(record.outcome == "success", won[record.episode_seed]) for record in first]
-    return pairs.count((True, False)), pairs.count((False, True))
 
 
 def swap(context: Context) -> CheckFinding:

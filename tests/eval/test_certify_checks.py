@@ -10,10 +10,11 @@ import torch
 from arena_newton import rule_sets, seeding, tasks, trackers
 from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.eval import certify
-from arena_newton.eval.certification import axes, visible
+from arena_newton.eval.certification import agreement, axes, visible
 from arena_newton.eval.certification.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
-from arena_newton.eval.certification.finding import Score
-from arena_newton.eval.certification.swap import discordant, retention
+from arena_newton.eval.certification.context import CertifyCell
+from arena_newton.eval.certification.finding import Score, discordant
+from arena_newton.eval.certification.swap import retention
 from arena_newton.eval.certification.traces import first_difference, play
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.run import Factories
@@ -203,6 +204,42 @@ def test_replays_are_paired_with_their_recordings():
     ends = ("success", "fall", "success", "fall", "success")
     replayed = [SimpleNamespace(episode_seed=seed, outcome=outcome) for seed, outcome in enumerate(ends)]
     assert discordant(recorded, replayed[::-1]) == (2, 0) and discordant(replayed, recorded) == (0, 2)
+    assert discordant(recorded, replayed, "fall") == (0, 2)
+
+
+class Played:
+    """A context whose episodes ended before: outcomes by engine, or by whether the weights are the official ones."""
+
+    def __init__(self, **outcomes):
+        self.outcomes, self.tasks, self.trackers = outcomes, ("boxing",), ("twist2",)
+        self.options = SimpleNamespace(engine="mujoco", device=None, checks=("engines",), twist2_checkpoint="official")
+
+    def evaluate(self, cell):
+        which = "other" if cell.engine == "warp" or cell.checkpoint == "official" else "own"
+        ends = [{"s": "success", "f": "fall", "t": "timeout"}[letter] for letter in self.outcomes[which]]
+        records = [SimpleNamespace(episode_seed=seed, outcome=outcome) for seed, outcome in enumerate(ends)]
+        return records[::-1] if which == "other" else records
+
+
+def test_engines_and_weights_are_compared_episode_by_episode(monkeypatch):
+    """Equal rates of other episodes are no difference, and eleven episodes that one alone solves are one."""
+    monkeypatch.setattr(agreement, "recorded", lambda context, task, tracker: CertifyCell(task, tracker))
+    exact = 2 * 0.5**11
+    found = agreement.official(Played(own="s" * 12, other="s" + "t" * 11))
+    assert (found.verdict, found.sheets[0].rows[0][-1]) == (
+        "note",
+        f"{exact:.2g}",
+    ) and f"p = {exact:.2g}" in found.summary
+    assert any("McNemar" in note for note in found.notes) and any(
+        "tuned on our weights" in note for note in found.notes
+    )
+    assert agreement.official(Played(own="s" + "t" * 11, other="s" * 12)).verdict == "fail"
+    even = agreement.official(Played(own="s" * 6 + "t" * 6, other="t" * 6 + "s" * 6))
+    assert even.verdict == "pass" and "p = 1" in even.summary and len(even.notes) == 1
+    engines = agreement.engines(Played(own="s" * 12, other="s" + "f" * 11))
+    assert engines.verdict == "fail" and [engines.sheets[0].rows[0][i] for i in (-3, -1)] == ["0.001", "0.001"]
+    assert "on cpu" in engines.sheets[0].head[4] and "McNemar" in engines.notes[0]
+    assert agreement.engines(Played(own="sstf", other="sttf")).verdict == "pass"
 
 
 def test_a_tiny_real_certification(tmp_path, capsys):
