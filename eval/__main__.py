@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 PROG = "python -m arena_newton.eval"
+LISTS = frozenset("--task --tracker --mode --seeds --checks --only --differ --axes --grid".split())
+"""Flags that take several values and are the whole list where they are not given."""
 OVERVIEW = f"""commands:
   {PROG} [run] [flags]           evaluate (flags below)
   {PROG} resume <out> [flags]    continue a run; finished episodes are kept
@@ -75,6 +78,7 @@ def main(argv: Sequence[str] | None = None, factories: Factories | None = None) 
     def work() -> int:
         if command == "run" and arguments and not arguments[0].startswith("-"):
             raise InputError(f"{arguments[0]}: unknown command, known are {' '.join(_COMMANDS)}")
+        _check_lists(arguments)
         return _COMMANDS[command](arguments, factories)
 
     return exit_code(work)
@@ -89,6 +93,13 @@ def _folder(arguments: list[str], command: str) -> Path:
 def _folders(arguments: list[str], command: str) -> list[Path]:
     """One results folder or several, each once."""
     return folders_named(arguments, command, PROG, noun="the results folder", shown="<out>")
+
+
+def _check_lists(arguments: Sequence[str]) -> None:
+    """Refuse a flag of several values that has none, as an empty variable of a shell leaves it: it would mean all."""
+    for flag, after in itertools.pairwise([*arguments, "--"]):
+        if flag in LISTS and after.startswith("--"):
+            raise InputError(f"{flag}: cannot read it without a value")
 
 
 def _wants_help(arguments: Sequence[str]) -> bool:
@@ -150,7 +161,10 @@ def _resume(arguments: list[str], factories: Factories | None) -> int:
     folder = _folder(arguments, "resume")
     from arena_newton.eval.folder import stored_options
 
-    options = parse_flags(RunOptions, arguments, f"{PROG} resume", default=stored_options(folder))
+    stored = stored_options(folder)
+    options = parse_flags(RunOptions, arguments, f"{PROG} resume", default=stored)
+    if stored.until_width is not None and options.max != stored.max:
+        raise InputError(f"--max was {stored.max}, now {options.max}: it was said before the first episode, and stays")
     if options.out != str(folder):
         raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
     return _execute(options, factories)

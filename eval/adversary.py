@@ -92,6 +92,7 @@ class _Study:
         self._budget = worlds.config.episodes[0].max_steps
         count = options.batch * options.batches * options.repeats + options.confirm
         self._progress = Progress(self._budget * count, planned=count)
+        self._progress.group(f"{worlds.config.flags.task[0]} {options.tracker} {options.mode}")
         self._points = 0
 
     def play(self, points: Sequence[Point], episodes: Sequence[Episode] | None = None) -> list[EpisodeResult]:

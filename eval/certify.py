@@ -76,7 +76,7 @@ def run(
         checks: What is checked, of which `options.checks` may choose.
 
     Returns:
-        Exit code: 0 no check fails, 1 one fails.
+        Exit code: 0 no check fails, 1 one fails or nothing was measured.
 
     Raises:
         InputError: A flag is wrong, or the folder holds something else; raised before the first check.
@@ -89,10 +89,30 @@ def run(
     if options.quick:
         print(f"--quick: {context.episodes} episodes of each cell, so the intervals are wide")
     quiet_warp()
+    facts = _facts(context, left_out, planned=[check.name for check in chosen])
+    try:
+        findings = _found(context, chosen, facts)
+    except KeyboardInterrupt:
+        if options.jobs:
+            print(f"\nwhat was played is kept; go on by {command_line(options)} --resume", file=sys.stderr)
+        raise
+    if options.jobs:
+        print(f"\n{certificate.printed(facts, findings)}\n")
+    failed = [check.name for check, finding in findings.items() if finding.verdict == "fail"]
+    measured = [finding for finding in findings.values() if finding.verdict != "skip"]
+    result = f"{len(failed)} of {len(findings)} checks failed: {' '.join(failed)}" if failed else "no check failed"
+    result = result if measured else "nothing was measured"
+    print(
+        f"{result}; this took {duration(time.perf_counter() - began)}\ncertificate: {context.folder / 'certify.html'}"
+    )
+    return 1 if failed or (options.jobs and not measured) else 0
+
+
+def _found(context: Context, chosen: Sequence[Check], facts: certificate.Facts) -> dict[Check, CheckFinding]:
+    """Run the checks; each is printed and written as it ends."""
+    options, findings = context.options, dict[Check, CheckFinding]()
     if options.jobs > 1:
         play_ahead(options, context.tasks, [check.name for check in chosen], _say)
-    findings: dict[Check, CheckFinding] = {}
-    facts = _facts(context, left_out, planned=[check.name for check in chosen])
     for check in chosen:
         started = time.perf_counter()
         finding = findings[check] = check.run(context)
@@ -100,14 +120,7 @@ def run(
         print(f"{finding.verdict:<4}  {check.name:<12}  {finding.summary}  ({spent})", flush=True)
         if options.jobs:
             certificate.write(context.folder, facts, findings)
-    if options.jobs:
-        print(f"\n{certificate.printed(facts, findings)}\n")
-    failed = [check.name for check, finding in findings.items() if finding.verdict == "fail"]
-    result = f"{len(failed)} of {len(findings)} checks failed: {' '.join(failed)}" if failed else "no check failed"
-    print(
-        f"{result}; this took {duration(time.perf_counter() - began)}\ncertificate: {context.folder / 'certify.html'}"
-    )
-    return 1 if failed else 0
+    return findings
 
 
 def _chosen(options: CertifyOptions, checks: Sequence[Check]) -> list[Check]:
@@ -136,8 +149,11 @@ def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str,
         raise InputError(f"--jobs {options.jobs}: expected 0 or more")
     if options.worlds < 1:
         raise InputError(f"--worlds {options.worlds}: expected at least 1")
-    if options.twist2_checkpoint is not None and not user_path(options.twist2_checkpoint).is_file():
-        raise InputError(f"--twist2-checkpoint {options.twist2_checkpoint}: no such file")
+    if options.twist2_checkpoint is not None:
+        try:
+            trackers.get("twist2", user_path(options.twist2_checkpoint))
+        except InputError as error:
+            raise InputError(str(error).replace("--checkpoint", "--twist2-checkpoint", 1)) from None
     if not options.out.strip():
         raise InputError("--out: is empty, name a folder")
     resolve_engine(options.engine, options.device)

@@ -11,7 +11,9 @@ from arena_newton.eval.comparison import Comparison, compare
 from arena_newton.eval.comparison_page import comparison_page
 from arena_newton.eval.comparison_text import as_csv, as_json, as_markdown, p_text, rate_text, remarks, verdict
 from arena_newton.eval.contenders import read_contenders
+from arena_newton.eval.document import CONFIG_FILE
 from arena_newton.eval.journal import StorageError, write_atomic
+from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.eval.table_options import CompareOptions
 from arena_newton.eval.wording import plain
 from arena_newton.flags import user_path
@@ -29,6 +31,9 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
     if not options.out.strip():
         raise InputError("--out: is empty, name a folder")
     out = user_path(options.out)
+    for held, what in ((CONFIG_FILE, "a run"), (SUITE_FILE, "a suite")):
+        if (out / held).is_file():
+            raise InputError(f"--out {out}: holds {what}; name a folder of its own")
     contenders = read_contenders(folders, differ=options.differ, only=options.only, per_tracker=options.per_tracker)
     comparison = compare(contenders.contenders)
     try:

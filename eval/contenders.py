@@ -13,7 +13,7 @@ from arena_newton.eval.comparison import Contender
 from arena_newton.eval.document import CONFIG_FILE
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, check_whole_plan, load_run
+from arena_newton.eval.results import RunRecord, check_whole_plan, is_complete, load_run, width_rule
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
@@ -111,7 +111,7 @@ def read_contenders(
         if (folder / SUITE_FILE).is_file():
             gathered += _of_suite(folder, title if len(folders) > 1 else "", per_tracker, notes)
         else:
-            gathered += _of_run(folder, title, per_tracker)
+            gathered += _of_run(folder, title, per_tracker, notes)
     gathered = _chosen(gathered, only)
     _check_alike(gathered, differ)
     notes += _notes(gathered, differ)
@@ -159,18 +159,23 @@ def _check_evaluation(run: RunRecord) -> None:
         raise InputError(f"{run.folder}: holds recordings for training; what is compared are evaluations")
 
 
-def _of_run(folder: Path, title: str, per_tracker: bool) -> list[_Gathered]:
+def _of_run(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> list[_Gathered]:
     run = load_run(folder)
     _check_evaluation(run)
     check_whole_plan(run)
     played, planned = len(run.records), run.document["planned"]
     if not played:
         raise InputError(f"{folder}: holds no finished episode")
-    if played < planned:
+    if not is_complete(run):
         # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
         raise InputError(
             f"{folder}: is unfinished ({played} of {planned} episodes), and what ends first is no fair sample; "
             f"finish it by eval resume {folder}"
+        )
+    if (rule := width_rule(run.config)) is not None:
+        notes.append(
+            f"{folder}: rows ended when their interval was at most {100 * rule.width:g} points wide, or at "
+            f"{rule.most:,} episodes; tests are of the episodes that a pair shares."
         )
     found: dict[tuple[str, str], _Gathered] = {}
     policies = {record.policy for record in run.records}
@@ -195,7 +200,7 @@ def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> 
             waiting += cell.status != "failed"
             continue
         _check_evaluation(run)
-        if len(run.records) < run.document["planned"]:
+        if not is_complete(run):
             notes.append(
                 f"{run.folder} is unfinished, and left out: {len(run.records)} of {run.document['planned']} episodes."
             )
@@ -238,6 +243,8 @@ def _chosen(gathered: Sequence[_Gathered], only: Sequence[str]) -> list[_Gathere
         if name not in known:
             raise InputError(f"--only {plain_text(name, 60)}: unknown, found are {', '.join(known)}")
     kept = [one for one in gathered if not only or one.name in only]
+    if only and len(kept) < 2 <= len(gathered):
+        raise InputError(f"--only {kept[0].name}: keeps one, which has nothing to be compared with")
     if len(kept) < 2:
         raise InputError(
             f"compare: {kept[0].name} alone has nothing to be compared with; name two results folders or more, "

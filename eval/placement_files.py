@@ -98,7 +98,7 @@ def study_folder(out: str | None, *words: str) -> Path:
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
-        raise InputError(f"--out {folder}: exists; remove it or name another folder") from None
+        raise InputError(f"--out {folder}: exists; name another folder") from None
     except OSError as error:
         raise StorageError(f"--out {folder}: cannot be made ({error.strerror})") from None
     return folder

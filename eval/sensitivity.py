@@ -55,6 +55,7 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
         rows = PlacedRows(folder, axes)
         budget = config.episodes[0].max_steps
         progress = Progress(budget * count, planned=count)
+        progress.group(f"{config.flags.task[0]} {options.tracker} {options.mode}")
 
         def ended(result: EpisodeResult) -> None:
             rows.add(result)

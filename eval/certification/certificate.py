@@ -24,6 +24,8 @@ from arena_newton.text import counted
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 
 FILE = "certify.json"
+FEW = 20
+"""Fewer episodes of a cell than this are said to be few."""
 MEANING = {
     "pass": "holds",
     "fail": "does not hold",
@@ -126,6 +128,8 @@ def _warnings(facts: Facts) -> list[str]:
     found = []
     if facts["quick"]:
         found.append(f"--quick: {facts['episodes']} episodes of each cell, so the intervals are wide.")
+    elif facts["episodes"] < FEW:
+        found.append(f"{counted(facts['episodes'], 'episode')} of each cell, so the intervals are wide.")
     absent = [name for claim in CLAIMS for name in claim.checks if name not in facts["planned"]]
     if absent:
         found.append(f"Checks that were not asked for: {' '.join(absent)}.")

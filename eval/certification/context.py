@@ -198,15 +198,17 @@ class Context:
         known = config_hash([self._ground(played, through), dict(settings)])
         name = f"{name}_{task}_{tracker}" if isinstance(task, str) else name
         path = self.folder / "measured" / f"{name}.json"
-        with contextlib.suppress(OSError, ValueError, KeyError):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             stored = json.loads(path.read_text(encoding="utf-8"))
-            if stored["known_by"] == known:
+            if stored["known_by"] == known and stored["digest"] == config_hash(stored["value"]):
                 value: Json = stored["value"]
                 return value
         self.say(f"{name}: measuring")
         value = json.loads(json.dumps(measure(), allow_nan=False))
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps({"known_by": known, "value": value}, indent=1) + "\n")
+        write_atomic(
+            path, json.dumps({"known_by": known, "digest": config_hash(value), "value": value}, indent=1) + "\n"
+        )
         return value
 
     def _ground(self, played: tuple[str, ...], through: tuple[str, ...]) -> Json:

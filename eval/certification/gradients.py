@@ -121,12 +121,16 @@ def gradients(context: Context) -> CheckFinding:
                 rows.append((task, tracker, what, *counts, f"{100 * one.error:.2f}"))
                 worst = max(worst, one.error)
                 which = f"{task} through {tracker}, {what}"
-                if one.error > TOLERANCE:
+                if not one.total:
+                    wrong.append(f"{which}: no slope was measured")
+                elif one.error > TOLERANCE:
                     wrong.append(f"{which}: an exact slope is {100 * one.error:.2f} % from the estimate")
                 elif not one.holds:
                     wrong.append(f"{which}: only {one.compared} of {one.total} slopes can be compared")
     head = ("task", "tracker", "slope of", "compared", "at a kink", "largest difference [%]")
     compared, kinks = (sum(int(row[number]) for row in rows) for number in (3, 4))
+    if not compared:
+        wrong.append("no slope was compared")
     summary = f"{compared:,} exact slopes are at most {100 * worst:.2f} % from the estimates, {kinks:,} are at a kink"
     notes = (
         f"The tolerance is {100 * TOLERANCE:g} % of the estimate, or of the root mean square of all of the same kind. "

@@ -14,6 +14,7 @@ from arena_newton.eval import run as runs
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.certification import certificate, claims, legs, solvable, swap
 from arena_newton.eval.certification.bodies import Body
+from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.stats import mcnemar
@@ -184,6 +185,10 @@ def test_it_goes_on_where_it_was(tmp_path, capsys):
         (["--worlds", "0"], "--worlds 0"),
         (["--engine", "bullet"], "--engine bullet"),
         (["--twist2-checkpoint", "absent.onnx"], "--twist2-checkpoint absent.onnx: no such file"),
+        (["--twist2-checkpoint", "full/diary.txt"], "--twist2-checkpoint full/diary.txt: --tracker twist2 reads .onnx"),
+        (["--twist2-checkpoint", "full"], "--twist2-checkpoint full: "),
+        (["--checks", "--quick"], "--checks: cannot read it without a value"),
+        (["--quick", "--task"], "--task: cannot read it without a value"),
         (["--out", ""], "--out: is empty"),
         (["--out", "full"], "--out full: is not empty and holds no certification"),
         (["--quik"], "--quik: unknown argument, did you mean --quick"),
@@ -197,6 +202,39 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, flags, message):
     assert main(["certify", *flags]) == 2
     assert re.fullmatch(rf"error: .*{re.escape(message)}.*\n", capsys.readouterr().err)
     assert not (tmp_path / "results").exists()
+
+
+def test_an_interrupt_says_how_to_go_on(tmp_path, capsys):
+    """Ctrl-C leaves what was played and the command that continues it."""
+
+    def interrupted(context):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        certify.run(options(tmp_path), factories(**PARTS), checks=(Check("late", "?", interrupted),))
+    assert re.search(r"what was played is kept; go on by python -m .* --resume$", capsys.readouterr().err.strip())
+
+
+def test_a_certification_of_nothing_is_no_success(tmp_path, capsys):
+    """Where every check that was asked for is skipped, the command does not end well."""
+    assert main(["certify", "--checks", "official", "--task", "boxing", "--out", str(tmp_path / "c")]) == 1
+    said = capsys.readouterr().out
+    assert "nothing was measured; this took" in said and "no check failed" not in said
+
+
+@pytest.mark.parametrize("text", ["[]", "null", '{"known_by": "KNOWN", "value": {}}', '{"known_by": "KNOWN", "di', ""])
+def test_a_damaged_measurement_is_measured_again(tmp_path, text):
+    """What is kept counts only as it was written."""
+    context = Context(options(tmp_path), tmp_path, ("boxing",), lambda _: None)
+    measured, counts = [{"ticks": 3}, {"ticks": 4}], iter(range(2))
+
+    def look():
+        return context.measured("ticks", "boxing", "twist2", {}, lambda: measured[next(counts)])
+
+    assert look() == look() == measured[0]
+    (file,) = (tmp_path / "measured").iterdir()
+    file.write_text(text.replace("KNOWN", json.loads(file.read_text())["known_by"]))
+    assert look() == measured[1]
 
 
 def test_the_page_needs_no_other_file(tmp_path):

@@ -209,6 +209,7 @@ REFUSED = [
     (["a", "b", "--out", "~nosuchuser/b"], "~nosuchuser/b: no home folder of that user"),
     (["a", "half"], "half: is unfinished (30 of 60 episodes)"),
     (["a", "b", "--only", "c"], "--only c: unknown, found are a, b"),
+    (["a", "b", "--only", "a"], "--only a: keeps one, which has nothing to be compared with"),
     (["a", "b", "--differ", "policy"], "--differ policy: choose from rules engine"),
     (["a", "b", "--out", ""], "--out: is empty"),
     (["a", "b", "--out", "a/config.json"], "cannot be made"),

@@ -168,7 +168,7 @@ def test_a_folder_is_never_written_twice(tmp_path, capsys):
     """An existing folder is refused, whatever is in it."""
     (tmp_path / "out").mkdir()
     assert call(tmp_path / "out", "--grid", "2") == 2
-    assert "exists; remove it or name another folder" in capsys.readouterr().err
+    assert "exists; name another folder" in capsys.readouterr().err
 
 
 def test_samples_place_what_the_seed_would(tmp_path):

@@ -82,6 +82,25 @@ def test_a_run_stops_each_row_by_itself(tmp_path, capsys):
     again = (tmp_path / "b" / "episodes.jsonl").read_text().splitlines()
     assert {json.loads(line)["index"] for line in again} == {json.loads(line)["index"] for line in lines}
     assert merge([tmp_path / "a"], tmp_path / "m").results["complete"]
+    half = tmp_path / "half"
+    half.mkdir()
+    (half / "config.json").write_text((tmp_path / "a" / "config.json").read_text())
+    (half / "episodes.jsonl").write_text("".join(lines[:9]))
+    compare, out = ["compare", str(tmp_path / "a")], ["--out", str(tmp_path / "c")]
+    assert (
+        main([*compare, str(half), *out]) == 2 and "half: is unfinished (9 of 180 episodes)" in capsys.readouterr().err
+    )
+    assert main([*compare, str(tmp_path / "b"), *out]) == 0
+    compared = json.loads((tmp_path / "c" / "compare.json").read_text())
+    assert (
+        sum(
+            "rows ended when their interval was at most 34 points wide, or at 90 episodes" in note
+            for note in compared["notes"]
+        )
+        == 2
+    )
+    with_out = ["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "m")]
+    assert main(with_out) == 2 and "m: holds a run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -108,6 +127,9 @@ def test_another_rule_is_refused_in_the_same_folder(tmp_path, capsys):
     flags = [*RUN, "--until-width", "0.5", "--max", "6", "--out", str(tmp_path / "a")]
     assert main(flags, factories()) == 0
     assert main([*flags, "--max", "9"], factories()) == 2
+    capsys.readouterr()
+    assert main(["resume", str(tmp_path / "a"), "--max", "9"], factories()) == 2
+    assert capsys.readouterr().err.startswith("error: --max was 6, now 9: it was said before the first episode")
     assert main([*RUN, "--seeds", "0", "--out", str(tmp_path / "a"), "--repeats", "2"], factories()) == 2
     assert "another configuration" in capsys.readouterr().err
 
