@@ -152,16 +152,16 @@ def test_a_run_that_shows_nothing_does_not_pass(tmp_path, by_copy, facts, verdic
 
 
 def test_without_ray_it_says_so(tmp_path, monkeypatch):
-    """Without the extra the check is skipped in one line that says how to install it; bits are mujoco's."""
+    """Without the extra the check is skipped in one line that says how to install it; alone it is no success."""
 
     def absent(extra, purpose, modules=()):
         raise InputError(f"{purpose}: needs the extra [{extra}]")
 
     monkeypatch.setattr(machines, "require", absent)
     code, found = certified(tmp_path / "a", "ray")
-    assert code == 0 and (found["verdict"], found["summary"]) == ("skip", "not run: needs the extra [ray]")
+    assert code == 1 and (found["verdict"], found["summary"]) == ("skip", "not run: needs the extra [ray]")
     code, found = certified(tmp_path / "b", "shards", engine="warp")
-    assert code == 0 and found["verdict"] == "skip" and "engine mujoco alone" in found["summary"]
+    assert code == 1 and found["verdict"] == "skip" and "engine mujoco alone" in found["summary"]
 
 
 def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
