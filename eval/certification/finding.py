@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from arena_newton.eval.stats import paired_rates
 from arena_newton.intervals import wilson
 
 if TYPE_CHECKING:
@@ -119,9 +120,13 @@ def discordant(
     first: Sequence[EpisodeRecord], second: Sequence[EpisodeRecord], outcome: str = "success"
 ) -> tuple[int, int]:
     """Episodes with an outcome the first time alone, and the second time alone, paired by their seeds."""
-    had = {record.episode_seed: record.outcome == outcome for record in second}
-    pairs = [(record.outcome == outcome, had[record.episode_seed]) for record in first]
-    return pairs.count((True, False)), pairs.count((False, True))
+
+    def ended(records: Sequence[EpisodeRecord]) -> dict[Hashable, bool]:
+        return {record.episode_seed: record.outcome == outcome for record in records}
+
+    found = paired_rates(ended(first), ended(second))
+    assert not found.unpaired, "the same episodes, whatever plays them"
+    return found.only_first, found.only_second
 
 
 def skipped(reason: str) -> CheckFinding:
