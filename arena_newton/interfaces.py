@@ -230,7 +230,7 @@ class Policy(Protocol):
         """Get to know the environment before its first episode."""
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: np.ndarray | None = None) -> None:
-        """Begin new episodes in the worlds of `mask`."""
+        """Begin new episodes in the worlds of `mask`; `seeds` are for noise alone (`seeding.policy_seed`)."""
 
     def act(self, observation: Observation) -> Chunk:
         """Actions for the worlds that ask."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from arena_newton import seeding
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import (
@@ -29,6 +30,7 @@ from arena_newton.interfaces import (
 from arena_newton.kernels import tick as codes
 from arena_newton.robot import TICK
 from arena_newton.text import counted
+from arena_newton.world_view import WorldView
 
 __all__ = ["Rollout", "ending"]
 
@@ -106,6 +108,7 @@ class Rollout:
             on_tick: Called each tick with the number of active worlds.
         """
         self.env, self.policy = env, policy
+        self._view = WorldView(env)
         self.recorders: Sequence[Recorder] = [recorder] if isinstance(recorder, Recorder) else recorder
         self.disturbance, self.spawn, self.samples = disturbance, spawn, samples
         self.budget = max_steps or env.budget
@@ -132,7 +135,7 @@ class Rollout:
             InputError: A chunk of the policy or targets of the tracker have another shape than the interface says.
         """
         env = self.env
-        self.policy.attach(env)
+        self.policy.attach(self._view)
         self._assign(range(env.worlds))
         while env.active.any():
             asks = env.active & (env.tick >= 0) & (self._next + self.latency >= self._length)
@@ -166,14 +169,16 @@ class Rollout:
         mask, seeds = np.zeros(env.worlds, dtype=bool), [0] * env.worlds
         for world, (index, episode) in taken.items():
             self._running[world] = _Running(index, episode, time.perf_counter())
-            mask[world], seeds[world] = True, episode.episode_seed
+            mask[world], seeds[world] = True, seeding.policy_seed(episode.episode_seed)
             self._length[world] = self._next[world] = 0
             for one in self.recorders:
                 one.start(env, world, episode)
+        self._view.refresh()
         self.policy.reset(seeds, [env.spec.gym_id] * env.worlds, mask)
 
     def _ask(self, observation: Observation) -> list[int]:
         """Take new chunks from the policy; ends the episodes for which it has none, and returns their worlds."""
+        self._view.refresh()
         answer, asks = self.policy.act(observation), observation.mask
         self._take(answer, asks)
         failed = {world: message for world, message in answer.errors.items() if asks[world]}

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 
 __all__ = ["DEMONSTRATION", "EVALUATION", "TELEOPERATION", "episode_seed", "light_rng", "object_rng", "object_seed"]
-__all__ += ["planned_seed", "recording_seed", "seed_range"]
+__all__ += ["planned_seed", "policy_seed", "recording_seed", "seed_range"]
 
 EVALUATION = "evaluation"
 """Range of the seeds that judge a policy, which are positive int32 as the original's: 0 to 2^31 - 1."""
@@ -65,6 +65,15 @@ def planned_seed(gym_id: str, kind: str, group_seed: int, repeat: int) -> int:
 def seed_range(episode_seed: int) -> str:
     """`EVALUATION` for a seed that may judge a policy, otherwise `DEMONSTRATION`: whoever learns may use it."""
     return DEMONSTRATION if int(episode_seed) & _RECORDED else EVALUATION
+
+
+def policy_seed(episode_seed: int) -> int:
+    """Seed of an episode that a policy is given, for its noise alone: 0 to 2^31 - 1, by SHA-256 of the episode seed.
+
+    It leads back to no placement. It is no secret: who tries all numbers of a plan finds the episode.
+    """
+    digest = hashlib.sha256(f"policy|{int(episode_seed)}".encode()).digest()
+    return int.from_bytes(digest[-4:], "big") & 0x7FFFFFFF
 
 
 def object_seed(episode_seed: int) -> int:

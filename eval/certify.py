@@ -22,8 +22,10 @@ from arena_newton.eval.certification import (
     error_rates,
     failures,
     gradients,
+    inputs,
     legs,
     machines,
+    replays,
     sill,
     solvable,
     swap,
@@ -45,7 +47,9 @@ from arena_newton.quiet import quiet_warp
 __all__ = ["CHECKS", "run"]
 
 CHECKS: tuple[Check, ...] = (
+    *replays.CHECKS,
     *solvable.CHECKS,
+    *inputs.CHECKS,
     *legs.CHECKS,
     *axes.CHECKS,
     *agreement.CHECKS,

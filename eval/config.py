@@ -29,7 +29,7 @@ from arena_newton.eval.sharding import Shard, dealt, parse_shard
 from arena_newton.extras import require
 from arena_newton.noise_levels import NoiseLevels
 from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, robot_fit, video_sizes
-from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
+from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.text import counted, is_printable, plain_text
@@ -119,7 +119,7 @@ class RunConfig:
     tracker_facts: JsonObject | None = None
     """`Tracker.describe()` by tracker, once the trackers are made."""
     policy_facts: JsonObject | None = None
-    """`Policy.describe()`, once the policy is made."""
+    """`Policy.describe()` and, of one that takes the world itself, `privileged`, once the policy is made."""
 
     def identity(self) -> Identity:
         """What the results depend on, by flag name; two runs with equal identity may share a results folder.
@@ -189,6 +189,11 @@ class RunConfig:
         return self.flags.disturb_scale * task_specs.get(task).disturbance if self.flags.disturb else 0.0
 
     @property
+    def privileged(self) -> bool:
+        """Whether the policy takes the world itself; known when it was made."""
+        return bool((self.policy_facts or {}).get("privileged"))
+
+    @property
     def hash(self) -> str:
         """Hash of `identity`."""
         return config_hash(self.identity())
@@ -207,7 +212,7 @@ class RunConfig:
             labels=self.flags.labels or getattr(policy, "labels", None) or "v3.1",
             worlds_matter=policy.depends_on_worlds,
             tracker_facts={name: _facts(tracker) for name, tracker in made.items()},
-            policy_facts=_facts(policy),
+            policy_facts=_facts(policy) | ({"privileged": True} if is_privileged(policy) else {}),
         )
 
 

@@ -178,9 +178,9 @@ def _of_run(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> li
             f"{rule.most:,} episodes; tests are of the episodes that a pair shares."
         )
     found: dict[tuple[str, str], _Gathered] = {}
-    policies = {record.policy for record in run.records}
+    policies = {record.shown_policy for record in run.records}
     for record in run.records:
-        key = (record.policy if len(policies) > 1 else "", record.tracker if per_tracker else "")
+        key = (record.shown_policy if len(policies) > 1 else "", record.tracker if per_tracker else "")
         name = " ".join([title, *(plain_text(word, None) for word in key if word)])
         found.setdefault(key, _Gathered(name, folder)).episodes.append(PlayedEpisode(record, run))
     return list(found.values())
@@ -345,7 +345,7 @@ def _by_episode(
 
 
 def _facts(one: _Gathered) -> tuple[tuple[str, str], ...]:
-    policies = dict.fromkeys(plain_text(played.record.policy, 120) for played in one.episodes)
+    policies = dict.fromkeys(plain_text(played.record.shown_policy, 120) for played in one.episodes)
     shown_policies = " ".join(list(policies)[:3]) + (f" and {len(policies) - 3} more" if len(policies) > 3 else "")
     return (
         ("policy", shown_policies),

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypedDict
 
 from arena_newton import rule_sets, seeding, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord
+from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, contradiction
 from arena_newton.eval.records import (
     MAX_CONFIG_BYTES,
     MAX_EPISODES,
@@ -206,6 +206,7 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
     run: JsonObject = {key: config[key] for key in _PARTS if key in config}
     named = trackers_of(config)
     kind = config.get("seed_range") or seeding.EVALUATION
+    privileged = bool((config.get("policy_facts") or {}).get("privileged"))
     for record in records:
         key = (record.task, record.tracker, record.mode, record.group_seed, record.repeat)
         words = f"{record.task} {record.mode} seed {record.group_seed} repeat {record.repeat}"
@@ -223,7 +224,7 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
         if numbers.setdefault(key, record.index) != record.index:
             raise InputError(f"{name}: is in the journal as episode {numbers[key]} too")
         seed = seeding.planned_seed(document["gym_ids"][record.task], kind, record.group_seed, record.repeat)
-        planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
+        planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed), "privileged": privileged}
         if named is not None and record.tracker not in named:
             planned["tracker"] = " or ".join(named)
         if record.task in budgets:
@@ -238,6 +239,8 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
                 )
         if record.steps > record.max_steps:
             raise InputError(f"{name}: {record.steps} steps of at most {record.max_steps}; {by_hand}")
+        if (said := contradiction(record)) is not None:
+            raise InputError(f"{name}: {said}; {by_hand}")
         before = ended.get(record.index)
         if before is not None and before.outcome != "error" and not _recorded_again(before, record):
             raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")

@@ -146,7 +146,7 @@ def _of_suite(folder: Path, notes: list[str]) -> list[tuple[str, EvaluatedCell, 
 def _suite_cell(cell: SuiteCell, run: RunRecord) -> EvaluatedCell:
     facts = _facts(run.config.get("policy_facts"))
     return EvaluatedCell(
-        policy=cell.policy,
+        policy=dataclasses.replace(run.records[0], policy=cell.policy).shown_policy,
         family=cell.family,
         trained_on=tuple(sorted(cell.trained_on, key=_tracker_order)),
         trained_tasks=cell.trained_tasks,
@@ -177,11 +177,11 @@ def _of_run(run: RunRecord) -> list[EvaluatedCell]:
     facts = _facts(config.get("policy_facts"))
     groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
     for record in run.records:
-        groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
+        groups.setdefault((record.task, record.tracker, record.shown_policy, record.mode), []).append(record)
     found = []
     for (task, tracker, policy, mode), records in groups.items():
         family = _text(facts.get("family"))
-        scheme = policy.partition(":")[0]
+        scheme = records[0].policy.partition(":")[0]
         recipe = _text(facts.get("recipe"))
         replan = config.get("replan")
         found.append(

@@ -47,7 +47,7 @@ def failure_cells(records: Iterable[EpisodeRecord]) -> list[FailureCell]:
     groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
     for record in sorted(records, key=lambda one: one.index):
         if record.signals is not None and record.outcome != "error":
-            groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
+            groups.setdefault((record.task, record.tracker, record.shown_policy, record.mode), []).append(record)
     return [_cell(names, group) for names, group in groups.items()]
 
 

@@ -41,8 +41,8 @@ _REPORTING = """__main__ action_map adversary bench bench_figure bench_learned b
     sharding signal_recorder slice_events slice_player stats success_film suite_call suite_estimate suite_figures
     suite_file suite_folder suite_options suite_records suite_run suite_tables suite_timing table_entries table_options
     table_text tables tables_command tsne_command whole_run wording worst_placement"""
-_CHECKS = """agreement axes certificate claims context error_rates failures finding gradients jobs legs machines
-    same_files sill solvable swap traces visible"""
+_CHECKS = """agreement axes certificate claims context error_rates failures finding gradients inputs jobs legs machines
+    replays same_files sill solvable swap traces visible"""
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
 _TRAINING = """__main__ act_family augmentation batching decoder_pool decoder_process demonstration_rows

@@ -43,6 +43,7 @@ __all__ = [
     "Journal",
     "LockedLines",
     "StorageError",
+    "contradiction",
     "read_journal",
     "write_atomic",
 ]
@@ -75,6 +76,8 @@ class EpisodeRecord:
     tracker: Name
     policy: Name
     """Spec of the policy, a local path shortened to its file name."""
+    privileged: bool = False
+    """The policy takes the world itself (`Policy.attach`): it knows more of an episode than state and picture show."""
     mode: Mode
     rules: Name = ""
     engine: Name = ""
@@ -118,6 +121,11 @@ class EpisodeRecord:
     signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
     """What tells why it failed; None, and absent in the line, without `eval run --failures`."""
 
+    @property
+    def shown_policy(self) -> str:
+        """Name of the policy in tables, which mark one that takes the world itself."""
+        return f"{self.policy} (privileged)" if self.privileged else self.policy
+
     def to_json(self) -> JsonObject:
         """The line as a JSON object."""
         values = {key.name: getattr(self, key.name) for key in dataclasses.fields(self)}
@@ -145,6 +153,24 @@ class EpisodeRecord:
         if line.get("signals") is not None:
             known["signals"] = EpisodeSignals.from_json(line["signals"])
         return cls(**known)
+
+
+def contradiction(record: EpisodeRecord) -> str | None:
+    """What a line says against itself, so that it was not written as the episode ended; None where all fits."""
+    last = next(reversed(record.predicates.values()), None) if record.predicates else record.steps
+    fell = next((event.tick for event in record.events if event.kind == "fall"), None)
+    if record.outcome == "success":
+        if record.margin is not None and record.margin < 0.0:
+            return f"a success with a margin of {record.margin:g}"
+        if last != record.steps:
+            return f"a success at step {record.steps}, whose last predicate held first at {last}"
+    elif record.outcome == "timeout" and record.reason == "timeout" and record.steps != record.max_steps:
+        return f"a timeout after {record.steps} of {record.max_steps} steps"
+    elif record.outcome == "fall" and record.schema > 1 and fell is None:
+        return "a fall without the event fall"
+    if record.outcome != "fall" and fell is not None and fell < record.steps:
+        return f"a {record.outcome} at step {record.steps} after a fall at {fell}"
+    return None
 
 
 class StorageError(ArenaError):

@@ -445,8 +445,9 @@ class CertifyOptions:
     tracker: tuple[str, ...] = ("twist2", "sonic")
     """Trackers, with the weights they come with; the first one alone where one is enough."""
     checks: tuple[str, ...] = ()
-    """Names of checks to run: solvable frozen-legs gliding-base visual semantic execution engines batches official
-    shards ray swap visible sill failures statistics gradients; all when none is named."""
+    """Names of checks to run: journal recording solvable policy-inputs tracker-inputs frozen-legs gliding-base visual
+    semantic execution engines batches official shards ray swap visible sill failures statistics gradients; all when
+    none is named."""
     episodes: int | None = None
     """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
     worlds: int = 20

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import warp as wp
 
-from arena_newton import policies, trackers
+from arena_newton import policies, seeding, trackers
 from arena_newton.data.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
@@ -120,7 +120,7 @@ def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Pol
     policy = factories.policy(config.policy, **config.policy_options)
     policy.check()
     for (task, _, mode), group in groups(config.episodes).items():
-        policy.check_task(task, mode, [episode.episode_seed for episode in group])
+        policy.check_task(task, mode, [seeding.policy_seed(episode.episode_seed) for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
     config = config.with_parts(made, policy)
@@ -384,7 +384,7 @@ class RunPlayer:
         """
         where, records = self.folder.path, self.journal.records
         check_again(self.config, where, records, result, result.episode, media.values())
-        record = _record(result, media, self.hashes, signals)
+        record = _record(result, media, self.hashes, signals, privileged=self.config.privileged)
         self.journal.append(record)
         self.ended[record.index] = record
 
@@ -424,6 +424,8 @@ def _record(
     media: dict[str, str],
     hashes: dict[str, str | None],
     signals: EpisodeSignals | None = None,
+    *,
+    privileged: bool = False,
 ) -> EpisodeRecord:
     """Journal line of an episode that ended now."""
     finished = time.time()
@@ -432,6 +434,7 @@ def _record(
     return EpisodeRecord(
         schema=SCHEMA,
         **planned,
+        privileged=privileged,
         hashes=hashes,
         outcome=result.outcome,
         reason=result.reason,

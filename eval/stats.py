@@ -211,7 +211,7 @@ def aggregate(records: Iterable[EpisodeRecord]) -> Aggregate:
     """Cells and suite averages of a run, in the order of the plan (`index`), whatever order the episodes ended in."""
     groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}
     for record in sorted(records, key=lambda r: r.index):
-        groups.setdefault((record.task, record.tracker, record.policy, record.mode), []).append(record)
+        groups.setdefault((record.task, record.tracker, record.shown_policy, record.mode), []).append(record)
     cells: list[ResultCell] = [
         {"task": task, "tracker": tracker, "policy": policy, "mode": mode, **cell(group)}
         for (task, tracker, policy, mode), group in groups.items()

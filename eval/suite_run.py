@@ -28,6 +28,7 @@ from arena_newton.eval.suite_folder import SuiteFolder
 from arena_newton.eval.suite_options import MatrixOptions
 from arena_newton.eval.suite_records import SUITE_FILE, CellEnding, CellEvent, SuiteCell
 from arena_newton.quiet import quiet_warp
+from arena_newton.seeding import policy_seed
 from arena_newton.text import counted, plain_text
 
 __all__ = ["CellPlayer", "run"]
@@ -152,7 +153,9 @@ class CellPlayer:
                     policy = self.factories.policy(config.policy, **config.policy_options)
                     with contextlib.closing(policy):
                         policy.check()
-                        policy.check_task(cell.task, cell.mode, [episode.episode_seed for episode in config.episodes])
+                        policy.check_task(
+                            cell.task, cell.mode, [policy_seed(one.episode_seed) for one in config.episodes]
+                        )
                     made.add((cell.spec, cell.task + cell.mode))
 
     def _changed(self, chosen: Sequence[str]) -> list[str]:

@@ -60,7 +60,7 @@ def _played(run: RunRecord) -> list[EpisodeRecord]:
     said = [f"looks every {counted(replan, 'tick')}"] if replan else []
     said += ["ensembled"] if run.config.get("ensemble") else []
     said += [f"{counted(late, 'tick')} late"] if late else []
-    return [dataclasses.replace(r, policy=", ".join([r.policy, *said])) for r in run.records] if said else run.records
+    return [dataclasses.replace(r, policy=", ".join([r.shown_policy, *said]), privileged=False) for r in run.records]
 
 
 def _records(runs: Sequence[RunRecord]) -> list[EpisodeRecord]:

@@ -29,6 +29,7 @@ __all__ = [
     "dataset_target",
     "get",
     "hub_name",
+    "is_privileged",
     "names",
     "register",
     "world_mask",
@@ -88,21 +89,31 @@ class Policy:
         """
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:
-        """Check before the first episode that the policy can do a task, in a mode and with episode seeds if known yet.
+        """Check before the first episode that the policy can do a task, in a mode and with seeds if known yet.
+
+        Args:
+            task: Name of the task.
+            mode: Evaluation mode.
+            seeds: What `reset` will be given.
 
         Raises:
             InputError: It cannot.
         """
 
     def attach(self, env: World) -> None:
-        """Take the environment of the next episodes; only privileged policies (experts) read its state.
+        """Take a view of the worlds of the next episodes, to read (`arena_newton.world_view`).
+
+        A policy that overrides this is privileged, and marked so in every result.
 
         Raises:
             InputError: The policy cannot work in this environment.
         """
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
-        """Begin new episodes in the worlds of `mask`, given an episode seed and a Gym id per world of the batch."""
+        """Begin new episodes in the worlds of `mask`, given a seed and a Gym id per world of the batch.
+
+        The seeds are for noise alone: `seeding.policy_seed` of the episodes, from which no placement follows.
+        """
 
     def act(self, observation: Observation) -> Chunk:
         """Actions for the worlds that ask."""
@@ -132,6 +143,11 @@ POLICIES: Registry[Policy] = Registry(
 """Makers of policies; each takes the text after the colon, or None, and the options of `get` that it knows."""
 register = POLICIES.register
 names = POLICIES.names
+
+
+def is_privileged(policy: Policy) -> bool:
+    """Whether a policy takes the world itself, so that it knows more of an episode than state and picture show."""
+    return getattr(policy.attach, "__func__", None) is not Policy.attach
 
 
 def world_mask(mask: Mask, worlds: int) -> np.ndarray:

@@ -42,7 +42,7 @@ class RecordedEpisodes(Policy):
         self._steps = np.zeros(0, dtype=np.int64)
 
     def recording(self, task: str, mode: str, seed: int) -> np.ndarray | None:
-        """Actions of an episode, by Gym id, mode and episode seed, shape [ticks, 40]; None where there are none."""
+        """Actions of an episode, by Gym id, mode and policy's seed, shape [ticks, 40]; None where there are none."""
         raise NotImplementedError
 
     def attach(self, env: World) -> None:
@@ -67,8 +67,8 @@ class RecordedEpisodes(Policy):
         for world in np.flatnonzero(world_mask(observation.mask, worlds)):
             recording = self.playing[world]
             if recording is None:
-                task, mode, seed = self._asked[world]
-                errors[int(world)] = f"{self.path}: no recording of {task}, mode {mode}, episode seed {seed}"
+                task, mode, _ = self._asked[world]
+                errors[int(world)] = f"{self.path}: no recording of this episode of {task}, mode {mode}"
                 continue
             ticks = self._steps[world] + np.arange(self.chunk_size)
             actions[world] = played(recording, ticks)

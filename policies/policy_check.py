@@ -42,7 +42,7 @@ def _check(argv: Sequence[str]) -> int:
 
     from arena_newton.env import ArenaEnv
     from arena_newton.pictures.settings import CameraConfig
-    from arena_newton.policies.base import Policy, get
+    from arena_newton.policies.base import get, is_privileged
     from arena_newton.quiet import quiet_warp
     from arena_newton.testing import check_policy
     from arena_newton.testing.findings import table
@@ -57,7 +57,7 @@ def _check(argv: Sequence[str]) -> int:
         return ArenaEnv(args.task, tracker=PdTracker(), worlds=worlds, engine="mujoco", camera=camera, rules="released")
 
     seeds = SEEDS if args.seeds is None else tuple(args.seeds)
-    made = make_worlds if type(policy).attach is not Policy.attach else None
+    made = make_worlds if is_privileged(policy) else None
     results = check_policy(policy, task=args.task, seeds=seeds, make_worlds=made, raises=False)
     print(table(f"policy {args.spec.partition(':')[0]}", results))
     return int(not all(result.ok for result in results))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from arena_newton import seeding
 from arena_newton import tasks as task_registry
 from arena_newton.errors import InputError
 from arena_newton.extras import require
@@ -103,6 +104,7 @@ class ReplayEpisodes(RecordedEpisodes):
         self.path = Path(folder)
         self.name = f"replay-{self.path.parent.name if self.path.name == 'actions' else self.path.name}"
         self._episodes: dict[tuple[str, str, int], np.ndarray] = {}
+        """Actions by Gym id, mode and the seed that a policy is given."""
         files = sorted(self.path.glob("*.npz"))
         if not files:
             raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; run --actions writes them")
@@ -110,12 +112,13 @@ class ReplayEpisodes(RecordedEpisodes):
             actions = load_actions(file)
             arrays = read_arrays(file, ("task", "mode", "episode_seed"), where=f"--policy replay:{file}")
             try:
-                episode = str(arrays["task"]), str(arrays["mode"]), int(arrays["episode_seed"])
+                seed = int(arrays["episode_seed"])
+                episode = str(arrays["task"]), str(arrays["mode"]), seeding.policy_seed(seed)
             except (KeyError, TypeError, ValueError, OverflowError):
                 where = f"--policy replay:{file}"
                 raise InputError(f"{where}: episode_seed, task and mode are missing or unfit") from None
             if episode in self._episodes:
-                raise InputError(f"--policy replay:{file}: a second recording of episode seed {episode[2]}, keep one")
+                raise InputError(f"--policy replay:{file}: a second recording of episode seed {seed}, keep one")
             self._episodes[episode] = actions
 
     def check_task(self, task: str, mode: str | None = None, seeds: Sequence[int] = ()) -> None:

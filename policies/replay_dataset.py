@@ -61,7 +61,7 @@ class ReplayDataset(RecordedEpisodes):
         for number, seed in enumerate(self.dataset.seeds()):
             if seed.task not in task_registry.names():
                 raise InputError(f"{self.dataset.where}: arena: episode {number}: no task {seed.task[:80]!r}")
-            key = task_registry.get(seed.task).gym_id, seed.mode, seed.episode_seed
+            key = task_registry.get(seed.task).gym_id, seed.mode, seeding.policy_seed(seed.episode_seed)
             self._seeded.setdefault(key, []).append((seed.tracker, number))
         if not self._seeded:
             raise InputError(
@@ -98,7 +98,7 @@ class ReplayDataset(RecordedEpisodes):
         if mode is not None and mode not in modes:
             raise InputError(f"{self.where}: no recording of task {task} in mode {mode}, only {', '.join(modes)}")
         if seeds and not any((mode, seed) in here for seed in seeds):
-            kinds = sorted({seeding.seed_range(seed) for _, seed in here})
+            kinds = sorted({seeding.seed_range(one.episode_seed) for one in self.dataset.seeds() if one.task == task})
             raise InputError(f"{self.where}: recordings of task {task}, but of other seeds (of {', '.join(kinds)})")
 
     def attach(self, env: World) -> None:

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from arena_newton import seeding
 from arena_newton import tasks as task_registry
 from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION, STATE_WIDTH, validate_action
 from arena_newton.errors import InputError
@@ -171,7 +172,7 @@ class _Trial:
         stage.begin(seeds, worlds)
         given, mask = [0] * stage.worlds, np.zeros(stage.worlds, dtype=bool)
         for seed, world in zip(seeds, worlds, strict=True):
-            given[world], mask[world] = seed, True
+            given[world], mask[world] = seeding.policy_seed(seed), True
         self.policy.reset(given, [stage.gym_id] * stage.worlds, mask)
 
     def run(
@@ -269,7 +270,7 @@ class _Trial:
         self.run(self.seeds[:1])
         stage = self.stage(len(self.seeds))
         stage.begin(self.seeds, range(stage.worlds))
-        self.policy.reset(list(self.seeds), [stage.gym_id] * stage.worlds)
+        self.policy.reset(list(map(seeding.policy_seed, self.seeds)), [stage.gym_id] * stage.worlds)
         mask = np.ones(stage.worlds, dtype=bool)
         self.taken(self.policy.act(stage.observe(mask)), mask)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from arena_newton.devices import resolve_engine
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, discordant, pooled_score, score, skipped
-from arena_newton.eval.certification.solvable import recorded
+from arena_newton.eval.certification.replays import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.slice_player import device_name

@@ -13,7 +13,7 @@ from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, Sheet, score, skipped
-from arena_newton.eval.certification.solvable import recorded
+from arena_newton.eval.certification.replays import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
 from arena_newton.eval.records import JsonObject
 from arena_newton.interfaces import World

@@ -48,7 +48,9 @@ class ClaimFinding:
 
 
 CLAIMS = (
-    Claim("Every task can be solved, through each tracker and under both rule sets.", ("solvable",)),
+    Claim("What is written down is what happened, and a replay of it shows it.", ("journal", "recording")),
+    Claim("Every task can be solved, by actions alone, through each tracker and under both rule sets.", ("solvable",)),
+    Claim("Policy and tracker know no more than they are given.", ("policy-inputs", "tracker-inputs")),
     Claim("Experts need their legs, but where a gliding base is known to do.", ("frozen-legs", "gliding-base")),
     Claim(
         "Each axis of generalisation moves what its name says, and nothing else.", ("visual", "semantic", "execution")
@@ -59,7 +61,8 @@ CLAIMS = (
     Claim("A failure is named by the stage at which it happened.", ("failures",)),
     Claim("Of two policies one is called better no more often by mistake than the page says.", ("statistics",)),
     Claim(
-        "An episode depends on its seed alone, not on its batch, its machine or a process that is lost.",
+        "An episode depends on its seed alone, not on its batch, on which processes of one machine play it or on one "
+        "that is lost.",
         ("batches", "shards", "ray"),
     ),
     Claim("Both physics engines give the same rates.", ("engines",)),

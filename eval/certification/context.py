@@ -57,6 +57,8 @@ class CertifyCell:
     """Keep the signals of failures."""
     first_seed: int = 0
     """The first of its group seeds; the protocol's is 0."""
+    episodes: int | None = None
+    """Its first episodes alone; None: as many as the certification says."""
 
     @property
     def folder(self) -> str:
@@ -96,14 +98,16 @@ class Context:
         """Trackers of checks that compare experts with themselves: under --quick the first one stands for all."""
         return self.trackers[:1] if self.options.quick else self.trackers
 
-    def plan(self, first: int = 0) -> tuple[tuple[int, ...], int]:
+    def plan(self, first: int = 0, episodes: int | None = None) -> tuple[tuple[int, ...], int]:
         """Group seeds and repeats: the protocol's 20 repeats of each seed where the episodes are a multiple of 20.
 
         Args:
             first: The first group seed.
+            episodes: How many; the certification's by default.
         """
-        groups, rest = divmod(self.episodes, PROTOCOL_REPEATS)
-        return ((first,), self.episodes) if rest else (tuple(range(first, first + groups)), PROTOCOL_REPEATS)
+        episodes = episodes or self.episodes
+        groups, rest = divmod(episodes, PROTOCOL_REPEATS)
+        return ((first,), episodes) if rest else (tuple(range(first, first + groups)), PROTOCOL_REPEATS)
 
     def seeds(self, task: str, count: int) -> list[int]:
         """Episode seeds of a task's first episodes in the protocol: 20 repeats of each group seed."""
@@ -121,7 +125,7 @@ class Context:
             InputError: A flag is wrong, or the folder was begun with another configuration.
             KeyboardInterrupt: The run was interrupted; what was played is kept.
         """
-        seeds, repeats = self.plan(cell.first_seed)
+        seeds, repeats = self.plan(cell.first_seed, cell.episodes)
         options = RunOptions(
             task=(cell.task,),
             tracker=(cell.tracker,),
@@ -131,7 +135,7 @@ class Context:
             rules=cell.rules,
             seeds=seeds,
             repeats=repeats,
-            worlds=min(self.options.worlds, self.episodes),
+            worlds=min(self.options.worlds, cell.episodes or self.episodes),
             engine=cell.engine or self.options.engine,
             device="cpu" if cell.engine == "mujoco" else self.options.device,
             actions=cell.actions,

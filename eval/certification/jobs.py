@@ -39,11 +39,21 @@ class Piece:
 
 FIRST = "solvable"
 """The check whose evaluations others compare with: it is played before them."""
-COMPARING = (FIRST, "frozen-legs", "gliding-base", "semantic", "engines", "official", "swap")
+COMPARING = (
+    FIRST,
+    "journal",
+    "tracker-inputs",
+    "frozen-legs",
+    "gliding-base",
+    "semantic",
+    "engines",
+    "official",
+    "swap",
+)
 """It, and the checks that compare with its evaluations."""
 BY_NAME = "engines"
 """The check that without CUDA is skipped unless it is named: a process that plays it for others would name it."""
-BY_FIRST = ("visual", "execution", "visible")
+BY_FIRST = ("visual", "execution", "visible", "policy-inputs")
 """Checks that play through the first tracker alone."""
 BY_ALL = ("official", "swap")
 """Checks whose measurements of a task are not apart by tracker."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet, Verdict, pooled_score, score
-from arena_newton.eval.certification.solvable import recorded
+from arena_newton.eval.certification.replays import recorded
 
 __all__ = ["CHECKS", "GLIDES"]
 

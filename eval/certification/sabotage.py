@@ -384,13 +384,15 @@ class StubbornExpert(ClumsyExpert):
     """
 
     env: RelocatingEnv
+    left_at: Tensor | None = None
+    """Where a free object was when it was moved [m], shape [worlds, 3]."""
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
         if self.handling and self.env.free:  # it falls where it was put
-            kept = self.env.relocated.any(dim=1)[:, None]
-            self.env.left_at = torch.where(kept, self.env.left_at, self.sight.view.centre)
-            self.sight.object_off = self.env.left_at - self.sight.view.centre
+            kept, there = self.env.relocated.any(dim=1)[:, None], self.sight.view.centre
+            self.left_at = there.clone() if self.left_at is None else torch.where(kept, self.left_at, there)
+            self.sight.object_off = self.left_at - there
             return
         self.sight.object_off = -self.env.relocated
 
@@ -408,6 +410,8 @@ class StubbornExpert(ClumsyExpert):
 
 class RelocatingEnv(ArenaEnv):
     """Moves the object away at its first touch; engine `mujoco` alone."""
+
+    shown = ("relocated", "movable", "free")
 
     @functools.cached_property
     def view(self) -> InteractionView:
@@ -435,11 +439,6 @@ class RelocatingEnv(ArenaEnv):
     def free(self) -> bool:
         """Whether the object is a free body."""
         return int(self.scene.mj_model.body_mocapid[self.root]) < 0
-
-    @functools.cached_property
-    def left_at(self) -> Tensor:
-        """Where a free object was when it was moved [m], shape [worlds, 3]."""
-        return self.view.centre.clone()
 
     def reset(
         self,

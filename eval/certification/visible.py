@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from arena_newton import policies
+from arena_newton import policies, seeding
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.certification.traces import world_of
@@ -114,7 +114,7 @@ def first_sights(env: World, seeds: list[int], prim: str) -> tuple[list[int | No
     policy = policies.get("expert")
     policy.attach(env)
     env.reset(seeds)
-    policy.reset(seeds, [env.spec.gym_id] * env.worlds)
+    policy.reset([seeding.policy_seed(seed) for seed in seeds], [env.spec.gym_id] * env.worlds)
     shapes = _shapes_of(env, prim)
     first: list[int | None] = [None] * env.worlds
     pixels, image = [0] * env.worlds, None

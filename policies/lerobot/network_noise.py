@@ -14,7 +14,7 @@ import torch
 
 __all__ = ["NOISE_RULE", "Draw", "generators", "normal"]
 
-NOISE_RULE = "sha256(episode seed|look)"
+NOISE_RULE = "sha256(policy seed|look)"
 """How the seed of a look's generator is made; results record it."""
 
 

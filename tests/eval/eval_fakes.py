@@ -16,8 +16,9 @@ import torch
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.run import Factories
-from arena_newton.interfaces import Chunk, Observation, Verdict
+from arena_newton.interfaces import Chunk, EpisodeEvent, Observation, Verdict
 from arena_newton.kernels import tick as codes
+from arena_newton.policies.base import Policy
 
 SLOW = 10
 """Every episode that ends by itself has ended after so many ticks; the others then leap from one leap to the next."""
@@ -76,7 +77,10 @@ class FakeEnv:
         raise NotImplementedError
 
     def verdict(self, world):
-        return Verdict(margin=self.seeds[world] % 997 / 997 - 0.5)
+        far, kind = self.seeds[world] % 997 / 997, self.seeds[world] % 10
+        ended = self.tick[world] > self.seeds[world] % SLOW
+        fell = (EpisodeEvent("fall", int(self.tick[world])),) if ended and 5 <= kind < 8 else ()
+        return Verdict(margin=far if ended and kind < 5 else -far, events=fell)
 
     def describe(self):
         return {"engine": self.options["engine"], "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
@@ -109,8 +113,8 @@ class FakePolicy:
     def check_task(self, task, mode=None, seeds=()):
         """It can do every task."""
 
-    def attach(self, env):
-        """It does not look at the world."""
+    attach = Policy.attach
+    """It does not look at the world."""
 
     def reset(self, seeds, tasks, mask=None):
         old = [*self.seeds, *seeds[len(self.seeds) :]]

@@ -23,10 +23,19 @@ def full(row):
     rest = {"schema": SCHEMA, "rules": "paper", "engine": "mujoco", "episode_seed": seed}
     rest |= {"object_seed": seeding.object_seed(seed), "max_steps": 1300, "margin": 0.1}
     rest |= {"hashes": {"config": "0123456789ab"}, "startup_fall": False}
-    rest |= {"reason": row["outcome"], "overflow": False, "error": None, "media": {}, "video": ""}
+    ended = row["outcome"], row["steps"]
+    rest |= {
+        "reason": {"timeout": "ball_out"}.get(ended[0], ended[0]),
+        "overflow": False,
+        "error": None,
+        "media": {},
+        "video": "",
+    }
     rest |= {"durations": {"wall_s": 1.0, "sim_s": 2.0}, "started_at": "a", "finished_at": "b"}
-    rest |= {"phases": [["walk", 0], ["reach", 40]], "predicates": {"approach": 30, "contact": None}, "progress": 0.5}
-    rest |= {"events": [{"kind": "contact", "tick": 61, "detail": "hand"}]}
+    rest |= {"phases": [["walk", 0], ["reach", 40]], "progress": 0.5}
+    rest |= {"predicates": {"approach": 30, "contact": ended[1] if ended[0] == "success" else None}}
+    fell = [{"kind": "fall", "tick": ended[1], "detail": "tilt"}] * (ended[0] == "fall")
+    rest |= {"events": [{"kind": "contact", "tick": 61, "detail": "hand"}, *fell]}
     return rest | row
 
 

@@ -162,7 +162,7 @@ def test_wrong_episodes_are_named(standing, tmp_path):
     with pytest.raises(InputError, match="is an episode of boxing, not of football"):
         policies.get(f"replay:{root}#0").check_task("football")
     policy = policies.get(f"replay:{write_dataset(tmp_path / 'own', standing, info=arena([2**31 + 5, 2**31 + 6]))}#all")
-    policy.check_task("boxing", "base", [2**31 + 6])
+    policy.check_task("boxing", "base", [seeding.policy_seed(2**31 + 6)])
     for arguments, message in {
         ("football",): "no recording of task football",
         ("boxing", "visual"): "in mode visual, only base",

@@ -214,7 +214,7 @@ def test_what_a_result_records(made, checkpoints):
     """Family, hash of the weights and how chunks are executed; equal for the same checkpoint at another path."""
     about = made["flow"].describe()
     assert about["family"] == "flow"
-    assert about["noise"] == "sha256(episode seed|look)"
+    assert about["noise"] == "sha256(policy seed|look)"
     assert made["act"].describe()["noise"] is None
     assert len(about["weights"]) == 12
     assert (about["predicted"], about["replan"], made["act"].describe()["predicted"]) == (CHUNK, CHUNK, 10)
