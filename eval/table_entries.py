@@ -198,8 +198,8 @@ def ours_average(table: str, name: str, cells: Sequence[EvaluatedCell], tasks: I
         successes=sum(record.outcome == "success" for record in records),
         sr=math.fsum(rates) / len(rates),
         sr_std=population_std(rates),
-        low=max(0.0, found.low) if found else None,
-        high=min(1.0, found.high) if found else None,
+        low=found.low if found else None,
+        high=found.high if found else None,
         afr=sum(record.outcome == "fall" for record in records) / len(records),
     )
     known = _known(chosen[0]) | {"task": name, "tracker": "+".join(dict.fromkeys(cell.tracker for cell in chosen))}
