@@ -323,10 +323,10 @@ def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | N
     and Min, Y. (2005), Simple improved confidence intervals for comparing matched proportions, Statistics in Medicine
     24, where paired, and of Agresti, A. and Caffo, B. (2000), Simple and effective confidence intervals for
     proportions, The American Statistician 54, where not. Of several strata each has the two in its variance, while the
-    two that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004), An improved confidence interval
-    for a linear function of binomial proportions, Computational Statistics & Data Analysis 45; two in each stratum
-    would draw the middle of many small ones to 0. It covers other episodes of the same networks, no other trainings:
-    those `trainings.trained_contrast` adds.
+    two that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004), An improved confidence
+    interval for a linear function of binomial proportions, Computational Statistics & Data Analysis 45; two in each
+    stratum would draw the middle of many small ones to 0. It covers other episodes of the same networks, no other
+    trainings: those `trainings.trained_contrast` adds.
 
     Args:
         strata: Of each its conditions: weight and outcomes.
