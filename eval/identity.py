@@ -40,7 +40,7 @@ _REPORTING = """__main__ action_map adversary bench bench_figure bench_learned b
     ray_actor ray_crew ray_run ray_suite recording records report rerecord results rounds sensitivity shard_merge
     sharding signal_recorder slice_events slice_player stats success_film suite_call suite_estimate suite_figures
     suite_file suite_folder suite_options suite_records suite_run suite_tables suite_timing table_entries table_options
-    table_text tables tables_command tsne_command whole_run wording worst_placement"""
+    table_text tables tables_command trainings tsne_command whole_run wording worst_placement"""
 _CHECKS = """agreement axes certificate claims context error_rates failures finding gradients inputs jobs legs machines
     replays same_files sill solvable swap traces visible"""
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
-from arena_newton.eval.results import RunRecord, due_episodes, is_complete
+from arena_newton.eval.results import RunRecord, changed_conditions, due_episodes, is_complete
 from arena_newton.eval.stats import wilson
 from arena_newton.eval.wording import markdown_table, plain
 from arena_newton.rules import MODES
@@ -123,7 +123,7 @@ def _conditions(runs: Sequence[RunRecord], policies: Sequence[str], weights: Map
 
 def _notes(runs: Sequence[RunRecord], records: Sequence[EpisodeRecord]) -> list[str]:
     """What a reader of the table must know besides it."""
-    found = []
+    found = changed_conditions(runs[0])
     for run in runs:
         played, shard, planned = len(run.records), run.document.get("shard"), run.document["planned"]
         if shard is not None:

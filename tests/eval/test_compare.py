@@ -17,9 +17,8 @@ from test_report import folder_with
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.comparison import Contender, compare
 from arena_newton.eval.comparison_text import difference_text, p_text, verdict
-from arena_newton.eval.rate_tests import RateDifference
 from arena_newton.eval.sharding import Shard, dealt
-from arena_newton.eval.stats import mcnemar, wilson
+from arena_newton.eval.stats import Contrast, mcnemar, wilson
 from arena_newton.eval.suite_records import CellEvent, event_line
 
 
@@ -304,6 +303,6 @@ def test_the_sentence_has_the_direction_of_the_test():
 
 def test_figures_have_no_minus_zero():
     """A difference and its bounds that are shown as 0 have no minus, and what is too small for a number is said so."""
-    assert difference_text(RateDifference(-0.0001, -0.004, 0.02)) == "+0.0 (0 to 2)"
-    assert difference_text(RateDifference(0.12, 0.034, 0.206)) == "+12.0 (3 to 21)"
+    assert difference_text(Contrast(-0.0001, -0.004, 0.02, 0, 0, 1, 1, 0)) == "+0.0 (0 to 2)"
+    assert difference_text(Contrast(0.12, 0.034, 0.206, 0, 0, 1, 1, 0)) == "+12.0 (3 to 21)"
     assert (p_text(mcnemar(1680, 0)), p_text(3e-5), p_text(0.034), p_text(1.0)) == ("<1e-300", "3e-05", "0.034", "1.00")
