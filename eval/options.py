@@ -264,7 +264,7 @@ class LoopOptions:
     policy: str = "act"
     """Family: act, diffusion, flow or pi05."""
     recipe: str | None = None
-    """Settings of the training: fast (when none is named), paper, compact."""
+    """Settings of the training: fast (when none is named), paper, released, compact."""
     minutes: float | None = None
     """Time of the training [min]; the schedule is fitted to it. The recipe's number of steps when none is given."""
     steps: int | None = None

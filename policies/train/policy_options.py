@@ -34,7 +34,8 @@ class PolicyTrainOptions:
     dataset: tuple[Path, ...] = ()
     """Folders of LeRobot v3.0 datasets; several are trained on together."""
     recipe: str = "fast"
-    """Settings: paper (the paper's table), fast (better per GPU minute), compact (ACT in 32 MB), small (for tests)."""
+    """Settings: paper (the paper's table), released (the original's own files), fast (better per GPU minute), compact
+    (ACT in 32 MB), small (for tests, with pictures of `eval record --size 64x64`)."""
     out: Path | None = None
     """Folder of the training; runs/<policy>_<recipe>_<dataset> by default."""
     steps: int = field(default=0, metadata=bounds(0, 10_000_000))
