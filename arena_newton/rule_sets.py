@@ -113,7 +113,10 @@ def table(rules: RuleSet) -> list[tuple[str, str]]:
         ("standing", f"root z ≥ {num(rules.standing.min_root_z)} m and up-axis ≥ {num(rules.standing.min_up)}"),
         ("placed absolutely", _placement_text(rules, "absolute")),
         ("placed as offset from the initial pose", _placement_text(rules, "offset")),
-        ("placed as initial pose + spawn scale × sample", _placement_text(rules, "scaled")),
+        (
+            "placed by the original's offset and scale: initial pose + spawn scale × sample",
+            _placement_text(rules, "scaled"),
+        ),
         (
             "execution mode",
             "ranges widened about the base range, never shifted, never void, and not into a fixture where the original "

@@ -288,8 +288,8 @@ _SMALL: dict[str, object] = {
 }
 _SMALL_CLIP = {"hidden": 32, "layers": 1, "heads": 2, "patch": 16}
 _CHANGES: dict[tuple[str, str], dict[str, object]] = {
-    # The original's own files, `lerobot/configs/humanoidarena_batch_train/{act,dp,mtp,pi05}.json` of its code: what they
-    # set otherwise than the paper's table, or leave at LeRobot's default. ACT's sets nothing otherwise.
+    # The original's files, `lerobot/configs/humanoidarena_batch_train/{act,dp,mtp,pi05}.json` of its code: what
+    # they set otherwise than the paper's table, or leave at LeRobot's default. ACT's agrees with the table.
     ("diffusion", "released"): {"network": {"drop_n_last_frames": 7}},
     ("flow", "released"): {"steps": 50_000},
     ("pi05", "released"): {

@@ -184,7 +184,9 @@ def test_checkpoint_in_lerobot(model, tmp_path):
 def test_a_frozen_vision_encoder_stays(base):
     """With the `released` recipe's `freeze_vision_encoder` training moves everything but the vision tower."""
     frozen = recipe("pi05", "released").network["freeze_vision_encoder"]
-    model = families.build(recipe("pi05", "small", network={"freeze_vision_encoder": frozen}), made_stats(), "cpu", base)
+    model = families.build(
+        recipe("pi05", "small", network={"freeze_vision_encoder": frozen}), made_stats(), "cpu", base
+    )
     before = {name: value.clone() for name, value in model.state_dict().items()}
     optimizer = torch.optim.AdamW(model.groups(), lr=1e-3)
     model.loss(made_batch(model)).backward()

@@ -125,13 +125,13 @@ RELEASED = {
     "flow": (64, 50_000, 20, False),
     "pi05": (8, 100_000, 0, True),
 }
-"""Batch of a process, steps, frames without a sample at an episode's end, frozen vision encoder; of the original's files
+"""Batch of a process, steps, frames without a sample at an episode's end, frozen vision encoder: of the original's
 `lerobot/configs/humanoidarena_batch_train/{act,dp,mtp,pi05}.json`, LeRobot's default where they set none."""
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_released_recipe_is_the_originals_files(family):
-    """`released` has the four numbers in which the original's stored files and the paper's table differ, nothing else."""
+    """`released` has what the original's stored files say otherwise than the paper's table, and nothing else."""
     found, paper = recipe(family, "released"), recipe(family, "paper")
     frozen = bool(found.network.get("freeze_vision_encoder"))
     dropped = found.network.get("drop_n_last_frames", 0)
@@ -157,7 +157,11 @@ def test_fast_act_is_what_was_measured():
     ("arguments", "overrides", "match"),
     [
         (("vqbet", "fast"), {}, "--policy vqbet: unknown, choose from act, diffusion, flow, pi05"),
-        (("act", "quick"), {}, "--recipe quick: unknown for --policy act, choose from paper, released, fast, small, compact"),
+        (
+            ("act", "quick"),
+            {},
+            "--recipe quick: unknown for --policy act, choose from paper, released, fast, small, compact",
+        ),
         (("flow", "compact"), {}, "--recipe compact: unknown for --policy flow"),
         (("act", "fast"), {"stepz": 3}, "no field stepz"),
         (("act", "fast"), {"steps": 0}, "steps is 0, expected at least 1"),
