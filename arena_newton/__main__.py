@@ -19,6 +19,10 @@ from arena_newton.errors import InputError
 __all__ = ["COMMANDS", "Command", "main"]
 
 PROG = "arena-newton"
+_EVAL = (
+    "evaluate: run resume record merge report film list compare tables tsne matrix loop pack sensitivity adversary "
+    "bench doors engines certify"
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Command:
 COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
     Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
-    Command("eval", "arena_newton.eval.__main__", "evaluate a policy: run, resume, report, list, bench, engines"),
+    Command("eval", "arena_newton.eval.__main__", _EVAL),
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
     Command("policies serve", "arena_newton.policies.serve.__main__", "serve a policy: openpi, vla-eval, HTTP"),
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),

@@ -8,11 +8,12 @@ import gc
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from arena_newton.errors import ArenaError
 from arena_newton.text import plain_text
 
-__all__ = ["INTERRUPTED", "exit_code"]
+__all__ = ["INTERRUPTED", "exit_code", "program"]
 
 COLLECTED = (50_000, 10, 10)
 """Thresholds of the garbage collector. Imports and kernels make a million objects that stay; with Python's own first
@@ -22,6 +23,14 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 NO_HOME = "Could not determine home directory."
 """What `pathlib` says of a path such as `~nobody/x`."""
+
+
+def program(words: str, module: str) -> str:
+    """A command's name for help and messages, as the process was started: by the one command line or by its module."""
+    if Path(sys.argv[0]).name == "arena-newton":
+        return f"arena-newton {words}"
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return f"python -m arena_newton {words}" if spec and spec.name == "arena_newton.__main__" else f"python -m {module}"
 
 
 def exit_code(work: Callable[[], int | None]) -> int:

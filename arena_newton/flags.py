@@ -8,12 +8,19 @@ import difflib
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, TypeVar
 
 import tyro
 
 from arena_newton.errors import InputError
 
-__all__ = ["folders_named", "parse_flags", "user_path"]
+__all__ = ["Several", "folders_named", "parse_flags", "user_path"]
+
+_T = TypeVar("_T")
+Several = Annotated[
+    tuple[_T, ...], tyro.conf.arg(help_behavior_hint=lambda shown: f"(default: {shown})" if shown else "")
+]
+"""Values of a flag that takes several; help shows no default where it is none of them."""
 
 
 def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | None = None) -> T:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.errors import InputError
 from arena_newton.eval.door_options import DoorOptions
 from arena_newton.eval.options import (
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton.eval"
+PROG = program("eval", "arena_newton.eval")
 LISTS = frozenset("--task --tracker --mode --seeds --checks --only --differ --axes --grid".split())
 """Flags that take several values and are the whole list where they are not given."""
 OVERVIEW = f"""commands:

@@ -87,7 +87,8 @@ def failed(group: str, error: OSError) -> str:
 
 def result(run: RunRecord, results: Results, resume: str, seconds: float) -> None:
     """Print the table, what a reader must know besides it, why episodes ended as errors, and the command to resume."""
-    print(f"\n{report.table(results, row_results(run))}")
+    beside = row_results(run)
+    print(f"\n{report.table(results, beside)}")
     for note in report.notes(run, results):
         print(note)
     reasons = stats.error_reasons(run.records)
@@ -96,5 +97,6 @@ def result(run: RunRecord, results: Results, resume: str, seconds: float) -> Non
         for cause in reasons:
             print(f"  {cause['count']:>4} x {cause['reason']}: {cause['message']}")
         print(f"Run them again with: {resume} --retry-errors")
-    print(f"{counted(results['finished'], 'episode')}, this run took {duration(seconds)}")
+    played = results["finished"] + (beside["finished"] if beside is not None else 0)
+    print(f"{counted(played, 'episode')}, this run took {duration(seconds)}")
     print(f"report: {run.folder / 'report.html'}")

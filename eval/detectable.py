@@ -30,25 +30,27 @@ def detectable_text(cells: Sequence[int]) -> str:
     """
     if not cells:
         return ""
-    said = [f"{counted(min(cells), 'episode')} of a cell {_range(min(cells))}"] if min(cells) <= MOST_PAIRS else []
+    said = [f"{counted(min(cells), 'episode')} per cell: {_range(min(cells))}"] if min(cells) <= MOST_PAIRS else []
     if len(cells) > 1 and sum(cells) <= MOST_PAIRS:
-        said.append(f"all {sum(cells):,} {_range(sum(cells))}")
+        said.append(f"all {sum(cells):,}: {_range(sum(cells))}")
     if not said:
         return ""
     text = (
-        f"two such runs tell a policy of 50 % from a better one (McNemar's test, 5 %, power {100 * POWER:.0f} %): "
-        f"{', '.join(said)}"
+        "smallest difference from a success rate of 50 % that two such runs detect (McNemar's test, 5 %, power "
+        f"{100 * POWER:.0f} %): {', '.join(said)}"
     )
     if " to " not in text:
         return text
-    return f"{text}; the first if it also solves all that the other does, the last if outcomes are independent"
+    return (
+        f"{text}; the first if the better one also solves all that the other does, the last if outcomes are independent"
+    )
 
 
 def _range(pairs: int) -> str:
     """The differences for nested and for independent outcomes in points, such as `13 to 26.5 points`."""
     nested, independent = (detectable_difference(pairs, nested=how) for how in (True, False))
     if nested is None:
-        return "at no difference"
+        return "none"
     return (
         f"{100 * nested:g} points or more"
         if independent is None

@@ -16,11 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
+from markupsafe import Markup
 
 from arena_newton.eval.document import Document, trackers_of
 from arena_newton.eval.failure_rules import stage_of
 from arena_newton.eval.failure_text import SENTENCES, stage_bars
 from arena_newton.eval.journal import EpisodeRecord
+from arena_newton.eval.learned_row import ROW_FOLDER
 from arena_newton.eval.results import Results, RunRecord
 from arena_newton.eval.stats import ErrorReason, ResultCell
 from arena_newton.eval.wording import (
@@ -106,6 +108,12 @@ def _policy() -> str:
     )
 
 
+def _linked(note: str) -> str:
+    """A note whose last word is the folder of the learned policy's row, with a link to the report in it."""
+    before, name, after = note.rpartition(f"{ROW_FOLDER}/.")
+    return Markup('{}<a href="{}/report.html">{}</a>.{}').format(before, ROW_FOLDER, name[:-1], after) if name else note
+
+
 def page(
     run: RunRecord,
     results: Results,
@@ -132,7 +140,7 @@ def page(
         script=_source("report.js"),
         results=results,
         facts=_facts(document, results),
-        notes=notes,
+        notes=[_linked(note) for note in notes],
         changes=document.get("variant_changes") or [],
         table=_table(head, rows, cells),
         outcomes=OUTCOMES,

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from arena_newton.flags import Several
+
 __all__ = [
     "QUICK_REPEATS",
     "QUICK_SEEDS",
@@ -41,9 +43,9 @@ class RunOptions:
     the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
-    task: tuple[str, ...] = ()
+    task: Several[str] = ()
     """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
-    tracker: tuple[str, ...] = ()
+    tracker: Several[str] = ()
     """Trackers that execute the 40D action, one or several: twist2 (when none is named) sonic pd ..."""
     checkpoint: str | None = None
     """Weights of the one tracker named: a .safetensors or official .onnx file (SONIC: a folder or two files with a
@@ -62,13 +64,13 @@ class RunOptions:
     --replan says."""
     latency_ticks: int = 0
     """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
-    mode: tuple[str, ...] = ()
+    mode: Several[str] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"
     """Gains of the joints' drives: auto (what rule set and tracker ask for), twist2, humanoidarena."""
-    seeds: tuple[int, ...] = ()
+    seeds: Several[int] = ()
     """Group seeds; the protocol's are 0 1 2."""
     repeats: int | None = None
     """Episodes per group seed; the protocol's are 20."""
@@ -183,15 +185,15 @@ class RecordOptions:
     With --from FOLDER recorded episodes are played again, action by action, for more cameras.
     """
 
-    task: tuple[str, ...] = ()
+    task: Several[str] = ()
     """Task names, or `all`; all when none is named."""
-    tracker: tuple[str, ...] = ()
+    tracker: Several[str] = ()
     """Trackers that execute the 40D action: twist2 (when none is named) sonic ..."""
     checkpoint: str | None = None
     """Weights of the one tracker named; those that come with the package when none are named."""
     policy: str = "expert"
     """Policy that is recorded."""
-    mode: tuple[str, ...] = ()
+    mode: Several[str] = ()
     """Modes: base (when none is named) execution semantic visual."""
     rules: str = "paper"
     """Rule set: paper or released."""
@@ -264,7 +266,7 @@ class LoopOptions:
     policy: str = "act"
     """Family: act, diffusion, flow or pi05."""
     recipe: str | None = None
-    """Settings of the training: fast (when none is named), paper, compact."""
+    """Settings of the training: fast (when none is named), paper, released, compact."""
     minutes: float | None = None
     """Time of the training [min]; the schedule is fitted to it. The recipe's number of steps when none is given."""
     steps: int | None = None
@@ -371,14 +373,14 @@ class BenchOptions:
     """Ticks of an episode of `policy` at most; 0: what the rules or the length of usual successes say."""
     learned_ticks: int = 300
     """Ticks of an episode of `learned`, and of the expert's beside it."""
-    peers: tuple[str, ...] = ()
+    peers: Several[str] = ()
     """Measure beside other programs instead: tick world_ticks act_training tracker_training lerobot_eval camera, or
     `all`."""
     peers_dataset: str | None = None
     """Dataset of `act_training`, read by both sides."""
     mjlab_python: str | None = None
     """Interpreter that has mjlab, for `tracker_training`."""
-    peers_worlds: tuple[int, ...] = ()
+    peers_worlds: Several[int] = ()
     """Worlds of `tracker_training`; 4096 and 8192 on CUDA, 4 on the CPU when none are named."""
     peers_iterations: int = 10
     """Iterations of PPO in a round of `tracker_training`."""
@@ -440,11 +442,11 @@ class CertifyOptions:
     """Folder of the certificate and of the evaluations behind it."""
     quick: bool = False
     """A few episodes of everything: minutes instead of hours, and wide intervals."""
-    task: tuple[str, ...] = ()
+    task: Several[str] = ()
     """Tasks; all that have an expert when none is named."""
     tracker: tuple[str, ...] = ("twist2", "sonic")
     """Trackers, with the weights they come with; the first one alone where one is enough."""
-    checks: tuple[str, ...] = ()
+    checks: Several[str] = ()
     """Names of checks to run: journal recording solvable policy-inputs tracker-inputs frozen-legs gliding-base visual
     semantic execution engines batches official shards ray swap visible sill failures statistics gradients; all when
     none is named."""

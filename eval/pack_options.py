@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arena_newton.flags import Several
+
 __all__ = ["ENOUGH", "PackOptions"]
 
 ENOUGH = 0.75
@@ -20,10 +22,10 @@ class PackOptions:
 
     out: str | None = None
     """Folder to write; that of the policy that comes with the package when none is named."""
-    tasks: tuple[str, ...] = ()
+    tasks: Several[str] = ()
     """Tasks that it is offered for, the one first that the default run shows; with results those that it solves at
     75 % in mode base through every tracker of its training, otherwise those of its training."""
-    results: tuple[str, ...] = ()
+    results: Several[str] = ()
     """Results folders or suites of eval whose cells of this checkpoint go into the card; a packed policy that is
     packed again keeps its other cells."""
     command: str = ""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arena_newton.flags import Several
+
 __all__ = ["AdversaryOptions", "PlacementOptions", "SensitivityOptions"]
 
 
@@ -23,7 +25,7 @@ class PlacementOptions:
     """Mode whose ranges are searched: base, execution (wider), semantic, visual."""
     rules: str = "paper"
     """Rule set: paper or released."""
-    axes: tuple[str, ...] = ()
+    axes: Several[str] = ()
     """Numbers that are moved, such as football.x football.y; the seeds draw the others. An unknown name lists all."""
     seed: int = 0
     """Group seed of what is drawn; the same seeds are played at every placement."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arena_newton.flags import Several
+
 __all__ = ["FORMATS", "CompareOptions", "TablesOptions", "TsneOptions"]
 
 FORMATS = ("md", "tex", "csv", "png")
@@ -34,9 +36,9 @@ class CompareOptions:
 
     out: str = "comparison"
     """Folder to write: compare.html, compare.md, compare.json and compare.csv."""
-    only: tuple[str, ...] = ()
+    only: Several[str] = ()
     """Names of those to compare, as the command prints them; all when none is named."""
-    differ: tuple[str, ...] = ()
+    differ: Several[str] = ()
     """What may differ between them, because it is what is compared: rules engine max_steps variant fast_physics."""
     per_tracker: bool = False
     """Each tracker of a folder is compared as one of its own, and against the others."""
@@ -48,7 +50,7 @@ class TsneOptions:
 
     policy: str = ""
     """Policy that predicts, such as lerobot:<checkpoint>."""
-    datasets: tuple[str, ...] = ()
+    datasets: Several[str] = ()
     """Two LeRobot datasets of the same tasks, such as one recorded through each tracker."""
     samples: int = 1000
     """Observations of each dataset and task."""

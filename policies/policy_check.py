@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from arena_newton import tasks
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.errors import InputError
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton policies check"
+PROG = program("policies check", "arena_newton policies check")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from arena_newton.command_line import program
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.quiet import quiet_warp
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Entry", "main"]
 
-PROG = "python -m arena_newton.trackers.evaluate"
+PROG = program("trackers evaluate", "arena_newton.trackers.evaluate")
 ROLLOUTS = {"full": 64, "quick": 8}
 """Rollouts per cell, unless --rollouts says otherwise."""
 

@@ -10,12 +10,12 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.errors import InputError
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton trackers check"
+PROG = program("trackers check", "arena_newton trackers check")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.data.data_options import (
     BuildOptions,
     CleanOptions,
@@ -24,7 +24,7 @@ from arena_newton.flags import folders_named, parse_flags
 
 __all__ = ["COMMANDS", "DataCommand", "main"]
 
-PROG = "python -m arena_newton.data"
+PROG = program("data", "arena_newton.data")
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton.flags import Several
+
 __all__ = [
     "BuildOptions",
     "CleanOptions",
@@ -27,7 +29,7 @@ class BuildOptions:
     """What the actions mean: v3.1 (reference pose, the original's) or v4 (root velocities)."""
     layout: str = "arena"
     """Names of the features: arena (the original's), sonic (GR00T-WholeBodyControl) or lerobot (Unitree G1)."""
-    cameras: tuple[str, ...] = ()
+    cameras: Several[str] = ()
     """Cameras to take: front left_wrist right_wrist world; all that the episodes have by default."""
     repo_id: str = ""
     """Name of the dataset in LeRobot, such as local/boxing; local/<folder> by default. It is not stored."""
@@ -43,7 +45,7 @@ class BuildOptions:
 class VerifyOptions:
     """Check a dataset against itself and against the recordings that it was built from."""
 
-    recordings: tuple[Path, ...] = ()
+    recordings: Several[Path] = ()
     """Folders of the recorded episodes; without them only the dataset itself is checked."""
     jobs: int = 0
     """Threads that decode videos, a file each; 0: one per core that the process may use."""
@@ -55,7 +57,7 @@ class DatasetBenchOptions:
 
     reads: int = 2000
     """Pictures that each reader reads."""
-    recordings: tuple[Path, ...] = ()
+    recordings: Several[Path] = ()
     """Folders of recorded episodes: they are built and verified once more, and the time is measured."""
     made: int = 0
     """The folder holds recordings; so many copies of them under other seeds are built, verified and read."""

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Sequence
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.extras import require
 from arena_newton.flags import parse_flags
 from arena_newton.policies.base import check_spec
@@ -17,7 +17,7 @@ from arena_newton.policies.teleop.ports import bind
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton.policies.serve"
+PROG = program("policies serve", "arena_newton.policies.serve")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

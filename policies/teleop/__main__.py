@@ -9,7 +9,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.errors import InputError
 from arena_newton.extras import require
 from arena_newton.flags import parse_flags
@@ -18,7 +18,7 @@ from arena_newton.policies.teleop.teleop_options import BrowserOptions, RedisOpt
 
 __all__ = ["COMMANDS", "TeleopCommand", "main"]
 
-PROG = "python -m arena_newton.policies.teleop"
+PROG = program("policies teleop", "arena_newton.policies.teleop")
 
 
 @dataclass(frozen=True)

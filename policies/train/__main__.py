@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.extras import require
 from arena_newton.flags import parse_flags
 from arena_newton.policies.train.policy_options import (
@@ -18,7 +18,7 @@ from arena_newton.policies.train.policy_options import (
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton.policies.train"
+PROG = program("policies train", "arena_newton.policies.train")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

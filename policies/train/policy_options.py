@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from arena_newton.errors import InputError
+from arena_newton.flags import Several
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
 __all__ = ["PolicyTrainOptions", "TeachableOptions", "TrainingBenchOptions", "check_numbers", "check_teachable"]
@@ -31,10 +32,11 @@ class PolicyTrainOptions:
 
     policy: str = "act"
     """Family: act, diffusion, flow or pi05."""
-    dataset: tuple[Path, ...] = ()
+    dataset: Several[Path] = ()
     """Folders of LeRobot v3.0 datasets; several are trained on together."""
     recipe: str = "fast"
-    """Settings: paper (the paper's table), fast (better per GPU minute), compact (ACT in 32 MB), small (for tests)."""
+    """Settings: paper (the paper's table), released (the original's own files), fast (better per GPU minute), compact
+    (ACT in 32 MB), small (for tests, with pictures of `eval record --size 64x64`)."""
     out: Path | None = None
     """Folder of the training; runs/<policy>_<recipe>_<dataset> by default."""
     steps: int = field(default=0, metadata=bounds(0, 10_000_000))
@@ -90,7 +92,7 @@ class TrainingBenchOptions:
     """Family: act, diffusion, flow or pi05."""
     recipe: str = "fast"
     """Settings, as of a training."""
-    dataset: tuple[Path, ...] = ()
+    dataset: Several[Path] = ()
     """Datasets; without them pictures are made up."""
     frames: int = field(default=20_000, metadata=bounds(100, 10_000_000))
     """Pictures that are made up."""

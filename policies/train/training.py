@@ -238,7 +238,8 @@ def check_pictures(datasets: list[DatasetRows], settings: TrainingRecipe) -> Non
         if (dataset.width, dataset.height) != (settings.picture, settings.picture):
             raise InputError(
                 f"--dataset {dataset.root}: pictures of {dataset.width}x{dataset.height} pixels, recipe "
-                f"{settings.family}/{settings.name} takes {settings.picture}x{settings.picture}"
+                f"{settings.family}/{settings.name} takes {settings.picture}x{settings.picture}: record with "
+                f"--size {settings.picture}x{settings.picture}"
             )
 
 

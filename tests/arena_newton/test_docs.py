@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from arena_newton.data import __main__ as data
+from arena_newton.eval import __main__ as evaluation
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 
@@ -41,6 +44,8 @@ def test_commands_of_the_index_exist():
     listed = re.findall(r"`([^`]+)`", first)
     for command in COMMANDS:
         assert any(f"{words} ".startswith(f"{command.words} ") for words in listed), command.words
+    assert {f"data {name}" for name in data.COMMANDS} <= set(listed)
+    assert {f"eval {name}" for name in evaluation._COMMANDS} - {"eval run"} <= set(listed)
     known = {word for command in COMMANDS for word in command.words.split()}
     assert {words.split()[0] for words in listed} <= known | {"validate", "list", "preview", "new"}
 

@@ -60,6 +60,9 @@ def test_torchcodec_without_ffmpeg_is_a_note(monkeypatch):
     finding = found(doctor.examine_extras(), "torchcodec")
     assert finding.status == "note" and "libavutil.so.56" in finding.value and "\n" not in finding.value
     assert "apt install ffmpeg" in finding.advice and "2 to 4 times slower" in finding.advice
+    whole = "Likely causes: FFmpeg is not installed in your environment. "
+    monkeypatch.setattr(doctor, "faults", lambda *_, **__: [whole + "We support versions 4 to 8" + " and more" * 9])
+    assert found(doctor.examine_extras(), "torchcodec").value == f"does not load ({whole[:-2]})", "no half sentence"
     monkeypatch.setattr(doctor, "faults", lambda *_, **__: [None])
     assert found(doctor.examine_extras(), "torchcodec").status == "ok"
 

@@ -9,6 +9,7 @@ import pytest
 
 from arena_newton.__main__ import COMMANDS, main
 from arena_newton.command_line import exit_code
+from arena_newton.eval import __main__ as evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = Path(sys.executable).with_name("arena-newton")
@@ -47,6 +48,25 @@ def test_every_command_explains_itself(command, capsys):
         code = stop.code
     assert code == 0
     assert capsys.readouterr().out.count("\n") > 1
+
+
+def test_the_overview_names_every_command_of_eval():
+    """The one line on `eval` names all of its commands."""
+    (purpose,) = (command.purpose for command in COMMANDS if command.words == "eval")
+    assert set(purpose.removeprefix("evaluate: ").split()) == set(evaluation._COMMANDS)
+
+
+def test_help_answers_in_the_name_of_the_call():
+    """Help names the program as it was called, and shows no default where a list has none."""
+    calls = {
+        ("-m", "arena_newton", "eval"): "python -m arena_newton eval",
+        ("-m", "arena_newton.eval"): "python -m arena_newton.eval",
+    }
+    calls |= {(str(SCRIPT), "eval"): "arena-newton eval"}
+    for call, name in calls.items():
+        shown = subprocess.run([sys.executable, *call, "--help"], capture_output=True, text=True, check=True).stdout
+        assert f"usage: {name} run" in shown and f"  {name} resume" in shown
+        assert "(default: )" not in shown and "(default: paper)" in shown
 
 
 def test_arguments_and_exit_codes_pass(tmp_path, capsys):

@@ -65,7 +65,10 @@ def test_the_default_run_has_a_row_that_sees(shipped, tmp_path, capsys):
     assert sum(row[2] == "learned" for row in rows(printed)) == 1 and printed.count("| task ") == 1
     assert "report of their own are in learned/" in printed
     assert rows((out / "table.md").read_text()) == rows(printed) == rows((out / "report.md").read_text())
-    assert "learned" in (out / "report.html").read_text()
+    assert 'are in <a href="learned/report.html">learned/</a>.' in (out / "report.html").read_text()
+    assert re.findall(r"^(\d+) episodes, this run took", printed, re.M) == [
+        str(sum(int(row[4]) for row in rows(printed)))
+    ]
     results = json.loads((out / "learned" / "results.json").read_text())
     assert results["config"]["policy_facts"]["weights"] == read_card(shipped).weights and results["complete"]
     assert all(cell["policy"] == "expert" for cell in json.loads((out / "results.json").read_text())["cells"])

@@ -319,8 +319,8 @@ def test_the_power_is_the_enumeration():
     assert detectable_difference(5, nested=True) is None  # five coins alone never reach 5 %
     assert detectable_difference(60, nested=True) < gain
     text = detectable_text([60] * 7)
-    assert f"60 episodes of a cell 13 to {100 * gain:g} points" in text and "all 420" in text
-    assert "3 episodes of a cell at no difference" in detectable_text([3]) and detectable_text([]) == ""
+    assert f"60 episodes per cell: 13 to {100 * gain:g} points" in text and "all 420" in text
+    assert "3 episodes per cell: none" in detectable_text([3]) and detectable_text([]) == ""
 
 
 def test_every_plan_that_is_said_to_be_computed_is():

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.errors import InputError
 from arena_newton.quiet import quiet_warp
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton.trackers.motions"
+PROG = program("trackers motions", "arena_newton.trackers.motions")
 ROWS = 40
 """Clips that `inspect` lists unless asked for all."""
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import tyro
 
-from arena_newton.command_line import exit_code
+from arena_newton.command_line import exit_code, program
 from arena_newton.errors import InputError
 from arena_newton.trackers.train.train_options import CurveOptions, ExportCommand, TrainOptions, check
 
 __all__ = ["main"]
 
-PROG = "python -m arena_newton.trackers.train"
+PROG = program("trackers train", "arena_newton.trackers.train")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from arena_newton.errors import InputError
+from arena_newton.flags import Several
 from arena_newton.trackers.interface import names
 
 __all__ = ["FAMILY_WEIGHTS", "CurveOptions", "ExportCommand", "ExportOptions", "TrainOptions", "check", "runner_config"]
@@ -62,7 +63,7 @@ class TrainOptions:
     """Motion library (NPZ); without it, references are generated."""
     families: dict[str, int] = field(default_factory=dict, metadata=at_least(1))
     """Number of generated clips per family, e.g. `--families walk 900 squat 200`; the generator's mix by default."""
-    clips: tuple[Path, ...] = ()
+    clips: Several[Path] = ()
     """Further motion files of any format that `motions convert` reads."""
     clips_licence: str = "unknown"
     """Licence of those files, for the card."""

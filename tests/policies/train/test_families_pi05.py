@@ -181,6 +181,20 @@ def test_checkpoint_in_lerobot(model, tmp_path):
     assert (model.samples, model.drop_last, model.capturable) == (range(20), 0, False)
 
 
+def test_a_frozen_vision_encoder_stays(base):
+    """With the `released` recipe's `freeze_vision_encoder` training moves everything but the vision tower."""
+    frozen = recipe("pi05", "released").network["freeze_vision_encoder"]
+    model = families.build(
+        recipe("pi05", "small", network={"freeze_vision_encoder": frozen}), made_stats(), "cpu", base
+    )
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    optimizer = torch.optim.AdamW(model.groups(), lr=1e-3)
+    model.loss(made_batch(model)).backward()
+    optimizer.step()
+    moved = {name for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved and not any(model.is_backbone(name) for name in moved)
+
+
 def test_absent_base_weights(monkeypatch, tmp_path):
     """The paper's recipe without base weights is one clear error, before 3.6 billion parameters are made."""
     monkeypatch.setattr(pretrained_weights.constants, "HF_HUB_OFFLINE", True)

@@ -483,7 +483,7 @@ BAD = [
     (["--dataset", "."], "--dataset .: no LeRobot dataset, meta/info.json is missing; `python -m arena_newton.data"),
     (["--device", "tpu"], "--device tpu: unknown"),
     (["--hold-out", "9"], "--hold-out 9: "),
-    (["--recipe", "fast"], "pictures of 64x64 pixels, recipe act/fast takes 224x224"),
+    (["--recipe", "fast"], "pictures of 64x64 pixels, recipe act/fast takes 224x224: record with --size 224x224"),
     (["--resume", "nowhere"], "--resume nowhere: no such folder"),
     (["--steps", "many"], "--steps: cannot read many"),
     (["--speed", "1"], "--speed: unknown argument"),

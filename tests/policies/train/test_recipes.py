@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import draccus
@@ -14,6 +14,7 @@ import pytest
 import torch
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from arena_newton.data.label_protocols import LABELS
 from arena_newton.errors import InputError
@@ -118,6 +119,32 @@ def test_every_recipe_is_complete(family, name):
         assert found.lr_factor(15_000) == pytest.approx(found.final_lr_fraction)
 
 
+RELEASED = {
+    "act": (64, 100_000, 0, False),
+    "diffusion": (64, 100_000, 7, False),
+    "flow": (64, 50_000, 20, False),
+    "pi05": (8, 100_000, 0, True),
+}
+"""Batch of a process, steps, frames without a sample at an episode's end, frozen vision encoder: of the original's
+`lerobot/configs/humanoidarena_batch_train/{act,dp,mtp,pi05}.json`, LeRobot's default where they set none."""
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_released_recipe_is_the_originals_files(family):
+    """`released` has what the original's stored files say otherwise than the paper's table, and nothing else."""
+    found, paper = recipe(family, "released"), recipe(family, "paper")
+    frozen = bool(found.network.get("freeze_vision_encoder"))
+    dropped = found.network.get("drop_n_last_frames", 0)
+    assert (found.batch_size, found.steps, dropped, frozen) == RELEASED[family] and not found.image_transforms
+    changed = {"name", "batch_size", "steps", "network", "image_transforms"}
+    for one in fields(TrainingRecipe):
+        assert one.name in changed or getattr(found, one.name) == getattr(paper, one.name), one.name
+    other = {name for name, value in found.network.items() if value != paper.network[name]}
+    assert other == {"diffusion": {"drop_n_last_frames"}, "pi05": {"freeze_vision_encoder"}}.get(family, set())
+    if family == "diffusion":
+        assert DiffusionConfig().drop_n_last_frames == found.network["drop_n_last_frames"]
+
+
 def test_fast_act_is_what_was_measured():
     """ACT's fast recipe: BatchNorm, no pretrained weights, learning rate 1e-4 for both parts, weight decay 1e-4."""
     found = recipe("act", "fast")
@@ -130,7 +157,11 @@ def test_fast_act_is_what_was_measured():
     ("arguments", "overrides", "match"),
     [
         (("vqbet", "fast"), {}, "--policy vqbet: unknown, choose from act, diffusion, flow, pi05"),
-        (("act", "quick"), {}, "--recipe quick: unknown for --policy act, choose from paper, fast, small, compact"),
+        (
+            ("act", "quick"),
+            {},
+            "--recipe quick: unknown for --policy act, choose from paper, released, fast, small, compact",
+        ),
         (("flow", "compact"), {}, "--recipe compact: unknown for --policy flow"),
         (("act", "fast"), {"stepz": 3}, "no field stepz"),
         (("act", "fast"), {"steps": 0}, "steps is 0, expected at least 1"),
