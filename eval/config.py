@@ -32,7 +32,7 @@ from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, Came
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
-from arena_newton.text import counted, is_printable, plain_text
+from arena_newton.text import counted, plain_text, unprintable
 
 if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
@@ -385,8 +385,8 @@ def _check_flags(options: RunOptions) -> None:
     for field in dataclasses.fields(options):
         given = getattr(options, field.name)
         for text in given if isinstance(given, tuple) else (given,):
-            if isinstance(text, str) and not is_printable(text):
-                raise InputError(f"{_flag(field.name)} {plain_text(text)}: has control characters in it")
+            if isinstance(text, str) and (reason := unprintable(text)) is not None:
+                raise InputError(f"{_flag(field.name)} {plain_text(text)}: {reason}")
     if options.drive not in DRIVES:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
     if options.labels not in (None, *LABELS):

@@ -181,6 +181,7 @@ def test_difference_is_told_to_the_key():
         ({"seeds": (10**400,)}, "--seeds 10{39}[.]{3}: expected at most"),
         ({"max_steps": 10**7 + 1}, "--max-steps 10000001: expected at most 10,000,000"),
         ({"repeats": 10**4000}, "--repeats 10{39}[.]{3}: makes too many episodes"),
+        ({"out": "erg \udcc3\udc9f"}, "--out erg: holds bytes that are no text in this locale's character set"),
         ({"policy": "remote:\x1b[2J"}, "--policy remote:: has control characters"),
         ({"repeats": 10**9}, "--repeats 1000000000: makes 3,000,000,000 episodes, at most 200,000"),
         ({"variant": "/dev/zero"}, "--variant /dev/zero: is not a regular file"),
