@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import hashlib
 import importlib
 import os
@@ -120,6 +121,10 @@ def test_code_of_other_packages_counts(tmp_path, monkeypatch):
     before = identity.own_code(part)
     (tmp_path / "their_policy" / "network.py").write_text("")
     assert before is not None and identity.own_code(part) != before
+    assert (
+        identity.own_code(type(part)) == identity.own_code(functools.partial(type(part), 1)) == identity.own_code(part)
+    )
+    assert identity.own_code(resolve) is None
     assert identity.own_code(object()) is None
     from arena_newton import policies
 
