@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton.command_line import exit_code
 from arena_newton.extras import EXTRAS
 from arena_newton.probe import faults
 
@@ -262,6 +263,11 @@ def main(argv: Sequence[str] = ()) -> int:
             file=None if helps else sys.stderr,
         )
         return 0 if helps else 2
+    return exit_code(_print_findings)
+
+
+def _print_findings() -> int:
+    print("examining packages, devices, engines and scenes ...", file=sys.stderr, flush=True)
     findings = examine()
     width = max(len(finding.subject) for finding in findings)
     for finding in findings:

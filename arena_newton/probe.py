@@ -69,9 +69,16 @@ def _network(given: str) -> None:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    rows = session.get_inputs()[0].shape[0]
-    rows = rows if isinstance(rows, int) else 2
-    session.run(None, {session.get_inputs()[0].name: np.zeros((rows, int(width)), np.float32)})
+    first, *others = session.get_inputs()
+    rows = first.shape[0] if isinstance(first.shape[0], int) else 2
+    fed = {first.name: np.zeros((rows, int(width)), np.float32)}
+    kinds = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(int32)": np.int32}
+    for other in others:  # such as a time step
+        shape = [n if isinstance(n, int) else rows for n in other.shape]
+        if np.prod(shape) > 1_000_000:
+            raise ValueError(f"its input {other.name} takes {shape} numbers")
+        fed[other.name] = np.zeros(shape, kinds.get(other.type, np.int64))
+    session.run(None, fed)
 
 
 def _module(name: str) -> None:

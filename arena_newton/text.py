@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 import unicodedata
 from collections.abc import Collection
 
-__all__ = ["counted", "is_printable", "plain_text"]
+__all__ = ["counted", "is_printable", "plain_text", "unprintable"]
 
 _ESCAPES = re.compile(
     r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[PX^_][^\x1b]*(?:\x1b\\)?|[@-Z\\-_])?"
@@ -51,6 +52,18 @@ def _clean(text: str, mark: str, marks: Collection[str]) -> str:
 def is_printable(text: str) -> bool:
     """Whether a text has no control characters, unpaired surrogates or marks that turn its direction."""
     return text.isprintable() or _clean(text, "", _TURNING) == text
+
+
+def unprintable(text: str) -> str | None:
+    """Reason for which a text of the command line cannot be shown, None when it can."""
+    if is_printable(text):
+        return None
+    if re.search("[\udc80-\udcff]", text):  # bytes that Python could not decode
+        return (
+            f"holds bytes that are no text in this locale's character set ({sys.getfilesystemencoding()}); "
+            "LC_ALL=C.UTF-8 makes that UTF-8"
+        )
+    return "has control characters in it"
 
 
 def counted(number: int, noun: str) -> str:

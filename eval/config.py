@@ -32,7 +32,7 @@ from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, Came
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
-from arena_newton.text import counted, is_printable, plain_text
+from arena_newton.text import counted, plain_text, unprintable
 
 if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
@@ -106,6 +106,8 @@ class RunConfig:
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str
     """The package's own code that moves and judges, by content."""
+    foreign_tasks: Mapping[str, JsonObject] = dataclasses.field(default_factory=dict)
+    """Hashes of scene and code of each task that another package brings; the built-in ones are hashed as a whole."""
     shard: Shard | None = None
     """Part of the plan; None: all of it. It is no part of the identity."""
     recording: Mapping[str, CameraConfig] | None = None
@@ -153,6 +155,7 @@ class RunConfig:
             "code": self.code_hash,
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
+            **({"foreign_tasks": dict(self.foreign_tasks)} if self.foreign_tasks else {}),
             **self._chunks(),
             **self._budget(),
             **self._demonstrations(),
@@ -365,7 +368,18 @@ def resolve(options: RunOptions) -> RunConfig:
         variant_hash=variant_hash,
         scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
         code_hash=code_hash(),
+        foreign_tasks={name: facts for name in tasks if (facts := _foreign_task(name))},
     )
+
+
+def _foreign_task(name: str) -> JsonObject:
+    """Hashes of a task's scene, with all that it names, and of the package of its judge and sampler, unless ours."""
+    spec = task_specs.get(name)
+    codes = {code for part in (spec.judge, spec.sample) if (code := own_code(part)) is not None}
+    facts: JsonObject = {"code": config_hash(sorted(codes))} if codes else {}
+    if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
+        facts["scene"] = _variant_hash(spec.scene)
+    return facts
 
 
 def _card(target: str) -> PolicyCard:
@@ -390,8 +404,8 @@ def _check_flags(options: RunOptions) -> None:
     for field in dataclasses.fields(options):
         given = getattr(options, field.name)
         for text in given if isinstance(given, tuple) else (given,):
-            if isinstance(text, str) and not is_printable(text):
-                raise InputError(f"{_flag(field.name)} {plain_text(text)}: has control characters in it")
+            if isinstance(text, str) and (reason := unprintable(text)) is not None:
+                raise InputError(f"{_flag(field.name)} {plain_text(text)}: {reason}")
     if options.drive not in DRIVES:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
     if options.labels not in (None, *LABELS):

@@ -100,6 +100,8 @@ class Identity(_Identity, total=False):
     drive: Name
     scenes: Annotated[str, Fit("a hash")]
     code: Annotated[str, Fit("a hash")]
+    foreign_tasks: Annotated[dict[Name, Facts], Fit("facts by task")]
+    """Hashes of the tasks that another package brings; absent where there is none."""
     tracker_facts: FactsOrNone
     policy_facts: FactsOrNone
     seed_range: Annotated[str, Fit("a range of seeds", lambda value: value in SEED_RANGES)]

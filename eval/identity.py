@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import json
 import os
 import sys
@@ -191,17 +192,23 @@ def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str] 
 
 
 def own_code(part: object) -> str | None:
-    """Hash of the package, or the single module, that a tracker or policy of others was written in.
+    """Hash of the package, or the single module, that a tracker, policy, class or function of others was written in.
 
     Returns:
         None for the parts of this package, whose code is hashed as a whole.
     """
-    module = sys.modules.get(type(part).__module__)
+    if isinstance(part, functools.partial):
+        part = part.func
+    module = sys.modules.get((part if inspect.isclass(part) or inspect.isroutine(part) else type(part)).__module__)
     name = module.__name__.partition(".")[0] if module is not None else ""
-    top = sys.modules.get(name)
-    if top is None or getattr(top, "__file__", None) is None or name in {"arena_newton", *sys.stdlib_module_names}:
+    if name in {"", "arena_newton", *sys.stdlib_module_names}:
         return None
-    file = Path(str(top.__file__)).resolve()
-    if not hasattr(top, "__path__"):
-        return hash_path(file)
-    return hash_paths(file.parent, [f for f in package_files(file.parent) if f.suffix == ".py"])
+    top = sys.modules.get(name)
+    whole = getattr(top, "__file__", None) is not None  # not so of a namespace, which other packages may be in too
+    file = getattr(top if whole else module, "__file__", None)
+    if file is None:
+        return None
+    if whole and not hasattr(top, "__path__"):
+        return hash_path(Path(file).resolve())
+    folder = Path(file).resolve().parent
+    return hash_paths(folder, [f for f in package_files(folder) if f.suffix == ".py"])

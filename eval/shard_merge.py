@@ -26,7 +26,7 @@ from arena_newton.eval.results import Results, RunRecord, due_episodes, is_compl
 from arena_newton.eval.sharding import Shard, dealt, read_shard
 from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.files import PARTIAL, file_label, replace_atomically
-from arena_newton.text import counted, is_printable, plain_text
+from arena_newton.text import counted, plain_text, unprintable
 
 __all__ = ["MergedRun", "merge", "run"]
 
@@ -74,8 +74,8 @@ def run(folders: Sequence[Path], options: RunMergeOptions) -> int:
     """
     if options.out is None or not options.out.strip():
         raise InputError("merge: name a new folder with --out")
-    if not is_printable(options.out):
-        raise InputError(f"--out {plain_text(options.out)}: has control characters in it")
+    if (reason := unprintable(options.out)) is not None:
+        raise InputError(f"--out {plain_text(options.out)}: {reason}")
     out = Path(options.out).expanduser()
     merged = merge(folders, out, partial=options.partial, accept_versions=options.accept_versions)
     print(report.table(merged.results))

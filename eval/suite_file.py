@@ -38,6 +38,9 @@ SHIPPED = Path(__file__).resolve().parent / "suites"
 """Folder of the suite files that come with the package."""
 MAX_BYTES = 1 << 20
 """A suite file with every policy of the paper has 3 kB."""
+MAX_ENTRIES = 1000
+"""Most policies, rules, or values of a list: a megabyte of them takes hours to multiply out. The paper's suites have 30
+policies, three seeds."""
 CONDITIONS = (
     *("seeds", "repeats", "max_steps", "worlds", "engine", "device", "drive", "fast_physics", "skip_broken"),
     *("video", "strip", "video_episodes", "video_size", "follow", "actions"),
@@ -196,7 +199,7 @@ def _toml(path: Path) -> tuple[JsonObject, str]:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: {path.stat().st_size:,} bytes, expected at most {MAX_BYTES:,}")
         data = path.read_bytes()
-        content = tomllib.loads(data.decode("utf-8"))
+        content = tomllib.loads(data.decode("utf-8-sig"))  # editors of Windows begin with a mark
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except RecursionError:
@@ -218,6 +221,8 @@ def _check_plain(where: str, value: object, depth: int = 0) -> None:
                     raise InputError(f"{where}: {plain_text(key, 60)} has control characters in it")
                 _check_plain(f"{where}: {plain_text(key, 60)}", part, depth + 1)
         case list():
+            if len(value) > MAX_ENTRIES:
+                raise InputError(f"{where}: has {len(value):,} entries, expected at most {MAX_ENTRIES:,}")
             for part in value:
                 _check_plain(where, part, depth + 1)
         case str():

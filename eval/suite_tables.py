@@ -500,6 +500,8 @@ def _perturbation(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteT
         "Mean success rate in % over a suite's tasks that were played in every mode shown, and its change from base in "
         f"points with the 95 % interval over paired episode seeds.{_about(*modes)}"
     )
+    if others := sorted({c.mode for c in cells} - set(MODE_ORDER)):
+        caption += f" Without {', '.join(others)}: no mode of the paper, each has a table of its own."
     return SuiteTable(
         "perturbation", "Perturbation profile", caption, head, 4, tuple(rows), tuple(groups), tuple(entries)
     )

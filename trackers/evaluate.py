@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from arena_newton.command_line import program
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.command_line import exit_code, program
+from arena_newton.errors import InputError
 from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -199,14 +199,14 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 done, 2 bad input."""
-    try:
+    """Run the command line; 0 done, 2 bad input, 130 interrupted."""
+
+    def work() -> int:
         args = _parser().parse_args(argv)
         quiet_warp()
         return _evaluate(args)
-    except (ArenaError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return getattr(error, "exit_code", 2)
+
+    return exit_code(work)
 
 
 if __name__ == "__main__":

@@ -5,14 +5,29 @@ import importlib
 from arena_newton.errors import InputError
 from arena_newton.tasks.base import Draws, LightDraw, ObjectSpec, Pose, Required, TaskSpec
 
-__all__ = ["Draws", "LightDraw", "ObjectSpec", "Pose", "Required", "TaskSpec", "get", "names", "register", "unregister"]
+__all__ = [
+    "PAPER",
+    "Draws",
+    "LightDraw",
+    "ObjectSpec",
+    "Pose",
+    "Required",
+    "TaskSpec",
+    "get",
+    "names",
+    "register",
+    "unregister",
+]
 
-_NAMES = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
+PAPER = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
+"""The paper's tasks in its order: three object tasks, four scene tasks."""
+_NAMES = PAPER
+"""All tasks of this package; one that is not the paper's follows here."""
 _registered: dict[str, TaskSpec] = {}
 
 
 def names() -> tuple[str, ...]:
-    """Task names: the paper's in its order (three object tasks, four scene tasks), then those registered."""
+    """Task names: the paper's, then those registered."""
     return (*_NAMES, *_registered)
 
 

@@ -1,6 +1,8 @@
 """One command line for everything: it finds each command, answers at once and keeps exit codes."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -147,3 +149,44 @@ def test_a_home_that_is_nobodys_is_bad_input(capsys):
     """A path with the name of an unknown user is one line and exit code 2, in whichever command."""
     assert exit_code(lambda: int(Path("~nosuchuser/x").expanduser().exists())) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "library", "title"),
+    [
+        ("arena_newton.eval list --task football --seeds 0", "warp", "Warp, Newton and MuJoCo"),
+        ("arena_newton.eval list --task football --seeds 0 --json", "warp", None),
+        ("arena_newton.trackers.evaluate --tracker twist2", "warp", "Warp, Newton and MuJoCo"),
+        ("arena_newton trackers motions inspect nothing.npz", "torch", "torch"),
+        ("arena_newton scenes validate football", "pxr", "USD"),
+    ],
+)
+def test_a_command_says_what_it_loads_before_it_does(command, library, title, tmp_path):
+    """The first line on the error stream names a large library before a line of it runs; none where JSON is asked."""
+    (tmp_path / f"{library}.py").write_text("import os\nos.write(2, b'it runs\\n')\nos._exit(3)\n")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-m", *command.split()], capture_output=True, text=True, timeout=120, env=environment
+    )
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr.splitlines() == ([] if title is None else [f"loading {title} ..."]) + ["it runs"]
+
+
+def test_text_that_a_stream_lacks_is_no_crash():
+    """On a stream of another character set a command prints `?` for what that lacks, and its whole answer."""
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-m", "arena_newton", "rules"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert (done.returncode, done.stderr) == (0, "") and "?" in done.stdout and len(done.stdout.splitlines()) > 50
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_disk_that_refuses_is_one_line(number, capsys):
+    """A full or read-only disk that no part of a command foresaw is one line that names the file, and exit code 2."""
+
+    def work():
+        raise OSError(number, os.strerror(number), "/somewhere/a.json")
+
+    assert exit_code(work) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: /somewhere/a.json: ") and said.count("\n") == 1

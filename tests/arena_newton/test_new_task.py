@@ -10,6 +10,8 @@ from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval import stats
 from arena_newton.eval.__main__ import main as eval_main
+from arena_newton.eval.config import resolve
+from arena_newton.eval.options import RunOptions
 from arena_newton.usd_scenes.__main__ import main as scenes_main
 from arena_newton.usd_scenes.build import parts
 from arena_newton.usd_scenes.skeleton import write
@@ -62,6 +64,23 @@ def test_an_evaluation_reports_it_outside_the_papers_averages(bell, tmp_path):
     assert stats.outside_suites([bell, "football"]) == [bell]
 
 
+def test_its_scene_and_its_code_are_part_of_a_runs_identity(bell, monkeypatch):
+    """A run of a task of others is known by the task's scene and package; identities of built-in tasks have no key."""
+
+    def identity(*names):
+        return resolve(RunOptions(task=names, policy="stand", tracker=("pd",), engine="mujoco")).identity()
+
+    assert "foreign_tasks" not in identity("football")
+    first = identity("football", bell)["foreign_tasks"]
+    assert list(first) == [bell] and set(first[bell]) == {"code", "scene"}
+    with tasks.get(bell).layer.open("a", encoding="utf-8") as layer:
+        layer.write("# heavier\n")
+    second = identity(bell)["foreign_tasks"]
+    assert second[bell]["code"] == first[bell]["code"] and second[bell]["scene"] != first[bell]["scene"]
+    monkeypatch.setattr("arena_newton.eval.config.own_code", lambda part: "0123456789ab")
+    assert identity(bell)["foreign_tasks"][bell]["code"] != first[bell]["code"]
+
+
 def test_names_that_are_taken_are_refused(bell):
     """A second task of the same name, and one without a scene, are refused in words."""
     with pytest.raises(InputError, match="'bell': the name is taken"):
@@ -72,7 +91,7 @@ def test_names_that_are_taken_are_refused(bell):
         tasks.get("gong")
 
 
-@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("name", tasks.PAPER)
 def test_every_task_of_the_paper_is_complete(name):
     """A suite, requirements, predicates and, where there is one, an expert that can be imported."""
     import importlib

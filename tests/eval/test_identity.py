@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import hashlib
 import importlib
 import os
@@ -120,6 +121,10 @@ def test_code_of_other_packages_counts(tmp_path, monkeypatch):
     before = identity.own_code(part)
     (tmp_path / "their_policy" / "network.py").write_text("")
     assert before is not None and identity.own_code(part) != before
+    assert (
+        identity.own_code(type(part)) == identity.own_code(functools.partial(type(part), 1)) == identity.own_code(part)
+    )
+    assert identity.own_code(resolve) is None
     assert identity.own_code(object()) is None
     from arena_newton import policies
 
@@ -181,6 +186,7 @@ def test_difference_is_told_to_the_key():
         ({"seeds": (10**400,)}, "--seeds 10{39}[.]{3}: expected at most"),
         ({"max_steps": 10**7 + 1}, "--max-steps 10000001: expected at most 10,000,000"),
         ({"repeats": 10**4000}, "--repeats 10{39}[.]{3}: makes too many episodes"),
+        ({"out": "erg \udcc3\udc9f"}, "--out erg: holds bytes that are no text in this locale's character set"),
         ({"policy": "remote:\x1b[2J"}, "--policy remote:: has control characters"),
         ({"repeats": 10**9}, "--repeats 1000000000: makes 3,000,000,000 episodes, at most 200,000"),
         ({"variant": "/dev/zero"}, "--variant /dev/zero: is not a regular file"),

@@ -21,12 +21,12 @@ def expand(*names: str, **changes):
 
 def test_full_protocol():
     """Seven tasks × four modes × three seeds × twenty repeats, numbered in order, with unique keys."""
-    episodes = expand(modes=("base", "execution", "semantic", "visual"))
+    episodes = expand(*tasks.PAPER, modes=("base", "execution", "semantic", "visual"))
     assert len(episodes) == 7 * 4 * 60
     assert [e.index for e in episodes] == list(range(len(episodes)))
     assert len({e.key for e in episodes}) == len(episodes)
-    assert tuple(dict.fromkeys(e.task for e in episodes)) == tasks.names()
-    assert all(len({e.episode_seed for e in episodes if e.task == t}) == 60 for t in tasks.names())
+    assert tuple(dict.fromkeys(e.task for e in episodes)) == tasks.PAPER
+    assert all(len({e.episode_seed for e in episodes if e.task == t}) == 60 for t in tasks.PAPER)
 
 
 def test_trackers_of_a_task_follow_each_other():

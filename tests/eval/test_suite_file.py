@@ -51,6 +51,11 @@ def test_labels_are_those_of_the_product():
         ("colour = 1\n" + START, "colour is unknown, known are name defaults matrix checkpoints policies cells"),
         ("name = 1979-05-27\n" + START, "name: 1979-05-27 is neither text nor number"),
         ("[defaults]\nseeds = nan\n" + START, "number out of range"),
+        (
+            f"[defaults]\nseeds = {[*range(1001)]}\n" + START,
+            r"defaults: seeds: has 1,001 entries, expected at most 1,000",
+        ),
+        (START + START[START.index("[[") :] * 1000, "policies: has 1,001 entries, expected at most 1,000"),
         ('name = "../x"\n' + START, 'name is "../x", expected letters'),
         (START.replace("boxing", "bxing"), r"\[matrix\]: tasks: bxing is unknown, known are football"),
         (START.replace('["twist2", "sonic"]', '"twist3"'), r"\[matrix\]: trackers: --tracker twist3: unknown tracker"),
@@ -100,6 +105,11 @@ def test_a_wrong_file_is_one_error(tmp_path, text, said):
         cells = read(tmp_path, text)
         check_policies(read_suite_file(tmp_path / "s.toml"), cells)
     assert str(caught.value).startswith(f"{tmp_path / 's.toml'}: ")
+
+
+def test_a_mark_of_byte_order_is_no_error(tmp_path):
+    """A suite file that an editor of Windows wrote is read as one without its leading mark."""
+    assert read(tmp_path, "\ufeff" + START) == read(tmp_path, START)
 
 
 def test_rules_are_taken_in_order(tmp_path):

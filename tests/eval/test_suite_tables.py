@@ -16,7 +16,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import paper_claims, table_text
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.evaluated_cells import read_cells
-from arena_newton.eval.paper_numbers import paper_numbers
+from arena_newton.eval.paper_numbers import paper_numbers, read_paper
 from arena_newton.eval.stats import contrast, holm, mcnemar, suites, wilson
 from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.eval.suite_tables import suite_tables
@@ -156,6 +156,16 @@ def test_families_are_compared_on_the_same_episodes(tables):
         e for e in tables["families"].entries if (e.policy, e.task) == ("dp", "football") and e.only_first == 18
     ]
     assert found.p == mcnemar(18, 0) <= found.p_holm
+
+
+def test_a_mode_that_the_paper_lacks_changes_no_other_table(cells, tables, monkeypatch):
+    """A further mode gets its table; the paper's numbers are read as ever, and the profile says that it lacks it."""
+    monkeypatch.setattr("arena_newton.rules.MODES", ("base", "execution", "semantic", "visual", "dynamics"))
+    further = [dataclasses.replace(c, mode="dynamics") for c in cells.cells if c.mode == "visual"]
+    found = {t.name: t for t in suite_tables([*cells.cells, *further], read_paper())}
+    assert set(found) == {*tables, "in_gmt_dynamics"}
+    assert found["perturbation"].rows == tables["perturbation"].rows
+    assert "Without dynamics" in found["perturbation"].caption and "Without" not in tables["perturbation"].caption
 
 
 def test_perturbation_profile(tables):

@@ -91,6 +91,50 @@ def test_wrong_width(tmp_path):
         trackers.get("twist2", path)
 
 
+def tracking_export(path, *, timed=False):
+    """A tracking network as mjlab exports it: observation and time step in, actions and the motion of that step out."""
+    b = Builder()
+    observation = b.add("Add", "obs", "time_step") if timed else "obs"
+    b.linear(b.add("Elu", b.linear(observation, 154, 32), alpha=1.0), 32, 29, output="actions")
+    names = ["joint_pos", "joint_vel", "body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w"]
+    for name in names:
+        step = b.add("Squeeze", b.add("Cast", "time_step", to=7), axes=[1])
+        b.add("Gather", b.weight(50, 29), step, axis=0, output=name)
+    info = onnx.helper.make_tensor_value_info
+    graph = onnx.helper.make_graph(
+        b.nodes,
+        "network",
+        [info("obs", 1, [1, 154]), info("time_step", 1, [1, 1])],
+        [info(name, 1, [1, 29]) for name in ("actions", *names)],
+        b.weights,
+    )
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 11)], ir_version=8), str(path))
+    return path
+
+
+def test_a_training_programs_export_is_read(tmp_path):
+    """Of an export with a time step and its motion both readers run the network from first input to first output."""
+    path = tracking_export(tmp_path / "a.onnx")
+    x = torch.randn(3, 154)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    whole = onnxruntime.InferenceSession(str(path), options)
+    step = np.full((1, 1), 7, np.float32)
+    expected = np.concatenate([whole.run(None, {"obs": row[None], "time_step": step})[0] for row in x.numpy()])
+    session = onnx_session.OnnxSession(path, in_width=154, out_width=29)
+    assert np.array_equal(session(x).numpy(), expected)
+    with torch.inference_mode():
+        assert np.abs(onnx_mlp.load(path, in_width=154, out_width=29)(x).numpy() - expected).max() < 1e-5
+    with pytest.raises(InputError, match="the network takes 154 numbers, expected 155"):
+        onnx_session.OnnxSession(path, in_width=155, out_width=29)
+
+
+def test_actions_that_depend_on_the_time_are_refused(tmp_path):
+    """A network whose actions a further input decides is refused by that input's name."""
+    with pytest.raises(InputError, match="its output actions depends on a further input, time_step"):
+        onnx_session.OnnxSession(tracking_export(tmp_path / "a.onnx", timed=True), in_width=154, out_width=29)
+
+
 def test_unknown_operator(tmp_path):
     """An operator that has no torch module is named."""
     b = Builder()

@@ -382,11 +382,18 @@ def _evaluate(op: str, x: list[Any], attributes: dict[str, Any]) -> torch.Tensor
     raise _Unfit(f"operator {op} with these arguments is not supported")
 
 
-def read(path: str | Path, *, in_width: int, flag: str = "--checkpoint") -> tuple[onnx.ModelProto, bytes]:
-    """The graph of an ONNX file that holds all of its weights, and the file's content; errors name the `flag`.
+def read(path: str | Path, *, in_width: int, flag: str = "--checkpoint") -> tuple[onnx.ModelProto, bytes, bytes]:
+    """The graph from the first input of an ONNX file to its first output; errors name the `flag`.
+
+    Training programs export more: mjlab's tracking networks have a second input, the time step, and give the reference
+    motion of that step after the actions.
+
+    Returns:
+        The graph, the same as bytes for a runtime, and the file's content.
 
     Raises:
-        InputError: The file is absent, not an ONNX network, keeps weights in another file, or has another input width.
+        InputError: The file is absent, not an ONNX network, keeps weights in another file, has another input width, or
+            its first output depends on a further input.
     """
     where = f"{flag} {path}"
     data = read_bytes(path, limits.NETWORK_BYTES, where=where)
@@ -396,12 +403,35 @@ def read(path: str | Path, *, in_width: int, flag: str = "--checkpoint") -> tupl
             raise _Unfit("it holds no graph")
         if any(i.data_location == onnx.TensorProto.EXTERNAL for i in model.graph.initializer):
             raise _Unfit("its weights are in another file")
-        width = [d.dim_value for i in model.graph.input for d in i.type.tensor_type.shape.dim][-1:]
+        weights = {i.name for i in model.graph.initializer}
+        inputs = [i for i in model.graph.input if i.name not in weights]
+        width = [d.dim_value for i in inputs[:1] for d in i.type.tensor_type.shape.dim][-1:]
+        if width and width[0] not in (0, in_width):
+            raise InputError(f"{where}: the network takes {width[0]} numbers, expected {in_width}")
+        if len(inputs) < 2 and len(model.graph.output) == 1:
+            return model, data, data
+        _keep_first(model.graph, inputs)
+        return model, model.SerializeToString(), data
+    except InputError:
+        raise
     except Exception as error:  # a damaged file fails anywhere inside protobuf
         raise InputError(f"{where}: {_reason(error)}") from error
-    if width and width[0] not in (0, in_width):
-        raise InputError(f"{where}: the network takes {width[0]} numbers, expected {in_width}")
-    return model, data
+
+
+def _keep_first(graph: onnx.GraphProto, inputs: list[onnx.ValueInfoProto]) -> None:
+    """Drop all outputs but the first, all inputs but the first, and what only they need."""
+    needed = {graph.output[0].name}
+    nodes = []
+    for node in reversed(graph.node):
+        if needed.intersection(node.output):
+            needed.update(node.input)
+            nodes.append(node)
+    for one in inputs[1:]:
+        if one.name in needed:
+            raise _Unfit(f"its output {graph.output[0].name} depends on a further input, {one.name}")
+        graph.input.remove(one)
+    del graph.node[:], graph.output[1:]
+    graph.node.extend(reversed(nodes))
 
 
 def _reason(error: Exception) -> str:
@@ -422,7 +452,7 @@ def load(
         InputError: The file is absent, not an ONNX network, holds an unknown operator, or has other widths.
     """
     where = f"{flag} {path}"
-    model, _ = read(path, in_width=in_width, flag=flag)
+    model, _, _ = read(path, in_width=in_width, flag=flag)
     try:
         graph = _Graph(model, in_width, fuse=fuse)
         network = OnnxNetwork(graph).eval()

@@ -39,7 +39,7 @@ class OnnxSession(torch.nn.Module):
         super().__init__()
         where = f"{flag} {path}"
         self.path, self.in_width, self.out_width, self.twin = Path(path), in_width, out_width, None
-        _, data = onnx_mlp.read(path, in_width=in_width, flag=flag)
+        _, runnable, data = onnx_mlp.read(path, in_width=in_width, flag=flag)
         self.sha256 = hashlib.sha256(data).hexdigest()
         # Its compiled reader takes a file on trust, and some operators make any number of numbers of none.
         (fault,) = probe.faults(
@@ -48,7 +48,9 @@ class OnnxSession(torch.nn.Module):
         if fault:
             raise InputError(f"{where}: not a usable ONNX file ({' '.join(fault.split())[:160]})")
         try:
-            self._session = onnxruntime.InferenceSession(data, session_options(), providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(
+                runnable, session_options(), providers=["CPUExecutionProvider"]
+            )
             inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
             if len(inputs) != 1:
                 raise InputError(f"{where}: the network has {len(inputs)} inputs, expected one")
