@@ -2,7 +2,8 @@
 
 No kick motion: a foot of a robot that walks at 0.6 m/s sends the ball off at 0.8 to 2.3 m/s, and it rolls on without
 loss. What decides is that the robot is on its line at the touch: 13 cm beside it, the ball leaves 24° off. So it walks
-slower the farther it is from the line, and tries again after a weak kick or a miss.
+slower the farther it is from the line, and tries again after a weak kick or a miss. The foot that kicks is the one on
+the ball's side of the picture.
 
 Read from the head camera's picture (105° wide, from 3° below the horizon down): the ball, which is in view at the spawn
 pose wherever it is drawn; whether it moves, and where to; the goal, whose mouth is ahead and does not move; the other
@@ -95,9 +96,7 @@ class FootballExpert(Expert):
         self._arms = MotionCommand.neutral(worlds, device).arms
 
     def begin(self, mask: Tensor, style: Style) -> None:
-        """Choose the foot, and look where the ball is."""
-        right = style.coin("foot")
-        self._side = torch.where(mask, torch.where(right, LANE, -LANE), self._side)
+        """Look where the ball is."""
         self._speed = torch.where(mask, style.uniform("speed", 0.54, 0.63), self._speed)
         self._back = torch.where(mask, style.uniform("back", 0.68, 0.82), self._back)
         self._step_time = torch.where(mask, style.uniform("step", 0.44, 0.47), self._step_time)
@@ -107,6 +106,7 @@ class FootballExpert(Expert):
         self._arms = select(mask, arms, self._arms)
         self.walk.begin(mask)
         self.states.begin(mask)
+        self._choose_foot(mask)
         self._approach(mask)
 
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
@@ -129,6 +129,7 @@ class FootballExpert(Expert):
         missed = missed | mask & states.at("kick") & states.late
         over = mask & states.at("watch") & ((speed < SLOW) | self._hopeless(ball, velocity) | states.late)
         states.enter("approach", missed | over)
+        self._choose_foot(missed | over)
         away = torch.linalg.vector_norm(ball - self._aimed, dim=1) > ROLLED
         again = missed | over | mask & states.at("approach") & (away | states.late)
         if again.any():
@@ -173,6 +174,12 @@ class FootballExpert(Expert):
         yaw = atan2(offset[:, 1], offset[:, 0])
         beside = torch.stack([torch.zeros_like(self._side), self._side], dim=1)
         return torch.cat([ball + rotate_xy(yaw, beside), yaw[:, None]], dim=1)
+
+    def _choose_foot(self, mask: Tensor) -> None:
+        """The foot on the ball's side of the picture, so that who sees the picture knows the line."""
+        pose, ball = self.sight.pose, self.sight.body(self._ball)[0][:, :2]
+        left = rotate_xy(-pose[:, 2], ball - pose[:, :2])[:, 1] > 0.0
+        self._side = torch.where(mask, torch.where(left, -LANE, LANE), self._side)
 
     def _approach(self, mask: Tensor) -> None:
         """Draw the line through the ball, and plan the path to its beginning."""

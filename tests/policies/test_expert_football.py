@@ -72,6 +72,17 @@ def test_the_line_leads_the_foot_to_the_ball_and_the_ball_to_the_goal():
     assert (crossing - GOAL_MIDDLE[0]).abs().max() < GOAL_HALF[0] - 1.0
 
 
+def test_the_foot_is_the_one_on_the_balls_side():
+    """Left of the picture's middle the left foot kicks, right of it the right one, whatever the seed draws."""
+    ball = spread(40)
+    ball[:, 0] += np.where(ball[:, 0] > 0, 0.05, -0.05)
+    left = torch.tensor(ball[:, 0] < 0.0)  # the robot looks along y from x = 0
+    for seeds in (range(40), range(40, 80)):
+        lane = begun(Pitch(ball), list(seeds)).lane
+        offset = rotate_xy(-lane[:, 2], torch.tensor(ball, dtype=torch.float32) - lane[:, :2])
+        assert torch.equal(offset[:, 1] > 0, left)
+
+
 def test_the_ball_is_led_past_another_one():
     """The ball's path keeps its distance from a ball that lies on the way to the goal."""
     ball = np.array([[0.0, -0.8], [0.6, -1.0], [-0.5, -0.5]])
