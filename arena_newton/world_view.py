@@ -53,7 +53,7 @@ def _readable(what: str, value: Any) -> Any:
     """A value, where it can be changed in place as something that cannot."""
     if isinstance(value, np.ndarray):
         value = value.view()
-        value.flags.writeable = False
+        value.setflags(write=False)
         return value
     if isinstance(value, dict):
         return MappingProxyType(value)

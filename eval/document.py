@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypedDict
 
 from arena_newton import rule_sets, seeding, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, contradiction
+from arena_newton.eval.journal import JOURNAL_FILE, ContradictionError, EpisodeRecord, contradiction
 from arena_newton.eval.records import (
     MAX_CONFIG_BYTES,
     MAX_EPISODES,
@@ -243,7 +243,7 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
         if before is not None and before.outcome != "error" and not _recorded_again(before, record):
             raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
         if (said := contradiction(record)) is not None:
-            raise InputError(f"{name}: {said}; {by_hand}")
+            raise ContradictionError(f"{name}: {said}; {by_hand}, or wrong when it was written")
         ended[record.index] = record
 
 

@@ -1,6 +1,6 @@
 """One policy for many robots: every session is a row of the policy's batch, and looks that come close together are one.
 
-A policy's memory belongs to the row, so to the session: `begin` clears it with the seed of the episode, and a session that
+A policy's memory belongs to the row, so to the session: `begin` clears it with the episode's seed, and a session that
 leaves frees its row. What a session is answered does not depend on which others asked with it, as far as the policy
 keeps its promises (docs/policies.md). One thread has the policy; every connection has its own and waits for it.
 """
