@@ -1,14 +1,14 @@
 """What a policy is shown of the worlds that it plays in: everything to read, nothing to write.
 
-Positions and velocities are copies, renewed before each look, so that what is written into them moves nothing; arrays
-of the model are read-only. A policy that gets hold of the world in another way is found by the replay of its actions.
+Arrays are copies, positions and velocities renewed before each look, so that what is written into them moves nothing;
+attributes cannot be set. A policy that gets hold of the world in another way is found by the replay of its actions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from types import MappingProxyType, SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ import warp as wp
 from arena_newton.errors import InputError
 from arena_newton.interfaces import World
 
-__all__ = ["WorldView", "world_view"]
+__all__ = ["WorldView"]
 
 OF_WORLD = "spec mode rules worlds device torch_device engine startup_ticks tick active budget camera_config".split()
 """Attributes of a `World` that a policy may read, besides `scene`, `physics`, the tracker's name and those that a class
@@ -37,7 +37,7 @@ class _Frozen:
         self.__dict__.update(_what=what, _names=names, _read=read)
 
     def __getattr__(self, name: str) -> Any:
-        """A public attribute, its arrays read-only."""
+        """A public attribute; an array is a copy."""
         if name.startswith("_"):
             raise AttributeError(name)
         if self._names is not None and name not in self._names:
@@ -50,11 +50,9 @@ class _Frozen:
 
 
 def _readable(what: str, value: Any) -> Any:
-    """A value, where it can be changed in place as something that cannot."""
+    """A value, or what can be changed instead of it without harm."""
     if isinstance(value, np.ndarray):
-        value = value.view()
-        value.flags.writeable = False
-        return value
+        return value.copy()
     if isinstance(value, dict):
         return MappingProxyType(value)
     if isinstance(value, list):
@@ -89,16 +87,7 @@ class WorldView(_Frozen):
         }
 
         def read(name: str) -> Any:
-            if name in parts:
-                return parts[name]
-            value = getattr(env, name)
-            return value.copy() if isinstance(value, np.ndarray) else value  # a tensor of a view could be written to
+            return parts[name] if name in parts else getattr(env, name)
 
         super().__init__("the world", [*OF_WORLD, *parts, *getattr(env, "shown", ())], read)
         self.__dict__.update(refresh=refresh)
-
-
-def world_view(env: World) -> tuple[World, Callable[[], None]]:
-    """A read-only view of an environment, and what renews the positions and velocities in it."""
-    view = WorldView(env)
-    return cast("World", view), view.refresh

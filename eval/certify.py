@@ -37,12 +37,14 @@ from arena_newton.eval.certification.finding import Check, CheckFinding
 from arena_newton.eval.certification.jobs import command_line, play_ahead
 from arena_newton.eval.config import plain_facts
 from arena_newton.eval.identity import code_hash
+from arena_newton.eval.journal import ContradictionError
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.plan import MAX_EPISODES
 from arena_newton.eval.progress import duration
 from arena_newton.eval.run import Factories
 from arena_newton.flags import user_path
 from arena_newton.quiet import quiet_warp
+from arena_newton.text import plain_text
 
 __all__ = ["CHECKS", "run"]
 
@@ -119,7 +121,11 @@ def _found(context: Context, chosen: Sequence[Check], facts: certificate.Facts) 
         play_ahead(options, context.tasks, [check.name for check in chosen], _say)
     for check in chosen:
         started = time.perf_counter()
-        finding = findings[check] = check.run(context)
+        try:
+            finding = findings[check] = check.run(context)
+        except ContradictionError as error:
+            said = plain_text(str(error).replace(f"{context.folder}/", ""), 300)
+            finding = findings[check] = CheckFinding("fail", said)
         spent = duration(time.perf_counter() - started)
         print(f"{finding.verdict:<4}  {check.name:<12}  {finding.summary}  ({spent})", flush=True)
         if options.jobs:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypedDict
 
 from arena_newton import rule_sets, seeding, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, contradiction
+from arena_newton.eval.journal import JOURNAL_FILE, ContradictionError, EpisodeRecord, contradiction
 from arena_newton.eval.records import (
     MAX_CONFIG_BYTES,
     MAX_EPISODES,
@@ -191,7 +191,7 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
     """Hold a journal to its configuration.
 
     No episode that the plan lacks or that another run played, none twice under two numbers, and none again that had
-    ended as something else than an error; seeds and step budgets are the plan's.
+    ended as something else than an error; seeds and step budgets are the plan's, and no line contradicts itself.
 
     Raises:
         InputError: A record belongs to another plan or another run.
@@ -241,11 +241,11 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
                 )
         if record.steps > record.max_steps:
             raise InputError(f"{name}: {record.steps} steps of at most {record.max_steps}; {by_hand}")
-        if (said := contradiction(record)) is not None:
-            raise InputError(f"{name}: {said}; {by_hand}")
         before = ended.get(record.index)
         if before is not None and before.outcome != "error" and not _recorded_again(before, record):
             raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
+        if (said := contradiction(record)) is not None:
+            raise ContradictionError(f"{name}: {said}; {by_hand}, or wrong when it was written")
         ended[record.index] = record
 
 

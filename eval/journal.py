@@ -39,6 +39,7 @@ from arena_newton.text import counted
 __all__ = [
     "JOURNAL_FILE",
     "SCHEMA",
+    "ContradictionError",
     "EpisodeRecord",
     "Journal",
     "LockedLines",
@@ -153,6 +154,10 @@ class EpisodeRecord:
         if line.get("signals") is not None:
             known["signals"] = EpisodeSignals.from_json(line["signals"])
         return cls(**known)
+
+
+class ContradictionError(InputError):
+    """A line of a journal contradicts itself."""
 
 
 def contradiction(record: EpisodeRecord) -> str | None:

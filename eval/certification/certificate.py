@@ -94,7 +94,7 @@ def document(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding])
     return {
         "verdict": verdict_of(findings, len(facts["planned"])),
         "claims": [
-            {"claim": one.claim.text, "verdict": one.verdict, "checks": [check.name for check, _ in one.findings]}
+            {"claim": one.text, "verdict": one.verdict, "checks": [check.name for check, _ in one.findings]}
             for one in claimed(findings)
         ],
         "certified": certified,
@@ -113,6 +113,7 @@ def _said(facts: Facts) -> list[tuple[str, str]]:
     said = [
         ("made by", facts["command"]),
         ("tasks", " ".join(facts["tasks"])),
+        ("policies", "the tasks' experts, privileged: they read the world itself"),
         ("trackers", " ".join(facts["trackers"])),
         ("episodes of each cell", str(facts["episodes"])),
         ("engine", f"{facts['engine']} on {facts['device']}, {counted(facts['cores'], 'CPU core')}"),
@@ -146,7 +147,7 @@ def printed(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The first page as text for a terminal: the verdict, then every claim with what was measured."""
     lines = [verdict_of(findings, len(facts["planned"])), ""]
     for one in claimed(findings):
-        lines.append(f"{one.verdict:<4}  {one.claim.text}")
+        lines.append(f"{one.verdict:<4}  {one.text}")
         lines += [f"      {name}: {text}" for name, text in _measured(one)]
     return "\n".join([*lines, "", *_warnings(facts)]).rstrip()
 
@@ -160,7 +161,7 @@ def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     for one in claims:
         verdicts = {check.name: finding.verdict for check, finding in one.findings}
         told = [f"[{name}](#{name}-{verdicts[name]}): {_escaped(text)}" for name, text in _measured(one)]
-        lines.append(f"| {_escaped(one.claim.text)} | {one.verdict} | {'<br>'.join(told)} |")
+        lines.append(f"| {_escaped(one.text)} | {one.verdict} | {'<br>'.join(told)} |")
     lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
     lines += ["## What was certified", ""]
     lines += [f"- {name}: {_escaped(text)}" for name, text in _said(facts)]
@@ -187,7 +188,7 @@ def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
         policy=f"default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
         style=style,
         verdict=verdict_of(findings, len(facts["planned"])),
-        claims=[{"text": one.claim.text, "verdict": one.verdict, "measured": _measured(one)} for one in claims],
+        claims=[{"text": one.text, "verdict": one.verdict, "measured": _measured(one)} for one in claims],
         facts=_said(facts),
         warnings=_warnings(facts),
         meaning=MEANING,

@@ -41,6 +41,12 @@ class ClaimFinding:
     """Those of its checks that have run, at least one, in its order."""
 
     @property
+    def text(self) -> str:
+        """The claim, with what its checks found that belongs into its line."""
+        said = "; ".join(finding.claim for _, finding in self.findings if finding.claim)
+        return f"{self.claim.text.removesuffix('.')}: {said}." if said else self.claim.text
+
+    @property
     def verdict(self) -> Verdict:
         """The worst verdict of its checks."""
         found = {finding.verdict for _, finding in self.findings}

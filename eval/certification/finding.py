@@ -60,6 +60,8 @@ class CheckFinding:
     notes: tuple[str, ...] = ()
     """What a reader must know besides the numbers: causes, exceptions, limits."""
     pictures: tuple[Picture, ...] = ()
+    claim: str = ""
+    """What a reader must see in the line of the claim itself."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet, Verdict, pooled_score, score
 from arena_newton.eval.certification.replays import recorded
+from arena_newton.text import counted
 
 __all__ = ["CHECKS", "GLIDES"]
 
@@ -97,7 +98,8 @@ def gliding(context: Context) -> CheckFinding:
     broken = _broken(context, "gliding")
     notes += broken
     verdict: Verdict = "fail" if unknown or broken else "note" if solved else "pass"
-    return CheckFinding(verdict, summary, (sheet,), tuple(notes), pictures)
+    claim = f"a gliding base solves {len(solved)} of {counted(len(found), 'task')}"
+    return CheckFinding(verdict, summary, (sheet,), tuple(notes), pictures, claim)
 
 
 CHECKS = (

@@ -378,6 +378,37 @@ class Dated(Policy):
         return Chunk(actions, phases=[f"look {tick}" for tick in self.env.tick])
 
 
+def test_a_policy_reads_the_world_and_writes_nothing(env):
+    """What `attach` gives shows positions of this tick; writing is an error, or moves nothing."""
+    seen = []
+
+    class Meddling(Sway):
+        def attach(self, env):
+            self.env, self.qpos = env, wp.to_torch(env.physics.qpos)
+
+        def act(self, observation):
+            seen.append(bool((self.qpos == there).all()))
+            self.qpos += 1.0
+            self.env.tick[:] = -100
+            for write in (
+                lambda: setattr(self.env, "budget", 1),
+                lambda: self.env.physics.add_velocity,
+                lambda: self.env.physics.data,
+                lambda: self.env.step,
+                lambda: self.env.scene.model,
+                lambda: setattr(self.env.scene.mj_model.opt, "timestep", 1.0),
+            ):
+                with pytest.raises(InputError, match="a policy"):
+                    write()
+            self.env.scene.mj_model.geom_pos[:] = 0.0
+            return super().act(observation)
+
+    there = wp.to_torch(env.physics.qpos)
+    first = Rollout(env, Sway(), _episodes(2), max_steps=12).run()
+    second = Rollout(env, Meddling(), _episodes(2), max_steps=12).run()
+    assert [(r.steps, r.margin) for r in first] == [(r.steps, r.margin) for r in second] and all(seen)
+
+
 class Executed(Recorder):
     """Keeps the forward steps that each world executed."""
 

@@ -18,6 +18,7 @@ from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.stats import mcnemar
+from arena_newton.interfaces import Verdict
 from arena_newton.kernels import tick as codes
 
 
@@ -25,16 +26,19 @@ class SolvedEnv(FakeEnv):
     """Every episode succeeds after five ticks, but not under a replay through another tracker than the recording's."""
 
     built = 0
-    lost = False
+    lost = swapped = False
 
     def __init__(self, task, **options):
         super().__init__(task, **options)
         type(self).built += 1
 
+    def verdict(self, world):
+        return Verdict(margin=-1.0 if self.lost or self.swapped else 1.0)
+
     def step(self, action, worlds=None):
         leapt = (self.tick // LEAP + 1) * LEAP
         self.tick[self.active] = np.where(self.tick < SLOW, self.tick + 1, leapt)[self.active]
-        over = self.active & (self.tick > 5) & (not self.lost)
+        over = self.active & (self.tick > 5) & (not (self.lost or self.swapped))
         return np.where(over, codes.SUCCESS, codes.RUNNING).astype(np.int32)
 
 
@@ -45,11 +49,11 @@ class StuckEnv(SolvedEnv):
 
 
 class SwappedPolicy(FakePolicy):
-    """Tells the world whether it replays what was recorded through another tracker."""
+    """Tells the worlds whether it replays what was recorded through another tracker."""
 
     def attach(self, env):
-        recorded = re.search(r"replay:.*/(\w+?)_paper", self.name)
-        env.lost = env.lost or recorded is not None and recorded[1] != env.tracker.name
+        recorded = re.search(r"replay:.*/(\w+?)_(paper|released)", self.name)
+        SolvedEnv.swapped = recorded is not None and recorded[1] != env.tracker.name
 
 
 def bodies(**envs):
@@ -115,6 +119,8 @@ def test_tasks_that_need_no_legs_are_named(tmp_path, envs, name, verdict, said):
     code = certify.run(options(tmp_path), factories(**PARTS), bodies=bodies(**envs), checks=legs.CHECKS)
     assert code == (verdict == "fail")
     found = read(tmp_path)[name]
+    claim = json.loads((tmp_path / "certify.json").read_text())["claims"][0]["claim"]
+    assert ("a gliding base solves 2 of 2 tasks" in claim) == (verdict == "note")
     assert found["verdict"] == verdict and any(said in note for note in found["notes"])
 
 
@@ -144,12 +150,12 @@ def test_a_swap_that_costs_nothing_is_told_apart_from_one_with_few_episodes(tmp_
 
 
 def test_the_control_of_the_swap(tmp_path):
-    """Without --quick each recording is replayed through its own tracker too; one that ends otherwise is a failure."""
+    """Each recording is replayed through its own tracker too, under --quick some; one that ends otherwise fails."""
     given = {"quick": False, "task": ("boxing",), "checks": ("swap",), "episodes": 20}
 
     class Forgetful(SwappedPolicy):
         def attach(self, env):
-            env.lost = env.lost or self.name.startswith("replay:")
+            SolvedEnv.swapped = self.name.startswith("replay:")
 
     assert certify.run(options(tmp_path / "a", **given), factories(**PARTS), checks=CHECKS) == 0
     rows = {tuple(row[:3]): row[3:5] for row in read(tmp_path / "a")["swap"]["tables"][0]["rows"]}
@@ -157,7 +163,13 @@ def test_the_control_of_the_swap(tmp_path):
     assert rows["boxing", "twist2", "sonic"] == ["20/20", "0/20"]
     parts = PARTS | {"policy": Forgetful}
     assert certify.run(options(tmp_path / "b", **given), factories(**parts), checks=CHECKS) == 1
-    assert "twist2: a replay through the tracker of the recording" in read(tmp_path / "b")["swap"]["notes"][0]
+    said = "ends otherwise: boxing through twist2 under paper, seed 0 repeat 0: outcome success, in the replay timeout"
+    assert said in read(tmp_path / "b")["swap"]["notes"][0]
+    quick = given | {"quick": True, "episodes": 2}
+    assert certify.run(options(tmp_path / "c", **quick), factories(**parts), checks=CHECKS) == 1
+    solved = options(tmp_path / "d", **quick | {"checks": ("solvable",)})
+    assert certify.run(solved, factories(**parts), checks=CHECKS) == 1
+    assert "not by their actions alone: boxing through twist2" in read(tmp_path / "d")["solvable"]["summary"]
 
 
 def test_it_goes_on_where_it_was(tmp_path, capsys):
@@ -180,7 +192,7 @@ def test_it_goes_on_where_it_was(tmp_path, capsys):
         (["--task", "boxing", "boxing"], "--task boxing: given twice"),
         (["--tracker", "nobody"], "--tracker nobody"),
         (["--tracker", "twist2", "twist2"], "--tracker twist2: given twice"),
-        (["--checks", "everything"], "--checks everything: unknown, choose from solvable"),
+        (["--checks", "everything"], "--checks everything: unknown, choose from journal"),
         (["--episodes", "0"], "--episodes 0"),
         (["--worlds", "0"], "--worlds 0"),
         (["--engine", "bullet"], "--engine bullet"),

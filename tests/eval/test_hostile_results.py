@@ -196,6 +196,7 @@ def refused(folder, capsys, *words):
         ("object_seed", 5),
         ("max_steps", 3),
         ("steps", 1_000_000),
+        ("privileged", True),
         ("hashes", {"config": "deadbeef0000"}),
         ("hashes", {}),
     ],
@@ -207,6 +208,26 @@ def test_a_line_of_another_run_is_refused(base, capsys, field, value):
     lines[2][field] = value
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     refused(base, capsys, "changed by hand", f"episode {lines[2]['index']} ")
+
+
+@pytest.mark.parametrize(
+    ("ended", "changes", "said"),
+    [
+        ("success", {"margin": -0.5}, "a success with a margin of -0.5"),
+        ("success", {"predicates": {"goal": None}}, "whose last predicate held first at None"),
+        ("success", {"outcome": "timeout", "reason": "timeout"}, "a timeout after"),
+        ("success", {"outcome": "fall", "reason": "fall"}, "a fall without the event fall"),
+        ("fall", {"outcome": "success", "reason": "success"}, "a success with a margin of -"),
+        ("fall", {"outcome": "timeout", "reason": "ball_out", "steps": 900}, "a timeout at step 900 after a fall"),
+    ],
+)
+def test_a_line_that_contradicts_itself_is_refused(base, capsys, ended, changes, said):
+    """An outcome that was edited without all that belongs to it stops whoever reads the folder."""
+    path = base / "episodes.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    next(line for line in lines if line["outcome"] == ended).update(changes)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    refused(base, capsys, "changed by hand", said)
 
 
 def test_a_finished_episode_stands_once(base, capsys):

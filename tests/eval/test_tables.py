@@ -7,7 +7,7 @@ from test_report import document_of, folder_with
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.results import RunRecord, load_run
-from arena_newton.eval.stats import wilson
+from arena_newton.eval.stats import aggregate, wilson
 from arena_newton.eval.tables import joint_table
 
 
@@ -42,6 +42,14 @@ def test_two_runs_make_one_table(tmp_path):
     assert ("football", "u") not in found
     assert list(found)[2] == ("football", "t")  # after head and rule, in the order of the tasks
     assert "policy p, rules paper, engine warp" in text and "3 episodes of 180 ended in a fall." in text
+
+
+def test_a_privileged_policy_is_marked(tmp_path):
+    """Whoever takes the world itself is named so in every table."""
+    rows = [row | {"privileged": True} for row in episodes("boxing", (20, 20, 20))]
+    run = run_of(tmp_path, "a", rows)
+    assert "policy p (privileged), rules paper" in joint_table([run])
+    assert {cell["policy"] for cell in aggregate(run.records)["cells"]} == {"p (privileged)"}
 
 
 def test_what_is_missing_is_said(tmp_path):
