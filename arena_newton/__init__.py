@@ -1,7 +1,7 @@
 """HumanoidArena on Newton/Warp.
 
-A policy decides a 40D whole-body action, a tracker executes it, a world moves, a rule judges. The names of `__all__`
-are imported when they are first used, so that `import arena_newton` itself loads no library.
+A policy decides a 40D whole-body action, a tracker executes it, the simulator steps, a success rule scores. The names
+of `__all__` are imported when they are first used, so that `import arena_newton` itself loads no library.
 """
 
 import importlib
