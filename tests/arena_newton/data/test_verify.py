@@ -145,7 +145,7 @@ def test_rows_of_next_to_no_bytes_are_not_read(dataset, monkeypatch):
     monkeypatch.setattr(pq.ParquetFile, "read", lambda *a, **k: pytest.fail("read"))
     with pytest.raises(ArenaError, match="file-000.parquet: its rows take more than 32 MiB of memory"):
         DatasetFiles(dataset).columns(dataset / DATA, ("action",))
-    pq.write_table(pa.table({"tasks": ["x" * 2**17] * frames}), dataset / EPISODES)
+    pq.write_table(pa.table({"tasks": ["x" * 2**20] * frames}), dataset / EPISODES)
     with pytest.raises(ArenaError, match="file-000.parquet: its rows take more than 32 MiB of memory"):
         DatasetFiles(dataset).table(dataset / EPISODES)
 
