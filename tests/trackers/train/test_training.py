@@ -568,19 +568,6 @@ def test_training_options_have_one_default():
     assert not found
 
 
-def test_a_training_says_first_what_it_builds(tmp_path, monkeypatch, capsys):
-    """Before references are made, which takes minutes on a CPU; without --worlds a CPU gets 16 of them, not a GPU's."""
-
-    def stop(options, device, seed):
-        raise InputError(f"{options.worlds} worlds")
-
-    monkeypatch.setattr(session, "make_library", stop)
-    assert command_line.main(["--device", "cpu", "--log-dir", str(tmp_path / "log")]) == 2
-    said = capsys.readouterr()
-    assert said.out == "generating references, then building 16 worlds on cpu ...\n"
-    assert said.err == "error: 16 worlds\n"
-
-
 @pytest.mark.parametrize(
     "flags",
     [
