@@ -251,6 +251,7 @@ class ArenaEnv:
                 if self.scene.has_body(f"{prim}/Frame"):
                     mocap = self.scene.mocap_id(prim)
                     mocap_pos[k, mocap], mocap_quat[k, mocap] = placed.pos, placed.quat
+                    mocap_pos[k, mocap, 2] += self._raised[prim]
                 else:
                     address = self.scene.joint_qpos(prim)
                     qpos[k, address : address + 3] = placed.pos

@@ -30,6 +30,7 @@ __all__ = [
     "RECORDING_FLAGS",
     "SUBFOLDERS",
     "ResultsFolder",
+    "PROCESSOR",
     "comparable",
     "iso",
     "results_folder",
@@ -300,6 +301,12 @@ def _versions(document: Document) -> list[dict[str, str | None]]:
     return [document.get("versions", {}), *document.get("later_versions", ())]
 
 
+PROCESSOR = "processor"
+"""Fact of an environment: the vector instructions that torch computes with on this machine, such as AVX512. Networks'
+last bits depend on it. It is no part of any hash: nodes of a cluster differ, and may play one plan."""
+
+
 def comparable(facts: JsonObject) -> JsonObject:
-    """Facts of an environment without the number of its device: `cuda:0` and `cuda:1` are alike."""
-    return {key: str(value).split(":")[0] if key == "device" else value for key, value in facts.items()}
+    """Facts of an environment without its processor and the number of its device: `cuda:0` and `cuda:1` are alike."""
+    kept = {key: value for key, value in facts.items() if key != PROCESSOR}
+    return kept | ({"device": str(kept["device"]).split(":")[0]} if "device" in kept else {})

@@ -20,7 +20,7 @@ from arena_newton.data.episode import EpisodeFile
 from arena_newton.disturbance import ActionNoise
 from arena_newton.errors import InputError
 from arena_newton.eval.config import RunConfig
-from arena_newton.eval.folder import EPISODES
+from arena_newton.eval.folder import EPISODES, comparable
 from arena_newton.eval.identity import PACKAGE, hash_paths, moving_versions, scene_files
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.plan import Episode
@@ -53,15 +53,16 @@ def facts_of(
     """
     identity, flags = config.identity(), config.flags
     left_out = ("task", "mode", "tracker", "seeds", "repeats", "keep", "checkpoint", "tracker_facts", "scenes")
+    left_out += ("foreign_tasks",)
     facts: JsonObject = {key: value for key, value in identity.items() if key not in left_out}
-    comparable = {key: str(value).split(":")[0] if key == "device" else value for key, value in environment.items()}
     return facts | {
         "checkpoint": config.checkpoint_hashes[tracker],
         "tracker_facts": (config.tracker_facts or {}).get(tracker),
         "rules_hash": rule_sets.get(flags.rules).hash_for((task,)),
         "scenes": hash_paths(PACKAGE, scene_files(PACKAGE, (task,), task_specs.names())),
-        "environment": comparable,
+        "environment": comparable(environment),
         "versions": moving_versions(dict(versions)) | {"av": av.__version__},
+        **({"foreign_task": config.foreign_tasks[task]} if task in config.foreign_tasks else {}),
         **({"disturbance": noise.describe()} if (noise := disturbance_of(config, task, 1)) is not None else {}),
     }
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+import torch
 import warp as wp
 
 from arena_newton import policies, seeding, trackers
@@ -22,7 +23,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval import console, recording
 from arena_newton.eval.config import DRIVES, RunConfig
 from arena_newton.eval.episode_signals import EpisodeSignals
-from arena_newton.eval.folder import ResultsFolder, iso
+from arena_newton.eval.folder import PROCESSOR, ResultsFolder, iso
 from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, StorageError
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.plan import Episode
@@ -293,7 +294,7 @@ class RunPlayer:
             self.progress.say("  compiling kernels, once; this takes a minute or some")
         try:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
-            facts = self.folder.register(group, env.describe())
+            facts = self.folder.register(group, env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()})
             if flags.verbose:
                 self.progress.say(console.environment(group, facts))
             recorder = _recorder(config, self.folder.path, tracker)

@@ -28,6 +28,8 @@ _TARGETS = ("physics:", "collection:colliders:")
 """Relationships of these namespaces count as well; those of a joint's bodies are reported under their short names."""
 _FIRST = ("scene:", "gravity:", "collisions:")
 """Sentences that begin so come first, since they concern everything."""
+_APART = 0.01
+"""Difference of what is drawn and what collides from which it is reported [m]."""
 _CLOSE = 1e-6
 """Relative difference of numbers that are the same."""
 
@@ -70,6 +72,9 @@ def differences(path: str | Path, task: str) -> list[str]:
         reported[f"scene: selects the variant {own} by itself"] = None
         _select(ours, own)
     needed = [item.path for item in tasks.get(task).requires]
+    for item in tasks.get(task).requires:
+        if item.kind == "body" and (sentence := _drawn_apart(theirs, ours, item.path)) is not None:
+            reported[sentence] = None
     for variant in ("base", "semantic"):
         selected = [own if own in _names(stage) else None for stage in (theirs, ours)]
         if variant != "base":
@@ -89,6 +94,35 @@ def differences(path: str | Path, task: str) -> list[str]:
     if len(sentences) > _MOST:
         return [*sentences[: _MOST - 1], f"and {len(sentences) - _MOST + 1} more changes"]
     return sentences
+
+
+def _drawn_apart(theirs: Usd.Stage, ours: Usd.Stage, path: str) -> str | None:
+    """That a body is drawn of another size than it collides with, more than in our own scene; None where it is not."""
+    drawn, solid = _extents(theirs, path)
+    own_drawn, own_solid = _extents(ours, path)
+    if np.abs((drawn - solid) - (own_drawn - own_solid)).max() <= _APART:
+        return None
+    sizes = [" x ".join(f"{n:.2f}" for n in size) for size in (drawn, solid)]
+    return f"drawn: {path}: is drawn {sizes[0]} m large, its colliders are {sizes[1]} m"
+
+
+def _extents(stage: Usd.Stage, path: str) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes of what a body shows and of its colliders, along its axes [m]; authored extents may be out of date."""
+    body, poses = stage.GetPrimAtPath(path), UsdGeom.XformCache()
+    drawn, solid = Gf.Range3d(), Gf.Range3d()
+    for prim in Usd.PrimRange(body, Usd.TraverseInstanceProxies()) if body else ():
+        geom = UsdGeom.Gprim(prim)
+        extent = UsdGeom.Boundable.ComputeExtentFromPlugins(geom, Usd.TimeCode.Default()) if geom else None
+        if not extent:
+            continue
+        pose, _ = poses.ComputeRelativeTransform(prim, body)
+        box = Gf.BBox3d(Gf.Range3d(Gf.Vec3d(extent[0]), Gf.Vec3d(extent[1])), pose).ComputeAlignedRange()
+        if prim.HasAPI(UsdPhysics.CollisionAPI):
+            solid.UnionWith(box)
+        if geom.ComputeVisibility() != UsdGeom.Tokens.invisible:
+            drawn.UnionWith(box)
+    none = np.zeros(3)
+    return tuple(none if box.IsEmpty() else np.array(box.GetSize()) for box in (drawn, solid))  # type: ignore[return-value]  # two
 
 
 def _authored(theirs: dict[str, _Part], ours: dict[str, _Part], same_gravity: bool) -> list[str]:

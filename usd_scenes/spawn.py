@@ -73,6 +73,7 @@ def _inside(scene: Scene, draws: Draws, spec: TaskSpec) -> dict[tuple[str, str],
         if scene.has_body(f"{thing.prim}/Frame"):
             mocap = scene.mocap_id(thing.prim)
             data.mocap_pos[mocap], data.mocap_quat[mocap] = pose.pos, pose.quat
+            data.mocap_pos[mocap, 2] += thing.raised(scene)
         else:
             address = scene.joint_qpos(thing.prim)
             data.qpos[address : address + 7] = (*pose.pos, *pose.quat)

@@ -28,6 +28,10 @@ PARQUET_BYTES = 1024 * limits.MIB
 """Size of a parquet file; LeRobot begins another at 100 MB."""
 JSON_BYTES = 64 * limits.MIB
 """Size of a JSON file of a dataset: 100,000 episodes."""
+TEXT_ROWS = 256
+"""Rows of a table with text that are read at once."""
+_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8}
+"""Parquet's types of numbers → bytes of one in memory."""
 _KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,200}")
 
 
@@ -77,6 +81,21 @@ def _integer(value: object, where: str, least: int = 0) -> int:
     if not least <= value < 2**40:
         raise InputError(f"{where} is {value}, expected at least {least}")
     return int(value)
+
+
+def _check_memory(path: Path, size: int) -> None:
+    if size > limits.ROWS_MEMORY:
+        raise InputError(f"{path}: its rows take more than {limits.ROWS_MEMORY // limits.MIB} MiB of memory")
+
+
+def _text_table(path: Path, file: pyarrow.parquet.ParquetFile, columns: list[str] | None) -> pyarrow.Table:
+    """A table with text, a few rows at a time: no header says how long a text is that many rows repeat."""
+    parts, size = [], 0
+    for part in file.iter_batches(TEXT_ROWS, columns=columns):
+        size += part.nbytes
+        _check_memory(path, size)
+        parts.append(part)
+    return pyarrow.Table.from_batches(parts) if parts else file.read(columns)
 
 
 class DatasetFiles:
@@ -201,14 +220,34 @@ class DatasetFiles:
             InputError: It is absent, too large, damaged, or lacks a column.
         """
         check_size(path, PARQUET_BYTES)
+        chosen = None if columns is None else list(columns)
         try:
-            table = pyarrow.parquet.read_table(
-                path, columns=None if columns is None else list(columns), memory_map=False
-            )
+            with pyarrow.parquet.ParquetFile(path, memory_map=False) as file:
+                plain = self._check_rows(path, file.metadata, chosen)
+                table = file.read(chosen) if plain else _text_table(path, file, chosen)
             table.validate(full=True)  # text of a damaged file may be none
             return table
         except (pyarrow.ArrowException, OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: not a readable parquet file ({type(error).__name__})") from error
+
+    def _check_rows(self, path: Path, about: pyarrow.parquet.FileMetaData, columns: list[str] | None) -> bool:
+        """Refuse a table whose rows would take too much memory, by its header; False where it has text.
+
+        Raises:
+            InputError: It has more rows than the dataset has frames, or too many numbers.
+        """
+        if about.num_rows > self.frames:
+            raise InputError(
+                f"{path}: has {about.num_rows:,} rows, {self._info.name} says {self.frames:,} total_frames"
+            )
+        size, plain = 0, True
+        for group in map(about.row_group, range(about.num_row_groups)):
+            for part in map(group.column, range(group.num_columns)):
+                if columns is None or part.path_in_schema.partition(".")[0] in columns:
+                    plain &= part.physical_type in _WIDTHS
+                    size += part.num_values * _WIDTHS.get(part.physical_type, 1)
+            _check_memory(path, size)
+        return plain
 
     def columns(self, path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Columns of a file as arrays of shape [rows] or [rows, width].

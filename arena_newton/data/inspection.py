@@ -26,7 +26,7 @@ from arena_newton.canonical import ACTION, HAND_CLOSED, STATE
 from arena_newton.data.episode_figures import FIGURES, EpisodeFigures, figures, ranked
 from arena_newton.data.frame_reader import OpenVideo
 from arena_newton.data.motion_source import Motion, motions
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
 from arena_newton.pictures.video import evenly
 from arena_newton.text import counted, plain_text
@@ -116,7 +116,7 @@ def inspect(folders: Sequence[Path], options: InspectOptions) -> int:
 
     Raises:
         InputError: A folder holds no episodes, or one is damaged.
-        ArenaError: The page cannot be written.
+        InputError: The page cannot be written.
     """
     if options.episodes < 1:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
@@ -138,7 +138,7 @@ def inspect(folders: Sequence[Path], options: InspectOptions) -> int:
         with replace_atomically(out) as file:
             file.write(text.encode())
     except OSError as error:
-        raise ArenaError(f"--out {out}: cannot be written ({error.strerror or error})") from error
+        raise InputError(f"--out {out}: cannot be written ({error.strerror or error})") from error
     print(f"{out}: {counted(len(found), 'episode')}, {len(shown)} of them in full, {len(text) / 2**20:.1f} MiB")
     return 0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,6 +178,18 @@ def _check_features(subject: _Subject) -> None:
             raise DatasetMismatch(subject.info, f"feature {key}: name {at} is {str(shown)[:80]!r}, expected {wanted}")
     if files.fps != FPS:
         raise DatasetMismatch(subject.info, f"fps is {files.fps}, expected {FPS}")
+    chunk = files.info.get("chunks_size")
+    if not isinstance(chunk, int) or isinstance(chunk, bool) or chunk < 1:
+        raise DatasetMismatch(subject.info, f"chunks_size is {chunk!r:.40}, expected a number of at least 1")
+    splits = files.info.get("splits")
+    if not isinstance(splits, dict):
+        raise DatasetMismatch(subject.info, f"splits is {splits!r:.80}, expected a table")
+    for name, part in splits.items():
+        ends = re.fullmatch(r"([0-9]{1,12}):([0-9]{1,12})", str(part))
+        if ends is None or not int(ends[1]) <= int(ends[2]) <= files.episodes:
+            raise DatasetMismatch(
+                subject.info, f"splits: {name[:40]} is {part!r:.60}, expected a range of its {files.episodes} episodes"
+            )
     protocol = files.info.get("vla_protocol")
     if subject.kind.name == "arena" and (subject.arena is not None or protocol is not None):
         told = protocol if isinstance(protocol, dict) else {}

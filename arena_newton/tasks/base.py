@@ -151,11 +151,18 @@ class ObjectSpec:
     """Height [m] of the origin above the lowest point of the object's geoms in our own scene; where a variant's geoms
     reach lower, the object starts that much higher. None: the height is the sample's alone."""
 
+    surface: tuple[Callable[[Scene], float], float] | None = None
+    """Height of the surface below it in a built scene, and in our own [m]: where a variant's surface is higher or
+    lower, the object starts that much higher or lower. None: it stays at the sample's height."""
+
     def raised(self, scene: Scene) -> float:
         """What a scene's own geoms add to the height of a sample [m]; 0 in our own scene."""
-        if self.rest_height is None:
-            return 0.0
-        added = -scene.lowest(self.prim) - self.rest_height
+        added = 0.0
+        if self.rest_height is not None:
+            added += -scene.lowest(self.prim) - self.rest_height
+        if self.surface is not None:
+            height, own = self.surface
+            added += height(scene) - own
         return added if abs(added) > SAME_HEIGHT else 0.0
 
     def rule(self, rules_name: str) -> ObjectRule:

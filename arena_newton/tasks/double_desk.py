@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,8 @@ BASKET = "/World/Basket"
 INSIDE = f"{BASKET}/Frame/Inside"
 RIGHT_DESK, LEFT_DESK = "/World/RightDesk", "/World/LeftDesk"
 SILL = "/World/Sill"
+DESK_TOP = 0.745
+"""Height of both desks in our own scene [m]."""
 
 OVER_CRATE = 0.3
 """Distance to the crate, seen from above [m], from which a lifted hammer counts as carried over: the desks are 2.5 m
@@ -124,6 +127,7 @@ TASK = TaskSpec(
             base=PoseRange(x=(-3.2, -2.4), y=(-3.15, -3.0), z=(0.8, 0.8), yaw=(-0.35, 0.35)),
             execution=PoseRange(x=(-3.36, -2.52), y=(-3.15, -3.0), z=(0.8, 0.8), yaw=(-0.35, 0.35)),
             init_quat=(0.7139051, 0.0, 0.0, -0.7002425),
+            surface=(functools.partial(top, prim=RIGHT_DESK), DESK_TOP),
         ),
         ObjectSpec(
             record="basket",
@@ -134,6 +138,7 @@ TASK = TaskSpec(
             spawn_scale=0.01,
             placement=ByRules(paper="absolute", released="scaled"),
             execution_void=True,
+            surface=(functools.partial(top, prim=LEFT_DESK), DESK_TOP),
         ),
     ),
     steps=ByRules.same(2000),

@@ -7,6 +7,7 @@ LeRobot loads, with one more file, `arena_policy.json`. One without it is somebo
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -15,6 +16,7 @@ from arena_newton.data.label_protocols import protocol
 from arena_newton.errors import InputError
 from arena_newton.files import replace_atomically
 from arena_newton.pictures.settings import CameraConfig
+from arena_newton.text import plain_text
 
 __all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder"]
 
@@ -24,6 +26,8 @@ CONFIG_FILE = "config.json"
 """File by which a folder is known to be a checkpoint of LeRobot."""
 NORMALISES = ("normalizer_processor", "unnormalizer_processor")
 """Steps of LeRobot's processors with statistics."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+"""Name of a task or tracker."""
 FORMAT = 1
 """Version of the file."""
 INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model", "last/pretrained_model")
@@ -101,6 +105,10 @@ class CheckpointFacts:
         facts = cls(**values)  # type: ignore[arg-type]  # each is of its default's kind
         if len(set(facts.task_vector)) < len(facts.task_vector):
             raise InputError(f"{path}: task_vector names a task twice")
+        for key in ("task_vector", "tasks", "trackers"):
+            for name in getattr(facts, key):
+                if not _NAME.fullmatch(name):
+                    raise InputError(f"{path}: {key} holds {plain_text(name, 60)!r}, which is no name")
         if facts.fit not in ("pad", "native"):
             raise InputError(f"{path}: fit is {facts.fit!r}, expected pad or native")
         if not 0.0 <= facts.realign <= 1.0:

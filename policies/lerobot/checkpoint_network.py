@@ -18,6 +18,7 @@ from safetensors.torch import load_model
 from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE
 from arena_newton.policies.lerobot.checkpoint_reader import WEIGHTS, PolicyCheckpoint, lerobot_silent
+from arena_newton.policies.lerobot.checkpoint_tensors import within_weights
 from arena_newton.policies.lerobot.network_noise import Draw, generators, normal
 
 __all__ = ["PolicyNetwork"]
@@ -135,13 +136,15 @@ def _loaded(checkpoint: PolicyCheckpoint) -> PreTrainedPolicy:
     """The network with its weights on the CPU; every weight is the checkpoint's."""
     path = checkpoint.folder / WEIGHTS
     try:
-        with lerobot_silent(), _own_encoders(checkpoint):
+        with lerobot_silent(), _own_encoders(checkpoint), within_weights(path):
             if checkpoint.type == "multi_task_dit":
                 from arena_newton.policies.lerobot.seeded_dit import build  # imports transformers
 
                 policy = build(checkpoint.config)
             else:
                 policy = get_policy_class(checkpoint.type)(checkpoint.config)
+    except InputError:
+        raise
     except Exception as error:  # what a configuration asks for fails anywhere in LeRobot, torch and transformers
         where = checkpoint.folder / CONFIG_FILE
         raise InputError(f"{where}: its network cannot be built: {_first(error)}") from None

@@ -31,7 +31,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import (
     CheckpointFacts,
     checkpoint_folder,
 )
-from arena_newton.policies.lerobot.checkpoint_tensors import check_family, check_statistics
+from arena_newton.policies.lerobot.checkpoint_tensors import check_family, check_layers, check_statistics
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
 
 __all__ = [
@@ -172,6 +172,7 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
         preparation = PicturePreparation.read(folder) if own is None else None
         camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
     check_family(folder / WEIGHTS, kind)
+    check_layers(folder / WEIGHTS, kind, config)
     digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
     return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
 

@@ -6,6 +6,8 @@ in milliseconds.
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE
 
-__all__ = ["check_family", "check_spread", "check_statistics"]
+__all__ = ["check_family", "check_layers", "check_spread", "check_statistics", "within_weights"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,20 @@ _FAMILIES: Mapping[str, _Names] = {
     ),
 }
 """LeRobot's type of policy → names of its tensors."""
+_LAYERS: Mapping[str, Mapping[str, str]] = {
+    "act": {
+        "n_encoder_layers": "model.encoder.layers.",
+        "n_decoder_layers": "model.decoder.layers.",
+        "n_vae_encoder_layers": "model.vae_encoder.layers.",
+    },
+    "diffusion": {"down_dims": "diffusion.unet.down_modules."},
+    "multi_task_dit": {"num_layers": "noise_predictor.transformer_blocks."},
+}
+"""LeRobot's type of policy → field of its configuration → how the names of the layers begin that it counts or lists."""
+PARAMETER_COST = 10_000
+"""What a parameter counts at least, in numbers: modules take memory too."""
+SPARE = 2**26
+"""Numbers that a network may be built with beyond twice its weights, in parts that it drops again: 256 MiB."""
 _SPREADS: Mapping[str, tuple[str, ...]] = {
     "MEAN_STD": ("std",),
     "MIN_MAX": ("min", "max"),
@@ -79,6 +95,52 @@ def check_family(path: Path, kind: str) -> None:
     for start in _FAMILIES[kind].always:
         if not any(name.startswith(start) for name in found):
             raise InputError(f"{path}: holds no tensor {start}*, {said}, which needs it")
+
+
+def check_layers(path: Path, kind: str, config: object) -> None:
+    """Refuse a configuration with another number of layers than the weights have.
+
+    Args:
+        path: The file of the weights, of which the header is read.
+        kind: LeRobot's type of policy.
+        config: LeRobot's configuration of it.
+
+    Raises:
+        InputError: They differ; the message names the field.
+    """
+    with _opened(path) as file:
+        names = list(file.keys())
+    for field, start in _LAYERS.get(kind, {}).items():
+        held = len({name[len(start) :].partition(".")[0] for name in names if name.startswith(start)})
+        said = getattr(config, field)
+        said = said if isinstance(said, int) else len(said)
+        if held and said != held:
+            raise InputError(f"{path}: holds {held} layers {start}*, but {CONFIG_FILE} says {field} {said}")
+
+
+@contextmanager
+def within_weights(path: Path) -> Iterator[None]:
+    """Stop the building of a network, in this thread, that takes far more than a file of weights holds.
+
+    Raises:
+        InputError: The file is damaged, or the network too large.
+    """
+    with _opened(path) as file:
+        held = sum(max(math.prod(file.get_slice(name).get_shape()), PARAMETER_COST) for name in file.keys())  # noqa: SIM118 (not a mapping)
+    left, builder = 2 * held + SPARE, threading.get_ident()
+
+    def count(module: torch.nn.Module, name: str, made: torch.nn.Parameter | None) -> None:
+        nonlocal left
+        if made is not None and threading.get_ident() == builder:
+            left -= max(made.numel(), PARAMETER_COST)
+            if left < 0:
+                raise InputError(f"{path}: holds {held:,} numbers, the network of its {CONFIG_FILE} far more")
+
+    watch = torch.nn.modules.module.register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        watch.remove()
 
 
 def check_statistics(path: Path, modes: Mapping[str, str]) -> None:

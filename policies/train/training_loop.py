@@ -103,7 +103,8 @@ class TrainingLoop:
 
         Raises:
             InputError: The folder cannot be made, or another process trains in it.
-            ArenaError: The loss is not finite, or the disk is full.
+            ArenaError: The loss is not finite.
+            InputError: The log cannot be written, as on a full disk.
         """
         with _held(self._out) if self._processes.first else contextlib.nullcontext():
             if self._processes.first and self._new:
@@ -111,7 +112,7 @@ class TrainingLoop:
             try:
                 return self._work()
             except OSError as error:  # of the log; checkpoints say it themselves
-                raise ArenaError(f"{self._out}: cannot be written ({error.strerror or error})") from error
+                raise InputError(f"--out {self._out}: cannot be written ({error.strerror or error})") from error
 
     def _work(self) -> Path:
         options, trainer, first = self._options, self._trainer, self._processes.first

@@ -29,7 +29,7 @@ from lerobot.utils.random_utils import save_rng_state
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL, replace_atomically
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -150,7 +150,7 @@ def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, 
         Its folder, `<out>/checkpoints/<step>`.
 
     Raises:
-        ArenaError: It cannot be written.
+        InputError: It cannot be written.
     """
     parent = out / CHECKPOINTS_DIR
     final = parent / checkpoint_name(progress.step)
@@ -180,7 +180,7 @@ def write_checkpoint(out: Path, trainer: PolicyTrainer, facts: CheckpointFacts, 
     except (OSError, SafetensorError) as error:  # safetensors says a full disk in an error of its own
         shutil.rmtree(growing, ignore_errors=True)
         reason = (error.strerror if isinstance(error, OSError) else None) or " ".join(str(error).split())[:160]
-        raise ArenaError(f"{final}: the checkpoint cannot be written ({reason})") from error
+        raise InputError(f"{final}: the checkpoint cannot be written ({reason})") from error
     return final
 
 

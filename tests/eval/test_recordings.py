@@ -41,6 +41,7 @@ def test_what_ran_stands_with_the_results(recorded):
     assert {"engine", "device", "physics_dt", "substeps", "drive", "startup_ticks", "history"} <= set(facts)
     assert facts["engine"] == "mujoco" and facts["startup_ticks"] == 50
     assert facts["tracker"]["name"] == "twist2" and facts["tracker"]["inference"]
+    assert facts["processor"] == torch.backends.cpu.get_cpu_capability()
     assert document["config"]["policy_facts"]["name"] == "expert"
     hashes = {json.dumps(row["hashes"], sort_keys=True) for row in journal(recorded)}
     assert len(hashes) == 1 and '"environment": "' in hashes.pop()

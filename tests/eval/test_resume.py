@@ -91,6 +91,7 @@ def test_environments_are_stored_in_the_plans_order(tmp_path):
     names = [f"{task} twist2 {mode}" for task in ("football", "boxing") for mode in ("base", "visual")]
     for name in (names[2], names[3], names[0], names[2], names[1]):
         assert folder.register(name, {"engine": name}) == {"engine": name}
+    folder.register(names[0], {"engine": names[0], "processor": "AVX2"})  # nodes of a cluster differ
     stored = json.loads((tmp_path / "config.json").read_text())["environments"]
     assert list(stored) == names and stored[names[1]] == {"engine": names[1]}
 

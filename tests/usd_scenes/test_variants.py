@@ -254,6 +254,28 @@ def test_a_larger_ball_starts_on_the_floor(written):
     np.testing.assert_allclose(larger.lowest("/World/Ball"), -0.25, atol=1e-6)
 
 
+def test_a_ball_that_is_drawn_smaller_than_it_collides_is_named(written):
+    """Another radius alone leaves the drawn ball as it is, and that is said; with the mesh scaled too it is not."""
+    path = written(over("double radius = 0.15", "Ball", "Collider"))
+    said = "drawn: /World/Ball: is drawn 0.22 x 0.22 x 0.22 m large, its colliders are 0.30 x 0.30 x 0.30 m"
+    assert said in differences(path, "football")
+    scale = 1.3636
+    order = 'uniform token[] xformOpOrder = ["xformOp:scale"]'
+    look = f'over "Look" {{\ndouble3 xformOp:scale = ({scale}, {scale}, {scale})\n{order}\n}}'
+    both = 'over "Ball" {\nover "Collider" {\ndouble radius = 0.15\n}\n' + look + "\n}"
+    assert not any(text.startswith("drawn") for text in differences(written(both), "football"))
+
+
+def test_what_stands_on_a_desk_follows_its_height(written):
+    """Hammer and basket start as much higher as their desk; in the project's own scene nothing is added."""
+    own = load_scene("double_desk", native=True, device="cpu")
+    assert [thing.raised(own) for thing in tasks.get("double_desk").objects] == [0.0, 0.0]
+    path = written(over("double3 xformOp:translate = (0, 0, 0.775)", "RightDesk", "Top"), task="double_desk")
+    higher = load_scene("double_desk", variant_file=path, native=True)
+    assert [thing.raised(higher) for thing in tasks.get("double_desk").objects] == [pytest.approx(0.05), 0.0]
+    assert penetrations(path, "double_desk") == ([], [])
+
+
 def test_what_starts_inside_something_is_named(written, capsys):
     """`validate` resets an episode of each mode: a stool under the ball is named; what a variant changes is printed."""
     ball = tasks.get("football").draw(0, "base", rule_sets.get("paper"))

@@ -31,7 +31,14 @@ from arena_newton.trackers.train.rewards import configured, maximum
 from arena_newton.trackers.train.runner import TrackerRunner
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tracker_env import TrackerEnv
-from arena_newton.trackers.train.train_options import FAMILY_WEIGHTS, ExportOptions, TrainOptions, check
+from arena_newton.trackers.train.train_options import (
+    CPU_WORLDS,
+    FAMILY_WEIGHTS,
+    GPU_WORLDS,
+    ExportOptions,
+    TrainOptions,
+    check,
+)
 
 __all__ = ["build", "check_folder", "make_library", "train"]
 
@@ -165,6 +172,12 @@ def _device(name: str) -> str:
     return "cuda:0" if name == "cuda" else name
 
 
+def _with_worlds(options: TrainOptions) -> TrainOptions:
+    """Options that name a number of worlds."""
+    usual = CPU_WORLDS if _device(options.device) == "cpu" else GPU_WORLDS
+    return options if options.worlds else dataclasses.replace(options, worlds=usual)
+
+
 def build(options: TrainOptions) -> TrackerRunner:
     """Make references, environment and runner; resume if asked to.
 
@@ -172,6 +185,7 @@ def build(options: TrainOptions) -> TrackerRunner:
         InputError: An option does not fit.
     """
     check(options)
+    options = _with_worlds(options)
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
     rewards = configured(options.rewards, options.reward_scales)
@@ -187,6 +201,9 @@ def build(options: TrainOptions) -> TrackerRunner:
     torch.set_float32_matmul_precision("high")
     torch.manual_seed(options.seed + rank)
     began = time.monotonic()
+    if rank == 0:
+        source = "generating references" if options.library is None else f"reading {options.library}"
+        print(f"{source}, then building {options.worlds} worlds on {device} ...", flush=True)
     library = make_library(options, device, options.seed + 1000 * rank)
     generated = time.monotonic()
     weights = _family_weights(options, library)
@@ -226,6 +243,7 @@ def _tables(env: TrackerEnv) -> str:
 
 def train(options: TrainOptions) -> TrackerRunner:
     """Train to the end of the limits."""
+    options = _with_worlds(options)
     runner = build(options)
     runner.learn(options.iterations, minutes=options.minutes or (1.0 if options.bench else 0.0))
     if runner.is_distributed:

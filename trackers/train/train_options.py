@@ -18,7 +18,17 @@ from arena_newton.errors import InputError
 from arena_newton.flags import Several
 from arena_newton.trackers.interface import names
 
-__all__ = ["FAMILY_WEIGHTS", "CurveOptions", "ExportCommand", "ExportOptions", "TrainOptions", "check", "runner_config"]
+__all__ = [
+    "CPU_WORLDS",
+    "FAMILY_WEIGHTS",
+    "GPU_WORLDS",
+    "CurveOptions",
+    "ExportCommand",
+    "ExportOptions",
+    "TrainOptions",
+    "check",
+    "runner_config",
+]
 
 if TYPE_CHECKING:
     TrackerName = str
@@ -27,6 +37,10 @@ else:
 
 FAMILY_WEIGHTS: dict[str, float] = {"clips": 40.0}
 """Sampling weights of families per second of motion: there are minutes of captured motion, hours of generated one."""
+
+
+GPU_WORLDS, CPU_WORLDS = 8192, 16
+"""Worlds where none are named: what fills a GPU, and what a CPU trains an iteration of in seconds."""
 
 
 def within(low: float, high: float) -> dict[str, tuple[float, float]]:
@@ -45,8 +59,8 @@ class TrainOptions:
 
     tracker: TrackerName = "twist2"
     """Interface to train."""
-    worlds: int = field(default=8192, metadata=at_least(1))
-    """Parallel worlds of each process."""
+    worlds: int = field(default=0, metadata=at_least(0))
+    """Parallel worlds of each process, 0 = 8192 on a GPU, 16 on a CPU."""
     device: str = "auto"
     """cpu, cuda or cuda:N; with torchrun each process takes its own GPU."""
     minutes: float = field(default=0.0, metadata=at_least(0))
@@ -181,7 +195,7 @@ def check(options: TrainOptions) -> None:
             _refuse_outside(
                 "--" + option.name.replace("_", "-"), getattr(options, option.name), *option.metadata["bounds"]
             )
-    _refuse_outside("--minibatches", options.minibatches, 1, options.worlds * options.steps)
+    _refuse_outside("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
     if options.settle > 0.0 and options.minutes <= 0.0:
         raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")
     if options.resume is not None and options.start_from is not None:

@@ -185,7 +185,7 @@ def test_bad_input_is_one_clear_error(folder, tmp_path, capsys):
     }.items():
         assert main(list(arguments)) == 2
         assert message in capsys.readouterr().err
-    assert main(["inspect", str(folder), "--out", str(tmp_path)]) == 1
+    assert main(["inspect", str(folder), "--out", str(tmp_path)]) == 2
     assert "cannot be written" in capsys.readouterr().err
 
 

@@ -133,6 +133,23 @@ def two_tasks(dataset):
     change(dataset / EPISODES, "tasks", lambda rows: [["Dance."] for _ in rows])
 
 
+def test_rows_of_next_to_no_bytes_are_not_read(dataset, monkeypatch):
+    """Numbers and texts that a file repeats are refused before they take memory, by the header or after a few rows."""
+    frames = DatasetFiles(dataset).frames
+    rows = 2_000_000
+    edit_json(dataset / "meta/info.json", item("total_frames", rows))
+    zeros = {"action": pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(rows * 40, np.float32)), 40)}
+    pq.write_table(pa.table(zeros).slice(0, rows // 8), dataset / DATA)
+    assert (dataset / DATA).stat().st_size < 100_000
+    monkeypatch.setattr("arena_newton.limits.ROWS_MEMORY", 2**25)
+    monkeypatch.setattr(pq.ParquetFile, "read", lambda *a, **k: pytest.fail("read"))
+    with pytest.raises(ArenaError, match="file-000.parquet: its rows take more than 32 MiB of memory"):
+        DatasetFiles(dataset).columns(dataset / DATA, ("action",))
+    pq.write_table(pa.table({"tasks": ["x" * 2**20] * frames}), dataset / EPISODES)
+    with pytest.raises(ArenaError, match="file-000.parquet: its rows take more than 32 MiB of memory"):
+        DatasetFiles(dataset).table(dataset / EPISODES)
+
+
 FAULTS = {
     "one number of a state": (
         lambda d: change(d / DATA, "observation.state", item(57, 12, 3.0)),
@@ -197,6 +214,16 @@ FAULTS = {
     "the slices": (
         lambda d: edit_json(d / "meta/modality.json", item("action", "root_z", "start", 3)),
         r"modality.json: does not name",
+    ),
+    "no chunks": (lambda d: edit_json(d / "meta/info.json", item("chunks_size", 0)), "chunks_size is 0, expected"),
+    "a split beyond the end": (
+        lambda d: edit_json(d / "meta/info.json", item("splits", {"train": "0:99999999999"})),
+        "splits: train is '0:99999999999', expected a range of its 3 episodes",
+    ),
+    "a split backwards": (lambda d: edit_json(d / "meta/info.json", item("splits", {"train": "2:1"})), "splits: train"),
+    "rows beyond the end": (
+        lambda d: pq.write_table(pa.concat_tables([pq.read_table(d / DATA)] * 3), d / DATA),
+        r"file-000.parquet: has [0-9,]+ rows, info.json says [0-9,]+ total_frames",
     ),
     "the rate": (lambda d: edit_json(d / "meta/info.json", item("fps", 30)), r"fps is 30|timestamp"),
     "an episode's seed": (

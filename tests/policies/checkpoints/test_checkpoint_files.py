@@ -218,6 +218,22 @@ WRONG = {
         lambda f: edit(f / "config.json", type="pi05"),
         r"model.safetensors: holds the tensor model.action_head.bias of act, but config.json says type pi05, which has",
     ),
+    "more layers than weights": (
+        lambda f: edit(f / "config.json", n_encoder_layers=3000),
+        r"holds 1 layers model.encoder.layers.\*, but config.json says n_encoder_layers 3000",
+    ),
+    "layers without end": (
+        lambda f: edit(f / "config.json", n_decoder_layers=10**9),
+        r"holds 1 layers model.decoder.layers.\*, but config.json says n_decoder_layers 1000000000",
+    ),
+    "wider layers than weights": (
+        lambda f: edit(f / "config.json", dim_feedforward=10**8),
+        r"model.safetensors: holds [0-9,]+ numbers, the network of its config.json far more",
+    ),
+    "a tracker that is no name": (
+        lambda f: edit(f / "arena_policy.json", trackers=["<script>"]),
+        "arena_policy.json: trackers holds '<script>', which is no name",
+    ),
     "weights of no family": (
         lambda f: other_weights(f, add="normalize_inputs.buffer"),
         r"model.safetensors: holds the tensor normalize_inputs.buffer, but config.json says type act",
@@ -236,6 +252,16 @@ def test_what_cannot_be_run_is_one_clear_error(folder, kind):
     damage(folder)
     with pytest.raises(InputError, match=message):
         LeRobotPolicy(folder).check()
+
+
+def test_no_network_is_built_for_another_number_of_layers(folder, monkeypatch):
+    """The weights' header says how many there are, before memory or time is spent on those that the file says."""
+    monkeypatch.setattr(checkpoint_network, "get_policy_class", lambda kind: pytest.fail("built"))
+    for field in ("n_encoder_layers", "n_decoder_layers"):
+        edit(folder / "config.json", **{field: 2})
+        with pytest.raises(InputError, match=f"says {field} 2"):
+            LeRobotPolicy(folder).check()
+        edit(folder / "config.json", **{field: 1})
 
 
 def test_no_network_is_built_for_weights_of_another_family(folder, monkeypatch):

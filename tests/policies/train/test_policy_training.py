@@ -196,7 +196,7 @@ def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_pat
 
         with monkeypatch.context() as patch:
             patch.setattr(training_state, name, failing)
-            with pytest.raises(ArenaError, match="000006: the checkpoint cannot be written .No space left on device"):
+            with pytest.raises(InputError, match="000006: the checkpoint cannot be written .No space left on device"):
                 train(options(dataset, out, save_every=3, hold_out=1))
         assert os.readlink(out / "checkpoints" / "last") == "000003"
         assert CheckpointFacts.read(checkpoint_folder(out)).steps == 3
@@ -226,7 +226,7 @@ def test_a_log_on_a_full_disk_is_one_error(dataset, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(training_log.TrainingLog, "record", full)
-    with pytest.raises(ArenaError, match=r"run: cannot be written .No space left on device"):
+    with pytest.raises(InputError, match=r"--out .*run: cannot be written .No space left on device"):
         train(options(dataset, tmp_path / "run"))
 
 

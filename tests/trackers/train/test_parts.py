@@ -10,7 +10,8 @@ import torch
 from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.trackers.motions import kinematics
-from arena_newton.trackers.train import events
+from arena_newton.trackers.train import __main__ as command_line
+from arena_newton.trackers.train import events, session
 from arena_newton.trackers.train.measurement import TickMeasurement
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
 from arena_newton.trackers.train.rewards import REWARDS, configured, maximum
@@ -185,3 +186,16 @@ def test_guard_names_term_and_world(bank):
     tally.guard(torch.zeros_like(values), seen, seen, action)
     with pytest.raises(TrainingError, match="world 3: action is not finite"):
         tally.collect()
+
+
+def test_a_training_says_first_what_it_builds(tmp_path, monkeypatch, capsys):
+    """Before references are made, which takes minutes on a CPU; without --worlds a CPU gets 16 of them, not a GPU's."""
+
+    def stop(options, device, seed):
+        raise InputError(f"{options.worlds} worlds")
+
+    monkeypatch.setattr(session, "make_library", stop)
+    assert command_line.main(["--device", "cpu", "--log-dir", str(tmp_path / "log")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "generating references, then building 16 worlds on cpu ...\n"
+    assert said.err == "error: 16 worlds\n"

@@ -571,7 +571,7 @@ def test_training_options_have_one_default():
 @pytest.mark.parametrize(
     "flags",
     [
-        ["--worlds", "0"],
+        ["--worlds", "-1"],
         ["--keep-last", "-1"],
         ["--iterations", "0"],
         ["--minutes", "-1"],
