@@ -16,7 +16,7 @@ import pytest
 from made_suites import cell_of, outcomes, write_cell, write_suite
 
 from arena_newton.errors import InputError
-from arena_newton.eval import paper_claims, table_text
+from arena_newton.eval import findings_text, paper_claims, table_text
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.evaluated_cells import read_cells
 from arena_newton.eval.paper_numbers import paper_numbers, published
@@ -477,7 +477,7 @@ def test_findings_follow_the_data(cells):
     assert found["SR and AFR disagree: sonic"].paper == "highest success: DP, fewest falls: π0.5 (5.24 %)"
     assert found["tracker-conditioned: SONIC ahead on HSI"].verdict == "not measured"
     assert found["tracker-conditioned: SONIC ahead on HOI"].paper == "+16.1 points"
-    text = paper_claims.findings_text(list(found.values()))
+    text = findings_text.findings_text(list(found.values()))
     assert "## cross-GMT: twist2 → sonic: undecided" in text and "these networks" in text.splitlines()[2]
     assert "13 points" in text and "of 26 through another" in text and "28 of a difference" in text
 
