@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from arena_newton.errors import InputError
 from arena_newton.eval.rate_tests import (
     PairedCounts,
-    RateDifference,
     UnpairedCounts,
     excess,
     letters,
-    mean_difference,
     rate_test,
     stratified_test,
 )
-from arena_newton.eval.stats import holm
+from arena_newton.eval.stats import Contrast, contrast, holm
 from arena_newton.intervals import wilson
 
 __all__ = ["LEVEL", "Comparison", "Contender", "PairComparison", "Standing", "StratumPair", "compare", "counts_of"]
@@ -54,7 +52,7 @@ class StratumPair:
     p: float
     p_holm: float
     """Adjusted for the number of all pairs in all strata."""
-    difference: RateDifference
+    difference: Contrast
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class PairComparison:
     """Adjusted for the number of pairs."""
     excess: float
     """Successes of the first beyond what the test expects of equal rates: where it differs, whether it is better."""
-    difference: RateDifference
+    difference: Contrast
 
     @property
     def differs(self) -> bool:
@@ -155,12 +153,13 @@ def compare(contenders: Sequence[Contender]) -> Comparison:
                 tests[pair, stratum].name,
                 tests[pair, stratum].p,
                 adjusted[pair, stratum],
-                _difference([table[pair, stratum][0]]),
+                _difference(contenders, pair, [stratum]),
             )
             for stratum in strata
         )
         counts = [part.counts for part in parts]
-        pairs.append(PairComparison(*pair, parts, p, p_holm, excess(counts), _difference(counts)))
+        difference = _difference(contenders, pair, strata)
+        pairs.append(PairComparison(*pair, parts, p, p_holm, excess(counts), difference))
     within = {}
     for position, stratum in enumerate(strata):
         differing = [(pair.first, pair.second) for pair in pairs if pair.strata[position].p_holm <= LEVEL]
@@ -177,8 +176,11 @@ def compare(contenders: Sequence[Contender]) -> Comparison:
     )
 
 
-def _difference(counts: Sequence[PairedCounts | UnpairedCounts]) -> RateDifference:
-    found = mean_difference(counts)
+def _difference(contenders: Sequence[Contender], pair: tuple[int, int], strata: Sequence[Stratum]) -> Contrast:
+    """First rate minus second, averaged over strata that both have."""
+    first, second = (contenders[number].outcomes for number in pair)
+    weight = 1 / len(strata)
+    found = contrast([[(weight, first[stratum]), (-weight, second[stratum])] for stratum in strata])
     assert found is not None, "a stratum that all contenders have holds episodes"
     return found
 

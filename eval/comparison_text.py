@@ -9,8 +9,9 @@ from collections.abc import Sequence
 
 from arena_newton.eval.comparison import LEVEL, Comparison, PairComparison, Standing, StratumPair
 from arena_newton.eval.contenders import ContenderSet
-from arena_newton.eval.rate_tests import LARGEST_BOSCHLOO, PairedCounts, RateDifference, UnpairedCounts
+from arena_newton.eval.rate_tests import LARGEST_BOSCHLOO, PairedCounts, UnpairedCounts
 from arena_newton.eval.records import JsonObject
+from arena_newton.eval.stats import Contrast
 from arena_newton.eval.wording import escaped, markdown_table, plain
 from arena_newton.text import counted
 
@@ -67,7 +68,7 @@ def rate_text(standing: Standing) -> tuple[str, str, str]:
     return f"{standing.successes}/{standing.episodes}", f"{100 * standing.rate:.1f}", interval
 
 
-def difference_text(difference: RateDifference) -> str:
+def difference_text(difference: Contrast) -> str:
     """A difference in points with its interval, such as `+12.0 (3 to 21)`."""
     value, low, high = (100 * part for part in (difference.value, difference.low, difference.high))
     return f"{round(value, 1) + 0.0:+.1f} ({round(low)} to {round(high)})"  # + 0.0: no -0
@@ -157,7 +158,7 @@ def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _difference(difference: RateDifference) -> list[float]:
+def _difference(difference: Contrast) -> list[float]:
     return [difference.value, difference.low, difference.high]
 
 

@@ -13,7 +13,7 @@ from arena_newton.eval.comparison import Contender
 from arena_newton.eval.document import CONFIG_FILE
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, check_whole_plan, is_complete, load_run, width_rule
+from arena_newton.eval.results import RunRecord, changed_conditions, check_whole_plan, is_complete, load_run, width_rule
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
 from arena_newton.text import counted, plain_text
 
@@ -283,8 +283,9 @@ def _trackers(one: _Gathered) -> list[str]:
 
 
 def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
-    """What differs although it need not, and what went wrong."""
-    found = []
+    """What makes runs no results of the benchmark, what differs although it need not, and what went wrong."""
+    runs = {id(played.run): played.run for one in gathered for played in one.episodes}
+    found = list(dict.fromkeys(said for run in runs.values() for said in changed_conditions(run)))
     for name in dict.fromkeys((*differ, *NOTED)):
         if not _all_alike(gathered, name):
             said = "; ".join(f"{one.name}: {' and '.join(one.values(name))}" for one in gathered)
@@ -299,7 +300,7 @@ def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
             if now is not None:
                 weights.setdefault(played.record.tracker, {})[now] = None
     found += [f"Weights of {tracker} differ: {' '.join(kept)}." for tracker, kept in weights.items() if len(kept) > 1]
-    codes = {played.run.config.get("code") for one in gathered for played in one.episodes}
+    codes = {run.config.get("code") for run in runs.values()}
     found += [f"The runs were made with {len(codes)} versions of the code."] if len(codes) > 1 else []
     found += [
         f"{what} have changed between the runs: {' '.join(sorted(versions))}, of the same tasks."

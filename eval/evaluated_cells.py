@@ -1,18 +1,21 @@
-"""Episodes of suites and of plain results folders as cells of tables: a policy, tracker, task and its conditions."""
+"""Episodes of suites, results folders and cells.csv as cells of tables: a policy, tracker, task and its conditions."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from arena_newton import seeding
+from arena_newton import seeding, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
-from arena_newton.eval.records import Json, shown
-from arena_newton.eval.results import RunRecord, check_whole_plan, is_complete, load_run
+from arena_newton.eval.records import MAX_CONFIG_BYTES, MAX_COUNT, Json, read_regular, shown
+from arena_newton.eval.results import RunRecord, changed_conditions, check_whole_plan, is_complete, load_run
 from arena_newton.eval.suite_records import SUITE_FILE, SuiteCell, load_cell, read_suite
+from arena_newton.rules import MODES
 from arena_newton.text import counted, plain_text
 
 __all__ = ["CellSet", "EvaluatedCell", "read_cells"]
@@ -30,7 +33,7 @@ class EvaluatedCell:
     """Episodes of one policy through one tracker on one task under one set of conditions."""
 
     policy: str
-    """Name of its row in tables."""
+    """Name of its row in tables; `act#2` is the second training of recipe `act`, whose first is `act` or `act#1`."""
     family: str
     """`act`, `diffusion`, `flow`, `pi05`, or another; empty where nothing is known."""
     trained_on: tuple[str, ...]
@@ -58,6 +61,18 @@ class EvaluatedCell:
     """Hash of the policy's weights, where it says one."""
     training_minutes: float | None = None
     """Time that the training of these weights took [min], where the policy says it."""
+    tallied: Mapping[str, Mapping[Hashable, bool]] | None = None
+    """Outcomes made of counts, where a file has these alone: outcome -> whether each episode ended so."""
+
+    @property
+    def recipe(self) -> str:
+        """The policy without the number of the training: trainings of one recipe differ by chance alone."""
+        return self.policy.partition("#")[0]
+
+    @property
+    def training(self) -> tuple[Hashable, ...]:
+        """Key of the network, shared by all of its cells and no others; its first part is the policy."""
+        return (self.policy, self.trained_on, "" if self.merged else self.task)
 
     @property
     def merged(self) -> bool:
@@ -71,6 +86,8 @@ class EvaluatedCell:
 
     def held(self, outcome: str = "success") -> dict[Hashable, bool]:
         """Whether each episode ended so, by group seed and repeat; a task and these two decide an episode's start."""
+        if self.tallied is not None:
+            return dict(self.tallied[outcome])
         return {(record.group_seed, record.repeat): record.outcome == outcome for record in self.records}
 
 
@@ -82,14 +99,17 @@ class CellSet:
     rules: str
     notes: tuple[str, ...]
     """What a reader of the tables must know besides them."""
+    changed: tuple[str, ...] = ()
+    """Reasons for which these episodes are no results of the benchmark: cut step budgets, a variant of the scene."""
 
 
 def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
-    """Read suites (folders with `suite.json`) and results folders.
+    """Read suites (folders with `suite.json`), results folders, and files `cells.csv` that `eval tables` wrote.
 
     Args:
         folders: Each of them.
-        rules: Rule set whose episodes count; others are left out and counted in a note.
+        rules: Rule set whose episodes count; others are left out and counted in a note. A `cells.csv` does not say
+            its own, and is taken to be of these.
 
     Raises:
         InputError: A folder holds neither or is damaged, two hold the same cell, none holds an episode under the
@@ -97,9 +117,16 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
             tracker's weights.
     """
     found: list[tuple[str, EvaluatedCell, RunRecord]] = []
+    tallied: list[EvaluatedCell] = []
     notes: list[str] = []
     for folder in folders:
-        if (folder / SUITE_FILE).is_file():
+        if folder.suffix == ".csv":
+            tallied += _of_csv(folder)
+            notes.append(
+                f"{folder} has counts alone: episodes of a training that its own and another tracker executed are "
+                "paired, all others are not, which makes intervals wider."
+            )
+        elif (folder / SUITE_FILE).is_file():
             found += _of_suite(folder, notes)
         else:
             run = load_run(folder)
@@ -114,12 +141,93 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
         number = sum(len(cell.records) for other, cell, _ in found if other != rules)
         notes.append(f"{counted(number, 'episode')} under the rules {' '.join(others)} left out.")
     kept = [(cell, run) for other, cell, run in found if other == rules]
-    if not kept:
+    if not kept and not tallied:
         where = " ".join(str(folder) for folder in folders)
         raise InputError(f"{where}: no episode under the rules {rules}" + (f", only {' '.join(others)}" * bool(others)))
-    _check_alike([run for _, run in kept])
-    notes += _conditions(kept)
-    return CellSet(_named_rows([cell for cell, _ in kept]), rules, tuple(dict.fromkeys(notes)))
+    changed: tuple[str, ...] = ()
+    if kept:
+        _check_alike([run for _, run in kept])
+        notes += _conditions(kept)
+        changed = tuple(changed_conditions(kept[0][1]))
+    named = _named_rows([*tallied, *(cell for cell, _ in kept)])
+    return CellSet(named, rules, tuple(dict.fromkeys([*changed, *notes])), changed)
+
+
+def _of_csv(path: Path) -> list[EvaluatedCell]:
+    """Our single cells without latency in a `cells.csv`, with the pairing that its table of swapped trackers has.
+
+    Raises:
+        InputError: It is missing, or no such file; the message names file and line.
+    """
+    try:
+        text = read_regular(path, MAX_CONFIG_BYTES).decode("utf-8")
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is no table of CSV ({error})") from None
+    found: dict[tuple[Hashable, ...], EvaluatedCell] = {}
+    for number, row in enumerate(rows, 2):
+        table, where = row.get("table") or "", f"{path}: line {number}"
+        if row.get("source") != "ours" or not table.startswith(("in_gmt", "cross_gmt", "merge_all")):
+            continue
+        if row.get("task") not in tasks.names() or not row.get("trained_on") or row.get("latency") != "0":
+            continue
+        cell = _of_row(where, path, row, found)
+        found[cell.training, cell.task, cell.tracker, cell.mode] = cell
+    if not found:
+        raise InputError(f"{path}: has no cell of ours in the tables in_gmt, cross_gmt or merge_all")
+    return list(found.values())
+
+
+def _of_row(
+    where: str, path: Path, row: Mapping[str, str], others: Mapping[tuple[Hashable, ...], EvaluatedCell]
+) -> EvaluatedCell:
+    """A cell from its line; a swapped one is paired with the matched one of its training among those before."""
+
+    def count(column: str) -> int:
+        text = row.get(column) or ""
+        if not text.isdecimal() or not text.isascii() or int(text[:9]) > MAX_COUNT:
+            raise InputError(f"{where}: {column} is {plain_text(text, 60)!r}, expected a number")
+        return int(text[:9])
+
+    episodes, won, mode = count("episodes"), count("successes"), row.get("mode") or ""
+    try:
+        falls = round(float(row.get("afr") or 0) * episodes)
+    except (ValueError, OverflowError):
+        falls = -1
+    if not 0 < episodes or not 0 <= won <= won + falls <= episodes or falls < 0 or mode not in MODES:
+        raise InputError(f"{where}: episodes, successes, afr or mode are none of a cell")
+    trained_on = tuple(plain_text(name, 80) for name in row["trained_on"].split("+"))
+    merged = row["table"] == "merge_all"
+    cell = EvaluatedCell(
+        policy=plain_text(row.get("policy") or "", 80),
+        family=plain_text(row.get("family") or "", 80),
+        trained_on=trained_on,
+        trained_tasks=tuple(tasks.names()) if merged else (row["task"],),
+        tracker=plain_text(row.get("tracker") or "", 80),
+        task=row["task"],
+        mode=mode,
+        labels=plain_text(row.get("labels") or "", 80),
+        latency=0,
+        replan=None,
+        ensemble=False,
+        records=(),
+        folder=path,
+    )
+    names: list[Hashable] = [(str(path), *cell.training, cell.tracker, mode, n) for n in range(episodes)]
+    wins = set(names[:won])
+    matched = others.get((cell.training, cell.task, trained_on[0], "base"))
+    if row["table"] == "cross_gmt" and matched is not None and matched.tallied is not None:
+        before = matched.tallied["success"]
+        lost, gained = count("only_first"), count("only_second")
+        first, rest = ([name for name, held in before.items() if held is side] for side in (True, False))
+        if count("pairs") == len(before) == episodes and len(first) - lost + gained == won and gained <= len(rest):
+            names, wins = [*first, *rest], {*first[: len(first) - lost], *rest[:gained]}
+    fell = [name for name in names if name not in wins][:falls]
+    ends = {"success": wins, "fall": set(fell)}
+    tallied = {outcome: {name: name in ended for name in names} for outcome, ended in ends.items()}
+    return dataclasses.replace(cell, tallied=tallied)
 
 
 def _of_suite(folder: Path, notes: list[str]) -> list[tuple[str, EvaluatedCell, RunRecord]]:
@@ -271,17 +379,18 @@ def _named_rows(cells: Sequence[EvaluatedCell]) -> tuple[EvaluatedCell, ...]:
     """Cells whose `policy` names one row: label protocols and chunk executions that differ are told apart."""
     parts: dict[str, tuple[set[str], set[object], set[bool]]] = {}
     for cell in cells:
-        labels, replans, ensembles = parts.setdefault(cell.policy, (set(), set(), set()))
+        labels, replans, ensembles = parts.setdefault(cell.recipe, (set(), set(), set()))
         labels.add(cell.labels)
         replans.add(cell.replan)
         ensembles.add(cell.ensemble)
     named = []
     for cell in cells:
-        labels, replans, ensembles = parts[cell.policy]
+        recipe, sign, number = cell.policy.partition("#")
+        labels, replans, ensembles = parts[recipe]
         words = [cell.labels] if len(labels) > 1 else []
         words += [f"replan {cell.replan}"] if len(replans) > 1 and cell.replan is not None else []
         words += ["ensemble"] if len(ensembles) > 1 and cell.ensemble else []
-        named.append(dataclasses.replace(cell, policy=" ".join([cell.policy, *words])))
+        named.append(dataclasses.replace(cell, policy=" ".join([recipe, *words]) + sign + number))
     seen: dict[tuple[object, ...], EvaluatedCell] = {}
     for cell in named:
         key = (cell.policy, cell.trained_on, cell.merged, cell.tracker, cell.task, cell.mode, cell.latency)

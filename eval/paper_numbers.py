@@ -14,7 +14,17 @@ from arena_newton.errors import InputError
 from arena_newton.eval.stats import suites, wilson
 from arena_newton.rules import MODES
 
-__all__ = ["FAMILIES", "FOLDER", "PaperNumbers", "PaperRate", "PaperTransfer", "paper_numbers", "read_paper"]
+__all__ = [
+    "FAMILIES",
+    "FOLDER",
+    "PaperNumbers",
+    "PaperRate",
+    "PaperTransfer",
+    "PublishedRow",
+    "paper_numbers",
+    "published",
+    "read_paper",
+]
 
 FOLDER = Path(__file__).parent / "paper"
 """Where the files are, with a README that says what each column means."""
@@ -251,6 +261,37 @@ def _transfers(
         _distinct(where, found, (trained_on, tracker, family, task), cell)
     _complete(path, len(found), len(directions) * len(FAMILIES) * len(suites()["ALL_AVG"]))
     return found
+
+
+@dataclass(frozen=True)
+class PublishedRow:
+    """Success rates of base mode that others published of a policy of theirs, as they report them."""
+
+    policy: str
+    tracker: str
+    source: str
+    """Where the numbers are from, with the date."""
+    simulator: str
+    rates: Mapping[str, float]
+    """By task, from 0 to 1."""
+
+    def __str__(self) -> str:
+        return f"{self.policy} by its authors ({self.source}) in {self.simulator}"
+
+
+@functools.cache
+def published() -> tuple[PublishedRow, ...]:
+    """Rows of `published.csv`: what stands on the original's leaderboard beside the paper.
+
+    Raises:
+        InputError: The file is missing or damaged; the message names file and line.
+    """
+    path, columns = FOLDER / "published.csv", ("policy", "tracker", "source", "simulator", "task", "sr_pct")
+    found: dict[tuple[str, str, str, str], dict[str, float]] = {}
+    for where, row in _rows(path, columns):
+        rates = found.setdefault((row["policy"], row["tracker"], row["source"], row["simulator"]), {})
+        _distinct(where, rates, _one_of(where, row, "task", suites()["ALL_AVG"]), _fraction(where, row, "sr_pct"))
+    return tuple(PublishedRow(*key, rates) for key, rates in found.items())
 
 
 @functools.cache

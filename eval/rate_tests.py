@@ -1,4 +1,4 @@
-"""Exact tests and intervals of two success rates, paired by episode or not, over one task or several.
+"""Exact tests of two success rates, paired by episode or not, over one task or several.
 
 Pure: counts in, probabilities out. Needs SciPy, for one test.
 """
@@ -6,7 +6,6 @@ Pure: counts in, probabilities out. Needs SciPy, for one test.
 from __future__ import annotations
 
 import functools
-import math
 import string
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -17,17 +16,14 @@ import numpy.typing as npt
 from scipy.stats import boschloo_exact
 
 from arena_newton.eval.stats import mcnemar
-from arena_newton.intervals import Z95
 
 __all__ = [
     "LARGEST_BOSCHLOO",
     "PairedCounts",
-    "RateDifference",
     "TestOfRates",
     "UnpairedCounts",
     "excess",
     "letters",
-    "mean_difference",
     "rate_test",
     "stratified_test",
 ]
@@ -172,46 +168,6 @@ def excess(strata: Sequence[Counts]) -> float:
         elif episodes := counts.first_episodes + counts.second_episodes:
             found += counts.first - Fraction((counts.first + counts.second) * counts.first_episodes, episodes)
     return float(found)
-
-
-@dataclass(frozen=True)
-class RateDifference:
-    """First rate minus second, averaged over strata, and its 95 % interval, each from -1 to 1."""
-
-    value: float
-    low: float
-    high: float
-
-
-def mean_difference(strata: Sequence[Counts]) -> RateDifference | None:
-    """Mean over strata, each counting the same, of the difference of the rates; None without episodes.
-
-    The interval is normal, from counts to which made episodes are added, as many successes as failures. Of one stratum
-    it is that of Agresti, A. and Min, Y. (2005), Simple improved confidence intervals for comparing matched
-    proportions, Statistics in Medicine 24, where episodes are paired, and otherwise that of Agresti, A. and Caffo, B.
-    (2000), Simple and effective confidence intervals for proportions, The American Statistician 54: two made episodes
-    of each condition move its middle and widen it. Of several strata each has these two in its variance, while the two
-    that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004), An improved confidence interval
-    for a linear function of binomial proportions, Computational Statistics & Data Analysis 45; two in each stratum
-    would draw the middle of many small ones to 0.
-    """
-    if not strata or any(not counts.first_episodes or not counts.second_episodes for counts in strata):
-        return None
-    value, middle, variance, made = Fraction(), 0.0, 0.0, 2.0 / len(strata)
-    for counts in strata:
-        n, m = counts.first_episodes, counts.second_episodes
-        value += Fraction(counts.first, n) - Fraction(counts.second, m)
-        middle += (counts.first + made / 2) / (n + made) - (counts.second + made / 2) / (m + made)
-        if isinstance(counts, PairedCounts):
-            differing = counts.only_first + counts.only_second + 1
-            mean = (counts.only_first - counts.only_second) / (n + 2)
-            variance += (differing - (n + 2) * mean * mean) / (n + 2) ** 2
-        else:
-            first, second = (counts.first + 1) / (n + 2), (counts.second + 1) / (m + 2)
-            variance += first * (1 - first) / (n + 2) + second * (1 - second) / (m + 2)
-    number = len(strata)
-    half = Z95 * math.sqrt(variance) / number
-    return RateDifference(float(value / number), max(-1.0, middle / number - half), min(1.0, middle / number + half))
 
 
 def letters(number: int, differing: Collection[tuple[int, int]]) -> list[str]:

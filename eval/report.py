@@ -11,7 +11,7 @@ from arena_newton.eval.failure_text import failures_markdown
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.learned_row import ROW_FOLDER, row_results
 from arena_newton.eval.original_format import write_original
-from arena_newton.eval.results import Results, RunRecord, results_json, width_rule
+from arena_newton.eval.results import Results, RunRecord, changed_conditions, results_json, width_rule
 from arena_newton.eval.rounds import LOOK_EVERY
 from arena_newton.eval.stats import ResultCell, Suite, error_reasons, outside_suites
 from arena_newton.eval.wording import (
@@ -148,10 +148,7 @@ def notes(run: RunRecord, results: Results) -> list[str]:
         found.append(f"The policy looks again after {counted(replan, 'action')} of each chunk.")
     if results["config"].get("ensemble"):
         found.append("At each tick the mean of all chunks that cover it is executed.")
-    cap = results["config"]["max_steps"]
-    if cap is not None:
-        found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")
-    return found
+    return found + changed_conditions(run)
 
 
 def _code(text: object) -> str:

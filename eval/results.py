@@ -14,10 +14,13 @@ from arena_newton.eval.failure_counts import FailureCell, failure_cells
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.sharding import read_shard
 from arena_newton.eval.stats import Aggregate, aggregate
+from arena_newton.robot import TICK
+from arena_newton.text import plain_text
 
 __all__ = [
     "Results",
     "RunRecord",
+    "changed_conditions",
     "check_whole_plan",
     "due_episodes",
     "in_plan_order",
@@ -99,6 +102,17 @@ def check_whole_plan(run: RunRecord) -> None:
     shard = run.document.get("shard")
     if shard is not None:
         raise InputError(f"{run.folder}: is shard {shard} of a run; name the folder into which eval merge joins all")
+
+
+def changed_conditions(run: RunRecord) -> list[str]:
+    """Reasons for which a run is no result of the benchmark, in sentences: cut step budgets, a variant of the scene."""
+    found, cap = [], run.config.get("max_steps")
+    if cap is not None:
+        found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")
+    if run.config.get("variant") is not None:
+        name = plain_text(run.document["options"].get("variant") or run.config["variant"], 200)
+        found.append(f"The scene is the variant {name}: no benchmark result.")
+    return found
 
 
 def is_complete(run: RunRecord) -> bool:

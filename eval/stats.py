@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TypedDict
 
 from arena_newton import intervals, tasks
@@ -34,6 +36,7 @@ __all__ = [
     "seed_rates",
     "suites",
     "wilson",
+    "within",
 ]
 
 type Outcomes = Mapping[Hashable, bool]
@@ -299,48 +302,85 @@ class Contrast:
     value: float
     low: float
     high: float
+    middle: float
+    """Of the interval: the sum with made episodes."""
+    error: float
+    """Standard error."""
     strata: int
-    """Groups of paired episodes, usually tasks."""
+    """Groups of episodes, usually tasks."""
     episodes: int
-    """Paired episodes over all groups; each was played under every condition of its group."""
+    """Over all groups; those that several conditions share count once."""
     unpaired: int
-    """Episodes that some condition of their group lacks; they are left out."""
+    """Episodes that some condition lacks which shares others with theirs; they are left out."""
 
 
 def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | None:
-    """Sum of weight x rate over conditions whose episodes are paired within a stratum, and its interval.
+    """Sum of weight x rate over conditions in strata, and its interval; the one of every difference of rates.
 
-    The interval is normal, from the spread of the episodes' own sums within each stratum, so conditions that share
-    episodes may correlate. Two made episodes a stratum, whose outcomes are as those of fair coins, keep it from closing
-    where nothing varies: of one difference of two rates it is as wide as that of Agresti, A. and Min, Y. (2005), Simple
-    improved confidence intervals for comparing matched proportions, Statistics in Medicine 24. Its middle is the
-    observed sum, while theirs, and that of `rate_tests.mean_difference`, is moved by the two, which matters where
-    episodes are few: of 60 it is 1/31 of the difference.
+    Conditions of a stratum that share episodes are paired: those that all of them have count. Those that share none are
+    independent. The interval is normal, from the spread of the episodes' own sums. Two made episodes, whose outcomes
+    are as those of fair coins, keep it from closing where nothing varies. Of one difference it is that of Agresti, A.
+    and Min, Y. (2005), Simple improved confidence intervals for comparing matched proportions, Statistics in Medicine
+    24, where paired, and of Agresti, A. and Caffo, B. (2000), Simple and effective confidence intervals for
+    proportions, The American Statistician 54, where not. Of several strata each has the two in its variance, while the
+    two that move the middle are shared out, as by Price, R. M. and Bonett, D. G. (2004), An improved confidence
+    interval for a linear function of binomial proportions, Computational Statistics & Data Analysis 45; two in each
+    stratum would draw the middle of many small ones to 0. It covers other episodes of the same networks, no other
+    trainings: those `trainings.trained_contrast` adds.
 
     Args:
-        strata: Of each group of paired episodes its conditions: weight and outcomes.
+        strata: Of each its conditions: weight and outcomes.
 
     Returns:
-        None where a stratum has no episode that all its conditions played.
+        None where a stratum has a condition without an episode, or no episode that all which share some have.
     """
-    value = variance = 0.0
+    exact, middle, variance = Fraction(), 0.0, 0.0
     episodes = unpaired = 0
     for conditions in strata:
-        common = set.intersection(*(set(outcomes) for _, outcomes in conditions)) if conditions else set()
-        if not common:
+        blocks = _sharing(conditions)
+        for block in blocks:
+            common = set(block[0][1]).intersection(*(outcomes for _, outcomes in block[1:]))
+            if not common:
+                return None
+            n, made = len(common), 2 / len(strata)
+            ends = Counter(zip(*(map(outcomes.__getitem__, common) for _, outcomes in block), strict=True))
+            weights = [weight for weight, _ in block]
+            sums = [(math.fsum(itertools.compress(weights, end)), times) for end, times in ends.items()]
+            both = math.fsum(weights)
+            total = math.fsum(times * one for one, times in sums)
+            shrunk = (total + both) / (n + 2)
+            coin = math.fsum(weight * weight for weight in weights) / 4
+            squares = math.fsum(times * (one - shrunk) ** 2 for one, times in sums)
+            variance += (squares + 2 * (coin + (both / 2 - shrunk) ** 2)) / (n + 2) ** 2
+            middle += (total + both * made / 2) / (n + made)
+            for weight, outcomes in block:
+                exact += Fraction(weight) * Fraction(sum(map(outcomes.__getitem__, common)), n)
+            episodes += n
+            unpaired += len(set().union(*(outcomes for _, outcomes in block))) - n
+        if not blocks:
             return None
-        sums = [sum(weight * outcomes[key] for weight, outcomes in conditions) for key in common]
-        n = len(sums)
-        mean = math.fsum(sums) / n
-        shrunk = (n * mean + math.fsum(weight for weight, _ in conditions)) / (n + 2)
-        coin = math.fsum(weight * weight for weight, _ in conditions) / 4
-        centre = math.fsum(weight for weight, _ in conditions) / 2
-        squares = math.fsum((one - shrunk) ** 2 for one in sums) + 2 * (coin + (centre - shrunk) ** 2)
-        value += mean
-        variance += squares / (n + 2) ** 2
-        episodes += n
-        unpaired += len(set().union(*(set(outcomes) for _, outcomes in conditions))) - n
     if not strata:
         return None
-    half = intervals.Z95 * math.sqrt(variance)
-    return Contrast(value, value - half, value + half, len(strata), episodes, unpaired)
+    error = math.sqrt(variance)
+    low, high = within(strata, middle - intervals.Z95 * error, middle + intervals.Z95 * error)
+    return Contrast(float(exact), low, high, middle, error, len(strata), episodes, unpaired)
+
+
+def within(strata: Sequence[Sequence[tuple[float, Outcomes]]], low: float, high: float) -> tuple[float, float]:
+    """An interval without what no rates can give."""
+    weights = [weight for conditions in strata for weight, _ in conditions]
+    return max(low, math.fsum(min(0.0, w) for w in weights)), min(high, math.fsum(max(0.0, w) for w in weights))
+
+
+def _sharing(conditions: Sequence[tuple[float, Outcomes]]) -> list[list[tuple[float, Outcomes]]]:
+    """Conditions in groups that share episodes, one with another or through a third."""
+    groups: list[list[tuple[float, Outcomes]]] = []
+    for condition in conditions:
+        joined, others = [condition], list[list[tuple[float, Outcomes]]]()
+        for group in groups:
+            if all(condition[1].keys().isdisjoint(outcomes) for _, outcomes in group):
+                others.append(group)
+            else:
+                joined += group
+        groups = [*others, joined]
+    return groups

@@ -310,8 +310,9 @@ def _check_names(where: str, values: Sequence[str], known: Sequence[str]) -> Non
 
 def _policy(where: str, table: Mapping[str, Json]) -> PolicyEntry:
     entry = PolicyEntry(**_values(where, table, PolicyEntry))
-    if not re.fullmatch(r"[A-Za-z0-9+_-]{1,64}", entry.name):
-        raise InputError(f"{where}: name is {shown(entry.name)}, expected letters, digits, _ - and +")
+    if not re.fullmatch(r"[A-Za-z0-9+_-]{1,64}(#[1-9][0-9]{0,3})?", entry.name):
+        expected = "letters, digits, _ - and +; #2 at the end for a second training of one recipe"
+        raise InputError(f"{where}: name is {shown(entry.name)}, expected {expected}")
     where = f"{where} ({entry.name})"
     if not entry.spec or len(entry.spec) > 400:
         raise InputError(

@@ -68,7 +68,7 @@ type CellState = Literal["waiting", "started", "done", "failed"]
 """`waiting`: nothing was played; `started`: is being played, or was killed or interrupted; `done`: every planned
 episode is in its journal, episodes with errors counted; `failed`: it could not be played, `error` says why."""
 
-_FOLDER = re.compile(r"[A-Za-z0-9+_-][A-Za-z0-9.+_-]*(?:/[A-Za-z0-9+_-][A-Za-z0-9.+_-]*){0,7}")
+_FOLDER = re.compile(r"[A-Za-z0-9+_-][A-Za-z0-9.+_#-]*(?:/[A-Za-z0-9+_-][A-Za-z0-9.+_#-]*){0,7}")
 
 Text = Annotated[str, Fit("text of at most 512 characters", lambda value: len(value) <= 512)]
 Folder = Annotated[str, Fit("a path below the suite's folder", lambda value: bool(_FOLDER.fullmatch(value)))]

@@ -9,12 +9,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+from arena_newton import tasks
 from arena_newton.eval.cost_table import cost_table
 from arena_newton.eval.evaluated_cells import EvaluatedCell
-from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate
-from arena_newton.eval.stats import contrast, holm, paired_rates, suites
+from arena_newton.eval.paired_rows import PAIRED, RowPair, paired_rows
+from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate, PublishedRow, published
+from arena_newton.eval.stats import contrast, paired_rates, suites
 from arena_newton.eval.table_entries import (
     PAPER_NAMES,
+    SEMANTIC_STRENGTH,
     UNDEFINED,
     SuiteTable,
     TableEntry,
@@ -25,8 +28,12 @@ from arena_newton.eval.table_entries import (
     percent,
     points,
     probability,
+    published_entry,
     rate_text,
+    semantic_text,
+    task_title,
 )
+from arena_newton.eval.trainings_table import trainings_table
 
 __all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 
@@ -34,20 +41,32 @@ MODE_ORDER = ("base", "visual", "semantic", "execution")
 """Order of the paper's columns."""
 HALVES = ("HOI_AVG", "HSI_AVG")
 SHORT = {"HOI_AVG": "HOI avg", "HSI_AVG": "HSI avg"}
-INTERVALS = (
+OURS = (
     "Success rate in %: mean ± population std over seeds, in parentheses the 95 % interval (Wilson's of a cell; of an "
-    "average from the spread of its episodes). n: episodes of a cell. AFR: falls of all episodes of the row. Rows of "
-    "the paper: as printed; their intervals are derived from rate × episodes. Empty: not evaluated."
+    "average from the spread of its episodes). n: episodes of a cell. AFR: falls of all episodes of the row. Empty: "
+    "not evaluated."
+)
+INTERVALS = (
+    f"{OURS} Intervals are of these networks, and leave out how much trainings differ. Rows of the paper: as printed; "
+    "their intervals are derived from rate × episodes."
 )
 
 
-def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[SuiteTable]:
-    """All tables that the cells can fill, in the paper's order; those without an entry of ours are left out."""
+def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers, changed: Sequence[str] = ()) -> list[SuiteTable]:
+    """All tables that the cells can fill, in the paper's order; those without an entry of ours are left out.
+
+    `changed` says why episodes are no results of the benchmark: each table begins with it, and none has numbers of
+    others, which were played under the rules.
+    """
+    if changed:
+        paper = PaperNumbers({}, {}, {})
+    cells = [cell for cell in cells if cell.records]
     prompt = [cell for cell in cells if cell.latency == 0]
-    found: list[SuiteTable | None] = [
-        _in_gmt(prompt, paper, mode) for mode in _ordered({c.mode for c in prompt}, MODE_ORDER)
-    ]
+    modes = _ordered({c.mode for c in prompt}, MODE_ORDER)
+    found: list[SuiteTable | None] = [_in_gmt(prompt, paper, mode) for mode in modes]
+    found += [_untrained(prompt, mode) for mode in modes]
     found += [
+        trainings_table(prompt),
         _best(prompt, paper),
         _families(prompt),
         _perturbation(prompt, paper),
@@ -57,13 +76,13 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> list[Su
         _labels(prompt),
         cost_table(cells),
     ]
-    return [_with_rules(table) for table in found if table is not None]
+    return [_with_rules(table, changed) for table in found if table is not None]
 
 
-def _with_rules(table: SuiteTable) -> SuiteTable:
-    """The table without groups that have no row."""
+def _with_rules(table: SuiteTable, changed: Sequence[str]) -> SuiteTable:
+    """The table without groups that have no row, and with what makes it no result in front of its caption."""
     begun = dict.fromkeys(number for number in table.groups if number < len(table.rows))
-    return dataclasses.replace(table, groups=tuple(begun))
+    return dataclasses.replace(table, groups=tuple(begun), caption=" ".join([*changed, table.caption]))
 
 
 def tracker_order(names: set[str]) -> list[str]:
@@ -88,11 +107,7 @@ def _tasks(cells: Sequence[EvaluatedCell]) -> list[str]:
 
 def _in_gmt_cells(cells: Sequence[EvaluatedCell], mode: str = "base") -> list[EvaluatedCell]:
     """Cells of policies of one task's demonstrations that were executed by the tracker of their training."""
-    return [cell for cell in cells if cell.mode == mode and cell.matched and not cell.merged]
-
-
-def _title(task: str) -> str:
-    return {"pp_box": "P&PBox"}.get(task, "".join(word.capitalize() for word in task.split("_")))
+    return [cell for cell in cells if cell.mode == mode and cell.trained_on and cell.matched and not cell.merged]
 
 
 def _rate_columns(cells: Sequence[EvaluatedCell]) -> tuple[str, ...]:
@@ -163,10 +178,61 @@ def _in_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers, mode: str) -> S
                 texts, found = _paper_row(name, printed)
                 rows.append((tracker, PAPER_NAMES[family], "paper", *texts))
                 entries += found
-    head = ("tracker", "policy", "source", "n", "AFR", *(SHORT.get(c, _title(c)) for c in columns))
+        for other in _published(paper, tracker, mode):
+            found = [published_entry(name, other, task) for task in columns if task in other.rates]
+            texts = [percent(other.rates[task]) if task in other.rates else "" for task in columns]
+            rows.append((tracker, other.policy, "self-reported", "", "", *texts))
+            entries += found
+    named = [SHORT.get(c, task_title(c)) + _change(mode, c) for c in columns]
     title = "In-GMT evaluation" + ("" if mode == "base" else f", mode {mode}")
-    caption = f"Policies executed by the tracker of their training. {INTERVALS}"
+    about = _reported(paper) if mode == "base" else _about(mode)
+    caption = f"Policies executed by the tracker of their training. {INTERVALS}{about}"
+    head = ("tracker", "policy", "source", "n", "AFR", *named)
     return SuiteTable(name, title, caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
+
+
+def _published(paper: PaperNumbers, tracker: str, mode: str) -> list[PublishedRow]:
+    """Rows of others, in base mode; none where the paper's have no place."""
+    return [row for row in published() if paper.in_gmt and (row.tracker, mode) == (tracker, "base")]
+
+
+def _change(mode: str, task: str) -> str:
+    """Change that semantic mode makes in a task, to follow its name."""
+    change = tasks.get(task).semantic_change if mode == "semantic" and task in tasks.names() else None
+    return f" ({change})" if change else ""
+
+
+def _about(*modes: str) -> str:
+    """Sentences for a reader of numbers of semantic mode."""
+    return f" {semantic_text()} {SEMANTIC_STRENGTH}" if "semantic" in modes else ""
+
+
+def _reported(paper: PaperNumbers) -> str:
+    """Sentences that name whose the rows are which others published."""
+    return "".join(f" Self-reported: {row}." for row in published() if paper.in_gmt)
+
+
+def _untrained(cells: Sequence[EvaluatedCell], mode: str) -> SuiteTable | None:
+    """Policies without training, such as the expert, which no tracker is the own one of."""
+    mine = [cell for cell in cells if cell.mode == mode and not cell.trained_on]
+    if not mine:
+        return None
+    name = "untrained" if mode == "base" else f"untrained_{mode}"
+    columns = _rate_columns(mine)
+    rows: list[tuple[str, ...]] = []
+    entries: list[TableEntry] = []
+    groups = []
+    for tracker in tracker_order({cell.tracker for cell in mine}):
+        groups.append(len(rows))
+        here = [cell for cell in mine if cell.tracker == tracker]
+        for policy, family in _policies(here):
+            texts, found = _rate_row(name, [c for c in here if (c.policy, c.family) == (policy, family)], columns)
+            rows.append((tracker, policy, *texts))
+            entries += found
+    title = "Policies without training" + ("" if mode == "base" else f", mode {mode}")
+    head = ("tracker", "policy", "n", "AFR", *(SHORT.get(c, task_title(c)) + _change(mode, c) for c in columns))
+    caption = f"Policies that were not trained, or do not say on what. {OURS}{_about(mode)}"
+    return SuiteTable(name, title, caption, head, 2, tuple(rows), tuple(groups), tuple(entries))
 
 
 def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:
@@ -185,7 +251,7 @@ def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | N
                 continue
             top = max(here, key=lambda entry: (entry.sr or 0.0, entry.policy))
             entries.append(top)
-            row = [tracker, _title(task), top.policy, f"{top.successes}/{top.episodes}", rate_text(top)]
+            row = [tracker, task_title(task), top.policy, f"{top.successes}/{top.episodes}", rate_text(top)]
             if (tracker, "base", "act", task) in paper.in_gmt:
                 rate = paper.best(tracker, task)
                 theirs = paper_entry("best", rate)
@@ -196,76 +262,18 @@ def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | N
                 row.append(above)
             else:
                 row += ["", "", "", ""]
+            reported = [one for one in _published(paper, tracker, "base") if task in one.rates]
+            row.append(", ".join(f"{one.policy} {percent(one.rates[task])}" for one in reported))
+            entries += [published_entry("best", one, task) for one in reported]
             rows.append(tuple(row))
-    head = ("tracker", "task", "best of ours", "won", "rate", "best of the paper", "won", "rate", "ours is")
+    theirs_head = ("best of the paper", "won", "rate", "ours is", "self-reported")
+    head = ("tracker", "task", "best of ours", "won", "rate", *theirs_head)
     caption = (
         "The policy with the highest rate of each task, mode base. Apart: our interval is above the paper's. Choosing "
         "the highest of several favours it, on both sides. The paper's successes are derived from its rates."
+        f"{_reported(paper)}"
     )
     return SuiteTable("best", "Best policy per task", caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Pair:
-    """Two conditions on the same episodes: cells, the columns that name them, and what the paper says."""
-
-    first: EvaluatedCell
-    second: EvaluatedCell
-    named: tuple[str, ...]
-    paper: tuple[str, ...] = ()
-
-
-def _paired(table: str, pairs: Sequence[_Pair]) -> tuple[list[tuple[str, ...]], list[TableEntry]]:
-    """Rows and entries of pairs: rates over common episodes, difference, retention, test and adjusted test."""
-    results = [paired_rates(pair.first.held(), pair.second.held()) for pair in pairs]
-    tested = [r.p for r in results if r.p is not None]
-    adjusted = iter(holm(tested))
-    rows: list[tuple[str, ...]] = []
-    entries: list[TableEntry] = []
-    for pair, r in zip(pairs, results, strict=True):
-        found = contrast([[(1.0, pair.first.held()), (-1.0, pair.second.held())]])
-        if found is None or r.first is None or r.second is None:
-            rows.append((*pair.named, "0", *[""] * 8, *pair.paper))
-            continue
-        p_holm = next(adjusted)
-        retention = r.second / r.first if r.first > 0 else None
-        entry = dataclasses.replace(
-            ours(table, pair.second),
-            matched_sr=r.first,
-            drop=found.value,
-            drop_low=found.low,
-            drop_high=found.high,
-            retention=retention,
-            pairs=r.pairs,
-            unpaired=r.unpaired,
-            only_first=r.only_first,
-            only_second=r.only_second,
-            p=r.p,
-            p_holm=p_holm,
-        )
-        entries.append(entry)
-        rows.append(
-            (
-                *pair.named,
-                str(r.pairs),
-                percent(r.first),
-                percent(r.second),
-                f"{points(found.value)} {interval_text(found.low, found.high)}",
-                percent(retention) if retention is not None else UNDEFINED,
-                f"{r.only_first}/{r.only_second}",
-                probability(r.p),
-                probability(p_holm),
-                percent(entry.afr or 0.0, 2),
-                *pair.paper,
-            )
-        )
-    return rows, entries
-
-
-PAIRED = (
-    "Over the n episodes that both played: rates in %, their difference Δ in points with 95 % interval, successes of "
-    "the first / of the second alone, p of the exact McNemar test, and adjusted for the tests of this table (Holm). "
-)
 
 
 def _families(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
@@ -275,22 +283,26 @@ def _families(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
     for tracker in tracker_order({cell.tracker for cell in mine}):
         groups.append(len(pairs))
         for task in _tasks(mine):
-            here = {c.policy: c for c in mine if (c.tracker, c.task) == (tracker, task)}
-            ranked = [here[policy] for policy, _ in _policies(list(here.values()))]
+            here: dict[str, EvaluatedCell] = {}
+            for cell in mine:
+                if (cell.tracker, cell.task) == (tracker, task):
+                    here.setdefault(cell.recipe, cell)  # of several trainings the first
+            order = [policy for policy, _ in _policies(list(here.values()))]
+            ranked = sorted(here.values(), key=lambda cell: order.index(cell.policy))
             for number, first in enumerate(ranked):
                 pairs += [
-                    _Pair(first, second, (tracker, _title(task), first.policy, second.policy))
+                    RowPair(first, second, (tracker, task_title(task), first.policy, second.policy))
                     for second in ranked[number + 1 :]
                 ]
     if not pairs:
         return None
-    rows, entries = _paired("families", pairs)
+    rows, entries = paired_rows("families", pairs)
     rows = [(*row[:8], *row[9:-1]) for row in rows]
     head = ("tracker", "task", "first", "second", "n", "first %", "second %", "Δ", "alone", "p", "p (Holm)")
     return SuiteTable(
         "families",
         "Policies against each other",
-        PAIRED + "In-GMT, mode base.",
+        PAIRED + "In-GMT, mode base, of a recipe its first training. They tell networks apart, no families.",
         head,
         4,
         tuple(rows),
@@ -321,10 +333,10 @@ def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
                         whole = paper.in_gmt[a, "base", family, task].sr > 0
                         kept = percent(theirs.retention) if whole else UNDEFINED
                         said = (points(theirs.drop), kept, percent(theirs.task_afr, 2))
-                    pairs.append(_Pair(base, cell, (f"{a} → {b}", _title(task), policy), said))
+                    pairs.append(RowPair(base, cell, (f"{a} → {b}", task_title(task), policy), said))
     if not pairs:
         return None
-    rows, entries = _paired("cross_gmt", pairs)
+    rows, entries = paired_rows("cross_gmt", pairs)
     entries += _paper_transfers(pairs, paper)
     head = ("direction", "task", "policy", "n", "matched %", "swapped %", "Δ", "Ret %", "alone", "p", "p (Holm)", "AFR")
     heads = (*head, "paper Δ", "paper Ret %", "paper AFR")
@@ -337,7 +349,7 @@ def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
     )
 
 
-def _paper_transfers(pairs: Sequence[_Pair], paper: PaperNumbers) -> list[TableEntry]:
+def _paper_transfers(pairs: Sequence[RowPair], paper: PaperNumbers) -> list[TableEntry]:
     found = {}
     for pair in pairs:
         key = (pair.first.tracker, pair.second.tracker, pair.second.family, pair.second.task)
@@ -398,7 +410,7 @@ def _perturbation(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteT
     head = ("tracker", "policy", "source", "suite", *modes)
     caption = (
         "Mean success rate in % over a suite's tasks that were played in every mode shown, and its change from base in "
-        "points with the 95 % interval over paired episode seeds."
+        f"points with the 95 % interval over paired episode seeds.{_about(*modes)}"
     )
     return SuiteTable(
         "perturbation", "Perturbation profile", caption, head, 4, tuple(rows), tuple(groups), tuple(entries)
@@ -483,7 +495,7 @@ def _merge_all(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
                 texts, found = _paper_row("merge_all", printed, "+".join(trained_on))
                 rows.append((known.replace("x", " ×"), PAPER_NAMES[family], "paper", *texts))
                 entries += found
-    head = ("training", "policy", "source", "n", "AFR", *(SHORT.get(c, _title(c)) for c in columns))
+    head = ("training", "policy", "source", "n", "AFR", *(SHORT.get(c, task_title(c)) for c in columns))
     caption = (
         "Policies of merged demonstrations; those of several trackers are executed by each of them and pooled, as in "
         f"the paper. {INTERVALS}"
@@ -524,7 +536,7 @@ def _latency(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
                         text += f", p {probability(r.p)}" if r.p is not None else ""
                     entries.append(entry)
                     texts.append(text)
-                rows.append((tracker, policy, _title(task), *texts))
+                rows.append((tracker, policy, task_title(task), *texts))
     if not rows:
         return None
     head = ("tracker", "policy", "task", *(f"{20 * delay} ms" for delay in delays))
@@ -550,19 +562,20 @@ def _labels(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
                         alike = (first.family, first.merged) == (second.family, second.merged)
                         if alike and (first.labels, second.labels) == ("v3.1", "v4"):
                             kind = "matched" if tracker in trained_on else "swapped"
-                            words = ("+".join(trained_on), tracker, kind, _title(task), first.policy, second.policy)
-                            pairs.append(_Pair(first, second, words))
+                            words = ("+".join(trained_on), tracker, kind, task_title(task), first.policy, second.policy)
+                            pairs.append(RowPair(first, second, words))
             groups += [begun] if len(pairs) > begun else []
     if not pairs:
         return None
-    rows, entries = _paired("labels", pairs)
+    rows, entries = paired_rows("labels", pairs)
     rows = [(*row[:10], *row[11:-1]) for row in rows]
     named = ("trained on", "tracker", "", "task", "v3.1 policy", "v4 policy")
     head = (*named, "n", "v3.1 %", "v4 %", "Δ", "alone", "p", "p (Holm)")
     return SuiteTable(
         "labels",
         "Label protocols",
-        PAIRED + "Δ: v3.1 minus v4. The paper has labels of v3.1 only.",
+        PAIRED + "Δ: v3.1 minus v4. They tell networks apart, no labels: trainings of one recipe differ too. The paper "
+        "has labels of v3.1 only.",
         head,
         6,
         tuple(rows),

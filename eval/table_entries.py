@@ -7,12 +7,15 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from arena_newton import tasks
 from arena_newton.eval.evaluated_cells import EvaluatedCell
-from arena_newton.eval.paper_numbers import PaperRate
-from arena_newton.eval.stats import Contrast, contrast, population_std, seed_rates, wilson
+from arena_newton.eval.paper_numbers import PaperRate, PublishedRow
+from arena_newton.eval.stats import Contrast, contrast, population_std, seed_rates, suites, wilson
 
 __all__ = [
     "PAPER_NAMES",
+    "SEMANTIC_CHANGES",
+    "SEMANTIC_STRENGTH",
     "UNDEFINED",
     "SuiteTable",
     "TableEntry",
@@ -22,12 +25,26 @@ __all__ = [
     "paper_entry",
     "percent",
     "points",
+    "published_entry",
     "probability",
     "rate_text",
+    "semantic_text",
+    "task_title",
 ]
 
 PAPER_NAMES = {"act": "ACT", "diffusion": "DP", "flow": "FM", "pi05": "π0.5"}
 """Family → how the paper's tables name it."""
+SEMANTIC_STRENGTH = (
+    "How strong these shifts are was chosen here (bricks, wood, a blue sofa; the original's files were not at hand): "
+    "how much a policy loses cannot be compared with the paper, only the direction."
+)
+"""Sentence of every table of numbers of semantic mode."""
+SEMANTIC_CHANGES = {
+    "texture": "textures and colours in",
+    "shape": "the shape of something that is drawn and not touched in",
+    "clutter": "things that are added in",
+}
+"""Change that semantic mode makes → words for it."""
 UNDEFINED = "—"
 """Shown where a number is undefined, such as a retention of nothing."""
 
@@ -38,7 +55,7 @@ class TableEntry:
 
     table: str
     source: str
-    """`ours` or `paper`."""
+    """`ours`, `paper` or `self-reported`."""
     policy: str
     family: str
     trained_on: str = ""
@@ -96,6 +113,20 @@ class SuiteTable:
     groups: tuple[int, ...]
     """Numbers of the rows that begin a group; a rule is drawn above them."""
     entries: tuple[TableEntry, ...]
+
+
+def task_title(task: str) -> str:
+    """A task as the paper's tables name it, such as `DoubleDesk`."""
+    return {"pp_box": "P&PBox"}.get(task, "".join(word.capitalize() for word in task.split("_")))
+
+
+def semantic_text() -> str:
+    """Sentence that names what semantic mode changes in which of the paper's tasks."""
+    parts = []
+    for change, words in SEMANTIC_CHANGES.items():
+        named = [task_title(name) for name in suites()["ALL_AVG"] if tasks.get(name).semantic_change == change]
+        parts += [f"{words} {', '.join(named)}"] if named else []
+    return f"Semantic mode changes looks, no object of a task: {'; '.join(parts)}."
 
 
 def percent(value: float, digits: int = 1) -> str:
@@ -198,8 +229,8 @@ def ours_average(table: str, name: str, cells: Sequence[EvaluatedCell], tasks: I
         successes=sum(record.outcome == "success" for record in records),
         sr=math.fsum(rates) / len(rates),
         sr_std=population_std(rates),
-        low=max(0.0, found.low) if found else None,
-        high=min(1.0, found.high) if found else None,
+        low=found.low if found else None,
+        high=found.high if found else None,
         afr=sum(record.outcome == "fall" for record in records) / len(records),
     )
     known = _known(chosen[0]) | {"task": name, "tracker": "+".join(dict.fromkeys(cell.tracker for cell in chosen))}
@@ -227,4 +258,17 @@ def paper_entry(table: str, rate: PaperRate, trained_on: str = "") -> TableEntry
         high=high,
         derived=True,
         afr=rate.afr,
+    )
+
+
+def published_entry(table: str, row: PublishedRow, task: str) -> TableEntry:
+    """A rate that others published of a policy of theirs; its number of episodes is not known."""
+    return TableEntry(
+        table=table,
+        source="self-reported",
+        policy=row.policy,
+        family="",
+        tracker=row.tracker,
+        task=task,
+        sr=row.rates[task],
     )

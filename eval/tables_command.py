@@ -7,8 +7,8 @@ from pathlib import Path
 
 from arena_newton import rule_sets
 from arena_newton.errors import InputError
-from arena_newton.eval import paper_claims, table_text
-from arena_newton.eval.evaluated_cells import read_cells
+from arena_newton.eval import findings_text, paper_claims, table_text
+from arena_newton.eval.evaluated_cells import CellSet, read_cells
 from arena_newton.eval.journal import StorageError, write_atomic
 from arena_newton.eval.paper_numbers import paper_numbers
 from arena_newton.eval.suite_tables import suite_tables
@@ -17,6 +17,9 @@ from arena_newton.extras import require
 from arena_newton.flags import user_path
 
 __all__ = ["run"]
+
+BEGIN, END = "<!-- findings: written by eval tables --findings -->", "<!-- end of findings -->"
+"""Lines of a README.md between which the table of findings is written."""
 
 
 def run(folders: Sequence[Path], options: TablesOptions) -> int:
@@ -34,9 +37,14 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
         require("plots", "eval tables --format png", ("matplotlib",))
     cells = read_cells(folders, options.rules)
     paper = paper_numbers()
-    tables = suite_tables(cells.cells, paper)
-    if not tables:
-        raise InputError(f"{folders[0]}: holds no cell of any table (policies executed by another tracker only)")
+    if options.findings and cells.changed:
+        raise InputError(f"--findings: {' '.join(cells.changed)} No claim of the paper can be tested on it")
+    tables = suite_tables(cells.cells, paper, cells.changed)
+    if not tables and not options.findings:
+        why = "policies through another tracker than that of their training, or with late chunks, alone"
+        if not any(cell.records for cell in cells.cells):
+            why = "counts alone, of which --findings can be made"
+        raise InputError(f"{folders[0]}: holds no cell of any table ({why})")
     out = user_path(options.out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -48,20 +56,47 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
         ("tex", "tables.tex", table_text.as_latex(tables, cells.notes)),
         ("csv", "cells.csv", table_text.as_csv(tables)),
     ):
-        if form in options.format:
+        if form in options.format and tables:
             write_atomic(out / name, text)
             written.append(name)
-    if "png" in options.format:
+    if "png" in options.format and tables:
         from arena_newton.eval import suite_figures
 
         written += suite_figures.write(out, tables)
     for note in cells.notes:
         print(note)
     if options.findings:
-        text = paper_claims.findings_text(paper_claims.findings(cells.cells, paper))
+        found = paper_claims.findings(cells.cells, paper)
+        text = findings_text.findings_text(found, _sources(folders, cells))
         write_atomic(out / "findings.md", text)
         written.append("findings.md")
+        written += _into_page(out / "README.md", findings_text.findings_table(found))
         print(text, end="")
-    print(f"tables: {', '.join(table.name for table in tables)}")
+    if tables:
+        print(f"tables: {', '.join(table.name for table in tables)}")
     print(f"written: {', '.join(str(out / name) for name in written)}")
     return 0
+
+
+def _sources(folders: Sequence[Path], cells: CellSet) -> list[str]:
+    """Of what findings are made, and by which command."""
+    names = " ".join(map(str, folders))
+    return [f"Made by python -m arena_newton.eval tables {names} --findings", *cells.notes]
+
+
+def _into_page(page: Path, table: str) -> list[str]:
+    """Write the findings between the marks of a page of results, where it has them; names of files that were written.
+
+    Raises:
+        StorageError: It cannot be read or written.
+    """
+    try:
+        text = page.read_text(encoding="utf-8") if page.is_file() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise StorageError(f"{page}: cannot be read ({error})") from None
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        return []
+    write_atomic(page, f"{before}{begin}\n\n{table}\n{end}{after}")
+    return [page.name]

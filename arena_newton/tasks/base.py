@@ -10,7 +10,7 @@ import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -336,6 +336,9 @@ class TaskSpec:
     overlaps: tuple[Overlap, ...] = ()
     """Episodes that start with things inside each other."""
     semantic_variant: ByRules[str] = field(default_factory=lambda: ByRules.same("semantic"))
+    semantic_change: Literal["texture", "shape", "clutter"] | None = None
+    """Change that semantic mode of rule set `paper` makes: in textures and colours; in shapes that are drawn and not
+    touched; or by things that are added. The compiled model is else that of base mode. None: not said."""
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""
     mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)

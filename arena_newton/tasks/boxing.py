@@ -122,6 +122,7 @@ TASK = TaskSpec(
     success=ByRules(paper=BoxingRule(min_radius=0.0), released=BoxingRule(min_radius=0.10)),
     judge=BoxingJudge,
     predicates=PREDICATES,
+    semantic_change="shape",
     expert="arena_newton.policies.experts.boxing:BoxingExpert",
     sample=sample_target,
 )

@@ -143,6 +143,7 @@ TASK = TaskSpec(
     ),
     judge=DoubleDeskJudge,
     predicates=PREDICATES,
+    semantic_change="texture",
     expert="arena_newton.policies.experts.double_desk:DoubleDeskExpert",
     disturbance=0.5,
     light=ByRules(paper=None, released=DISTANT_LIGHT),

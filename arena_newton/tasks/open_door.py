@@ -142,5 +142,6 @@ TASK = TaskSpec(
     success=ByRules(paper=DoorPassedRule(), released=DoorOpenRule()),
     judge=OpenDoorJudge,
     predicates=PREDICATES,
+    semantic_change="texture",
     expert="arena_newton.policies.experts.open_door:OpenDoorExpert",
 )

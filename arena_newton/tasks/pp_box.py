@@ -192,6 +192,7 @@ TASK = TaskSpec(
     judge=PPBoxJudge,
     predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
+    semantic_change="clutter",
     expert="arena_newton.policies.experts.pp_box:PPBoxExpert",
     disturbance=0.5,
 )

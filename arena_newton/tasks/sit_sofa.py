@@ -183,6 +183,7 @@ TASK = TaskSpec(
     steps=ByRules(paper=1050, released=2000),
     success=ByRules(paper=SeatPressedRule(), released=SeatTouchedRule()),
     judge=SitSofaJudge,
+    semantic_change="texture",
     expert="arena_newton.policies.experts.sit_sofa:SitSofaExpert",
     predicates=PREDICATES,
     overlaps=(

@@ -166,6 +166,7 @@ TASK = TaskSpec(
     success=ByRules(paper=VisNaviRule(round_signs=False), released=VisNaviRule(round_signs=True)),
     judge=VisNaviJudge,
     predicates=PREDICATES,
+    semantic_change="shape",
     expert="arena_newton.policies.experts.vis_navi:VisNaviExpert",
     mode_notes={
         "visual": ByRules(

@@ -6,23 +6,26 @@ import random
 import time
 
 import pytest
+from rows import episodes, record
 from scipy.stats import binomtest, fisher_exact, hypergeom
 
 from arena_newton.eval.certification import error_rates
 from arena_newton.eval.comparison import Contender, compare
 from arena_newton.eval.comparison_page import beta_density
 from arena_newton.eval.detectable import MOST_PAIRS, POWER, STEP, detectable_difference, detectable_text, paired_power
+from arena_newton.eval.evaluated_cells import EvaluatedCell
+from arena_newton.eval.paper_numbers import paper_numbers
 from arena_newton.eval.rate_tests import (
     LARGEST_BOSCHLOO,
     PairedCounts,
     UnpairedCounts,
     excess,
     letters,
-    mean_difference,
     rate_test,
     stratified_test,
 )
 from arena_newton.eval.stats import contrast, mcnemar
+from arena_newton.eval.suite_tables import suite_tables
 
 
 def test_paired_test_is_the_binomial_test():
@@ -130,34 +133,67 @@ def test_letters_say_exactly_what_differs():
     assert letters(3, [(0, 2)]) == ["a", "ab", "b"]
 
 
-def test_the_difference_is_the_contrast_of_the_tables():
-    """Of paired episodes value and width are those of `stats.contrast`, and both kinds shrink as episodes grow."""
-    rng = random.Random(8)
-    strata, counts = [], []
-    for _ in range(3):
-        first, second = ({n: rng.random() < rate for n in range(30)} for rate in (0.7, 0.5))
-        strata.append([(1 / 3, first), (-1 / 3, second)])
-        cells = [sum((first[n], second[n]) == ends for n in range(30)) for ends in itertools.product((1, 0), repeat=2)]
-        counts.append(PairedCounts(*cells))
-    found, expected = mean_difference(counts), contrast(strata)
-    assert (found.value, found.high - found.low) == pytest.approx((expected.value, expected.high - expected.low))
-    assert found.low < expected.low < found.high < expected.high  # the middle is moved towards 0
-    few, many = (mean_difference([UnpairedCounts(6 * k, 10 * k, 3 * k, 10 * k)]) for k in (1, 50))
+def difference(strata):
+    """The contrast of two rates from counts, averaged over strata."""
+    made = []
+    for counts in strata:
+        if isinstance(counts, PairedCounts):
+            ends = [(1, 1)] * counts.both + [(1, 0)] * counts.only_first + [(0, 1)] * counts.only_second
+            ends += [(0, 0)] * counts.neither
+            pair = [{n: bool(end[k]) for n, end in enumerate(ends)} for k in (0, 1)]
+        else:
+            pair = [{n: n < counts.first for n in range(counts.first_episodes)}]
+            pair += [{-1 - n: n < counts.second for n in range(counts.second_episodes)}]
+        made.append([(1 / len(strata), pair[0]), (-1 / len(strata), pair[1])])
+    return contrast(made)
+
+
+def test_one_interval_of_a_difference(tmp_path):
+    """`tables` and `compare` give a difference of the same episodes the same interval, to the last bit."""
+    cell = {"policy": "p", "family": "act", "trained_on": ("twist2",), "trained_tasks": ("boxing",), "task": "boxing"}
+    cell |= {"mode": "base", "labels": "v4", "latency": 0, "replan": None, "ensemble": False, "folder": tmp_path}
+    cells = [
+        EvaluatedCell(**cell, tracker=tracker, records=tuple(map(record, episodes("boxing", won))))
+        for tracker, won in (("twist2", (15, 14, 20)), ("sonic", (12, 17, 3)))
+    ]
+    (table,) = [table for table in suite_tables(cells, paper_numbers()) if table.name == "cross_gmt"]
+    (entry,) = [entry for entry in table.entries if entry.source == "ours"]
+    (pair,) = compare([Contender(cell.tracker, {("boxing",): cell.held()}) for cell in cells]).pairs
+    found = pair.difference
+    assert (entry.drop, entry.drop_low, entry.drop_high) == (found.value, found.low, found.high)
+
+
+def test_differences_tighten_with_episodes():
+    """Of unpaired episodes the interval shrinks as they grow, and nothing compared gives none."""
+    few, many = (difference([UnpairedCounts(6 * k, 10 * k, 3 * k, 10 * k)]) for k in (1, 50))
     assert few.value == many.value == pytest.approx(0.3)
     assert few.low < 0 < many.low and many.high - many.low < 0.2 * (few.high - few.low)
-    assert mean_difference([]) is None
+    assert contrast([]) is None
+
+
+def test_conditions_that_share_episodes_through_a_third_are_paired():
+    """Of three conditions of a stratum those that share episodes are one group, others are independent of it."""
+    a, b, c = (
+        {n: n % 2 == 0 for n in range(20)},
+        {n: n % 2 == 0 for n in range(20)},
+        {-1 - n: n < 5 for n in range(9)},
+    )
+    found = contrast([[(1.0, a), (-1.0, b), (1.0, c)]])
+    alone, pair = contrast([[(1.0, c)]]), contrast([[(1.0, a), (-1.0, b)]])
+    assert found.value == pytest.approx(5 / 9) and (found.episodes, found.unpaired) == (29, 0)
+    assert found.error**2 == pytest.approx(alone.error**2 + pair.error**2)
 
 
 def test_published_intervals_of_one_task():
     """Of one task the interval is that of Agresti and Min where paired, of Agresti and Caffo where not."""
     # Agresti and Caffo: p1' = 7/12, p2' = 4/12.
     half = 1.959963984540054 * math.sqrt((7 / 12 * 5 / 12 + 4 / 12 * 8 / 12) / 12)
-    found = mean_difference([UnpairedCounts(6, 10, 3, 10)])
+    found = difference([UnpairedCounts(6, 10, 3, 10)])
     assert (found.low, found.high) == pytest.approx((3 / 12 - half, 3 / 12 + half))
     # Agresti and Min: half an episode more of each kind.
     n, b, c = 22, 8.5, 2.5
     half = 1.959963984540054 * math.sqrt((b + c) - (b - c) ** 2 / n) / n
-    found = mean_difference([PairedCounts(4, 8, 2, 6)])
+    found = difference([PairedCounts(4, 8, 2, 6)])
     assert found.value == pytest.approx(6 / 20)
     assert (found.low, found.high) == pytest.approx(((b - c) / n - half, (b - c) / n + half))
 
@@ -176,7 +212,7 @@ def coverage(n, first, second, interval):
 def test_few_episodes_of_a_task_are_covered():
     """Of ten episodes of a task the interval holds the difference in about 95 of 100 experiments, wherever it is."""
     for first, second in ((0.3, 0.1), (0.5, 0.3), (0.6, 0.1), (0.3, 0.6), (0.15, 0.15)):
-        assert coverage(10, first, second, mean_difference) > 0.93
+        assert coverage(10, first, second, difference) > 0.93
 
 
 def test_many_small_tasks_are_covered():
@@ -191,7 +227,7 @@ def test_many_small_tasks_are_covered():
                     *[both.count(ends) for ends in ((True, True), (True, False), (False, True), (False, False))]
                 )
             )
-        found = mean_difference(strata)
+        found = difference(strata)
         held += found.low <= 0.6 <= found.high
     assert held > 0.92 * 300
 
@@ -208,10 +244,10 @@ def test_the_difference_lies_in_its_interval_and_is_exact():
                 strata.append(PairedCounts(*(ends.count(k) for k in range(4))))
             else:
                 strata.append(UnpairedCounts(rng.choice((0, n)), n, rng.choice((0, m)), m))
-        found = mean_difference(strata)
+        found = difference(strata)
         assert -1 <= found.low <= found.value <= found.high <= 1
     lot = [PairedCounts(0, a, b, 60 - a - b) for a, b in ((2, 0), (3, 0), (0, 5))]
-    assert mean_difference(lot).value == 0.0
+    assert difference(lot).value == 0.0
 
 
 def test_a_stratum_without_episodes_says_nothing():
@@ -220,7 +256,7 @@ def test_a_stratum_without_episodes_says_nothing():
     assert stratified_test([nothing]) == 1.0 and excess([nothing]) == excess([]) == 0.0
     assert stratified_test([nothing, some]) == stratified_test([some])
     assert excess([nothing, some]) == excess([some]) == 3.0
-    assert mean_difference([nothing]) is None and rate_test(nothing).p == 1.0
+    assert difference([nothing]) is None and rate_test(nothing).p == 1.0
 
 
 def test_many_episodes_take_no_time():
@@ -259,12 +295,12 @@ def test_small_probabilities_are_precise():
 
 def test_posterior_is_a_density():
     """The violin's density integrates to 1 and has its mean at (s + 1)/(n + 2)."""
-    for successes, episodes in ((0, 5), (3, 20), (20, 20), (41, 60)):
+    for successes, played in ((0, 5), (3, 20), (20, 20), (41, 60)):
         grid = [(k + 0.5) / 20_000 for k in range(20_000)]
-        values = [beta_density(successes, episodes, rate) for rate in grid]
+        values = [beta_density(successes, played, rate) for rate in grid]
         assert sum(values) / 20_000 == pytest.approx(1.0, abs=1e-4)
         mean = sum(v * r for v, r in zip(values, grid, strict=True)) / 20_000
-        assert mean == pytest.approx((successes + 1) / (episodes + 2), abs=1e-4)
+        assert mean == pytest.approx((successes + 1) / (played + 2), abs=1e-4)
     assert beta_density(0, 5, 0.0) == 6.0 and beta_density(5, 5, 1.0) == 6.0 and beta_density(2, 5, 1.0) == 0.0
 
 
@@ -313,6 +349,14 @@ def test_a_test_that_errs_is_found_out(monkeypatch):
     """A test that quarters its p breaks its level in the same simulation."""
     monkeypatch.setattr("arena_newton.eval.comparison.stratified_test", lambda strata: stratified_test(strata) / 4)
     assert any(not tally.holds for tally in error_rates.tallies(150, episodes=20))
+
+
+def test_an_interval_of_episodes_alone_is_found_out(monkeypatch):
+    """An interval that leaves out how much trainings differ does not cover them in the same simulation."""
+    monkeypatch.setattr("arena_newton.eval.trainings.MATCHED_SPREAD", 0.0)
+    monkeypatch.setattr("arena_newton.eval.trainings.ENOUGH", 99)
+    held = {t.what: t.holds for t in error_rates.tallies(60) if t.case == "2 recipes, trainings differ by 20 points"}
+    assert len(held) == 4 and not held["interval over 3 trainings, one task, covers"]
 
 
 def test_family_is_adjusted_over_all_pairs():
