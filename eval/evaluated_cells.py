@@ -66,12 +66,12 @@ class EvaluatedCell:
 
     @property
     def recipe(self) -> str:
-        """The policy without the number of the training: what trainings share that differ by chance alone."""
+        """The policy without the number of the training: trainings of one recipe differ by chance alone."""
         return self.policy.partition("#")[0]
 
     @property
     def training(self) -> tuple[Hashable, ...]:
-        """What cells of one network share, and no others; its first part is the policy."""
+        """Key of the network, shared by all of its cells and no others; its first part is the policy."""
         return (self.policy, self.trained_on, "" if self.merged else self.task)
 
     @property
@@ -100,7 +100,7 @@ class CellSet:
     notes: tuple[str, ...]
     """What a reader of the tables must know besides them."""
     changed: tuple[str, ...] = ()
-    """Why these episodes are no results of the benchmark: step budgets that were cut, a scene that is a variant."""
+    """Reasons for which these episodes are no results of the benchmark: cut step budgets, a variant of the scene."""
 
 
 def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:

@@ -17,20 +17,15 @@ from arena_newton import tasks
 from arena_newton.eval.evaluated_cells import EvaluatedCell
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers
 from arena_newton.eval.stats import holm, suites
-from arena_newton.eval.table_entries import PAPER_NAMES, SEMANTIC_STRENGTH, points, probability, semantic_text
+from arena_newton.eval.table_entries import PAPER_NAMES, SEMANTIC_STRENGTH, points, semantic_text
 from arena_newton.eval.trainings import (
-    DROP_SPREAD,
-    ENOUGH,
-    MATCHED_SPREAD,
-    SWAPPED_SPREAD,
     RateTerm,
     TrainedContrast,
     trained_contrast,
 )
-from arena_newton.eval.wording import escaped, markdown_table
 from arena_newton.text import counted
 
-__all__ = ["NEGLIGIBLE", "ClaimResult", "findings", "findings_table", "findings_text"]
+__all__ = ["NEGLIGIBLE", "SIGNIFICANT", "ClaimResult", "findings"]
 
 type Verdict = Literal["reproduces", "does not", "undecided", "not measured"]
 
@@ -56,7 +51,7 @@ class ClaimResult:
     """The statistic on our episodes, with interval and size; why it is missing where it is."""
     verdict: Verdict
     remark: str = ""
-    """What a reader must know besides the statistic."""
+    """Sentences to read with the statistic."""
     p: float | None = None
     """Of the test that the verdict is from, two-sided; None where nothing was tested."""
     p_holm: float | None = None
@@ -595,43 +590,3 @@ def _merging(cells: _Cells, family: str, trackers: tuple[str, ...], suite: Seque
         terms += [_term(m, weight / len(merged)) for m in merged]
         terms += [_term(s, -weight / len(single)) for s in single]
     return terms
-
-
-def findings_text(found: Sequence[ClaimResult], notes: Sequence[str] = ()) -> str:
-    """The findings as Markdown."""
-    parts = ["# The paper's findings, tested on the trainings that were evaluated\n"]
-    parts.append(
-        "What these networks say of the paper's claims. Its claims are about families, trackers and modes, so that "
-        "their unit is a training, not an episode: the 95 % intervals in parentheses cover other trainings of the "
-        f"same recipes. {DECLARED}\n"
-    )
-    parts.append(
-        "Reproduces: the interval is on the claim's side of 0, and of a claim that something differs beyond "
-        f"{100 * NEGLIGIBLE:.0f} points. Does not: it excludes an effect of {100 * NEGLIGIBLE:.0f} points. Undecided: "
-        f"neither, or p is {SIGNIFICANT:g} and above when adjusted for all claims of this page (Holm).\n"
-    )
-    parts += ["".join(f"- {escaped(note)}\n" for note in notes)] if notes else []
-    for one in found:
-        parts.append(f"## {escaped(one.name)}: {one.verdict}\n")
-        parts.append(f"- Claim: {escaped(one.claim)}\n- Paper: {escaped(one.paper)}\n- Ours: {escaped(one.ours)}")
-        parts[-1] += f". {escaped(one.remark)}" if one.remark else ""
-        if one.p is not None:
-            parts[-1] += f"\n- p {probability(one.p)}, adjusted {probability(one.p_holm)}"
-        parts[-1] += "\n"
-    return "\n".join(parts)
-
-
-DECLARED = (
-    f"How much trainings of a recipe differ is read from them where {ENOUGH} or more were evaluated. Elsewhere it is "
-    f"declared, after eight cells of three trainings: a standard deviation of {100 * MATCHED_SPREAD:.0f} points of a "
-    f"rate through the tracker of the training, of {100 * SWAPPED_SPREAD:.0f} through another, and of "
-    f"{100 * DROP_SPREAD:.0f} of a difference between trackers or modes; for falls the spread over the cells compared "
-    "stands for it."
-)
-
-
-def findings_table(found: Sequence[ClaimResult]) -> str:
-    """The findings as one Markdown table, for a page of results."""
-    rows = [(one.name, one.verdict, one.paper, one.ours, probability(one.p_holm)) for one in found]
-    head = ("finding", "here", "the paper", "these networks", "p (Holm)")
-    return markdown_table(head, rows, 4)

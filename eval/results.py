@@ -105,7 +105,7 @@ def check_whole_plan(run: RunRecord) -> None:
 
 
 def changed_conditions(run: RunRecord) -> list[str]:
-    """Why a run is no result of the benchmark, in sentences: its step budgets were cut, or its scene is a variant."""
+    """Reasons for which a run is no result of the benchmark, in sentences: cut step budgets, a variant of the scene."""
     found, cap = [], run.config.get("max_steps")
     if cap is not None:
         found.append(f"--max-steps cut the step budgets to {cap} ticks ({cap * TICK:g} s): no benchmark result.")

@@ -7,14 +7,14 @@ conditions played, and tested by the exact McNemar test, adjusted for the number
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 
 from arena_newton import tasks
 from arena_newton.eval.cost_table import cost_table
 from arena_newton.eval.evaluated_cells import EvaluatedCell
+from arena_newton.eval.paired_rows import PAIRED, RowPair, paired_rows
 from arena_newton.eval.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers, PaperRate, PublishedRow, published
-from arena_newton.eval.stats import contrast, holm, paired_rates, suites
+from arena_newton.eval.stats import contrast, paired_rates, suites
 from arena_newton.eval.table_entries import (
     PAPER_NAMES,
     SEMANTIC_STRENGTH,
@@ -33,6 +33,7 @@ from arena_newton.eval.table_entries import (
     semantic_text,
     task_title,
 )
+from arena_newton.eval.trainings_table import trainings_table
 
 __all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 
@@ -65,7 +66,7 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers, changed: S
     found: list[SuiteTable | None] = [_in_gmt(prompt, paper, mode) for mode in modes]
     found += [_untrained(prompt, mode) for mode in modes]
     found += [
-        _trainings(prompt),
+        trainings_table(prompt),
         _best(prompt, paper),
         _families(prompt),
         _perturbation(prompt, paper),
@@ -196,18 +197,18 @@ def _published(paper: PaperNumbers, tracker: str, mode: str) -> list[PublishedRo
 
 
 def _change(mode: str, task: str) -> str:
-    """What semantic mode changes in a task, after its name."""
+    """Change that semantic mode makes in a task, to follow its name."""
     change = tasks.get(task).semantic_change if mode == "semantic" and task in tasks.names() else None
     return f" ({change})" if change else ""
 
 
 def _about(*modes: str) -> str:
-    """What a reader of numbers of semantic mode must know."""
+    """Sentences for a reader of numbers of semantic mode."""
     return f" {semantic_text()} {SEMANTIC_STRENGTH}" if "semantic" in modes else ""
 
 
 def _reported(paper: PaperNumbers) -> str:
-    """Of whom the rows are that others published."""
+    """Sentences that name whose the rows are which others published."""
     return "".join(f" Self-reported: {row}." for row in published() if paper.in_gmt)
 
 
@@ -232,32 +233,6 @@ def _untrained(cells: Sequence[EvaluatedCell], mode: str) -> SuiteTable | None:
     head = ("tracker", "policy", "n", "AFR", *(SHORT.get(c, task_title(c)) + _change(mode, c) for c in columns))
     caption = f"Policies that were not trained, or do not say on what. {OURS}{_about(mode)}"
     return SuiteTable(name, title, caption, head, 2, tuple(rows), tuple(groups), tuple(entries))
-
-
-def _trainings(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
-    """Cells of several trainings of one recipe, and how much these differ."""
-    groups: dict[tuple[str, ...], list[EvaluatedCell]] = {}
-    for cell in cells:
-        if cell.trained_on:
-            key = (cell.recipe, "+".join(cell.trained_on), cell.tracker, cell.task, cell.mode)
-            groups.setdefault(key, []).append(cell)
-    rows = []
-    for (recipe, trained_on, tracker, task, mode), same in groups.items():
-        if len(same) > 1:
-            rates = [sum(cell.held().values()) / len(cell.held()) for cell in same]
-            mean = sum(rates) / len(rates)
-            spread = math.sqrt(sum((rate - mean) ** 2 for rate in rates) / (len(rates) - 1))
-            won = " ".join(str(sum(cell.held().values())) for cell in same)
-            row = (recipe, trained_on, tracker, task_title(task), mode, str(len(same)), won)
-            rows.append((*row, percent(mean), percent(spread)))
-    if not rows:
-        return None
-    head = ("recipe", "trained on", "tracker", "task", "mode", "trainings", "successes", "mean %", "sd, points")
-    caption = (
-        "Several trainings of one recipe: successes of each, their mean rate, and the standard deviation between "
-        "trainings, chance of episodes included."
-    )
-    return SuiteTable("trainings", "Several trainings", caption, head, 5, tuple(rows), (0,), ())
 
 
 def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:
@@ -301,69 +276,6 @@ def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | N
     return SuiteTable("best", "Best policy per task", caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Pair:
-    """Two conditions on the same episodes: cells, the columns that name them, and what the paper says."""
-
-    first: EvaluatedCell
-    second: EvaluatedCell
-    named: tuple[str, ...]
-    paper: tuple[str, ...] = ()
-
-
-def _paired(table: str, pairs: Sequence[_Pair]) -> tuple[list[tuple[str, ...]], list[TableEntry]]:
-    """Rows and entries of pairs: rates over common episodes, difference, retention, test and adjusted test."""
-    results = [paired_rates(pair.first.held(), pair.second.held()) for pair in pairs]
-    tested = [r.p for r in results if r.p is not None]
-    adjusted = iter(holm(tested))
-    rows: list[tuple[str, ...]] = []
-    entries: list[TableEntry] = []
-    for pair, r in zip(pairs, results, strict=True):
-        found = contrast([[(1.0, pair.first.held()), (-1.0, pair.second.held())]])
-        if found is None or r.first is None or r.second is None:
-            rows.append((*pair.named, "0", *[""] * 8, *pair.paper))
-            continue
-        p_holm = next(adjusted)
-        retention = r.second / r.first if r.first > 0 else None
-        entry = dataclasses.replace(
-            ours(table, pair.second),
-            matched_sr=r.first,
-            drop=found.value,
-            drop_low=found.low,
-            drop_high=found.high,
-            retention=retention,
-            pairs=r.pairs,
-            unpaired=r.unpaired,
-            only_first=r.only_first,
-            only_second=r.only_second,
-            p=r.p,
-            p_holm=p_holm,
-        )
-        entries.append(entry)
-        rows.append(
-            (
-                *pair.named,
-                str(r.pairs),
-                percent(r.first),
-                percent(r.second),
-                f"{points(found.value)} {interval_text(found.low, found.high)}",
-                percent(retention) if retention is not None else UNDEFINED,
-                f"{r.only_first}/{r.only_second}",
-                probability(r.p),
-                probability(p_holm),
-                percent(entry.afr or 0.0, 2),
-                *pair.paper,
-            )
-        )
-    return rows, entries
-
-
-PAIRED = (
-    "Over the n episodes that both played: rates in %, their difference Δ in points with 95 % interval, successes of "
-    "the first / of the second alone, p of the exact McNemar test, and adjusted for the tests of this table (Holm). "
-)
-
-
 def _families(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
     mine = [cell for cell in _in_gmt_cells(cells) if cell.trained_on]
     pairs = []
@@ -379,12 +291,12 @@ def _families(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
             ranked = sorted(here.values(), key=lambda cell: order.index(cell.policy))
             for number, first in enumerate(ranked):
                 pairs += [
-                    _Pair(first, second, (tracker, task_title(task), first.policy, second.policy))
+                    RowPair(first, second, (tracker, task_title(task), first.policy, second.policy))
                     for second in ranked[number + 1 :]
                 ]
     if not pairs:
         return None
-    rows, entries = _paired("families", pairs)
+    rows, entries = paired_rows("families", pairs)
     rows = [(*row[:8], *row[9:-1]) for row in rows]
     head = ("tracker", "task", "first", "second", "n", "first %", "second %", "Δ", "alone", "p", "p (Holm)")
     return SuiteTable(
@@ -421,10 +333,10 @@ def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
                         whole = paper.in_gmt[a, "base", family, task].sr > 0
                         kept = percent(theirs.retention) if whole else UNDEFINED
                         said = (points(theirs.drop), kept, percent(theirs.task_afr, 2))
-                    pairs.append(_Pair(base, cell, (f"{a} → {b}", task_title(task), policy), said))
+                    pairs.append(RowPair(base, cell, (f"{a} → {b}", task_title(task), policy), said))
     if not pairs:
         return None
-    rows, entries = _paired("cross_gmt", pairs)
+    rows, entries = paired_rows("cross_gmt", pairs)
     entries += _paper_transfers(pairs, paper)
     head = ("direction", "task", "policy", "n", "matched %", "swapped %", "Δ", "Ret %", "alone", "p", "p (Holm)", "AFR")
     heads = (*head, "paper Δ", "paper Ret %", "paper AFR")
@@ -437,7 +349,7 @@ def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
     )
 
 
-def _paper_transfers(pairs: Sequence[_Pair], paper: PaperNumbers) -> list[TableEntry]:
+def _paper_transfers(pairs: Sequence[RowPair], paper: PaperNumbers) -> list[TableEntry]:
     found = {}
     for pair in pairs:
         key = (pair.first.tracker, pair.second.tracker, pair.second.family, pair.second.task)
@@ -653,11 +565,11 @@ def _labels(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
                         if alike and (first.labels, second.labels) == ("v3.1", "v4"):
                             kind = "matched" if tracker in trained_on else "swapped"
                             words = ("+".join(trained_on), tracker, kind, task_title(task), first.policy, second.policy)
-                            pairs.append(_Pair(first, second, words))
+                            pairs.append(RowPair(first, second, words))
             groups += [begun] if len(pairs) > begun else []
     if not pairs:
         return None
-    rows, entries = _paired("labels", pairs)
+    rows, entries = paired_rows("labels", pairs)
     rows = [(*row[:10], *row[11:-1]) for row in rows]
     named = ("trained on", "tracker", "", "task", "v3.1 policy", "v4 policy")
     head = (*named, "n", "v3.1 %", "v4 %", "Δ", "alone", "p", "p (Holm)")

@@ -38,13 +38,13 @@ SEMANTIC_STRENGTH = (
     "How strong these shifts are was chosen here (bricks, wood, a blue sofa; the original's files were not at hand): "
     "how much a policy loses cannot be compared with the paper, only the direction."
 )
-"""What every table of numbers of semantic mode says."""
+"""Sentence of every table of numbers of semantic mode."""
 SEMANTIC_CHANGES = {
     "texture": "textures and colours in",
     "shape": "the shape of something that is drawn and not touched in",
     "clutter": "things that are added in",
 }
-"""What semantic mode changes in a task, in words."""
+"""Change that semantic mode makes → words for it."""
 UNDEFINED = "—"
 """Shown where a number is undefined, such as a retention of nothing."""
 
@@ -121,7 +121,7 @@ def task_title(task: str) -> str:
 
 
 def semantic_text() -> str:
-    """What semantic mode changes in which of the paper's tasks, in a sentence."""
+    """Sentence that names what semantic mode changes in which of the paper's tasks."""
     parts = []
     for change, words in SEMANTIC_CHANGES.items():
         named = [task_title(name) for name in suites()["ALL_AVG"] if tasks.get(name).semantic_change == change]

@@ -23,7 +23,8 @@ class TablesOptions:
     rules: str = "paper"
     """Rule set whose episodes count: paper or released."""
     findings: bool = False
-    """Also test the paper's claims on these episodes: print them and write findings.md."""
+    """Also test the paper's claims on these trainings: print them and write findings.md, and the table of findings
+    between its marks in a README.md of the folder; of files cells.csv nothing else is made."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.results import RunRecord, changed_conditions, due_episodes, is_complete
 from arena_newton.eval.stats import wilson
+from arena_newton.eval.table_entries import SEMANTIC_STRENGTH, semantic_text
 from arena_newton.eval.wording import markdown_table, plain
 from arena_newton.rules import MODES
 from arena_newton.text import counted
@@ -131,6 +132,8 @@ def _notes(runs: Sequence[RunRecord], records: Sequence[EpisodeRecord]) -> list[
             found.append(f"{run.folder} is shard {shard} of a plan of {planned:,} episodes: {due}.")
         elif not is_complete(run):
             found.append(f"{run.folder} is incomplete: {played} of {planned} episodes.")
+    if any(record.mode == "semantic" for record in records):
+        found.append(f"{semantic_text()} {SEMANTIC_STRENGTH}")
     falls, errors = (sum(record.outcome == outcome for record in records) for outcome in ("fall", "error"))
     found += [f"{counted(falls, 'episode')} of {len(records)} ended in a fall."] if falls else []
     found += [f"{counted(errors, 'episode')} of {len(records)} ended with an error."] if errors else []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from arena_newton import rule_sets
 from arena_newton.errors import InputError
-from arena_newton.eval import paper_claims, table_text
+from arena_newton.eval import findings_text, paper_claims, table_text
 from arena_newton.eval.evaluated_cells import CellSet, read_cells
 from arena_newton.eval.journal import StorageError, write_atomic
 from arena_newton.eval.paper_numbers import paper_numbers
@@ -67,10 +67,10 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
         print(note)
     if options.findings:
         found = paper_claims.findings(cells.cells, paper)
-        text = paper_claims.findings_text(found, _sources(folders, cells))
+        text = findings_text.findings_text(found, _sources(folders, cells))
         write_atomic(out / "findings.md", text)
         written.append("findings.md")
-        written += _into_page(out / "README.md", paper_claims.findings_table(found))
+        written += _into_page(out / "README.md", findings_text.findings_table(found))
         print(text, end="")
     if tables:
         print(f"tables: {', '.join(table.name for table in tables)}")

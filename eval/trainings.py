@@ -46,9 +46,9 @@ class RateTerm:
     weight: float
     outcomes: Outcomes
     recipe: Hashable
-    """What trainings share that differ by chance alone."""
+    """Key of trainings that differ by chance alone."""
     training: Hashable
-    """What the rates of one network share."""
+    """Key of the network."""
     swapped: bool = False
     """Whether another tracker than that of the training executed it."""
 

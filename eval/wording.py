@@ -48,8 +48,9 @@ def plain(value: object) -> str:
 
 
 def escaped(text: object) -> str:
-    """Text of a results folder as Markdown that stays text."""
-    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
+    """Text of a results folder as Markdown that stays text, also where a backslash does not keep a tag shut."""
+    shown = re.sub(r"([\\`*\[\]>|])", r"\\\1", re.sub(r"&(?=#?\w+;)", "&amp;", plain(text)))
+    return re.sub(r"<(?=[A-Za-z/!?]|$)", "&lt;", shown)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TypedDict
@@ -18,7 +17,7 @@ from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.html_report import FOLDER, page_template
 from arena_newton.eval.journal import write_atomic
 from arena_newton.eval.records import JsonObject
-from arena_newton.eval.wording import plain
+from arena_newton.eval.wording import escaped
 from arena_newton.text import counted
 
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
@@ -154,29 +153,25 @@ def printed(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
 
 def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as Markdown, without pictures."""
-    lines = ["# Certificate", "", f"**{_escaped(verdict_of(findings, len(facts['planned'])))}**", ""]
-    lines += [line for text in _warnings(facts) for line in (f"> {_escaped(text)}", "")]
+    lines = ["# Certificate", "", f"**{escaped(verdict_of(findings, len(facts['planned'])))}**", ""]
+    lines += [line for text in _warnings(facts) for line in (f"> {escaped(text)}", "")]
     lines += ["| claim | verdict | measured |", "|---|---|---|"]
     claims = claimed(findings)
     for one in claims:
         verdicts = {check.name: finding.verdict for check, finding in one.findings}
-        told = [f"[{name}](#{name}-{verdicts[name]}): {_escaped(text)}" for name, text in _measured(one)]
-        lines.append(f"| {_escaped(one.text)} | {one.verdict} | {'<br>'.join(told)} |")
+        told = [f"[{name}](#{name}-{verdicts[name]}): {escaped(text)}" for name, text in _measured(one)]
+        lines.append(f"| {escaped(one.text)} | {one.verdict} | {'<br>'.join(told)} |")
     lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
     lines += ["## What was certified", ""]
-    lines += [f"- {name}: {_escaped(text)}" for name, text in _said(facts)]
+    lines += [f"- {name}: {escaped(text)}" for name, text in _said(facts)]
     for check, finding in (part for one in claims for part in one.findings):
-        lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", _escaped(finding.summary), ""]
+        lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", escaped(finding.summary), ""]
         for sheet in finding.sheets:
-            lines += [f"{_escaped(sheet.title)}:", "", "| " + " | ".join(map(_escaped, sheet.head)) + " |"]
+            lines += [f"{escaped(sheet.title)}:", "", "| " + " | ".join(map(escaped, sheet.head)) + " |"]
             lines.append("|" + "---|" * len(sheet.head))
-            lines += ["| " + " | ".join(map(_escaped, row)) + " |" for row in sheet.rows] + [""]
-        lines += [f"- {_escaped(note)}" for note in finding.notes]
+            lines += ["| " + " | ".join(map(escaped, row)) + " |" for row in sheet.rows] + [""]
+        lines += [f"- {escaped(note)}" for note in finding.notes]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _escaped(text: object) -> str:
-    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", plain(text))
 
 
 def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:

@@ -1,8 +1,12 @@
-"""How often comparisons err and how often they find a difference, on synthetic episodes whose truth is known."""
+"""How often comparisons err and how often they find a difference, on synthetic episodes whose truth is known.
+
+Also how often intervals over trainings hold the truth, on synthetic recipes whose trainings differ by known amounts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -12,6 +16,7 @@ from scipy.stats import binom
 from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet
 from arena_newton.eval.comparison import LEVEL, Contender, compare
 from arena_newton.eval.detectable import paired_power
+from arena_newton.eval.trainings import MATCHED_SPREAD, RateTerm, trained_contrast
 from arena_newton.intervals import wilson
 
 if TYPE_CHECKING:
@@ -31,6 +36,10 @@ EPISODES = 60
 """Episodes of each task: the protocol's."""
 DIFFERENCES = (0.0, 0.1, 0.2)
 """By how much the last of the policies is better, in every episode."""
+SPREADS = (0.0, 0.05, 0.1, 0.2)
+"""Standard deviations between trainings of one recipe."""
+TRAININGS = 3
+"""Of a recipe, where they say how much they differ."""
 SLACK = 1e-4
 """Probability with which a test that keeps its level exactly would be said not to."""
 LEAST_COVERAGE = 0.93
@@ -45,7 +54,7 @@ class EventTally:
     case: str
     what: str
     kind: str
-    """`error`: at most the level; `power`: as high as it gets; `coverage`: about 95 %."""
+    """`error`: at most the level; `power`: as high as it gets; `coverage`: about 95 % or more; `shown`: as it is."""
     expected: float | None = None
     """What it must be, computed in closed form, where there is one."""
     happened: int = 0
@@ -68,7 +77,7 @@ class EventTally:
             return bool(self.happened <= binom.isf(SLACK, self.times, LEVEL))
         if self.kind == "coverage":
             return bool(self.happened >= binom.ppf(SLACK, self.times, LEAST_COVERAGE))
-        if self.expected is None:
+        if self.expected is None:  # power, or shown as it is
             return True
         low, high = binom.ppf(SLACK / 2, self.times, self.expected), binom.isf(SLACK / 2, self.times, self.expected)
         return bool(low <= self.happened <= high)
@@ -86,7 +95,7 @@ def tallies(comparisons: int, episodes: int = EPISODES, seed: int = SEED) -> lis
     """Make synthetic comparisons of each case and count.
 
     Three policies of which the last is better by each of `DIFFERENCES` play the same episodes; two of which the second
-    is better play different ones.
+    is better play different ones. Two equal recipes have trainings that differ by each of `SPREADS`.
 
     Args:
         comparisons: Of each case.
@@ -98,6 +107,8 @@ def tallies(comparisons: int, episodes: int = EPISODES, seed: int = SEED) -> lis
     for difference in DIFFERENCES:
         found += list(_paired(rng, comparisons, episodes, difference).values())
         found += list(_unpaired(rng, comparisons, episodes, difference).values())
+    for spread in SPREADS:
+        found += list(_trained(rng, comparisons, episodes, spread).values())
     return found
 
 
@@ -149,6 +160,44 @@ def _unpaired(rng: np.random.Generator, comparisons: int, episodes: int, differe
     return case.found
 
 
+def _trained(rng: np.random.Generator, comparisons: int, episodes: int, spread: float) -> dict[str, EventTally]:
+    """Two equal recipes, of which several trainings or one play the same episodes of all tasks."""
+    case = _Case(f"2 recipes, trainings differ by {100 * spread:.0f} points")
+    for _ in range(comparisons):
+        for number in (TRAININGS, 1):
+            terms = _recipes(rng, episodes, spread, number)
+            text = f"interval over {number} trainings" if number > 1 else "interval over a training, declared"
+            # What is declared covers trainings that differ by no more.
+            kind = "shown" if number == 1 and spread > MATCHED_SPREAD else "coverage"
+            for what, chosen, weight in (
+                (f"{text}, one task, covers", [term for term in terms if term.task == "0"], 1.0),
+                (f"{text}, all tasks, covers", terms, 1.0 / len(RATES)),
+            ):
+                found = trained_contrast([dataclasses.replace(one, weight=one.weight * weight) for one in chosen])
+                assert found is not None
+                case.count(what, kind, found.low <= 0.0 <= found.high)
+    return case.found
+
+
+def _recipes(rng: np.random.Generator, episodes: int, spread: float, number: int) -> list[RateTerm]:
+    """Terms of the first recipe's rate minus the second's in every task, each task for itself.
+
+    Rates of trainings are beta distributed around those of the tasks, so that they stay rates.
+    """
+    terms = []
+    for task, rate in enumerate(RATES):
+        harder = rng.integers(0, 2, size=episodes) * 2 - 1
+        total = rate * (1 - rate) / spread**2 - 1 if spread else 0.0
+        for recipe, sign in enumerate((1.0, -1.0)):
+            for training in range(number):
+                own = rng.beta(rate * total, (1 - rate) * total) if spread else rate
+                won = rng.random(episodes) < own + min(SPREAD, own, 1 - own) * harder
+                outcomes: dict[Hashable, bool] = dict(enumerate(won.tolist()))
+                key = (recipe, task)
+                terms.append(RateTerm(str(task), sign / number, outcomes, key, (*key, training)))
+    return terms
+
+
 def _contenders(
     rng: np.random.Generator, comparisons: int, episodes: int, gains: tuple[float, ...], shared: bool
 ) -> Iterator[list[Contender]]:
@@ -181,7 +230,12 @@ def _statistics(context: Context) -> CheckFinding:
         rows.append((tally.case, tally.what, tally.kind, *figures, "" if tally.holds else "fails"))
     errors = [tally.rate for tally in found if tally.kind == "error"]
     failed = [f"{tally.what} ({tally.case})" for tally in found if not tally.holds]
-    summary = f"{number:,} synthetic comparisons of each case: at most {100 * max(errors):.1f} % err at a level of 5 %"
+    least = min(tally.rate for tally in found if tally.kind == "coverage")
+    summary = (
+        f"{number:,} synthetic comparisons of each case: at most {100 * max(errors):.1f} % err at a level of 5 %, "
+    )
+    summary += f"intervals hold the truth in at least {100 * least:.1f} %, also over trainings that differ by up to "
+    summary += f"{100 * max(SPREADS):.0f} points"
     head = ("case", "what", "kind", "%", "95 % interval", "computed", "")
     return CheckFinding(
         "fail" if failed else "pass",

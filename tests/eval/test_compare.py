@@ -301,6 +301,19 @@ def test_the_sentence_has_the_direction_of_the_test():
     assert verdict(comparison, pair) == "a succeeds in more episodes than b, with equal mean rates"
 
 
+def test_markdown_of_strangers_folders_opens_no_tag(tmp_path):
+    """Names of folders and environments are no HTML in compare.md and report.md, whatever reads these."""
+    evil = "<img src=x onerror=alert(1)>"
+    runs = [run_in(tmp_path / f"{evil}{name}", (4, 5, 7), policy=f"p{evil}") for name in "ab"]
+    compared(tmp_path, *runs)
+    document = json.loads((runs[0] / "config.json").read_text())
+    (runs[0] / "config.json").write_text(json.dumps(document | {"environments": {evil: {"engine": evil}}}))
+    assert main(["report", str(runs[0])]) == 0
+    for file in (tmp_path / "out" / "compare.md", runs[0] / "report.md"):
+        text = re.sub(r"`[^`]*`", "", file.read_text())  # code stays code
+        assert "img src" in text and not re.search("<[A-Za-z/!?]", text), file
+
+
 def test_figures_have_no_minus_zero():
     """A difference and its bounds that are shown as 0 have no minus, and what is too small for a number is said so."""
     assert difference_text(Contrast(-0.0001, -0.004, 0.02, 0, 0, 1, 1, 0)) == "+0.0 (0 to 2)"

@@ -295,12 +295,12 @@ def test_small_probabilities_are_precise():
 
 def test_posterior_is_a_density():
     """The violin's density integrates to 1 and has its mean at (s + 1)/(n + 2)."""
-    for successes, episodes in ((0, 5), (3, 20), (20, 20), (41, 60)):
+    for successes, played in ((0, 5), (3, 20), (20, 20), (41, 60)):
         grid = [(k + 0.5) / 20_000 for k in range(20_000)]
-        values = [beta_density(successes, episodes, rate) for rate in grid]
+        values = [beta_density(successes, played, rate) for rate in grid]
         assert sum(values) / 20_000 == pytest.approx(1.0, abs=1e-4)
         mean = sum(v * r for v, r in zip(values, grid, strict=True)) / 20_000
-        assert mean == pytest.approx((successes + 1) / (episodes + 2), abs=1e-4)
+        assert mean == pytest.approx((successes + 1) / (played + 2), abs=1e-4)
     assert beta_density(0, 5, 0.0) == 6.0 and beta_density(5, 5, 1.0) == 6.0 and beta_density(2, 5, 1.0) == 0.0
 
 
@@ -349,6 +349,14 @@ def test_a_test_that_errs_is_found_out(monkeypatch):
     """A test that quarters its p breaks its level in the same simulation."""
     monkeypatch.setattr("arena_newton.eval.comparison.stratified_test", lambda strata: stratified_test(strata) / 4)
     assert any(not tally.holds for tally in error_rates.tallies(150, episodes=20))
+
+
+def test_an_interval_of_episodes_alone_is_found_out(monkeypatch):
+    """An interval that leaves out how much trainings differ does not cover them in the same simulation."""
+    monkeypatch.setattr("arena_newton.eval.trainings.MATCHED_SPREAD", 0.0)
+    monkeypatch.setattr("arena_newton.eval.trainings.ENOUGH", 99)
+    held = {t.what: t.holds for t in error_rates.tallies(60) if t.case == "2 recipes, trainings differ by 20 points"}
+    assert len(held) == 4 and not held["interval over 3 trainings, one task, covers"]
 
 
 def test_family_is_adjusted_over_all_pairs():

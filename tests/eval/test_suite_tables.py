@@ -3,25 +3,38 @@
 import csv
 import dataclasses
 import io
+import itertools
 import json
 import os
 import re
 import shutil
+import statistics
 import subprocess
+from pathlib import Path
 
 import pytest
 from made_suites import cell_of, outcomes, write_cell, write_suite
 
 from arena_newton.errors import InputError
-from arena_newton.eval import paper_claims, table_text
+from arena_newton.eval import findings_text, paper_claims, table_text
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.evaluated_cells import read_cells
-from arena_newton.eval.paper_numbers import paper_numbers, read_paper
-from arena_newton.eval.stats import contrast, holm, mcnemar, suites, wilson
+from arena_newton.eval.paper_numbers import paper_numbers, published, read_paper
+from arena_newton.eval.stats import contrast, holm, mcnemar, paired_rates, suites, wilson
 from arena_newton.eval.suite_records import SUITE_FILE
 from arena_newton.eval.suite_tables import suite_tables
-from arena_newton.eval.table_entries import SuiteTable, interval_text, points, probability
+from arena_newton.eval.table_entries import (
+    SEMANTIC_STRENGTH,
+    SuiteTable,
+    interval_text,
+    points,
+    probability,
+    semantic_text,
+)
+from arena_newton.eval.tables_command import BEGIN, END
+from arena_newton.eval.trainings import DROP_SPREAD, MATCHED_SPREAD, SWAPPED_SPREAD
 
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
 HOI, HSI = suites()["HOI_AVG"], suites()["HSI_AVG"]
 
 
@@ -83,8 +96,8 @@ def row(table, *start):
 
 def test_every_kind_of_table_is_made(tables):
     """All tables that the cells can fill are there, and each row has a text for each column."""
-    names = "in_gmt in_gmt_visual in_gmt_semantic best families perturbation cross_gmt merge_all latency labels cost"
-    assert list(tables) == names.split()
+    names = "in_gmt in_gmt_visual in_gmt_semantic untrained best families perturbation cross_gmt merge_all latency"
+    assert list(tables) == [*names.split(), "labels", "cost"]
     for table in tables.values():
         assert all(len(r) == len(table.head) for r in table.rows)
         assert all(group < len(table.rows) for group in table.groups)
@@ -113,8 +126,59 @@ def test_in_gmt_by_the_conventions_of_the_paper(tables):
     assert (
         theirs["AFR"] == "6.43" and entry(table, source="paper", family="act", tracker="twist2", task="boxing").derived
     )
-    assert row(table, "twist2", "expert", "ours")["Football"] == "100.0 ± 0.0 (94 to 100)"
-    assert not [r for r in table.rows if r[1] == "all"]
+    assert not [r for r in table.rows if r[1] in ("all", "expert")]
+
+
+def test_what_was_not_trained_is_under_no_tracker_of_its_training(tables):
+    """The expert has a table of its own, where the plan has a tracker of nobody's training."""
+    assert row(tables["untrained"], "twist2", "expert")["Football"] == "100.0 ± 0.0 (94 to 100)"
+    assert "of their training" not in tables["untrained"].caption
+
+
+def test_rows_of_others_are_marked(tables):
+    """What others published stands beside the paper's numbers, marked as self-reported in another simulator."""
+    (other,) = published()
+    assert other.policy == "WB-WAM" and sum(other.rates.values()) / 7 == pytest.approx(0.819, abs=5e-4)
+    assert row(tables["in_gmt"], "sonic", "WB-WAM", "self-reported")["DoubleDesk"] == "65.0"
+    assert row(tables["best"], "sonic", "DoubleDesk")["self-reported"] == "WB-WAM 65.0"
+    assert row(tables["best"], "twist2", "Football")["self-reported"] == ""
+    for name in ("in_gmt", "best"):
+        assert "Self-reported: WB-WAM by its authors" in tables[name].caption and "Isaac Sim" in tables[name].caption
+    assert not [r for r in tables["in_gmt_visual"].rows if "WB-WAM" in r]
+
+
+def test_semantic_numbers_say_what_was_changed(tables):
+    """Tables of semantic mode name what it changes in each task, and that its strength is this project's choice."""
+    assert {"Football (texture)", "P&PBox (clutter)"} <= set(tables["in_gmt_semantic"].head)
+    for name, table in tables.items():
+        semantic = name in ("in_gmt_semantic", "perturbation")
+        assert (SEMANTIC_STRENGTH in table.caption) == (semantic_text() in table.caption) == semantic, name
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"max_steps": 100}, "--max-steps cut the step budgets to 100 ticks (2 s): no benchmark result."),
+        ({"variant": "0123456789ab"}, "The scene is the variant 0123456789ab: no benchmark result."),
+    ],
+)
+def test_changed_runs_stand_beside_nothing(tmp_path, capsys, change, said):
+    """Runs with cut budgets or another scene say so everywhere, have no row of others beside them, and no findings."""
+    facts = {"family": "act", "facts": {"trackers": ["twist2"], "tasks": ["boxing"]}}
+    for name in "ab":
+        write_cell(tmp_path / name, cell_of("x", "x", "twist2", "boxing"), outcomes(9), policy_facts=facts, **change)
+    assert main(["tables", str(tmp_path / "a"), "--format", "md", "tex", "--out", str(tmp_path / "t")]) == 0
+    assert said in capsys.readouterr().out
+    text = (tmp_path / "t" / "tables.md").read_text()
+    assert text.count(said) == text.count("\n## ") and not re.search(r"\| (paper|WB-WAM)", text)
+    assert main(["tables", str(tmp_path / "a"), "--findings", "--out", str(tmp_path / "f")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "f").exists()
+    assert main(["report", str(tmp_path / "a"), "--table"]) == 0
+    assert said in capsys.readouterr().out
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "c")]) == 0
+    assert said in capsys.readouterr().out
+    for name in ("compare.html", "compare.md"):
+        assert said in (tmp_path / "c" / name).read_text().replace("&#39;", "'")
 
 
 def test_best_next_to_the_best_of_the_paper(tables):
@@ -263,7 +327,7 @@ def test_plain_folders_without_a_suite(tmp_path):
     made = {t.name: t for t in suite_tables(found.cells, paper_numbers())}
     assert row(made["in_gmt"], "twist2", "act fast", "ours")["Boxing"].startswith("50.0")
     assert row(made["cross_gmt"], "twist2 → sonic", "Boxing", "act fast")["Ret %"] == "20.0"
-    assert row(made["in_gmt"], "pd", "stand", "ours")["Boxing"].startswith("0.0")
+    assert row(made["untrained"], "pd", "stand")["Boxing"].startswith("0.0")
     assert entry(made["cross_gmt"], source="ours").labels == "v4"
 
 
@@ -299,7 +363,7 @@ def test_command_writes_the_same_bytes_again(suite, tmp_path, capsys):
     for name in ("a", "b"):
         assert main(["tables", str(suite), "--out", str(tmp_path / name), "--findings"]) == 0
     out = capsys.readouterr().out
-    assert "tables: in_gmt, in_gmt_visual" in out and "## perturbation: visual drop: reproduces" in out
+    assert "tables: in_gmt, in_gmt_visual" in out and "## perturbation: visual drop: undecided" in out
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert {"tables.md", "tables.tex", "cells.csv", "findings.md", "in_gmt.png", "cross_gmt.png"} <= set(names)
     for name in names:
@@ -346,7 +410,7 @@ def test_text_stays_text(text):
     (line,) = [line for line in latex.splitlines() if line.endswith("& 1 \\\\")]
     assert len(re.findall(r"(?<!\\)&", line)) == 1
     markdown = table_text.as_markdown([table], [text])
-    assert "<b>" not in markdown.replace("\\<", "") and "\x1b" not in markdown
+    assert "<b>" not in markdown and "\x1b" not in markdown
 
 
 def balanced(latex):
@@ -373,7 +437,7 @@ def test_latex_is_whole(suite, tmp_path):
     """The document of all tables closes what it opens and has a text for every column; where LaTeX is, it compiles."""
     assert main(["tables", str(suite), "--out", str(tmp_path), "--format", "tex"]) == 0
     text = (tmp_path / "tables.tex").read_text()
-    assert balanced(text) == [] and text.count(r"\toprule") == 11
+    assert balanced(text) == [] and text.count(r"\toprule") == 12
     assert balanced(text.replace(r"\bottomrule", r"\begin{x}", 1)) != []
     if shutil.which("pdflatex"):
         command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "tables.tex"]
@@ -386,14 +450,36 @@ def verdicts(found):
     return {one.name: one.verdict for one in found}
 
 
+def played_by(trainings, swapped=45, visual=45, won=45, families=(("act", "act"),)):
+    """A plan of so many trainings of each recipe on all tasks, matched, swapped and in visual mode."""
+    cells = []
+    for task, (tracker, other), number in itertools.product(
+        (*HOI, *HSI), (("twist2", "sonic"), ("sonic", "twist2")), range(trainings)
+    ):
+        for name, family in families:
+            policy = f"{name}#{number + 1}"
+            cells.append((cell_of(policy, family, tracker, task), outcomes(won + number)))
+            cells.append((cell_of(policy, family, tracker, task, mode="visual"), outcomes(visual + number)))
+            cells.append((cell_of(policy, family, other, task, trained_on=(tracker,)), outcomes(swapped + number)))
+    return cells
+
+
+def findings_of(tmp_path, monkeypatch, plan):
+    """Findings of a suite with these cells, by name."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+    found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
+    return {one.name: one for one in found}
+
+
 def test_findings_follow_the_data(cells):
-    """Claims that the made outcomes hold by far reproduce, those without data are not measured."""
+    """Claims without data are not measured; one training a cell tells little, and the paper's numbers are its own."""
     found = {one.name: one for one in paper_claims.findings(cells.cells, paper_numbers())}
-    assert found["perturbation: visual drop"].verdict == "reproduces"
+    assert found["perturbation: visual drop"].verdict == "undecided"  # three networks
     assert found["perturbation: visual drop"].ours.startswith("+25.0 points (")
     assert found["perturbation: visual drop"].paper == "+9.2 points"
     assert found["perturbation: visual against execution"].verdict == "not measured"
-    assert found["cross-GMT: twist2 → sonic"].verdict == "reproduces"
+    assert SEMANTIC_STRENGTH in found["perturbation: visual against semantic"].remark
+    assert "clutter 0.0 (1 cell), texture 0.0 (2 cells)" in found["perturbation: visual against semantic"].ours
     assert found["cross-GMT: twist2 → sonic"].paper == "+39.9 points on average; nothing left in 22 of 28 cells"
     said = "twist2 HOI: FM 36.1 %; twist2 HSI: FM 58.8 %; sonic HOI: DP 52.2 %; sonic HSI: DP 65.8 %"
     assert found["tracker-conditioned: best family"].paper == said
@@ -401,39 +487,141 @@ def test_findings_follow_the_data(cells):
     assert found["SR and AFR disagree: sonic"].paper == "highest success: DP, fewest falls: π0.5 (5.24 %)"
     assert found["tracker-conditioned: SONIC ahead on HSI"].verdict == "not measured"
     assert found["tracker-conditioned: SONIC ahead on HOI"].paper == "+16.1 points"
-    assert "## cross-GMT: twist2 → sonic: reproduces" in paper_claims.findings_text(list(found.values()))
+    text = findings_text.findings_text(list(found.values()))
+    assert "## cross-GMT: twist2 → sonic: undecided" in text and "these networks" in text.splitlines()[2]
+    assert "13 points" in text and "of 26 through another" in text and "28 of a difference" in text
 
 
 def test_a_claim_that_fails_does_not_reproduce(tmp_path, monkeypatch):
-    """Where visual perturbations change nothing and swaps cost nothing, the verdict says so."""
-    monkeypatch.setattr(os, "fsync", lambda file: None)
-    plan = []
-    for task in (*HOI, *HSI):
-        for tracker, other in (("twist2", "sonic"), ("sonic", "twist2")):
-            plan.append((cell_of("act", "act", tracker, task), outcomes(45)))
-            plan.append((cell_of("act", "act", tracker, task, mode="visual"), outcomes(45)))
-            plan.append((cell_of("act", "act", other, task, trained_on=(tracker,)), outcomes(45)))
-    found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
-    said = verdicts(found)
+    """Where in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
+    said = verdicts(findings_of(tmp_path, monkeypatch, played_by(3)).values())
     assert said["perturbation: visual drop"] == said["cross-GMT: sonic → twist2"] == "does not"
     assert said["cross-GMT: asymmetric drop"] == said["cross-GMT: asymmetric falls"] == "does not"
     assert said["tracker-conditioned: same family"] == "does not"
     assert said["SR and AFR disagree: sonic"] == "not measured"
 
 
+def test_a_claim_that_holds_in_three_trainings_reproduces(tmp_path, monkeypatch):
+    """Drops that all trainings share reproduce, by their own spread, which the page names."""
+    found = findings_of(tmp_path, monkeypatch, played_by(3, swapped=12, visual=20))
+    assert found["perturbation: visual drop"].verdict == found["cross-GMT: sonic → twist2"].verdict == "reproduces"
+    assert "42 trainings" not in found["cross-GMT: sonic → twist2"].ours.replace("21 trainings", "")
+    assert "their standard deviation measured" in found["cross-GMT: sonic → twist2"].ours
+
+
+def test_one_training_decides_nothing_small(tmp_path, monkeypatch):
+    """A difference of 20 points in one training of one task is within what trainings differ by."""
+    plan = [
+        (cell_of("act", "act", tracker, "boxing"), outcomes(won)) for tracker, won in (("twist2", 50), ("sonic", 38))
+    ]
+    found = findings_of(tmp_path, monkeypatch, plan)["tracker-conditioned: same family"]
+    assert found.verdict == "undecided" and found.p_holm > 0.2 and "+20.0 points" in found.ours
+
+
+def test_verdicts_are_adjusted_for_all_claims(tmp_path, monkeypatch):
+    """Each p counts the claims that were tested; a verdict stands only below the level after that."""
+    found = findings_of(tmp_path, monkeypatch, played_by(1, swapped=30, visual=30))
+    tested = [one for one in found.values() if one.p is not None]
+    assert [one.p_holm for one in tested] == pytest.approx(holm([one.p for one in tested]))
+    assert all((one.verdict == "undecided") == (one.p_holm >= 0.05) for one in tested)
+
+
+def test_more_policies_are_compared_on_fewer_tasks(tmp_path, monkeypatch):
+    """The runner-up that has three of seven tasks is compared on these, and who is left out is named."""
+    plan = []
+    for task, tracker in itertools.product((*HOI, *HSI), ("twist2", "sonic")):
+        plan += [(cell_of("act", "act", tracker, task), outcomes(55))]
+        plan += [(cell_of("dp", "diffusion", tracker, task), outcomes(53))] if task in HSI[:3] else []
+        plan += [(cell_of("other", "act", tracker, task), outcomes(3))] if task == HOI[0] else []
+    said = findings_of(tmp_path, monkeypatch, plan)["tracker-conditioned: best family"]
+    assert said.verdict == "undecided" and "act is best with both; leads over the second, dp: +3.3 points" in said.ours
+    assert said.ours.endswith(f"Compared: act, dp on {' '.join(HSI[:3])}; left out: other ({HOI[0]})")
+
+
 def test_merged_training_is_judged_by_its_own_trackers(tmp_path, monkeypatch):
     """A merged policy of one tracker that another one executes is a swap, no effect of merging."""
-    monkeypatch.setattr(os, "fsync", lambda file: None)
     plan = []
     for task in HOI:
         plan += [(cell_of("act", "act", tracker, task), outcomes(45)) for tracker in ("twist2", "sonic")]
         for tracker, won in (("twist2", 45), ("sonic", 0)):
             both = cell_of("all", "act", tracker, task, trained_on=("twist2",), tasks_of=HOI + HSI)
             plan.append((both, outcomes(won)))
-    found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
-    one = {one.name: one for one in found}["merged training: TWIST2x7 HOI"]
-    assert one.ours.startswith("act: 0.0 points (")
-    assert one.verdict == "does not"
+    one = findings_of(tmp_path, monkeypatch, plan)["merged training: TWIST2x7 HOI"]
+    assert one.ours.startswith("act: 0.0 points (") and "4 trainings" in one.ours
+    assert one.verdict == "undecided" and "not separated" in one.remark
+
+
+def test_several_trainings_of_a_recipe_have_a_table(tmp_path, monkeypatch):
+    """Policies `act#1` to `act#3` are one recipe: their successes, mean and standard deviation are one row."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+    plan = [(cell_of(f"act#{n}", "act", "sonic", "boxing"), outcomes(won)) for n, won in ((1, 30), (2, 36), (3, 42))]
+    made = {t.name: t for t in suite_tables(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())}
+    shown = row(made["trainings"], "act", "sonic", "sonic", "Boxing", "base")
+    assert (shown["successes"], shown["mean %"], shown["sd, points"]) == ("30 36 42", "60.0", "10.0")
+    assert "families" not in made
+
+
+def test_declared_spreads_are_those_of_the_page():
+    """The standard deviations between trainings are the pooled ones of the results' table of three trainings."""
+    page = (RESULTS / "README.md").read_text().split("## One training is one sample")[1].split("\n## ")[0]
+    rows = {
+        line.split("|")[1].strip(): [int(n) for n in re.findall(r"\| (\d+)", line)]
+        for line in page.splitlines()
+        if "|" in line
+    }
+    matched, swapped = (
+        [rows[f"{kind}, {which}"] for which in ("first", "second", "now")] for kind in ("matched", "swapped")
+    )
+    drops = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(matched, swapped, strict=True)]
+    for declared, three in ((MATCHED_SPREAD, matched), (SWAPPED_SPREAD, swapped), (DROP_SPREAD, drops)):
+        pooled = sum(statistics.variance(cell) for cell in zip(*three, strict=True)) / len(three[0])
+        assert declared == pytest.approx(pooled**0.5 / 60, abs=0.005)
+
+
+def test_pages_of_results_are_those_of_their_records(tmp_path, monkeypatch):
+    """findings.md and the table of findings in the results' README are what the command makes of the stored cells."""
+    shutil.copy(RESULTS / "README.md", tmp_path)
+    monkeypatch.chdir(RESULTS.parents[1])
+    files = sorted(str(path.relative_to(RESULTS.parents[1])) for path in RESULTS.glob("cells*.csv"))
+    files.remove("docs/results/cells_second.csv")  # other trainings of the same names
+    assert main(["tables", *files, "--findings", "--out", str(tmp_path)]) == 0
+    for name in ("README.md", "findings.md"):
+        assert (tmp_path / name).read_text() == (RESULTS / name).read_text(), name
+    text = (RESULTS / "README.md").read_text()
+    assert text.count(BEGIN) == text.count(END) == 1 and semantic_text() in text and SEMANTIC_STRENGTH in text
+
+
+def test_counts_say_what_episodes_said(suite, cells, tmp_path):
+    """Findings of the written cells.csv have the values of those of the episodes, and know what it says of pairs."""
+    assert main(["tables", str(suite), "--format", "csv", "--out", str(tmp_path)]) == 0
+    assert main(["tables", str(tmp_path / "cells.csv"), "--out", str(tmp_path / "t")]) == 2
+    told = {one.name: one for one in paper_claims.findings(read_cells([tmp_path / "cells.csv"]).cells, paper_numbers())}
+    for one in paper_claims.findings(cells.cells, paper_numbers()):
+        assert told[one.name].ours.split(" points")[0] == one.ours.split(" points")[0], one.name
+    swap = [c for c in read_cells([tmp_path / "cells.csv"]).cells if (c.policy, c.task) == ("act v3.1", "football")]
+    matched, swapped = (
+        next(c for c in swap if (c.tracker, c.mode) == (t, "base") and c.trained_on == ("twist2",))
+        for t in ("twist2", "sonic")
+    )
+    assert paired_rates(matched.held(), swapped.held()).only_first == 25
+    assert sum(swapped.held("fall").values()) == 12
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "message"),
+    [
+        (",60,30,", ",60,99,", r"cells.csv: line \d+: episodes, successes, afr or mode are none of a cell"),
+        (",60,30,", ",60,x,", r"cells.csv: line \d+: successes is 'x', expected a number"),
+        ("ours", "mine", "has no cell of ours"),
+    ],
+)
+def test_damaged_counts_are_refused(suite, tmp_path, was, now, message):
+    """A file of counts with an impossible number is one error that names file and line."""
+    assert main(["tables", str(suite), "--format", "csv", "--out", str(tmp_path)]) == 0
+    path = tmp_path / "cells.csv"
+    path.write_text(path.read_text().replace(was, now))
+    with pytest.raises(InputError, match=message):
+        read_cells([path])
 
 
 def test_damaged_suites_are_refused(suite, tmp_path):

@@ -8,6 +8,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.results import RunRecord, load_run
 from arena_newton.eval.stats import aggregate, wilson
+from arena_newton.eval.table_entries import SEMANTIC_STRENGTH, semantic_text
 from arena_newton.eval.tables import joint_table
 
 
@@ -60,6 +61,14 @@ def test_what_is_missing_is_said(tmp_path):
     run.document["planned"] = 60
     text = joint_table([run])
     assert "a is incomplete: 50 of 60 episodes." in text and "1 episode of 50 ended with an error." in text
+
+
+def test_semantic_numbers_say_what_they_are(tmp_path):
+    """A table with semantic mode says what that changes and who chose its strength; one without does not."""
+    for mode in ("base", "semantic"):
+        rows = [row | {"mode": mode} for row in episodes("football", (4, 5, 7))]
+        text = joint_table([run_of(tmp_path, "a", rows)])
+        assert (SEMANTIC_STRENGTH in text) == (semantic_text() in text) == (mode == "semantic")
 
 
 @pytest.mark.parametrize(

@@ -215,18 +215,6 @@ def test_stocked_decks_leave_the_second_one_empty():
     assert all(high < 0.67 - 0.03 or low > 1.17 for low, high in spans)
 
 
-@pytest.mark.parametrize("task", SCENES)
-def test_semantic_variant_changes_looks_not_the_task(task):
-    """The semantic variant keeps every body's mass and every collider of the base scene (P&PBox adds clutter)."""
-    base, changed = scene(task), scene(task, "semantic")
-    assert base.body_ids.keys() == changed.body_ids.keys()
-    np.testing.assert_array_equal(base.mj_model.body_mass, changed.mj_model.body_mass)
-    added = set(changed.geom_labels) - set(base.geom_labels)
-    assert set(base.geom_labels) <= set(changed.geom_labels)
-    assert all(label.startswith("/World/Clutter/") for label in added)
-    assert bool(added) == (task == "pp_box")
-
-
 def test_layers_are_what_their_authors_write(tmp_path):
     """Building again gives the stored scenes, variants and textures, byte for byte."""
     build_all(tmp_path, ["textures", *tasks.names()])

@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from arena_newton import tasks
+from arena_newton import rule_sets, tasks
+from arena_newton.eval.table_entries import semantic_text, task_title
 from arena_newton.scene import SCENES, load_scene
 
 TASKS = tuple(name for name in tasks.names() if tasks.get(name).suite == "HSI")
@@ -216,14 +217,40 @@ def test_zone_is_the_outline():
     assert (zone.round, ring.round) == (False, True) and ring.half == zone.half
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_semantic_variant_changes_looks_not_matter(task):
-    """The semantic variant looks different and has the same bodies, solids and masses."""
-    base, changed = scene_of(task), scene_of(task, variant="semantic")
-    assert base.geom_labels == changed.geom_labels
-    assert np.array_equal(base.mj_model.body_mass, changed.mj_model.body_mass)
+def compiled(scene):
+    """Every array and number of the compiled model, as bytes, but those of names and of the search trees of geoms."""
+    model = scene.mj_model
+    values = {name: getattr(model, name) for name in dir(model) if not name.startswith(("_", "name", "nname", "nbuf"))}
+    kept = {name: value for name, value in values.items() if isinstance(value, np.ndarray | int | float)}
+    return {name: np.asarray(value) for name, value in kept.items() if name != "signature"}
+
+
+@pytest.mark.parametrize("task", tasks.names())
+def test_semantic_mode_changes_what_its_task_says(task):
+    """Semantic mode compiles to the model of base mode to the last bit, but for geoms that are clutter by its task."""
+    spec = tasks.get(task)
+    base, changed = (
+        scene_of(task, variant=spec.variant(mode, rule_sets.get("paper"))) for mode in ("base", "semantic")
+    )
+    models = compiled(base), compiled(changed)
+    assert models[0].keys() == models[1].keys() and len(models[0]) > 200
+    differing = {name for name in models[0] if models[0][name].tobytes() != models[1][name].tobytes()}
+    added = [label for label in changed.geom_labels if label not in base.geom_labels]
+    assert (spec.semantic_change == "clutter") == bool(added)
+    if added:  # things that are fixed to the world; bodies, joints and the geoms of base mode are as they were
+        assert len(added) == 5 and all(label.startswith("/World/Clutter/") for label in added)
+        assert all(name.startswith(("geom_", "bvh_", "nbvh", "ngeom", "body_")) for name in differing), differing
+        kept = [changed.geom_labels.index(label) for label in base.geom_labels]
+        for name in ("geom_pos", "geom_quat", "geom_size", "geom_type", "geom_friction", "geom_solref", "geom_condim"):
+            assert models[0][name].tobytes() == models[1][name][kept].tobytes(), name
+        assert differing & {name for name in differing if name.startswith("body_")} <= {
+            f"body_{what}" for what in ("bvhadr", "bvhnum", "conaffinity", "contype", "geomadr", "geomnum")
+        }
+    else:
+        assert differing == set()
     colours = [s.model.shape_color.numpy() for s in (base, changed)]
     assert base.model.shape_label != changed.model.shape_label or not np.array_equal(*colours)
+    assert task_title(task) in semantic_text()
 
 
 def test_variant_by_override_alone(tmp_path):
