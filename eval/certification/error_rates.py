@@ -26,6 +26,8 @@ __all__ = ["CHECKS", "EventTally", "mcnemar_power", "tallies"]
 
 COMPARISONS = 10_000
 """Synthetic comparisons of each case."""
+MOST_TRAINED = 2_000
+"""Comparisons of a case of several trainings, which take longer."""
 QUICK_COMPARISONS = 300
 """Under --quick."""
 RATES = (0.2, 0.4, 0.6)
@@ -108,7 +110,7 @@ def tallies(comparisons: int, episodes: int = EPISODES, seed: int = SEED) -> lis
         found += list(_paired(rng, comparisons, episodes, difference).values())
         found += list(_unpaired(rng, comparisons, episodes, difference).values())
     for spread in SPREADS:
-        found += list(_trained(rng, comparisons, episodes, spread).values())
+        found += list(_trained(rng, min(comparisons, MOST_TRAINED), episodes, spread).values())
     return found
 
 

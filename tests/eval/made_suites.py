@@ -7,6 +7,7 @@ from test_report import document_of
 
 from arena_newton import seeding, tasks
 from arena_newton.eval.journal import Journal
+from arena_newton.eval.stats import suites
 from arena_newton.eval.suite_records import (
     SUITE_FILE,
     CellEvent,
@@ -17,6 +18,7 @@ from arena_newton.eval.suite_records import (
     suite_json,
 )
 
+HOI, HSI = suites()["HOI_AVG"], suites()["HSI_AVG"]
 SEEDS, REPEATS = (0, 1, 2), 20
 
 
@@ -83,3 +85,27 @@ def write_suite(folder, cells, name="made"):
     plan = SuitePlan(folder, name, "made.toml", "0123456789ab", tuple(cell for cell, _ in cells))
     (folder / SUITE_FILE).write_text(json.dumps(suite_json(plan)))
     return folder
+
+
+def plan():
+    """Cells of a suite: two families on HOI, swaps, modes, merged training, latency, both label protocols."""
+    cells = []
+    for number, task in enumerate(HOI):
+        cells.append((cell_of("act", "act", "twist2", task), outcomes(30 + 6 * number, falls=3)))
+        cells.append((cell_of("dp", "diffusion", "twist2", task), outcomes(12 + 6 * number, offset=3)))
+        cells.append((cell_of("act", "act", "sonic", task), outcomes(48)))
+        cells.append((cell_of("act", "act", "twist2", task, mode="visual"), outcomes(15 + 6 * number)))
+        cells.append((cell_of("act", "act", "twist2", task, mode="semantic"), outcomes(30 + 6 * number)))
+        for tracker, won in (("twist2", 20), ("sonic", 40)):
+            both = cell_of("all", "act", tracker, task, trained_on=("sonic", "twist2"), tasks_of=HOI + HSI)
+            cells.append((both, outcomes(won)))
+    cells.append((cell_of("act", "act", "sonic", "football", trained_on=("twist2",)), outcomes(5, falls=12)))
+    cells.append((cell_of("dp", "diffusion", "sonic", "football", trained_on=("twist2",)), outcomes(0)))
+    cells.append((cell_of("act", "act", "twist2", "football", trained_on=("sonic",)), outcomes(40)))
+    cells.append((cell_of("pi", "pi05", "twist2", "boxing"), outcomes(0)))
+    cells.append((cell_of("pi", "pi05", "sonic", "boxing", trained_on=("twist2",)), outcomes(0)))
+    cells.append((cell_of("act", "act", "twist2", "football", latency=10), outcomes(20)))
+    cells.append((cell_of("act", "act", "twist2", "football", labels="v4"), outcomes(45)))
+    cells.append((cell_of("expert", "expert", "twist2", "football", trained_on=(), tasks_of=()), outcomes(60)))
+    cells.append((cell_of("act", "act", "twist2", "vis_navi"), None))
+    return cells

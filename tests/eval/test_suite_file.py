@@ -57,6 +57,10 @@ def test_labels_are_those_of_the_product():
         ),
         (START + START[START.index("[[") :] * 1000, "policies: has 1,001 entries, expected at most 1,000"),
         ('name = "../x"\n' + START, 'name is "../x", expected letters'),
+        (
+            START.replace('"a"', '"a#0"'),
+            'name is "a#0", expected letters, digits, _ - and [+]; #2 at the end for a second',
+        ),
         (START.replace("boxing", "bxing"), r"\[matrix\]: tasks: bxing is unknown, known are football"),
         (START.replace('["twist2", "sonic"]', '"twist3"'), r"\[matrix\]: trackers: --tracker twist3: unknown tracker"),
         (START.replace('["twist2", "sonic"]', "[]"), r"\[matrix\]: trackers is empty"),
@@ -134,6 +138,12 @@ def test_conditions_are_in_the_id(tmp_path):
         "a/sonic/boxing/base.released",
         "a/sonic/boxing/base.released.latency5",
     ]
+
+
+def test_trainings_of_one_recipe_have_numbers(tmp_path):
+    """A name may end in the number of the training, which is in the id and so in the folder of its cells."""
+    cells = read(tmp_path, START.replace('"a"', '"a#2"'))
+    assert [cell.folder for cell in cells] == ["a#2/twist2/boxing/base", "a#2/sonic/boxing/base"]
 
 
 LEARNED = """[matrix]
