@@ -12,7 +12,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
 
-__all__ = ["link", "new_folder", "scratch_folder"]
+__all__ = ["held_folder", "link", "new_folder", "scratch_folder"]
 
 LOCK = f"{PARTIAL}.lock"
 """Ending of the file that is locked while the folder grows."""
@@ -65,6 +65,34 @@ def scratch_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
                 lock.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{flag} {out}: cannot be written ({error})") from error
+
+
+@contextlib.contextmanager
+def held_folder(out: Path, doing: str, flag: str = "--out") -> Iterator[None]:
+    """A folder, made where there is none and kept from other processes while the block lasts.
+
+    Args:
+        out: The folder.
+        doing: What another process does there, in the message: "trains in it".
+        flag: What the message names.
+
+    Raises:
+        InputError: Another process holds it, or it cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError(f"{flag} {out}: cannot be made ({error.strerror})") from None
+    try:
+        with contextlib.suppress(OSError):  # some network disks have no locks
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(f"{flag} {out}: another process {doing}") from None
+        yield
+    finally:
+        os.close(folder)
 
 
 def link(source: Path, target: Path) -> None:

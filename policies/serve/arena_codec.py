@@ -75,7 +75,7 @@ def pack_begin(begin: Begin) -> bytes:
     return _dumped({key: value for key, value in content.items() if value is not None})
 
 
-def unpack_begin(body: bytes) -> Begin:
+def unpack_begin(body: bytes | bytearray) -> Begin:
     """What the body of `/reset` says; an empty one begins an episode, too.
 
     Raises:
@@ -118,7 +118,7 @@ def pack_look(look: Look) -> bytes:
     return _dumped(content | {key: value for key, value in more.items() if value is not None})
 
 
-def unpack_look(body: bytes) -> tuple[Look, bool]:
+def unpack_look(body: bytes | bytearray) -> tuple[Look, bool]:
     """What the body of `/infer` shows, and whether a whole chunk is wanted.
 
     Raises:
@@ -209,14 +209,14 @@ def _refused(constant: str) -> object:
     raise ValueError(f"{constant} is no JSON")
 
 
-def _request(body: bytes, where: str) -> dict[str, object]:
+def _request(body: bytes | bytearray, where: str) -> dict[str, object]:
     """The object of a request, which has few values; they are counted before anything is made of them."""
     if sum(body.count(mark) for mark in (b",", b"[", b"{")) > MAX_OBJECTS:
         raise WireError(f"{where}: more than {MAX_OBJECTS} values")
     return _object(body, where)
 
 
-def _object(body: bytes, where: str) -> dict[str, object]:
+def _object(body: bytes | bytearray, where: str) -> dict[str, object]:
     if len(body) > MAX_FRAME:
         raise WireError(f"{where}: {len(body)} bytes, expected at most {MAX_FRAME}")
     try:
@@ -239,10 +239,16 @@ def _picture(value: object, where: str) -> np.ndarray:
     coded = value.get("data_b64")
     if not isinstance(coded, str) or len(coded) > MAX_FRAME:
         raise WireError(f"{where}: images.front.data_b64 is {_kind(coded)}, expected base64")
-    if value.get("dtype", "uint8") != "uint8":
-        raise WireError(f"{where}: images.front.dtype is {plain_text(value['dtype'], 20)!r}, expected uint8")
+    dtype = value.get("dtype", "uint8")
+    if dtype not in ("uint8", "float32"):
+        raise WireError(f"{where}: images.front.dtype is {plain_text(dtype, 20)!r}, expected uint8 or float32")
     try:
         data = base64.b64decode(coded, validate=True)
     except (binascii.Error, ValueError):
         raise WireError(f"{where}: images.front.data_b64 is not base64") from None
-    return read_picture(checked_array(data, "uint8", value.get("shape"), f"{where}: images.front"), where)
+    picture = checked_array(data, dtype, value.get("shape"), f"{where}: images.front")
+    if dtype == "float32":  # the original's server divides these by 255, too
+        if not ((picture >= 0.0) & (picture <= 255.0) & (picture == np.rint(picture))).all():
+            raise WireError(f"{where}: images.front of float32 holds other than whole numbers from 0 to 255")
+        picture = picture.astype(np.uint8)
+    return read_picture(picture, where)

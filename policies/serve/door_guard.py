@@ -6,12 +6,13 @@ import hmac
 import os
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from arena_newton.errors import InputError
+from arena_newton.policies.teleop.ports import names_this_machine
 
-__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "DoorGuard"]
+__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "DoorGuard", "same_token"]
 
 ACCESS_TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 """Environment variable with the token that clients must send; the same of which clients take theirs."""
@@ -28,12 +29,13 @@ _SCHEMES = ("bearer", "api-key")
 class DoorGuard:
     """Decides about connections and requests."""
 
-    def __init__(self, connections: int, token: str | None = None):
+    def __init__(self, connections: int, token: str | None = None, *, local: bool = False):
         """Take the number of connections at once and the token.
 
         Args:
             connections: Most at once.
             token: What clients must send as `Authorization: Bearer`; empty for none, the environment's by default.
+            local: The address is this machine's own: without a token, requests must name it so.
 
         Raises:
             InputError: A token that no HTTP header can carry; it is not printed.
@@ -43,7 +45,7 @@ class DoorGuard:
             raise InputError(
                 f"{ACCESS_TOKEN_VARIABLE}: holds a space, a line end or another character that no token has"
             )
-        self.connections = connections
+        self.connections, self._local = connections, local
         self._inside = self._arrived = 0
         self._lock = threading.Lock()
 
@@ -52,20 +54,25 @@ class DoorGuard:
         """Whether clients must send one."""
         return bool(self._token)
 
-    def refusal(self, path: str, authorization: str | None, origin: str | None) -> tuple[int, str] | None:
+    def refusal(
+        self, path: str, authorization: str | None, origin: str | None, hosts: Sequence[str]
+    ) -> tuple[int, str] | None:
         """Status and sentence for a request that is not let in; None for one that is.
 
         Args:
             path: Its route.
             authorization: Its header of that name.
             origin: Its header of that name, which browsers send: no page of a web site may ask a policy.
+            hosts: Its headers `Host`; browsers send one.
         """
         if origin is not None:
             return 403, "requests of browsers are not answered"
+        if self._local and not self._token and hosts and not names_this_machine(hosts):
+            return 403, "Host is another name than this machine's own (127.0.0.1, localhost)"
         if not self._token or path in HEALTH_PATHS:
             return None
         scheme, _, given = (authorization or "").partition(" ")
-        if scheme.lower() in _SCHEMES and hmac.compare_digest(_bytes(given.strip()), _bytes(self._token)):
+        if scheme.lower() in _SCHEMES and same_token(given.strip(), self._token):
             return None
         return 401, "the token is missing or wrong (Authorization: Bearer)"
 
@@ -99,6 +106,6 @@ class DoorGuard:
                 self._inside -= room
 
 
-def _bytes(text: str) -> bytes:
-    """Bytes of a header, also of one that is no text."""
-    return text.encode(errors="surrogateescape")
+def same_token(given: str, token: str) -> bool:
+    """Compare a token, which may be bytes that are no text, in a time that says nothing of it."""
+    return hmac.compare_digest(*(text.encode(errors="surrogateescape") for text in (given, token)))

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -103,7 +104,8 @@ class _Handler(BaseHTTPRequestHandler):
                 self.server.begin(address, client, self.connection, unpack_begin(body))
                 self._send(200, pack_begun(policy.facts))
             elif path == "/infer":
-                look, chunk = unpack_look(body)
+                look, chunk = policy.read(len(body), partial(unpack_look, body))
+                del body  # its picture is unpacked
                 actions = self.server.look(address, client, self.connection, look, chunk=chunk)
                 self._send(200, pack_chunk(actions, chunk=chunk))
             else:
@@ -115,7 +117,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refused(self, path: str) -> bool:
         headers = self.headers
-        refusal = self.server.guard.refusal(path, headers.get("Authorization"), headers.get("Origin"))
+        names = headers.get("Authorization"), headers.get("Origin"), headers.get_all("Host") or []
+        refusal = self.server.guard.refusal(path, *names)
         if refusal is None and path not in HEALTH_PATHS and not self._let_in():
             refusal = 503, f"there are {self.server.guard.connections} connections already"
         if refusal is not None:
@@ -131,7 +134,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.connection.settimeout(IDLE_CONNECTION)
         return self.room
 
-    def _body(self) -> bytes | None:
+    def _body(self) -> bytearray | None:
         """The body of a request; None where it cannot be read and the client was told so."""
         lengths = self.headers.get_all("Content-Length") or []
         if self.headers.get("Transfer-Encoding") or len(lengths) != 1 or not lengths[0].isascii():
@@ -145,17 +148,16 @@ class _Handler(BaseHTTPRequestHandler):
             self._hang_up(413, f"a body of {left} bytes, expected at most {MAX_FRAME}")
             self._drain(min(left, DRAIN_FRAMES * MAX_FRAME))
             return None
-        end, pieces = time.monotonic() + BODY_SECONDS, []
-        while left:
+        end, body, got = time.monotonic() + BODY_SECONDS, bytearray(left), 0
+        while got < left:
             self.connection.settimeout(max(end - time.monotonic(), 0.01))
-            piece = self.rfile.read1(min(left, 1 << 16))
-            if not piece:
+            read = self.rfile.readinto1(memoryview(body)[got : got + (1 << 16)])
+            if not read:
                 self.close_connection = True
                 return None
-            pieces.append(piece)
-            left -= len(piece)
+            got += read
         self.connection.settimeout(IDLE_CONNECTION)
-        return b"".join(pieces)
+        return body
 
     def _drain(self, left: int) -> None:
         """Read and drop what a client goes on sending."""

@@ -110,7 +110,7 @@ def unpack(
     data: bytes,
     keys: ArrayKeys,
     where: str,
-    special: Callable[[Mapping[str, object], str], np.ndarray | None] | None = None,
+    special: Callable[[Mapping[str, object], str], object] | None = None,
 ) -> Value:
     """What a message holds; arrays own their memory.
 

@@ -41,12 +41,13 @@ def fitted_picture(image: np.ndarray, camera: CameraConfig) -> np.ndarray:
     elif abs(aspect * camera.height / camera.width - 1.0) > SAME_ASPECT:
         wanted = f"{camera.width}x{camera.height}"
         raise WireError(f"a picture of {width}x{height} cannot be made {wanted}: send {wanted}, native")
-    channels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
-    scaled = torch.nn.functional.interpolate(
-        channels, size=(inner_h, inner_w), mode="bilinear", antialias=True, align_corners=False
-    )
     made = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     top, left = (camera.height - inner_h) // 2, (camera.width - inner_w) // 2
-    inner = scaled[0].permute(1, 2, 0).round().clamp(0.0, 255.0).to(torch.uint8)
-    made[top : top + inner_h, left : left + inner_w] = inner.numpy()
+    for colour in range(3):  # one after the other: in float32 a picture takes four times its memory
+        channel = torch.from_numpy(np.ascontiguousarray(image[..., colour]))[None, None].float()
+        scaled = torch.nn.functional.interpolate(
+            channel, size=(inner_h, inner_w), mode="bilinear", antialias=True, align_corners=False
+        )
+        inner = scaled[0, 0].round().clamp(0.0, 255.0).to(torch.uint8)
+        made[top : top + inner_h, left : left + inner_w, colour] = inner.numpy()
     return made

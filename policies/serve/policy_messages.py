@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.policies.serve.wire_error import WireError
+
+if TYPE_CHECKING:
+    from arena_newton.policies.serve.packed_picture import PackedPicture
 
 __all__ = [
     "LONGEST_CHUNK",
@@ -19,6 +23,7 @@ __all__ = [
     "End",
     "Look",
     "Request",
+    "check_picture_size",
     "read_actions",
     "read_count",
     "read_picture",
@@ -28,8 +33,10 @@ __all__ = [
 
 LONGEST_CHUNK = 4096
 """Most actions of a chunk."""
-PICTURE_SIDES = (16, 4096)
+PICTURE_SIDES = (16, 2048)
 """Smallest and largest width and height of a picture [px]."""
+MOST_PIXELS = 1920 * 1200
+"""Most pixels of a picture."""
 MAX_SEED = 2**63 - 1
 """Largest seed of an episode."""
 MAX_STEP = 10**9
@@ -70,6 +77,8 @@ class Look:
     """Actions that the episode has executed so far; None: not said."""
     robot_type: str = ""
     """The label protocol's `robot_type` that the robot executes; empty: not said."""
+    packed: PackedPicture | None = None
+    """The picture as its sender packed it, instead of `image`."""
 
 
 @dataclass(frozen=True)
@@ -125,12 +134,22 @@ def read_picture(value: object, where: str) -> np.ndarray:
     if not isinstance(value, np.ndarray) or value.dtype != np.uint8:
         kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
         raise WireError(f"{where}: the picture is {kind}, expected uint8")
-    low, high = PICTURE_SIDES
-    if value.ndim != 3 or value.shape[2] != 3 or not all(low <= n <= high for n in value.shape[:2]):
-        raise WireError(
-            f"{where}: the picture has shape {list(value.shape)}, expected [H, W, 3] with {low} to {high} pixels a side"
-        )
+    if value.ndim != 3 or value.shape[2] != 3:
+        raise WireError(f"{where}: the picture has shape {list(value.shape)}, expected [H, W, 3]")
+    check_picture_size(value.shape[1], value.shape[0], where)
     return value
+
+
+def check_picture_size(width: int, height: int, where: str) -> None:
+    """Check width and height of a picture [px].
+
+    Raises:
+        WireError: It is too small or too large.
+    """
+    low, high = PICTURE_SIDES
+    if not (low <= width <= high and low <= height <= high and width * height <= MOST_PIXELS):
+        expected = f"{low} to {high} pixels a side and at most {MOST_PIXELS}"
+        raise WireError(f"{where}: a picture of {width}x{height}, expected {expected}")
 
 
 def read_text(value: object, where: str, name: str) -> str:

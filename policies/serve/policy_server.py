@@ -16,9 +16,9 @@ import time
 import traceback
 import zlib
 from collections import Counter, deque
-from collections.abc import Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -33,6 +33,8 @@ from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.serve.handshake import RATE, ServedFacts, ServedPicture
+from arena_newton.policies.serve.message_readers import MessageReaders
+from arena_newton.policies.serve.packed_picture import PackedPicture
 from arena_newton.policies.serve.picture_fit import fitted_picture
 from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.wire_error import WireError
@@ -45,6 +47,8 @@ LONGEST_ACT = 600.0
 IDLE = 30.0
 """Time without a request after which no batch waits for a session any more, and after which one that no connection
 holds may lose its row to another [s]."""
+SMALL_MESSAGE = 64 * 2**10
+"""Largest message that a connection reads itself [bytes]."""
 ABANDONED = 5.0
 """The same of a session whose connection has closed, until it asks over another one [s]."""
 WARM_UP_SEED = 0
@@ -191,6 +195,7 @@ class PolicyServer:
         self._jobs: deque[_Job] = deque()
         self._news = threading.Condition()
         self._closed = False
+        self.readers = MessageReaders()
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._known = {}
         for name in tasks.names():
@@ -262,7 +267,25 @@ class PolicyServer:
         Raises:
             Refused: The look is unfit, its episode is not known, or the policy failed.
         """
-        return self._wait_for(_Job("look", owner, look.session, look, Future(), held))
+        return self._wait_for(_Job("look", owner, look.session, self._fitted(look), Future(), held))
+
+    def read[T](self, size: int, read: Callable[[], T]) -> T:
+        """What a message holds, read in its turn; a small one is read at once.
+
+        Args:
+            size: Bytes of the message.
+            read: Reads it.
+
+        Raises:
+            Refused: The server closes.
+        """
+        return read() if size <= SMALL_MESSAGE else self._in_turn(size, read)
+
+    def _in_turn[T](self, size: int, read: Callable[[], T]) -> T:
+        try:
+            return self.readers.run(size, read)
+        except CancelledError:
+            raise Refused("closing", "the server is closing") from None
 
     def end(self, owner: str, session: str) -> None:
         """End a session's episode and free its row."""
@@ -283,6 +306,7 @@ class PolicyServer:
         with self._news:
             self._closed = True
             self._news.notify_all()
+        self.readers.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
         self.policy.close()
@@ -465,6 +489,24 @@ class PolicyServer:
             self._act(task, asking)
         self.counts.last_look = time.monotonic()
 
+    def _fitted(self, look: Look) -> Look:
+        """A look as the policy sees it: its picture scaled, or none. Large pictures never wait unpacked for others."""
+        if self._image is None:
+            return replace(look, image=None, packed=None)
+        picture = look.image if look.packed is None else look.packed
+        size = (self._camera.height, self._camera.width)
+        if picture is None or isinstance(picture, np.ndarray) and picture.shape[:2] == size:
+            return look
+
+        def fit() -> np.ndarray:
+            pixels = picture.unpacked() if isinstance(picture, PackedPicture) else picture
+            return fitted_picture(pixels, self._camera)
+
+        try:
+            return replace(look, image=self._in_turn(picture.nbytes, fit), packed=None)
+        except Exception as error:
+            raise self._refusal(error) from None
+
     def _see(self, row: int, look: Look) -> None:
         """Put what a session sees into its row."""
         if look.robot_type and look.robot_type != self.protocol.robot_type:
@@ -473,8 +515,7 @@ class PolicyServer:
         if self._image is not None:
             if look.image is None:
                 raise Refused("unfit", f"policy {self.policy.name} looks at pictures, the message holds none")
-            picture = fitted_picture(look.image, self._camera)
-            self._image[row] = torch.from_numpy(np.ascontiguousarray(picture)).to(self.device)
+            self._image[row] = torch.from_numpy(np.ascontiguousarray(look.image)).to(self.device)
         self._state[row] = torch.from_numpy(look.state).to(self.device)
 
     def _observation(self, task: _Task, rows: Sequence[int]) -> Observation:

@@ -11,8 +11,8 @@ from arena_newton.policies.serve.wire_error import WireError
 
 __all__ = ["MAX_FRAME", "MAX_OBJECTS", "checked_array", "is_number_type"]
 
-MAX_FRAME = 16 * 2**20
-"""Longest message that is read [bytes]; a picture of 1920x1080 is 6.2 MB."""
+MAX_FRAME = 10 * 2**20
+"""Longest message that is read [bytes]; a picture of 1920x1200 is 6.9 MB, and 9.2 MB as base64."""
 MAX_OBJECTS = 65536
 """Most values in a message, those inside others counted; bytes of an array are one."""
 MAX_DIMENSIONS = 8

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import ssl
 import threading
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from arena_newton.policies.serve.http_door import HttpDoor
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.policies.serve.websocket_doors import WebsocketDoor
-from arena_newton.policies.teleop.ports import bind
+from arena_newton.policies.teleop.ports import bind, is_local
 
 __all__ = ["make_policy", "open_door", "serve_policy"]
 
@@ -49,7 +48,7 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
         InputError: A flag is wrong, or the policy cannot be served.
     """
     say = say or (lambda line: print(line, flush=True))
-    guard = DoorGuard(options.max_sessions + SPARE_CONNECTIONS)
+    guard = DoorGuard(options.max_sessions + SPARE_CONNECTIONS, local=is_local(options.host))
     tls = _tls(options)
     if options.task is not None:
         tasks.get(options.task)
@@ -176,13 +175,6 @@ def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, por
     ]
     asked = f"{options.protocol}+wss" if options.tls_cert else options.protocol
     lines.append(f"eval asks it by --policy remote:{scheme if kind == 'http' else asked}://{address}")
-    if not guard.wants_token and not _local(options.host):
+    if not guard.wants_token and not is_local(options.host):
         lines.append(f"warning: whoever reaches {address} can ask; set {ACCESS_TOKEN_VARIABLE} to a token")
     return lines
-
-
-def _local(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

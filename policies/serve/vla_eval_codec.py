@@ -10,8 +10,6 @@ github.com/allenai/vla-evaluation-harness at e1ee9ad. `task`, `seed`, `step` and
 from __future__ import annotations
 
 import io
-import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -22,10 +20,10 @@ from PIL import Image
 from arena_newton import __version__
 from arena_newton.policies.serve.handshake import ServedFacts, read_facts
 from arena_newton.policies.serve.packed_arrays import TEXT_KEYS, Value, WireError, checked_array, pack, unpack
+from arena_newton.policies.serve.packed_picture import PICTURE_FORMATS, PackedPicture
 from arena_newton.policies.serve.policy_messages import (
     MAX_SEED,
     MAX_STEP,
-    PICTURE_SIDES,
     Begin,
     End,
     Look,
@@ -60,14 +58,11 @@ TYPES = ("hello", "observation", "action", "episode_start", "episode_end", "erro
 """Types of messages."""
 CHUNKS = "chunks"
 """Capability of a robot that executes whole chunks, and of a server that gives them."""
-MOST_PIXELS = 4096 * 4096
-"""Most pixels of all packed pictures in a message; one of a single colour is a thousandth of its size."""
 CAMERA = "front"
 """Name of the head camera among the pictures."""
 WHERE = "message"
 """How errors name a request."""
 LARGEST_SEQ = 2**63 - 1
-_FORMATS = {"png": "PNG", "jpeg": "JPEG"}
 
 type ImageFormat = Literal["png", "jpeg", "raw"]
 """How pictures are written; `jpeg` changes them."""
@@ -95,22 +90,14 @@ def pack_message(
 
 
 def unpack_message(data: bytes | str) -> VlaEvalMessage:
-    """What a frame holds.
+    """What a frame holds; packed pictures in it are left packed.
 
     Raises:
         WireError: It is none.
     """
     if isinstance(data, str):
         raise WireError(f"{WHERE}: a text frame, expected MessagePack in a binary frame")
-    left = MOST_PIXELS
-
-    def read_picture_of(item: Mapping[str, object], where: str) -> np.ndarray | None:
-        nonlocal left
-        picture = _unpacked_picture(item, where, left)
-        left -= 0 if picture is None else picture.size // 3
-        return picture
-
-    content = unpack(data, TEXT_KEYS, WHERE, read_picture_of)
+    content = unpack(data, TEXT_KEYS, WHERE, _picture)
     if not isinstance(content, dict):
         raise WireError(f"{WHERE}: {type(content).__name__}, expected a map")
     missing = [name for name in ("type", "payload", "seq", "timestamp") if name not in content]
@@ -201,10 +188,12 @@ def unpack_request(message: VlaEvalMessage) -> Request:
         raise WireError(f"{WHERE}: images is {type(pictures).__name__}, expected a map")
     if len(pictures) > 1 and CAMERA not in pictures:
         raise WireError(f"{WHERE}: several pictures, and none is named {CAMERA}")
-    picture = pictures.get(CAMERA, next(iter(pictures.values()), None))
+    picture: object = pictures.get(CAMERA, next(iter(pictures.values()), None))
+    packed = picture if isinstance(picture, PackedPicture) else None
     return Look(
         state=read_state(payload.get("states"), WHERE),
-        image=None if picture is None else read_picture(picture, WHERE),
+        image=None if picture is None or packed is not None else read_picture(picture, WHERE),
+        packed=packed,
         task=task,
         instruction=instruction,
         session=session,
@@ -249,28 +238,17 @@ def _packed_picture(array: np.ndarray, images: ImageFormat) -> Mapping[str, obje
         return None
     file = io.BytesIO()
     more = {"quality": 95} if images == "jpeg" else {"compress_level": 1}
-    Image.fromarray(array).save(file, _FORMATS[images], **more)
+    Image.fromarray(array).save(file, images, **more)
     return {"__image__": True, "format": images, "data": file.getvalue(), "shape": list(array.shape)}
 
 
-def _unpacked_picture(content: Mapping[str, object], where: str, most: int) -> np.ndarray | None:
-    """The picture of at most `most` pixels that a map stands for; None where it is another map."""
+def _picture(content: Mapping[str, object], where: str) -> np.ndarray | PackedPicture | None:
+    """The picture that a map stands for; None where it is another map."""
     if content.get("__image__") is not True:
         return None
     form, data = content.get("format"), content.get("data")
     if form == "raw":
         return checked_array(data, content.get("dtype"), content.get("shape"), where)
-    if form not in _FORMATS or not isinstance(data, bytes):
+    if form not in PICTURE_FORMATS or not isinstance(data, bytes):
         raise WireError(f"{where}: a picture of format {plain_text(form, 20)!r}, expected png, jpeg or raw")
-    low, high = PICTURE_SIDES
-    try:
-        with warnings.catch_warnings(action="error"), Image.open(io.BytesIO(data), formats=[_FORMATS[form]]) as file:
-            if not all(low <= n <= high for n in file.size):  # before it is unpacked
-                raise WireError(f"{where}: a picture of {file.size[0]}x{file.size[1]}, expected {low} to {high} pixels")
-            if math.prod(file.size) > most:
-                raise WireError(f"{where}: pictures of more than {MOST_PIXELS} pixels in all")
-            return np.asarray(file.convert("RGB")).copy()
-    except WireError:
-        raise
-    except Exception as error:  # a damaged picture fails anywhere inside Pillow
-        raise WireError(f"{where}: not a picture of format {form} ({type(error).__name__})") from None
+    return PackedPicture.read(data, str(form), where)

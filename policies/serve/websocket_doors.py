@@ -7,15 +7,14 @@ back and never a traceback.
 from __future__ import annotations
 
 import http
-import logging
+import itertools
 import socket
 import ssl
 import sys
-import threading
 import time
 import traceback
 from collections import deque
-from contextlib import suppress
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -23,15 +22,16 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
-from websockets.sync.server import ServerConnection, serve
+from websockets.sync.server import ServerConnection
 
 from arena_newton.errors import ArenaError
 from arena_newton.policies.serve import openpi_codec, vla_eval_codec
 from arena_newton.policies.serve.arena_codec import pack_config, pack_failure
-from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
+from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
 from arena_newton.policies.serve.policy_messages import Begin, End, Look
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.raw_arrays import MAX_FRAME
+from arena_newton.policies.serve.websocket_listener import WebsocketListener
 from arena_newton.text import plain_text
 
 __all__ = ["WebsocketDoor", "WebsocketProtocol"]
@@ -39,12 +39,8 @@ __all__ = ["WebsocketDoor", "WebsocketProtocol"]
 type WebsocketProtocol = Literal["openpi", "roboarena", "vla-eval"]
 """What is spoken; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
 
-PING_SECONDS, PONG_SECONDS = 20.0, 300.0
-"""Time between two pings, and time that a client has to answer one: compiling kernels holds up a robot [s]."""
-FAREWELL_SECONDS = 1.0
-"""Time that clients have, all together, to answer that the server closes [s]."""
-PAUSE = 0.05
-"""Pause after a connection that could not be taken, such as for want of file descriptors [s]."""
+PONG_SECONDS = 300.0
+"""Time that a client has to answer a ping: compiling kernels holds up a robot [s]."""
 INTERNAL_ERROR, FULL = 1011, 1013
 """Codes with which a socket is closed: a request failed, as openpi's server does it; too many connections."""
 
@@ -71,79 +67,28 @@ class WebsocketDoor:
         """
         self.port = int(listening.getsockname()[1])
         self._policy, self._protocol, self._guard = server, protocol, guard
-        self._number, self._lock = 0, threading.Lock()
-        logger = logging.getLogger("arena_newton.serve")
-        logger.setLevel(logging.CRITICAL)  # what strangers send is no news
-        self._server = serve(
+        self._numbers = itertools.count(1)
+        self._listener = WebsocketListener(
+            listening,
+            guard,
             self._connected,
-            sock=listening,
-            ssl=tls,
+            self._answer_http,
             origins=[None],
-            process_request=self._answer_http,
-            compression=None,
-            max_size=MAX_FRAME,
-            open_timeout=STRANGER_SECONDS,
-            ping_interval=PING_SECONDS,
-            ping_timeout=PONG_SECONDS,
-            server_header=None,
-            logger=logger,
+            longest=MAX_FRAME,
+            pong_seconds=PONG_SECONDS,
+            tls=tls,
         )
-        self._open: set[ServerConnection] = set()
-        self._closed = False
-        self._thread = threading.Thread(target=self._listen, name="door", daemon=True)
-        self._thread.start()
 
     def close(self) -> None:
         """End the door and its connections."""
-        self._closed = True
-        with suppress(OSError):  # which wakes who waits for a connection
-            self._server.socket.shutdown(socket.SHUT_RDWR)
-        self._server.shutdown()
-        with self._lock:
-            connections = list(self._open)
-        threads = [threading.Thread(target=_say_goodbye, args=[one], daemon=True) for one in connections]
-        for thread in threads:
-            thread.start()
-        end = time.monotonic() + FAREWELL_SECONDS
-        for thread in threads:
-            thread.join(max(end - time.monotonic(), 0.0))
-        for connection in connections:  # some clients never answer, or never read
-            with suppress(OSError):
-                connection.socket.shutdown(socket.SHUT_RDWR)
-        self._thread.join(timeout=2.0)
-
-    def _listen(self) -> None:
-        """Take connections until the door closes.
-
-        The library's own loop ends at the first connection that cannot be taken, and its threads keep the process.
-        """
-        while not self._closed:
-            try:
-                connection, address = self._server.socket.accept()
-            except OSError:
-                time.sleep(PAUSE)
-                continue
-            if not self._guard.arrives():
-                connection.close()
-                continue
-            try:
-                threading.Thread(target=self._handle, args=[connection, address], daemon=True).start()
-            except RuntimeError:  # no more threads
-                self._guard.leaves()
-                connection.close()
-
-    def _handle(self, connection: socket.socket, address: object) -> None:
-        try:
-            self._server.handler(connection, address)
-        finally:
-            self._guard.leaves()
+        self._listener.close("the server is closing")
 
     def _answer_http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
         """A route; None lets the handshake of a socket go on."""
         path = request.path.partition("?")[0]
         headers = request.headers
         origin, authorization = (" ".join(headers.get_all(name)) or None for name in ("Origin", "Authorization"))
-        refused = self._guard.refusal(path, authorization, origin)
+        refused = self._guard.refusal(path, authorization, origin, headers.get_all("Host"))
         if refused is not None:
             return _response(refused[0], pack_failure(refused[1]))
         if path == "/healthz":
@@ -158,10 +103,7 @@ class WebsocketDoor:
 
     def _connected(self, connection: ServerConnection) -> None:
         """Serve a connection until it ends."""
-        with self._lock:
-            self._number += 1
-            owner = f"socket {self._number}"
-            self._open.add(connection)
+        owner = f"socket {next(self._numbers)}"
         try:
             with self._guard.inside() as room:
                 if not room:
@@ -177,8 +119,6 @@ class WebsocketDoor:
             connection.close(INTERNAL_ERROR, "the server failed; its console says more")
         finally:
             self._policy.leave(owner)
-            with self._lock:
-                self._open.discard(connection)
 
     def _serve_openpi(self, connection: ServerConnection, owner: str) -> None:
         connection.send(openpi_codec.pack_metadata(self._policy.facts, roboarena=self._protocol == "roboarena"))
@@ -186,7 +126,8 @@ class WebsocketDoor:
         for data in connection:
             began = time.monotonic()
             try:
-                request, roboarena = openpi_codec.unpack_request(data)
+                request, roboarena = self._policy.read(len(data), partial(openpi_codec.unpack_request, data))
+                del data  # its picture is unpacked
                 if isinstance(request, Begin):
                     self._policy.begin(owner, request)
                     connection.send(openpi_codec.RESET_ANSWER)
@@ -207,7 +148,8 @@ class WebsocketDoor:
         for data in connection:
             seq = 0
             try:
-                message = vla_eval_codec.unpack_message(data)
+                message = self._policy.read(len(data), partial(vla_eval_codec.unpack_message, data))
+                del data  # its pictures are unpacked
                 seq = message.seq
                 if message.type == "hello":
                     _, whole = vla_eval_codec.unpack_hello(message, "hello")
@@ -238,11 +180,6 @@ class WebsocketDoor:
         if not kept:
             kept.extend(self._policy.look(owner, look).actions)
         return kept.popleft()
-
-
-def _say_goodbye(connection: ServerConnection) -> None:
-    with suppress(OSError, ConnectionClosed):  # it was closed meanwhile
-        connection.close(1001, "the server is closing")
 
 
 def _response(status: int, body: bytes, kind: str = "application/json") -> Response:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from arena_newton import rule_sets, seeding, tasks, trackers
+from arena_newton.data.new_folder import held_folder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
@@ -87,20 +88,25 @@ def drive(
         InputError: A flag is wrong.
     """
     try:
-        out = options.out or f"teleop/{datetime.datetime.now():%Y%m%d_%H%M%S}"
-        session = TeleopSession(
-            env,
-            source,
-            folder=Path(out).expanduser(),
-            seed=options.seed,
-            camera=_camera(options),
-            displays=displays,
-            facts=session_facts(env, options),
-            say=lambda line: print(line, flush=True),
-        )
-        with contextlib.suppress(KeyboardInterrupt):
-            session.run()
-        print(f"\n{session.report()}", flush=True)
+        folder = Path(options.out or f"teleop/{datetime.datetime.now():%Y%m%d_%H%M%S}").expanduser()
+        with held_folder(folder, "saves a person's episodes in it"):
+            try:
+                session = TeleopSession(
+                    env,
+                    source,
+                    folder=folder,
+                    seed=options.seed,
+                    camera=_camera(options),
+                    displays=displays,
+                    facts=session_facts(env, options),
+                    say=lambda line: print(line, flush=True),
+                )
+                with contextlib.suppress(KeyboardInterrupt):
+                    session.run()
+                print(f"\n{session.report()}", flush=True)
+            finally:
+                with contextlib.suppress(OSError):  # it holds episodes
+                    folder.rmdir()
     finally:
         source.close()
         env.close()

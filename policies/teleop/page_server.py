@@ -8,10 +8,8 @@ go back; a slow or stalled browser is given the newest of both and never makes t
 from __future__ import annotations
 
 import contextlib
-import hmac
 import http
 import json
-import logging
 import secrets
 import socket
 import threading
@@ -25,12 +23,14 @@ import numpy as np
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
-from websockets.sync.server import ServerConnection, serve
+from websockets.sync.server import ServerConnection
 from websockets.typing import Origin
 
 from arena_newton.errors import InputError
+from arena_newton.policies.serve.door_guard import DoorGuard, same_token
+from arena_newton.policies.serve.websocket_listener import WebsocketListener, part
 from arena_newton.policies.teleop.driving import Held, read_held
-from arena_newton.policies.teleop.ports import LOCAL
+from arena_newton.policies.teleop.ports import LOCAL, names_this_machine
 
 __all__ = ["PageServer", "new_token"]
 
@@ -50,6 +50,10 @@ STATUS_PERIOD = 0.1
 """Time between two messages of state to the page [s]."""
 JPEG_QUALITY = 80
 """Of the head camera's pictures, in percent."""
+PAGES = 8
+"""Most pages at once, all but one of which have been taken over."""
+PONG_SECONDS = 20.0
+"""Time that a page has to answer a ping [s]."""
 TAKEN_OVER, UNFIT = 4001, 1008
 """Codes with which a socket is closed: another page drives now, a message cannot be read."""
 
@@ -75,8 +79,6 @@ class PageServer:
         self.port = int(listening.getsockname()[1])
         self._facts = {"kind": "facts", **facts, "frame": frame}
         hosts = [f"{name}:{self.port}" for name in (LOCAL, "localhost")]
-        self._named = [[host] for host in hosts]
-        """What the one `Host` of a request may be."""
         origin = frame.split("/", 3)[:3] if frame else None
         frames = "/".join(origin) if origin else "'none'"
         self._policy = (
@@ -92,20 +94,15 @@ class PageServer:
         self._status: dict[str, object] = {}
         self._image: np.ndarray | None = None
         self._closed = False
-        logger = logging.getLogger("arena_newton.teleop.page")
-        logger.setLevel(logging.CRITICAL)  # refused requests are no news
-        self._server = serve(
+        self._listener = WebsocketListener(
+            listening,
+            DoorGuard(PAGES, ""),
             self._connected,
-            sock=listening,
+            self._answer,
             origins=[Origin(f"http://{host}") for host in hosts],
-            process_request=self._answer,
-            compression=None,
-            max_size=LONGEST_MESSAGE,
-            server_header=None,
-            logger=logger,
+            longest=LONGEST_MESSAGE,
+            pong_seconds=PONG_SECONDS,
         )
-        self._thread = threading.Thread(target=self._server.serve_forever, name="teleop page", daemon=True)
-        self._thread.start()
 
     @property
     def url(self) -> str:
@@ -143,20 +140,14 @@ class PageServer:
     def close(self) -> None:
         """End server and connections."""
         with self._lock:
-            self._closed = True
-            driver, self._driver = self._driver, None
+            self._closed, self._driver = True, None
             self._lock.notify_all()
-        if driver is not None:
-            with contextlib.suppress(OSError, ConnectionClosed):
-                driver.close(1001, "the session is over")
-        self._server.shutdown()
-        self._thread.join(timeout=2.0)
+        self._listener.close("the session is over")
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """A file; None lets the socket's handshake go on; whatever does not name the token gets nothing."""
         token, _, path = request.path.partition("?")[0].removeprefix("/").partition("/")
-        known = hmac.compare_digest(token.encode(), self._token.encode())
-        if not known or request.headers.get_all("Host") not in self._named:
+        if not same_token(token, self._token) or not names_this_machine(request.headers.get_all("Host")):
             return _response(http.HTTPStatus.NOT_FOUND, b"", "text/plain")
         if path == SOCKET:
             return None
@@ -171,9 +162,10 @@ class PageServer:
         with self._lock:
             before, self._driver = self._driver, connection
             self._held, self._held_at = Held(), -float("inf")
-        if before is not None:
-            with contextlib.suppress(OSError, ConnectionClosed):
-                before.close(TAKEN_OVER, "another page drives now")
+            self._lock.notify_all()
+        if before is not None:  # which may have stopped reading
+            farewell = [before], TAKEN_OVER, "another page drives now"
+            threading.Thread(target=part, args=farewell, name="teleop farewell", daemon=True).start()
         sender = threading.Thread(target=self._send, args=[connection], name="teleop sender", daemon=True)
         sender.start()
         try:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import socket
+from collections.abc import Sequence
+from urllib.parse import urlsplit
 
 from arena_newton.errors import InputError
 
-__all__ = ["LOCAL", "bind"]
+__all__ = ["LOCAL", "bind", "is_local", "names_this_machine"]
 
 LOCAL = "127.0.0.1"
 """The address that is served where no other is asked for: this machine's own."""
@@ -34,3 +37,25 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
             raise InputError(f"--host {host}: no address of this machine") from None
         reason = error.strerror if isinstance(error, OSError) else "no such port"
         raise InputError(f"{flag} {port}: cannot be served at {host} ({reason}); name another port") from None
+
+
+def is_local(name: str) -> bool:
+    """Whether an address or name is this machine's own and no other machine's."""
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return name == "localhost"
+
+
+def names_this_machine(hosts: Sequence[str]) -> bool:
+    """Whether a request was sent to this machine by its own name.
+
+    A browser sends the name of the web site, also where that name has been made to point here.
+
+    Args:
+        hosts: All headers `Host` of the request.
+    """
+    try:
+        return len(hosts) == 1 and is_local(urlsplit(f"//{hosts[0]}").hostname or "")
+    except ValueError:
+        return False

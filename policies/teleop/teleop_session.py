@@ -127,9 +127,10 @@ class TeleopSession:
         self._recorder = DemonstrationRecorder(folder, seeds=seeding.TELEOPERATION, facts=facts)
         self._count = 0
         self._episode = self._plan(0)
-        taken = self._recorder.file(self._episode)
-        if taken.exists():
-            raise InputError(f"--seed {seed}: {taken} is there already; name another seed or --out")
+        first = self._recorder.file(self._episode)
+        taken = sorted(folder.glob(first.name.replace("__repeat0000.", "__repeat[0-9]*.")))
+        if taken:
+            raise InputError(f"--seed {seed}: {taken[0]} is there already; name another seed or --out")
         self._stander = Stander()
         self._recording: Recording = "idle"
         self._note = ""

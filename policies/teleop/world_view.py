@@ -6,7 +6,6 @@ viser serves whoever asks; here its socket needs the page's token and viser's ow
 from __future__ import annotations
 
 import contextlib
-import hmac
 import http
 import io
 import math
@@ -25,8 +24,9 @@ from websockets.typing import Origin
 from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CAMERA_PRIMS
 from arena_newton.pictures.follow import WALL_GAP, room_walls
+from arena_newton.policies.serve.door_guard import same_token
 from arena_newton.policies.teleop.driving import CAMERAS
-from arena_newton.policies.teleop.ports import LOCAL, bind
+from arena_newton.policies.teleop.ports import LOCAL, bind, names_this_machine
 from arena_newton.robot import TICK
 from arena_newton.rotations import heading_np
 
@@ -177,9 +177,9 @@ def _guarded(port: int, token: str) -> Iterator[None]:
 
     def guarded(*args: object, process_request: Callable[..., Response | None], **options: object) -> object:
         def answer(connection: object, request: Request) -> Response | None:
-            named = hmac.compare_digest(request.path.strip("/").encode(), token.encode())
+            named = same_token(request.path.strip("/"), token)
             wants_socket = bool(request.headers.get_all("Upgrade"))
-            if request.headers.get_all("Host") not in [[host] for host in hosts] or (wants_socket and not named):
+            if not names_this_machine(request.headers.get_all("Host")) or (wants_socket and not named):
                 return Response(http.HTTPStatus.NOT_FOUND.value, "Not Found", Headers({"Content-Length": "0"}), b"")
             return process_request(connection, request)
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import math
-import os
 import signal
 import threading
 import time
@@ -17,7 +15,8 @@ from pathlib import Path
 import torch
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.data.new_folder import held_folder
+from arena_newton.errors import ArenaError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -106,7 +105,7 @@ class TrainingLoop:
             ArenaError: The loss is not finite.
             InputError: The log cannot be written, as on a full disk.
         """
-        with _held(self._out) if self._processes.first else contextlib.nullcontext():
+        with held_folder(self._out, "trains in it") if self._processes.first else contextlib.nullcontext():
             if self._processes.first and self._new:
                 check_new(self._out)  # another one may have come and gone while this one decoded
             try:
@@ -236,25 +235,6 @@ class TrainingLoop:
             self._last = write_checkpoint(self._out, trainer, facts, progress)
             remove_older(self._out, options.keep)
         return self._last or self._out / CHECKPOINTS_DIR / checkpoint_name(trainer.step)
-
-
-@contextlib.contextmanager
-def _held(out: Path) -> Iterator[None]:
-    """A training's folder, made and kept from other processes: two of them would remove each other's files."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be made ({error.strerror})") from None
-    try:
-        with contextlib.suppress(OSError):  # some network disks have no locks
-            try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"--out {out}: another process trains in it") from None
-        yield
-    finally:
-        os.close(folder)
 
 
 def _wait(device: torch.device) -> None:

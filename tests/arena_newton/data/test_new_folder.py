@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from arena_newton.data.new_folder import LOCK, link, new_folder, scratch_folder
+from arena_newton.data.new_folder import LOCK, held_folder, link, new_folder, scratch_folder
 from arena_newton.errors import InputError
 from arena_newton.files import PARTIAL
 
@@ -31,6 +31,16 @@ def test_a_folder_appears_at_the_end(tmp_path):
         (folder / "a").write_text("a")
         assert not out.exists()
     assert [path.name for path in out.parent.iterdir()] == ["out"] and (out / "a").read_text() == "a"
+
+
+def test_a_held_folder_is_one_process_s(tmp_path):
+    """A folder that is held is refused to another holder by name, and free afterwards."""
+    with held_folder(tmp_path / "out", "trains in it"):
+        with pytest.raises(InputError, match="--out .*/out: another process trains in it"):
+            with held_folder(tmp_path / "out", "trains in it"):
+                pass
+    with held_folder(tmp_path / "out", "trains in it"):
+        pass
 
 
 def test_an_error_leaves_nothing(tmp_path):

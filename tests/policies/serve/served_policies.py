@@ -111,7 +111,7 @@ class Served:
         self.policy = policy
         self.server = PolicyServer(policy, **options)
         self.server.start()
-        guard = DoorGuard(connections or self.server.max_sessions, token)
+        guard = DoorGuard(connections or self.server.max_sessions, token, local=True)
         self.door = open_door(self.server, ServeOptions(policy="x", protocol=protocol, port=0), guard, tls)
         self.port = self.door.port
         policy.calls = []

@@ -149,7 +149,9 @@ def test_records_come_back():
     seen = look(0.3, image=image, session="3", seed=2**31 - 1, step=40)
 
     def same(got):
-        assert np.array_equal(got.image, image) and np.array_equal(got.state, seen.state)
+        assert np.array_equal(got.image if got.packed is None else got.packed.unpacked(), image) and np.array_equal(
+            got.state, seen.state
+        )
         named = ("task", "instruction", "session", "seed", "step")
         assert [getattr(got, name) for name in named] == [getattr(seen, name) for name in named]
 
@@ -283,7 +285,14 @@ def test_a_gray_picture_becomes_rgb():
     payload = {"images": {"cam": content}, "states": [1.0] * STATE_WIDTH}
     frame = msgpack.packb({"type": "observation", "payload": payload, "seq": 1, "timestamp": 0.0})
     seen = vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame))
-    assert seen.image.shape == (24, 32, 3) and (seen.image == 7).all()
+    assert seen.packed.unpacked().shape == (24, 32, 3) and (seen.packed.unpacked() == 7).all()
+
+
+def test_a_float32_picture_of_the_original_s_protocol():
+    """Pixels as float32, whole numbers from 0 to 255, are the same picture as uint8."""
+    pixels = np.random.default_rng(0).integers(0, 256, (16, 16, 3), np.uint8)
+    seen, _ = _front(dtype="float32", data_b64=base64.b64encode(pixels.astype("<f4")).decode())()
+    assert np.array_equal(seen.image, pixels)
 
 
 def _openpi(**more):
@@ -326,7 +335,9 @@ def _front(**more):
         (_arena(observation={"state": [[0.0], [1.0, 2.0]]}), "rows of different length"),
         (_arena(return_chunk=1), "return_chunk is int"),
         (_arena(world=2**40), "world is"),
-        (_front(dtype="object"), "dtype is 'object', expected uint8"),
+        (_front(dtype="object"), "dtype is 'object', expected uint8 or float32"),
+        (_front(dtype="float32", data_b64=base64.b64encode(np.full(768, 0.5, "<f4")).decode()), "whole numbers from 0"),
+        (_front(dtype="float32", data_b64=base64.b64encode(np.full(768, np.nan, "<f4")).decode()), "whole numbers"),
         (_front(data_b64="****"), "not base64"),
         (_front(shape=[16, 16, 4]), "with 768 bytes"),
         (_front(shape="16"), "without a shape"),

@@ -6,21 +6,24 @@ import os
 import resource
 import socket
 import struct
+import threading
 import time
+import warnings
 import zlib
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, suppress
 
 import msgpack
 import pytest
-from served_policies import Remembers, look, state
+from served_policies import Remembers, look, state, together
 
-from arena_newton.policies.serve import door_guard, openpi_codec, vla_eval_codec
+from arena_newton.policies.serve import door_guard, message_readers, openpi_codec, vla_eval_codec
 from arena_newton.policies.serve.arena_codec import unpack_look
 from arena_newton.policies.serve.wire_error import WireError
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
-RESET = b"POST /reset HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer abc\r\nContent-Length: 2\r\n\r\n{}"
+RESET = b"POST /reset HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer abc\r\nContent-Length: 2\r\n\r\n{}"
 
 
 def plain_socket(port, more=b""):
@@ -28,7 +31,9 @@ def plain_socket(port, more=b""):
     connection = socket.create_connection(("127.0.0.1", port), timeout=10)
     key = base64.b64encode(os.urandom(16))
     connection.sendall(
-        b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: " + key + b"\r\n"
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: "
+        + key
+        + b"\r\n"
         b"Sec-WebSocket-Version: 13\r\n" + more + b"\r\n"
     )
     return connection, int(connection.recv(4096).split()[1])
@@ -131,15 +136,98 @@ def picture(width, height):
     return {"__image__": True, "format": "png", "data": data, "shape": [height, width, 3]}
 
 
-def test_pictures_are_counted_together():
-    """A message of many large packed pictures is refused after the first of them."""
-    images = {f"camera {n}": picture(4096, 2048) for n in range(3)}
-    message = {"type": "observation", "payload": {"images": images}, "seq": 1, "timestamp": 0.0}
-    with pytest.raises(WireError, match="^message: pictures of more than 16777216 pixels in all$"):
-        vla_eval_codec.unpack_message(msgpack.packb(message))
-    images.popitem()
-    unpacked = vla_eval_codec.unpack_message(msgpack.packb(message)).payload["images"]
-    assert [p.shape for p in unpacked.values()] == [(2048, 4096, 3)] * 2
+LARGEST = 1920, 1200
+"""Width and height of the largest picture."""
+
+
+def asked_with(**images):
+    """A frame of vla-eval that shows pictures."""
+    payload = {"images": images, "states": [float(v) for v in state(0.1)], "task": "boxing"}
+    return msgpack.packb({"type": "observation", "payload": payload, "seq": 1, "timestamp": 0.0})
+
+
+def test_pictures_stay_packed():
+    """Of the pictures of a message only that of the head camera is ever unpacked, and none before its turn."""
+    frame = asked_with(wrist=picture(*LARGEST), front=picture(32, 24))
+    seen = vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame))
+    assert seen.image is None and seen.packed.unpacked().shape == (24, 32, 3)
+    with pytest.raises(WireError, match="^message: a picture of 1920x1201, expected 16 to 2048 pixels a side and at m"):
+        vla_eval_codec.unpack_message(asked_with(front=picture(1920, 1201)))
+
+
+def test_large_messages_are_read_one_by_one(monkeypatch):
+    """Of thirty large messages one is read at a time, and the others go past those that wait."""
+    monkeypatch.setattr(message_readers, "LONGEST_PAUSE", 0.0)
+    readers, begun, go_on = message_readers.MessageReaders(), threading.Event(), threading.Event()
+    large, usual = message_readers.LARGE + 1, 10**6
+    threads = [
+        threading.Thread(target=readers.run, args=[large, lambda: (begun.set(), go_on.wait(60))]) for _ in range(30)
+    ]
+    try:
+        for thread in threads:
+            thread.start()
+        assert begun.wait(60)
+        assert readers.run(usual, lambda: readers.inside) == large + usual, "while a large one is being read"
+        with pytest.raises(WireError, match="^damaged$"):
+            readers.run(usual, raise_damaged)
+        go_on.set()
+        for thread in threads:
+            thread.join(60)
+        assert readers.most_inside == large + usual and readers.inside == 0
+    finally:
+        go_on.set()
+        readers.close()
+    with pytest.raises(CancelledError):
+        readers.run(usual, int)
+
+
+def raise_damaged():
+    raise WireError("damaged")
+
+
+def test_unpacking_leaves_warnings_alone(served):
+    """Two robots send pictures while the policy warns: a warning stays one, and the process's filters as they were."""
+
+    class Warns(Remembers):
+        def act(self, observation):
+            warnings.warn("an old argument", UserWarning, stacklevel=1)
+            return super().act(observation)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        before = list(warnings.filters)
+        one = served(Warns(sees=True), "vla-eval")
+
+        def play():
+            with one.socket() as robot:
+                robot.send(vla_eval_codec.pack_hello(None, 1, 0.0))
+                robot.recv(timeout=30)
+                kinds = []
+                for _ in range(20):
+                    robot.send(asked_with(front=picture(640, 480)))
+                    kinds.append(vla_eval_codec.unpack_message(robot.recv(timeout=30)).type)
+            return kinds
+
+        assert together(*[play] * 3) == [["action"] * 20] * 3
+        assert warnings.filters == before
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "arena"])
+def test_another_name_for_this_machine_is_refused(served, protocol):
+    """A web site whose name was made to point here asks nothing, by GET neither, unless it knows a token."""
+    one = served(Remembers(), protocol)
+    for host, status in (
+        ("evil.example", 403),
+        (f"evil.example:{one.port}", 403),
+        ("127.0.0.1.evil.example", 403),
+        ("localhost", 200),
+        ("127.0.0.1:9", 200),
+        ("[::1]:8000", 200),
+    ):
+        assert one.http("GET", "/config", headers={"Host": host})[0] == status, host
+    two = served(Remembers(), protocol, token="abc")
+    headers = {"Host": "policies.example", "Authorization": "Bearer abc"}
+    assert two.http("GET", "/config", headers=headers)[0] == 200, "a proxy passes names on"
 
 
 def test_values_of_json_are_counted():

@@ -419,7 +419,7 @@ def test_a_slow_client_holds_up_nobody(served):
     """Clients that send a request by drips, never read, or stop in the middle do not delay another one's answers."""
     one = served(Remembers(), "arena", connections=16)
     body = arena_codec.pack_look(look(seed=1, step=0, image=np.zeros((480, 640, 3), np.uint8)))
-    head = b"POST /infer HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body)
+    head = b"POST /infer HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\n\r\n" % len(body)
     slow = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(6)]
     for n, connection in enumerate(slow):
         connection.sendall((head + body)[: 10 + 40 * n])
@@ -558,7 +558,7 @@ def test_strangers_are_no_news(served, protocol, capfd, caplog):
     for data in (
         b"",
         b"garbage\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: x\r\n",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
         b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
     ):
         with socket.create_connection(("127.0.0.1", one.port)) as connection:

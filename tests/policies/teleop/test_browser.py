@@ -7,9 +7,11 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +120,64 @@ def test_the_newest_page_drives(server):
             assert closed.value.rcvd.code == TAKEN_OVER
             second.send('{"turn": 1}')
             wait_for(lambda: server.held()[0].turn == 1.0, "message")
+
+
+def deaf_page(server: PageServer) -> socket.socket:
+    """A page that opens its socket and then reads nothing."""
+    page = socket.create_connection((LOCAL, server.port), timeout=READY)
+    page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    host = f"{LOCAL}:{server.port}"
+    head = f"GET /{server.url.split('/')[3]}/socket HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n"
+    head += "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    page.sendall(f"{head}Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode())
+    wait_for(lambda: server.connected, "deaf page")
+    return page
+
+
+def fill(server: PageServer) -> None:
+    """Send the page so much that it does not fit into what lies between."""
+    note = "x" * 2**24
+    server.publish({"tick": 1, "note": note}, None)
+    time.sleep(0.5)
+
+
+def test_a_page_that_reads_nothing_delays_nobody(server):
+    """A page that has stopped reading is taken over at once, and holds up neither the next page nor the end."""
+    with deaf_page(server):
+        fill(server)
+        server.publish({"tick": 2}, None)
+        with page_socket(server) as second:
+            assert json.loads(second.recv(timeout=READY))["kind"] == "facts"
+            second.send('{"turn": 1}')
+            wait_for(lambda: server.held()[0].turn == 1.0, "message of the second page")
+    with deaf_page(server):
+        fill(server)
+        ending = threading.Thread(target=server.close, daemon=True)
+        ending.start()
+        ending.join(READY)
+        assert not ending.is_alive()
+
+
+def test_strangers_do_not_end_the_page(server):
+    """A hundred idle connections are more than are taken, and the page is there when they have left."""
+    idle = [socket.create_connection((LOCAL, server.port), timeout=READY) for _ in range(100)]
+    assert idle[-1].recv(1) == b"", "it is closed unread"
+    for connection in idle:
+        connection.close()
+
+    def served() -> bool:
+        with suppress(OSError):
+            return fetch(server.url)[0] == 200
+        return False
+
+    wait_for(served, "page after the strangers")
+
+
+def test_a_path_that_is_no_text_is_not_found(server):
+    """Bytes that are no characters are a wrong token, and no fault of the server."""
+    with socket.create_connection((LOCAL, server.port), timeout=READY) as stranger:
+        stranger.sendall(b"GET /\xff\xfe/ HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n\r\n" % server.port)
+        assert stranger.recv(100).startswith(b"HTTP/1.1 404 ")
 
 
 @pytest.mark.parametrize("message", ["x", '{"forward": "fast"}', '{"x": 1}', b"\xff\x00", "[" + "1," * 5000 + "1]"])

@@ -254,6 +254,16 @@ def saved(env, tmp_path_factory):
     return one.run(), folder, source
 
 
+def test_any_episode_of_the_seed_is_in_the_way(env, tmp_path):
+    """A folder that holds a later episode of the seed is refused by that file's name; another seed is not."""
+    one = session(env, Script({}, quit_at=1), tmp_path)
+    file = one._recorder.file(one._plan(4))
+    file.touch()
+    with pytest.raises(InputError, match=rf"--seed 3: .*{file.name} is there already"):
+        session(env, Script({}, quit_at=1), tmp_path)
+    session(env, Script({}, quit_at=1), tmp_path, seed=33)
+
+
 def test_a_saved_episode_holds_what_was_driven(saved, env):
     """The file has each action as the source gave it, and a seed that no evaluation has; a discarded one no file."""
     report, folder, source = saved
