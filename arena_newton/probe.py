@@ -71,7 +71,7 @@ def _network(given: str) -> None:
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     first, *others = session.get_inputs()
     rows = first.shape[0] if isinstance(first.shape[0], int) else 2
-    fed = {first.name: np.zeros((rows, int(width)), np.float32)}
+    fed: dict[str, np.ndarray] = {first.name: np.zeros((rows, int(width)), np.float32)}
     kinds = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(int32)": np.int32}
     for other in others:  # such as a time step
         shape = [n if isinstance(n, int) else rows for n in other.shape]

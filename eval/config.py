@@ -155,7 +155,7 @@ class RunConfig:
             "code": self.code_hash,
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
-            **({"foreign_tasks": dict(self.foreign_tasks)} if self.foreign_tasks else {}),
+            **({"foreign_tasks": dict(self.foreign_tasks)} if self.foreign_tasks else {}),  # type: ignore[typeddict-item]
             **self._chunks(),
             **self._budget(),
             **self._demonstrations(),

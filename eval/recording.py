@@ -52,8 +52,18 @@ def facts_of(
     Only what concerns the episode's own task and tracker, so that its bytes do not depend on what else was played.
     """
     identity, flags = config.identity(), config.flags
-    left_out = ("task", "mode", "tracker", "seeds", "repeats", "keep", "checkpoint", "tracker_facts", "scenes")
-    left_out += ("foreign_tasks",)
+    left_out = (
+        "task",
+        "mode",
+        "tracker",
+        "seeds",
+        "repeats",
+        "keep",
+        "checkpoint",
+        "tracker_facts",
+        "scenes",
+        "foreign_tasks",
+    )
     facts: JsonObject = {key: value for key, value in identity.items() if key not in left_out}
     return facts | {
         "checkpoint": config.checkpoint_hashes[tracker],
