@@ -234,10 +234,10 @@ def _statistics(context: Context) -> CheckFinding:
     failed = [f"{tally.what} ({tally.case})" for tally in found if not tally.holds]
     least = min(tally.rate for tally in found if tally.kind == "coverage")
     summary = (
-        f"{number:,} synthetic comparisons of each case: at most {100 * max(errors):.1f} % err at a level of 5 %, "
+        f"Up to {number:,} synthetic comparisons of each case: at most {100 * max(errors):.1f} % err at a level of "
+        f"5 %, intervals hold the truth in at least {100 * least:.1f} %, also over trainings that differ by up to "
+        f"{100 * max(SPREADS):.0f} points"
     )
-    summary += f"intervals hold the truth in at least {100 * least:.1f} %, also over trainings that differ by up to "
-    summary += f"{100 * max(SPREADS):.0f} points"
     head = ("case", "what", "kind", "%", "95 % interval", "computed", "")
     return CheckFinding(
         "fail" if failed else "pass",
