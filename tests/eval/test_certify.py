@@ -16,6 +16,7 @@ from arena_newton.eval.certification import certificate, claims, legs, solvable,
 from arena_newton.eval.certification.bodies import Body
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.journal import ContradictionError
 from arena_newton.eval.options import CertifyOptions
 from arena_newton.eval.stats import mcnemar
 from arena_newton.interfaces import Verdict
@@ -225,6 +226,20 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, capsys):
     with pytest.raises(KeyboardInterrupt):
         certify.run(options(tmp_path), factories(**PARTS), checks=(Check("late", "?", interrupted),))
     assert re.search(r"what was played is kept; go on by python -m .* --resume$", capsys.readouterr().err.strip())
+
+
+def test_a_line_that_contradicts_itself_fails_by_name(tmp_path, capsys):
+    """A check that reads a journal with such a line fails; the others still run."""
+
+    def read_one(context):
+        raise ContradictionError(f"{context.folder}/runs/episodes.jsonl: episode 0: a success with a margin of -1")
+
+    found = (Check("edited", "?", read_one), Check("later", "?", lambda context: CheckFinding("pass", "ran")))
+    assert certify.run(options(tmp_path), factories(**PARTS), checks=found) == 1
+    said = capsys.readouterr().out
+    assert (
+        "fail  edited        runs/episodes.jsonl: episode 0: a success with a margin" in said and "pass  later" in said
+    )
 
 
 def test_a_certification_of_nothing_is_no_success(tmp_path, capsys):
