@@ -24,7 +24,9 @@ from arena_newton.eval.certification import (
     failures,
     gradients,
     legs,
+    lens,
     machines,
+    rule_ticks,
     sill,
     solvable,
     swap,
@@ -43,13 +45,18 @@ from arena_newton.eval.run import Factories
 from arena_newton.flags import user_path
 from arena_newton.quiet import quiet_warp
 
-__all__ = ["CHECKS", "run"]
+__all__ = ["CHECKS", "QUICK_JOBS", "run"]
+
+QUICK_JOBS = 2
+"""Processes that play at once under --quick where nobody says how many."""
 
 CHECKS: tuple[Check, ...] = (
     *solvable.CHECKS,
     *legs.CHECKS,
     *axes.CHECKS,
     *closed_forms.CHECKS,
+    *lens.CHECKS,
+    *rule_ticks.CHECKS,
     *agreement.CHECKS,
     *machines.CHECKS,
     *swap.CHECKS,

@@ -1,7 +1,7 @@
 """Does the world move as mechanics says? Fall, weight, masses, drives, sliding and bounce against their closed forms.
 
-Everything is measured on the worlds that episodes are played in, by what any policy could observe: positions after
-forces. No number of the compiled model is read, so that a change of it anywhere between its source and the motion shows.
+Everything is measured on the worlds that episodes are played in, by positions after forces.
+No number of the compiled model is read, so that a change of it anywhere between its source and the motion shows.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SLIDES: Mapping[str, tuple[str, float, float]] = {
 """Task → what slides on its floor, its mass [kg], and the height of its centre of mass above the floor [m]."""
 PULL = 1.05
 """What slides is pulled with so much of the friction."""
-MASS_TOLERANCE = (0.01, 0.025)
+MASS_TOLERANCE = (0.015, 0.035)
 """The same of one link's mass, and of that of a link lighter than ..."""
 LIGHT = 0.1
 """... this [kg]."""
@@ -406,13 +406,16 @@ def measured_in(env: ArenaEnv, *, whole: bool = True) -> list[Measurement]:
 def physics(context: Context) -> CheckFinding:
     """Measure what closed forms say, on both engines, in every task."""
     this = resolve_engine(context.options.engine, context.options.device)
-    rows, wrong, worst, count = [], [], [], 0
+    rows, wrong, count = [], [], 0
     for engine, device, task, tracker, whole in _plan(context, this):
 
         def measure(
             engine: str = engine, device: str = device, task: str = task, tracker: str = tracker, whole: bool = whole
         ) -> Json:
-            env = cast("ArenaEnv", world_of(context, task, tracker, worlds=WORLDS, engine=engine, device=device))
+            env = cast(
+                "ArenaEnv",
+                world_of(context, task, tracker, worlds=_worlds(engine, device), engine=engine, device=device),
+            )
             try:
                 return [list(one) for one in measured_in(env, whole=whole)]
             finally:
@@ -425,12 +428,11 @@ def physics(context: Context) -> CheckFinding:
         count += len(numbers)
         for kind, ones in _by_kind(numbers).items():
             most = max(ones, key=lambda one: abs(one.deviation))
-            worst.append(abs(most.deviation))
             rows.append((task, tracker, engine, kind, str(len(ones)), f"{100 * most.deviation:+.2f}", most.what))
     head = ("task", "tracker", "engine", "closed form", "numbers", "largest deviation [%]", "of")
     summary = f"{count - len(wrong):,} of {count:,} measured numbers are what closed forms say"
     notes = (
-        f"Allowed are {percent(TOLERANCE, 1)} of gravity and weight, {percent(MASS_TOLERANCE[0])} of a link's mass "
+        f"Allowed are {percent(TOLERANCE, 1)} of gravity and weight, {percent(MASS_TOLERANCE[0], 1)} of a link's mass "
         f"({percent(MASS_TOLERANCE[1], 1)} below {LIGHT:g} kg), {percent(DRIVE_TOLERANCE)} of stiffness and damping, "
         f"{percent(FRICTION_TOLERANCE)} of friction, and {BOUNCE[0]:+g} to {BOUNCE[1]:+g} of the restitution.",
         "Masses come from the momentum that pushes give, stiffness from a held torque, damping from the impulse of a "
@@ -451,6 +453,11 @@ def _plan(context: Context, this: tuple[str, str]) -> Iterator[tuple[str, str, s
     device = resolve_engine(other, None if other == "warp" else "cpu")[1]
     for task in context.tasks[:1] if context.options.quick or device == "cpu" else context.tasks:
         yield other, device, task, context.trackers[0], True
+
+
+def _worlds(engine: str, device: str) -> int:
+    """Worlds that measure side by side: fewer where each takes time."""
+    return 4 if engine == "warp" and device == "cpu" else WORLDS
 
 
 def _by_kind(numbers: list[Measurement]) -> dict[str, list[Measurement]]:
