@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import os
@@ -333,6 +334,8 @@ def _certify(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(CertifyOptions, arguments, f"{PROG} certify")
     from arena_newton.eval import certify
 
+    if options.quick and options.jobs == 1 and factories is None:
+        options = dataclasses.replace(options, jobs=min(certify.QUICK_JOBS, len(os.sched_getaffinity(0))))
     return certify.run(options, factories)
 
 

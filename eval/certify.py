@@ -19,13 +19,16 @@ from arena_newton.eval.certification import (
     agreement,
     axes,
     certificate,
+    closed_forms,
     error_rates,
     failures,
     gradients,
     inputs,
     legs,
+    lens,
     machines,
     replays,
+    rule_ticks,
     sill,
     solvable,
     swap,
@@ -46,7 +49,10 @@ from arena_newton.flags import user_path
 from arena_newton.quiet import quiet_warp
 from arena_newton.text import plain_text
 
-__all__ = ["CHECKS", "run"]
+__all__ = ["CHECKS", "QUICK_JOBS", "run"]
+
+QUICK_JOBS = 2
+"""Processes that play at once under --quick where nobody says how many."""
 
 CHECKS: tuple[Check, ...] = (
     *replays.CHECKS,
@@ -54,6 +60,9 @@ CHECKS: tuple[Check, ...] = (
     *inputs.CHECKS,
     *legs.CHECKS,
     *axes.CHECKS,
+    *closed_forms.CHECKS,
+    *lens.CHECKS,
+    *rule_ticks.CHECKS,
     *agreement.CHECKS,
     *machines.CHECKS,
     *swap.CHECKS,

@@ -441,15 +441,15 @@ class CertifyOptions:
     out: str = "results/certify"
     """Folder of the certificate and of the evaluations behind it."""
     quick: bool = False
-    """A few episodes of everything: minutes instead of hours, and wide intervals."""
+    """A few episodes of everything by two processes: minutes instead of hours, and wide intervals."""
     task: Several[str] = ()
     """Tasks; all that have an expert when none is named."""
     tracker: tuple[str, ...] = ("twist2", "sonic")
     """Trackers, with the weights they come with; the first one alone where one is enough."""
     checks: Several[str] = ()
     """Names of checks to run: journal recording solvable policy-inputs tracker-inputs frozen-legs gliding-base visual
-    semantic execution engines batches official shards ray swap visible sill failures statistics gradients; all when
-    none is named."""
+    semantic execution physics camera rules engines batches official shards ray swap visible sill failures statistics
+    gradients; all when none is named."""
     episodes: int | None = None
     """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
     worlds: int = 20
@@ -461,6 +461,7 @@ class CertifyOptions:
     twist2_checkpoint: str | None = None
     """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
     jobs: int = 1
-    """Processes that play at once, each on cores of its own (0: only play and write no page, as each of them does)."""
+    """Processes that play at once, each on cores of its own, 2 under --quick (0: only play and write no page, as each
+    of them does)."""
     resume: bool = False
     """Continue a certification in its folder; what was played is kept."""

@@ -2,17 +2,49 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import beta
+
+from arena_newton.canonical import STAND_ACTION
 from arena_newton.devices import resolve_engine
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, discordant, pooled_score, score, skipped
+from arena_newton.eval.certification.finding import (
+    Check,
+    CheckFinding,
+    Sheet,
+    Verdict,
+    discordant,
+    percent,
+    pooled_score,
+    score,
+    skipped,
+)
 from arena_newton.eval.certification.replays import recorded
 from arena_newton.eval.certification.traces import first_difference, play, world_of
 from arena_newton.eval.records import JsonObject
 from arena_newton.eval.slice_player import device_name
 from arena_newton.eval.stats import mcnemar
 
-__all__ = ["CHECKS"]
+if TYPE_CHECKING:
+    from arena_newton.interfaces import World
 
+__all__ = ["CHECKS", "bound_of_difference", "first_ticks"]
+
+SAME_TICKS = 5
+"""Ticks after the reset in which both engines must be in the same state: contacts have not diverged yet."""
+SAME_STATE = 1e-5
+"""Largest difference of a position [m, rad] in them; 4e-7 where both step the same model, and 7e-5 at the first tick
+where 3 % of gravity is missing."""
+SAME_FIELDS = (
+    "body_mass body_inertia body_ipos body_iquat body_pos body_quat body_gravcomp dof_armature dof_damping "
+    "dof_frictionloss jnt_range jnt_stiffness geom_friction actuator_gainprm actuator_biasprm actuator_forcerange"
+).split()
+"""Arrays of the compiled models that must be equal to the bit."""
+MARGIN = 0.05
+"""Largest difference of the rates of success or falls of both engines at which they count as equivalent: all 95 % of
+its interval must be within."""
 DIFFERENT = 0.01
 """Two rates differ from this p-value on, divided by the number of tests of the check (Bonferroni)."""
 BATCHED = 3
@@ -24,24 +56,104 @@ BATCHED_TASKS = 2
 
 
 def engines(context: Context) -> CheckFinding:
-    """Play the experts on the other engine and compare success and falls, episode by episode, by McNemar's."""
+    """Compare models and first ticks of both engines, and where it is affordable the rates of the experts."""
     other = "warp" if context.options.engine == "mujoco" else "mujoco"
     _, device = resolve_engine(other, None if other == "warp" else "cpu")
+    ticks, sheet, wrong = _same_start(context, other, device)
     if other == "warp" and device == "cpu" and "engines" not in context.options.checks:
-        return skipped("no CUDA device here; --checks engines measures Warp's CPU backend, which takes far longer")
-    rows, pairs = [], []
+        summary = f"in {ticks}; rates were not compared: no CUDA device here"
+        note = "--checks engines compares rates on Warp's CPU backend, which takes far longer."
+        return CheckFinding("fail" if wrong else "pass", summary, (sheet,), (*wrong, note))
+    verdict, rates, rate_sheet, notes = _rates(context, other, device)
+    return CheckFinding("fail" if wrong else verdict, f"in {ticks}; {rates}", (sheet, rate_sheet), (*wrong, *notes))
+
+
+def _same_start(context: Context, other: str, device: str) -> tuple[str, Sheet, list[str]]:
+    """What the first ticks say, in words, as a table and as faults."""
+    rows, wrong, most = [], [], 0.0
+    tracker = context.trackers[0]
+    for task in context.tasks:
+
+        def measure(task: str = task) -> JsonObject:
+            return first_ticks(context, task, tracker, other, device)
+
+        found = context.measured("engines", task, tracker, {"other": other, "device": device}, measure)
+        assert isinstance(found, dict)
+        unlike, gaps = [str(name) for name in found["unlike"]], [float(gap) for gap in found["gaps"]]
+        most = max(most, *gaps)
+        rows.append((task, " ".join(unlike) or "none", *(f"{gap:.1e}" for gap in gaps)))
+        wrong += [f"{task}: the compiled models differ in {' '.join(unlike)}"] * bool(unlike)
+        late = [tick for tick, gap in enumerate(gaps, 1) if not gap <= SAME_STATE]
+        wrong += [f"{task}: positions differ by {gaps[tick - 1]:.1e} at tick {tick}" for tick in late[:1]]
+    head = ("task", "arrays that differ", *(f"tick {tick + 1}" for tick in range(SAME_TICKS)))
+    sheet = Sheet(
+        f"Models of both engines, and the largest difference of a position [m, rad]; {SAME_STATE:.0e} is allowed",
+        head,
+        tuple(rows),
+    )
+    return f"the first {SAME_TICKS} ticks positions differ by at most {most:.1e}", sheet, wrong
+
+
+def first_ticks(context: Context, task: str, tracker: str, other: str, device: str) -> JsonObject:
+    """Arrays in which the compiled models of two engines differ, and differences of positions in the first ticks."""
+    states, models = [], []
+    for options in ({}, {"engine": other, "device": device}):
+        env = world_of(context, task, tracker, worlds=1, **options)
+        env.reset(context.seeds(task, 1))
+        models.append({name: _field(env, name) for name in SAME_FIELDS})
+        states.append([])
+        for _ in range(SAME_TICKS):
+            env.step(STAND_ACTION[None])
+            states[-1].append(env.physics.qpos.numpy()[0].astype(float))
+        env.close()
+    unlike = [name for name in SAME_FIELDS if not np.array_equal(models[0][name], models[1][name])]
+    gaps = [float(np.abs(a - b).max()) for a, b in zip(*states, strict=True)]
+    return {"unlike": list(unlike), "gaps": [gap if np.isfinite(gap) else 1e9 for gap in gaps]}
+
+
+def _field(env: World, name: str) -> np.ndarray:
+    """One array of the model that an engine steps, as float32."""
+    model = env.physics.mj_model if env.engine == "mujoco" else env.scene.solver.mjw_model
+    value = getattr(model, name)
+    rows = value if isinstance(value, np.ndarray) else value.numpy()
+    return np.asarray(rows, dtype=np.float32).reshape(-1)
+
+
+def bound_of_difference(only_first: int, only_second: int, pairs: int) -> tuple[float, float]:
+    """95 % interval of a difference of two paired rates that covers at least that often: exact bounds of its parts.
+
+    A difference is the rate of pairs in which the first alone has the outcome less that of the second alone; each is
+    bounded from above by 97.5 % (Clopper and Pearson 1934), and from below by 0.
+    """
+
+    def upper(count: int) -> float:
+        return 1.0 if count >= pairs else float(beta.ppf(0.975, count + 1, pairs - count))
+
+    return -upper(only_second), upper(only_first)
+
+
+def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Sheet, tuple[str, ...]]:
+    """Success and falls of the experts on both engines, episode by episode."""
+    rows, tests, total = [], [], {"success": [0, 0], "fall": [0, 0]}
+    pairs = 0
     for tracker in context.trackers:
         for task in context.tasks:
             first = context.evaluate(recorded(context, task, tracker))
             second = context.evaluate(CertifyCell(task, tracker, engine=other))
             a, b = score(first), score(second)
             falls = [sum(record.outcome == "fall" for record in found) for found in (first, second)]
-            p, q = (mcnemar(*discordant(first, second, outcome)) for outcome in ("success", "fall"))
-            pairs.append((task, tracker, p, q))
+            only = {outcome: discordant(first, second, outcome) for outcome in total}
+            p, q = (mcnemar(*only[outcome]) for outcome in ("success", "fall"))
+            for outcome, counts in only.items():
+                total[outcome] = [sum(two) for two in zip(total[outcome], counts, strict=True)]
+            pairs += a.episodes
+            tests.append((task, tracker, p, q))
             rows.append((task, tracker, *a.cells(), *b.cells(), f"{p:.3f}", f"{falls[0]} and {falls[1]}", f"{q:.3f}"))
-    level = DIFFERENT / max(2 * len(pairs), 1)
-    apart = [f"{task} through {tracker}" for task, tracker, p, q in pairs if min(p, q) < level]
-    least = min((min(p, q) for _, _, p, q in pairs), default=1.0)
+    level = DIFFERENT / max(2 * len(tests), 1)
+    apart = [f"{task} through {tracker}" for task, tracker, p, q in tests if min(p, q) < level]
+    bounds = {outcome: bound_of_difference(*counts, pairs) for outcome, counts in total.items()}
+    within = all(-MARGIN <= low and high <= MARGIN for low, high in bounds.values())
+    far = any(mcnemar(*counts) < DIFFERENT and abs(counts[0] - counts[1]) > MARGIN * pairs for counts in total.values())
     this, where = context.options.engine, device_name(device)
     head = (
         "task",
@@ -54,15 +166,22 @@ def engines(context: Context) -> CheckFinding:
         "falls",
         "p of falls",
     )
-    notes: tuple[str, ...] = (
-        f"Engines differ where p, that of McNemar's exact test of the same episodes, is below {level:.2g}: "
-        f"{DIFFERENT} over {2 * len(pairs)} tests.",
-    )
-    notes += tuple(f"{which}: the engines differ" for which in apart)
-    summary = f"{this} and {other} on {where}: smallest p of {2 * len(pairs)} tests is {least:.3f}"
-    return CheckFinding(
-        "fail" if apart else "pass", summary, (Sheet("Rates of both engines", head, tuple(rows)),), notes
-    )
+    said = [
+        f"{what} by {percent(low, 1)} to {percent(high, 1)}"
+        for what, (low, high) in zip(("success", "falls"), bounds.values(), strict=True)
+    ]
+    notes = [
+        f"Engines are equivalent where the 95 % interval of the difference of their rates, all {pairs} pairs of the "
+        f"same episodes together, is within {percent(MARGIN)} on either side: {'; '.join(said)}. "
+        f"They differ in a cell where p, that of McNemar's exact test, is below {level:.2g}: {DIFFERENT} over "
+        f"{2 * len(tests)} tests."
+    ]
+    notes += [f"{which}: the engines differ" for which in apart]
+    verdict: Verdict = "fail" if apart or far else "pass" if within else "note"
+    if verdict == "note":
+        notes.append(f"{pairs} pairs are too few to show that the rates are within {percent(MARGIN)}.")
+    summary = f"{this} and {other} on {where}: rates differ in {', '.join(said)} (95 %)"
+    return verdict, summary, Sheet("Rates of both engines", head, tuple(rows)), tuple(notes)
 
 
 def batches(context: Context) -> CheckFinding:
@@ -135,7 +254,7 @@ def official(context: Context) -> CheckFinding:
 
 
 CHECKS = (
-    Check("engines", "Do both physics engines give the same rates?", engines),
+    Check("engines", "Do both physics engines move alike, and give the same rates within the margin?", engines),
     Check("batches", "Do results depend on how many worlds run at once, or in which order?", batches),
     Check("official", "Do our TWIST2 weights execute the experts as well as the official ones?", official),
 )

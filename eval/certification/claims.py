@@ -71,7 +71,10 @@ CLAIMS = (
         "that is lost.",
         ("batches", "shards", "ray"),
     ),
-    Claim("Both physics engines give the same rates.", ("engines",)),
+    Claim("The world moves as mechanics says, on both engines.", ("physics",)),
+    Claim("Both physics engines move alike, and their rates are equivalent within 5 points.", ("engines",)),
+    Claim("The head camera's picture is as wide as the original's.", ("camera",)),
+    Claim("An episode succeeds at the tick at which the rule set's condition holds.", ("rules",)),
     Claim("Exact gradients are those that differences estimate.", ("gradients",)),
     Claim("What no rule counts is measured: feet on DoubleDesk's sill.", ("sill",)),
 )

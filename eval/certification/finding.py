@@ -100,9 +100,9 @@ class Score:
         return f"{self.successes}/{self.episodes}{errors}", f"{percent(low)} to {percent(high)}"
 
 
-def percent(fraction: float) -> str:
+def percent(fraction: float, decimals: int = 0) -> str:
     """A fraction in per cent."""
-    return f"{100.0 * fraction:.0f} %"
+    return f"{100.0 * fraction:.{decimals}f} %"
 
 
 def score(records: Sequence[EpisodeRecord]) -> Score:

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from arena_newton.devices import resolve_engine
+from arena_newton.eval.certification.agreement import BATCHED_TASKS
 from arena_newton.eval.options import CertifyOptions
 
 __all__ = ["Piece", "command_line", "flags", "play_ahead"]
@@ -53,7 +54,7 @@ COMPARING = (
 """It, and the checks that compare with its evaluations."""
 BY_NAME = "engines"
 """The check that without CUDA is skipped unless it is named: a process that plays it for others would name it."""
-BY_FIRST = ("visual", "execution", "visible", "policy-inputs")
+BY_FIRST = ("visual", "execution", "visible", "policy-inputs", "rules")
 """Checks that play through the first tracker alone."""
 BY_ALL = ("official", "swap")
 """Checks whose measurements of a task are not apart by tracker."""
@@ -61,6 +62,10 @@ ONE_PLAN = ("shards", "ray")
 """Checks that play the same plan of all tasks, by processes of their own."""
 LONGEST = ("shards", "ray", "failures", "swap")
 """Checks that take longest: they are begun before others, so that none is left when the others have ended."""
+WHOLE = ("physics", "camera")
+"""Checks that are not divided: of some tasks they measure more than of the others."""
+OF_FEW = "batches"
+"""The check that under --quick plays the first `BATCHED_TASKS` tasks alone."""
 PLAYS_NOTHING = ("statistics",)
 """Checks that are left to the end."""
 
@@ -78,7 +83,10 @@ def play_ahead(
         checks: Names of the checks that will run.
         say: Prints a line about what is going on.
     """
-    apart = [options.tracker] if options.quick else [(tracker,) for tracker in options.tracker]
+    if options.quick:
+        _work(options, _quick_pieces(options, tasks, checks), say)
+        return
+    apart = [(tracker,) for tracker in options.tracker]
     recorded = [Piece((FIRST,), (task,), some) for task in tasks for some in apart]
     if set(checks) & set(COMPARING):
         _work(options, recorded, say)
@@ -87,16 +95,41 @@ def play_ahead(
     if together:
         pieces.append(Piece(together, tuple(tasks), options.tracker, cores=False))
     for check in checks:
-        if check in (FIRST, *ONE_PLAN, *PLAYS_NOTHING) or (check == BY_NAME and not (cuda or check in options.checks)):
+        if check in (FIRST, *ONE_PLAN, *PLAYS_NOTHING) or _unnamed(options, check, cuda):
+            continue
+        if check in WHOLE:
+            pieces.append(Piece((check,), tuple(tasks), options.tracker))
             continue
         through = apart
-        if options.quick or check in BY_ALL:
+        if check in BY_ALL:
             through = [options.tracker]
         elif check in BY_FIRST:
             through = apart[:1]
         pieces += [Piece((check,), (task,), some) for task in tasks for some in through]
     pieces.sort(key=lambda piece: piece.checks[0] not in LONGEST)
     _work(options, pieces, say)
+
+
+def _unnamed(options: CertifyOptions, check: str, cuda: bool) -> bool:
+    """Whether a check is one that without CUDA plays less where nobody has named it."""
+    return check == BY_NAME and not (cuda or check in options.checks)
+
+
+def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequence[str]) -> list[Piece]:
+    """All checks of one task by one process: of a few episodes, a process's start is the longest part."""
+    cuda = resolve_engine("warp", None)[1] != "cpu"
+    own = [check for check in checks if check not in (*ONE_PLAN, *WHOLE, *PLAYS_NOTHING)]
+    own = [check for check in own if not _unnamed(options, check, cuda)]
+    own = [FIRST] * (FIRST not in own and bool(set(own) & set(COMPARING))) + own
+    pieces = [
+        Piece(some, tuple(tasks), options.tracker, cores=not set(some) <= set(ONE_PLAN))
+        for some in (tuple(check for check in checks if check in kind) for kind in (ONE_PLAN, WHOLE))
+        if some
+    ]
+    for number, task in enumerate(tasks):
+        some = tuple(check for check in own if check != OF_FEW or number < BATCHED_TASKS)
+        pieces += [Piece(some, (task,), options.tracker)] * bool(some)
+    return pieces
 
 
 def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str], None]) -> None:

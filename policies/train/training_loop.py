@@ -16,7 +16,7 @@ import torch
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
 from arena_newton.data.new_folder import held_folder
-from arena_newton.errors import ArenaError
+from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -101,9 +101,8 @@ class TrainingLoop:
         """Take all steps; returns the folder of the last checkpoint.
 
         Raises:
-            InputError: The folder cannot be made, or another process trains in it.
+            InputError: The folder cannot be made, another process trains in it, or the log cannot be written.
             ArenaError: The loss is not finite.
-            InputError: The log cannot be written, as on a full disk.
         """
         with held_folder(self._out, "trains in it") if self._processes.first else contextlib.nullcontext():
             if self._processes.first and self._new:

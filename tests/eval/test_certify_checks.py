@@ -13,7 +13,7 @@ from arena_newton.eval import certify
 from arena_newton.eval.certification import agreement, axes, visible
 from arena_newton.eval.certification.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
 from arena_newton.eval.certification.context import CertifyCell
-from arena_newton.eval.certification.finding import Score, discordant
+from arena_newton.eval.certification.finding import Score, Sheet, discordant
 from arena_newton.eval.certification.swap import retention
 from arena_newton.eval.certification.traces import first_difference, play
 from arena_newton.eval.options import CertifyOptions
@@ -224,6 +224,7 @@ class Played:
 def test_engines_and_weights_are_compared_episode_by_episode(monkeypatch):
     """Equal rates of other episodes are no difference, and eleven episodes that one alone solves are one."""
     monkeypatch.setattr(agreement, "recorded", lambda context, task, tracker: CertifyCell(task, tracker))
+    monkeypatch.setattr(agreement, "_same_start", lambda *given: ("both alike", Sheet("", (), ()), []))
     exact = 2 * 0.5**11
     found = agreement.official(Played(own="s" * 12, other="s" + "t" * 11))
     assert (found.verdict, found.sheets[0].rows[0][-1]) == (
@@ -237,9 +238,35 @@ def test_engines_and_weights_are_compared_episode_by_episode(monkeypatch):
     even = agreement.official(Played(own="s" * 6 + "t" * 6, other="t" * 6 + "s" * 6))
     assert even.verdict == "pass" and "p = 1" in even.summary and len(even.notes) == 1
     engines = agreement.engines(Played(own="s" * 12, other="s" + "f" * 11))
-    assert engines.verdict == "fail" and [engines.sheets[0].rows[0][i] for i in (-3, -1)] == ["0.001", "0.001"]
-    assert "on cpu" in engines.sheets[0].head[4] and "McNemar" in engines.notes[0]
-    assert agreement.engines(Played(own="sstf", other="sttf")).verdict == "pass"
+    assert engines.verdict == "fail" and [engines.sheets[1].rows[0][i] for i in (-3, -1)] == ["0.001", "0.001"]
+    assert "on cpu" in engines.sheets[1].head[4] and "McNemar" in engines.notes[0]
+    few = agreement.engines(Played(own="sstf", other="sttf"))
+    assert few.verdict == "note" and "4 pairs are too few" in few.notes[-1]
+    assert agreement.engines(Played(own="s" * 80, other="s" * 80)).verdict == "pass"
+    assert agreement.engines(Played(own="s" * 80, other="s" * 70 + "t" * 10)).verdict == "fail"
+
+
+def test_a_rate_at_the_ceiling_is_a_bound():
+    """Where no pair ends otherwise the bound is the exact one of none in n; where all do nothing is bounded."""
+    low, high = agreement.bound_of_difference(0, 0, 280)
+    assert high == pytest.approx(1.0 - 0.025 ** (1 / 280)) and low == -high and high < 0.0132
+    assert agreement.bound_of_difference(5, 0, 5)[1] == 1.0
+    assert agreement.bound_of_difference(0, 3, 100)[0] == pytest.approx(-0.0852, abs=1e-4)
+
+
+def test_engines_that_step_other_models_differ_at_once(tmp_path, monkeypatch):
+    """An array that differs and a tick beyond the bar are named; without CUDA the check still says so."""
+    found = {"unlike": ["body_mass"], "gaps": [1e-7, 2e-5, 1e-4, 1e-3, 1e-2]}
+    monkeypatch.setattr(agreement, "first_ticks", lambda *given: found)
+    monkeypatch.setattr(agreement, "resolve_engine", lambda *given: ("warp", "cpu"))
+    options = SimpleNamespace(engine="mujoco", device=None, checks=())
+    measured = lambda name, task, tracker, settings, measure: measure()  # noqa: E731
+    context = SimpleNamespace(options=options, tasks=("boxing",), trackers=("twist2",), measured=measured)
+    said = agreement.engines(context)
+    assert said.verdict == "fail" and said.notes[:2] == (
+        "boxing: the compiled models differ in body_mass",
+        "boxing: positions differ by 2.0e-05 at tick 2",
+    )
 
 
 def test_a_tiny_real_certification(tmp_path, capsys):

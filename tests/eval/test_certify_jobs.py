@@ -47,9 +47,21 @@ def test_each_process_plays_one_check_of_one_task(tmp_path, monkeypatch):
 def test_a_broken_process_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     """A process that is refused leaves its piece to the end, with its reason, and the rest is played."""
     log, said = stand_in(tmp_path, monkeypatch, code=2), []
-    jobs.play_ahead(CertifyOptions(out="x", jobs=3, quick=True), ["football"], ["solvable", "swap"], said.append)
+    jobs.play_ahead(CertifyOptions(out="x", jobs=1, quick=True), ["football", "boxing"], ["swap"], said.append)
     assert len(log.read_text().splitlines()) == 2
-    assert said == [f"{name} football twist2 sonic: left to the end: error: broken" for name in ("solvable", "swap")]
+    left = "twist2 sonic: left to the end: error: broken"
+    assert said == [f"solvable swap {task} {left}" for task in ("football", "boxing")]
+
+
+def test_a_quick_process_plays_all_checks_of_a_task(tmp_path, monkeypatch):
+    """Of a few episodes a process's start is the longest part: one a task, and one for what measures tasks unlike."""
+    log = stand_in(tmp_path, monkeypatch)
+    checks = ["physics", "camera", "rules", "batches", "swap", "shards", "statistics"]
+    options = CertifyOptions(out="x", jobs=1, quick=True)
+    jobs.play_ahead(options, ["football", "boxing", "sit_sofa"], checks, lambda text: None)
+    asked = [line.split("--checks ")[1].split(" --")[0] for line in log.read_text().splitlines()]
+    few = "solvable rules batches swap"
+    assert asked == ["shards", "physics camera", few, few, "solvable rules swap"]
 
 
 def test_a_process_understands_its_flags():
@@ -82,11 +94,10 @@ def test_engines_is_left_to_the_check_without_cuda_unless_it_was_named(tmp_path,
     for named, device in (((), "cpu"), (("engines",), "cpu"), ((), "cuda:0")):
         log.unlink(missing_ok=True)
         monkeypatch.setattr(jobs, "resolve_engine", lambda engine, given, device=device: (engine, device))
-        options = CertifyOptions(out="x", jobs=2, quick=True, checks=named)
+        options = CertifyOptions(out="x", jobs=1, quick=True, checks=named)
         jobs.play_ahead(options, ["boxing"], ["engines", "execution"], lambda text: None)
-        asked = [line.split("--checks ")[1].split()[0] for line in log.read_text().splitlines()]
-        played = ["engines"] if named or device != "cpu" else []
-        assert sorted(asked) == [*played, "execution", "solvable"]
+        (asked,) = [line.split("--checks ")[1].split(" --")[0] for line in log.read_text().splitlines()]
+        assert asked == ("solvable engines execution" if named or device != "cpu" else "execution")
 
 
 def test_one_plan_is_not_divided(tmp_path, monkeypatch):

@@ -1,0 +1,126 @@
+"""Cheats in physics, camera and rules that `eval certify --quick` must find, by the name of the check that fails.
+
+`CHEATS` has a row a cheat: the check that finds it, its task, and its patch. Without a patch the same checks pass.
+"""
+
+import dataclasses
+import re
+
+import pytest
+
+from arena_newton import physics_batch, scene
+from arena_newton.eval import certify
+from arena_newton.eval.certification import closed_forms
+from arena_newton.eval.options import CertifyOptions
+from arena_newton.kernels import success
+from arena_newton.pictures.camera import Camera
+
+
+def certified(folder, check, task):
+    """Exit code of a check of one task through TWIST2; engines that are not named compare their first ticks alone."""
+    options = CertifyOptions(out=str(folder), task=(task,), tracker=("twist2",), episodes=1, quick=True)
+    return certify.run(options, checks=[one for one in certify.CHECKS if one.name == check])
+
+
+@pytest.fixture(autouse=True)
+def one_engine(monkeypatch):
+    """Closed forms on engine mujoco alone: Warp's CPU backend takes half a minute."""
+    plan = closed_forms._plan
+    monkeypatch.setattr(closed_forms, "_plan", lambda *given: [one for one in plan(*given) if one[0] == "mujoco"])
+
+
+def compiled(monkeypatch, change):
+    """Change the models that episodes step, each as it is made."""
+    made = physics_batch._at_rate
+
+    def cheat(*given):
+        model = made(*given)
+        change(model)
+        return model
+
+    monkeypatch.setattr(physics_batch, "_at_rate", cheat)
+
+
+def gravity_less_3_percent(monkeypatch):
+    """9.516 m/s²."""
+    compiled(monkeypatch, lambda model: model.opt.gravity.__imul__(0.97))
+
+
+def friction_less_10_percent(monkeypatch):
+    """Of every contact."""
+    compiled(monkeypatch, lambda model: model.geom_friction.__imul__(0.9))
+
+
+def heavier_link(monkeypatch):
+    """The left knee has 5 % more mass than Unitree says."""
+
+    def cheat(model):
+        model.body_mass[next(b for b in range(model.nbody) if "left_knee" in model.body(b).name)] *= 1.05
+
+    compiled(monkeypatch, cheat)
+
+
+def weaker_drives(monkeypatch):
+    """Stiffness and damping are 5 % lower."""
+    drives = scene._set_drives
+
+    def cheat(builder, drive):
+        lower = {name: tuple(0.95 * value for value in getattr(drive, name)) for name in ("kp", "kd")}
+        drives(builder, dataclasses.replace(drive, **lower))
+
+    monkeypatch.setattr(scene, "_set_drives", cheat)
+
+
+def livelier_ball(monkeypatch):
+    """Its coefficient of restitution is higher by 0.05."""
+    given = physics_batch.set_restitution
+    monkeypatch.setattr(
+        physics_batch, "set_restitution", lambda scene, e, dt, *models: given(scene, e + 0.05, dt, *models)
+    )
+
+
+def wider_camera(monkeypatch):
+    """The picture is 3 % wider at the same distance."""
+    began = Camera.__init__
+
+    def cheat(self, *given, horizontal_aperture, **named):
+        began(self, *given, horizontal_aperture=1.03 * horizontal_aperture, **named)
+
+    monkeypatch.setattr(Camera, "__init__", cheat)
+
+
+def rule_that_confirms_a_tick_early(monkeypatch):
+    """SitSofa succeeds after 24 ticks instead of 25."""
+    launch = success.launch_sit_sofa_paper
+    monkeypatch.setattr(
+        success,
+        "launch_sit_sofa_paper",
+        lambda *given, confirm_ticks, **named: launch(*given, confirm_ticks=confirm_ticks - 1, **named),
+    )
+
+
+CHEATS = [
+    ("physics", "football", gravity_less_3_percent),
+    ("engines", "football", gravity_less_3_percent),
+    ("physics", "football", friction_less_10_percent),
+    ("physics", "football", heavier_link),
+    ("physics", "football", weaker_drives),
+    ("physics", "football", livelier_ball),
+    ("camera", "football", wider_camera),
+    ("rules", "sit_sofa", rule_that_confirms_a_tick_early),
+]
+"""The check that finds a cheat, a task, and its patch."""
+
+
+@pytest.mark.parametrize(("check", "task"), sorted({row[:2] for row in CHEATS}))
+def test_the_honest_pass(tmp_path, check, task):
+    """Without a patch every check that finds a cheat passes."""
+    assert certified(tmp_path, check, task) == 0
+
+
+@pytest.mark.parametrize(("check", "task", "cheat"), CHEATS, ids=[f"{row[0]}-{row[2].__name__}" for row in CHEATS])
+def test_a_cheat_is_found_by_name(tmp_path, monkeypatch, capsys, check, task, cheat):
+    """`certify --quick` fails, and its line names the check."""
+    cheat(monkeypatch)
+    assert certified(tmp_path, check, task) == 1
+    assert re.search(rf"^fail  {check} ", capsys.readouterr().out, re.MULTILINE)
