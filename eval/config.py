@@ -20,7 +20,17 @@ from arena_newton.devices import cluster_engine, resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.eval import plan, rounds
 from arena_newton.eval.document import Identity
-from arena_newton.eval.identity import PACKAGE, code_hash, config_hash, hash_path, hash_paths, own_code, scene_files
+from arena_newton.eval.identity import (
+    PACKAGE,
+    code_hash,
+    config_hash,
+    foreign_task,
+    hash_path,
+    hash_paths,
+    layers_hash,
+    own_code,
+    scene_files,
+)
 from arena_newton.eval.interaction import check_interactions
 from arena_newton.eval.options import QUICK_REPEATS, QUICK_SEEDS, QUICK_TRACKERS, RecordOptions, RunOptions, is_quick
 from arena_newton.eval.play_flags import RAY_FLAGS, check_ray, check_width
@@ -343,7 +353,7 @@ def resolve(options: RunOptions) -> RunConfig:
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
-    variant_hash = _variant_hash(variant) if variant else None
+    variant_hash = layers_hash(variant) if variant else None
     if options.ray is None:
         engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     else:
@@ -368,18 +378,8 @@ def resolve(options: RunOptions) -> RunConfig:
         variant_hash=variant_hash,
         scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
         code_hash=code_hash(),
-        foreign_tasks={name: facts for name in tasks if (facts := _foreign_task(name))},
+        foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name)))},
     )
-
-
-def _foreign_task(name: str) -> JsonObject:
-    """Hashes of a task's scene, with all that it names, and of the package of its judge and sampler, unless ours."""
-    spec = task_specs.get(name)
-    codes = {code for part in (spec.judge, spec.sample) if (code := own_code(part)) is not None}
-    facts: JsonObject = {"code": config_hash(sorted(codes))} if codes else {}
-    if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
-        facts["scene"] = _variant_hash(spec.scene)
-    return facts
 
 
 def _card(target: str) -> PolicyCard:
@@ -525,13 +525,6 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
         fit: Fit = "native" if name == "world" else robot_fit(width, height)
         found[name] = CameraConfig(width=width, height=height, prim="ego" if name == "front" else name, fit=fit)
     return found
-
-
-def _variant_hash(variant: Path) -> str:
-    """A USD file counts with every layer and asset that it names; the validator walks them before USD composes any."""
-    from arena_newton.usd_scenes import validate
-
-    return config_hash(sorted(map(hash_path, validate.layers(variant))))
 
 
 def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, dict[str, str | None]]:

@@ -10,9 +10,14 @@ import os
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import arena_newton
 from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.eval.records import JsonObject
+    from arena_newton.tasks import TaskSpec
 
 __all__ = [
     "PACKAGE",
@@ -22,8 +27,10 @@ __all__ = [
     "code_hash",
     "config_hash",
     "differing_key",
+    "foreign_task",
     "hash_path",
     "hash_paths",
+    "layers_hash",
     "moving_versions",
     "own_code",
     "package_files",
@@ -190,6 +197,22 @@ def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> l
 def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str] = hash_path) -> str:
     """Hash of files below a folder, by names and contents."""
     return config_hash([[file.relative_to(root).as_posix(), digest(file)] for file in files])
+
+
+def layers_hash(stage: Path) -> str:
+    """Hash of a USD file with every layer and asset that it names: the validator walks them before USD composes any."""
+    from arena_newton.usd_scenes import validate
+
+    return config_hash(sorted(map(hash_path, validate.layers(stage))))
+
+
+def foreign_task(spec: TaskSpec) -> JsonObject:
+    """Hashes of a task's scene, with all that it names, and of the package of its judge and sampler, unless ours."""
+    codes = {code for part in (spec.judge, spec.sample) if (code := own_code(part)) is not None}
+    facts: JsonObject = {"code": config_hash(sorted(codes))} if codes else {}
+    if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
+        facts["scene"] = layers_hash(spec.scene)
+    return facts
 
 
 def own_code(part: object) -> str | None:

@@ -77,7 +77,7 @@ def test_its_scene_and_its_code_are_part_of_a_runs_identity(bell, monkeypatch):
         layer.write("# heavier\n")
     second = identity(bell)["foreign_tasks"]
     assert second[bell]["code"] == first[bell]["code"] and second[bell]["scene"] != first[bell]["scene"]
-    monkeypatch.setattr("arena_newton.eval.config.own_code", lambda part: "0123456789ab")
+    monkeypatch.setattr("arena_newton.eval.identity.own_code", lambda part: "0123456789ab")
     assert identity(bell)["foreign_tasks"][bell]["code"] != first[bell]["code"]
 
 
