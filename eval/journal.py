@@ -78,7 +78,8 @@ class EpisodeRecord:
     policy: Name
     """Spec of the policy, a local path shortened to its file name."""
     privileged: bool = False
-    """The policy takes the world itself (`Policy.attach`): it knows more of an episode than state and picture show."""
+    """The policy takes the world itself (`Policy.attach`): it knows more of an episode than state and picture show.
+    Absent in the line of one that does not."""
     mode: Mode
     rules: Name = ""
     engine: Name = ""
@@ -132,6 +133,8 @@ class EpisodeRecord:
         values = {key.name: getattr(self, key.name) for key in dataclasses.fields(self)}
         values["events"] = [dataclasses.asdict(event) for event in self.events]
         signals = values.pop("signals")
+        if not self.privileged:
+            del values["privileged"]
         return values if signals is None else values | {"signals": dataclasses.asdict(signals)}
 
     @classmethod
