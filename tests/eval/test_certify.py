@@ -295,7 +295,7 @@ def test_the_page_needs_no_other_file(tmp_path):
     addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(address.startswith(("#", "data:image/png;base64,")) for address in addresses)
     assert "data:image/png;base64," in page and "<script>" not in page and "&lt;script&gt;" in page
-    assert "1 of 2 checks have not run" in page and "intervals are wide" in page and "not asked for: journal recording solvable" in page
+    assert "1 of 2 checks have not run" in page and "intervals are wide" in page and "not asked for: journal" in page
     assert page.index("Not finished") < page.index('id="claims"') < page.index("2 CPU cores") < page.index("A table")
     text = (tmp_path / "certify.md").read_text()
     assert r"a \| note" in text and "data:" not in text
