@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from arena_newton.eval.records import Json
     from arena_newton.physics_batch import Physics
 
-__all__ = ["CHECKS", "TOLERANCE", "Measurement", "measured_in"]
+__all__ = ["CHECKS", "TOLERANCE", "Bench", "Measurement", "measured_in"]
 
 TOLERANCE = 0.005
 """Largest deviation from a closed form, as a part of it."""
@@ -106,7 +106,7 @@ def _within(what: str, measured: float, expected: float, tolerance: float = TOLE
     return Measurement(what, float(measured), expected, -tolerance * abs(expected), tolerance * abs(expected))
 
 
-class _Bench:
+class Bench:
     """Worlds of a task without their judge: bodies are put somewhere, pushed, and watched."""
 
     def __init__(self, env: ArenaEnv, physics: Physics | None = None):
@@ -120,10 +120,10 @@ class _Bench:
         self.free = {int(model.jnt_bodyid[j]): int(model.jnt_qposadr[j]) for j in free}
         """Body with a free joint → its address in qpos."""
 
-    def step_by_step(self) -> _Bench:
+    def step_by_step(self) -> Bench:
         """The same worlds and engine with one physics step a tick."""
         rate = g1.PhysicsRate(self.physics.rate.dt, 1)
-        return _Bench(self.env, make_physics(self.scene, rate, self.env.engine, 1))
+        return Bench(self.env, make_physics(self.scene, rate, self.env.engine, 1))
 
     def start(self, qpos: np.ndarray) -> None:
         """Put all worlds at rest, with joint targets where the joints are."""
@@ -157,7 +157,7 @@ class _Bench:
         return getattr(self.physics, name).numpy().astype(float)
 
 
-def fall(bench: _Bench) -> Iterator[Measurement]:
+def fall(bench: Bench) -> Iterator[Measurement]:
     """Everything that is free falls with g: of a constant acceleration the second difference is exact."""
     bench.start(bench.pose())
     heights = []
@@ -170,7 +170,7 @@ def fall(bench: _Bench) -> Iterator[Measurement]:
     yield _within("free fall [m/s²]", worst, GRAVITY)
 
 
-def weight(bench: _Bench) -> Iterator[Measurement]:
+def weight(bench: Bench) -> Iterator[Measurement]:
     """The floor carries the standing robot."""
     env, model = bench.env, bench.scene.mj_model
     robot = np.isin(model.geom_bodyid, bench.scene.robot.bodies)
@@ -186,7 +186,7 @@ def weight(bench: _Bench) -> Iterator[Measurement]:
     yield _within("force of the floor on the standing robot [N]", np.mean(carried), MASS * GRAVITY)
 
 
-def masses(bench: _Bench) -> Iterator[Measurement]:
+def masses(bench: Bench) -> Iterator[Measurement]:
     """What each link weighs: pushed without a floor, the robot gains the momentum that the push gives.
 
     Whatever links and drives do among themselves, the links' accelerations under a push on one of them are a linear
@@ -217,7 +217,7 @@ def masses(bench: _Bench) -> Iterator[Measurement]:
         yield _within(f"mass of {link.name} [kg]", mass, link.mass, tolerance)
 
 
-def _velocities(bench: _Bench, bodies: list[int]) -> np.ndarray:
+def _velocities(bench: Bench, bodies: list[int]) -> np.ndarray:
     """Velocity of bodies' centres of mass per unit of qvel at the start, [bodies, 3, nv]: geometry alone."""
     model = bench.scene.mj_model
     data = mujoco.MjData(model)
@@ -230,7 +230,7 @@ def _velocities(bench: _Bench, bodies: list[int]) -> np.ndarray:
     return found
 
 
-def drives(bench: _Bench, damping: bool = True) -> Iterator[Measurement]:
+def drives(bench: Bench, damping: bool = True) -> Iterator[Measurement]:
     """Stiffness and, if asked, damping of every joint, of a robot without weight.
 
     A drive that holds a torque is bent by torque over stiffness. One that is let go comes to rest when spring and
@@ -304,7 +304,7 @@ def _axis(quat: np.ndarray, axis: int) -> np.ndarray:
     return matrix.reshape(-1, 3, 3)[:, :, axis]
 
 
-def soles(bench: _Bench) -> Iterator[Measurement]:
+def soles(bench: Bench) -> Iterator[Measurement]:
     """A robot without weight, its feet pressed on the floor, slides once it is pulled harder than the friction holds.
 
     Each foot carries half of the weight at its own centre, and the torque that keeps it from tipping: nothing of the
@@ -335,7 +335,7 @@ def soles(bench: _Bench) -> Iterator[Measurement]:
     yield _slid(bench, scene.robot.root_body, mu, "friction of the soles")
 
 
-def slides(bench: _Bench) -> Iterator[Measurement]:
+def slides(bench: Bench) -> Iterator[Measurement]:
     """A box on the floor, kept from tipping, slides once it is pulled harder than the friction holds."""
     scene, p = bench.scene, bench.physics
     prim, mass, half = SLIDES[bench.env.spec.name]
@@ -351,7 +351,7 @@ def slides(bench: _Bench) -> Iterator[Measurement]:
     yield _slid(bench, body, BOXES, f"friction of {prim}")
 
 
-def _slid(bench: _Bench, body: int, mu: float, what: str) -> Measurement:
+def _slid(bench: Bench, body: int, mu: float, what: str) -> Measurement:
     """The coefficient of friction from the acceleration of what is pulled with `PULL` times the friction."""
     way = []
     for tick in range(STARTING_TICKS + SLIDING_TICKS):
@@ -363,7 +363,7 @@ def _slid(bench: _Bench, body: int, mu: float, what: str) -> Measurement:
     return _within(what, PULL * mu - acceleration / GRAVITY, mu, FRICTION_TOLERANCE)
 
 
-def bounces(bench: _Bench) -> Iterator[Measurement]:
+def bounces(bench: Bench) -> Iterator[Measurement]:
     """A ball that falls on the floor leaves it with a part of its speed, wherever within a step it lands."""
     scene = bench.scene
     at, speed, radius = scene.joint_qpos(BALL), scene.joint_qvel(BALL) + 2, -scene.lowest(BALL)
@@ -390,7 +390,7 @@ def measured_in(env: ArenaEnv, *, whole: bool = True) -> list[Measurement]:
         env: Its worlds.
         whole: Everything; otherwise the drives alone, which are the tracker's.
     """
-    bench, found = _Bench(env), list[Measurement]()
+    bench, found = Bench(env), list[Measurement]()
     if whole:
         for measure in (fall, weight, masses, soles):
             found += measure(bench)
