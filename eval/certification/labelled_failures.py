@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,7 +70,7 @@ def labelled_failures(folder: Path = LABELLED) -> list[LabelledFailure]:
 def _said(path: Path, record: EpisodeRecord, row: dict[str, str]) -> tuple[FailureStage, ...]:
     ruled = stage_of(record)
     try:
-        read = [FailureStage(row[judge]) for judge in JUDGES[1:]]
+        read = [FailureStage(row[judge]) for judge in JUDGES[1:] if judge in row]
     except ValueError as error:
         raise InputError(f"{path}: number {record.index}: {error}") from None
     if ruled is None:
@@ -80,7 +81,7 @@ def _said(path: Path, record: EpisodeRecord, row: dict[str, str]) -> tuple[Failu
 def agreements(failures: Sequence[LabelledFailure]) -> list[JudgeAgreement]:
     """Of the rules with each reader and of the readers, for even and odd numbers and for all."""
     found = []
-    for a, b in ((0, 1), (0, 2), (1, 2)):
+    for a, b in itertools.combinations(range(len(failures[0].said)), 2):
         for part, remainders in PARTS.items():
             some = [one for one in failures if one.number % 2 in remainders]
             same = sum(one.said[a] == one.said[b] for one in some)
@@ -94,7 +95,7 @@ def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Sheet]:
         (*one.judges, one.part, str(one.failures), str(one.same), f"{one.rate:.2f}") for one in agreements(failures)
     ]
     sheets = [Sheet("real failures: agreement", ("judge", "and", "numbers", "failures", "same", "rate"), tuple(rows))]
-    for column, reader in enumerate(JUDGES[1:], start=1):
+    for column, reader in enumerate(JUDGES[1 : len(failures[0].said)], start=1):
         counts = Counter((one.said[column], one.said[0]) for one in failures)
         table = tuple((str(read), *(str(counts[read, said]) for said in FailureStage)) for read in FailureStage)
         head = (reader, *(f"said {stage}" for stage in FailureStage))
