@@ -183,9 +183,17 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
     if options.table or len(folders) > 1:
         if options.json:
             raise InputError("--json: is of one folder, without --table")
+        if options.own_tracker is not None:
+            raise InputError("--own-tracker: is of one folder, without --table")
         print(tables.joint_table([load_run(folder) for folder in folders]), end="")
         return 0
     (folder,) = folders
+    if options.own_tracker is not None:
+        from arena_newton.eval.own_tracker import own_options
+
+        failed = _execute(own_options(folder, options.own_tracker), factories)
+        if failed:
+            return failed
     run = load_run(folder)
     results = report.write_reports(run)
     if options.json:

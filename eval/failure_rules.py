@@ -7,12 +7,16 @@ did, then contact and what came after it, then posture, approach, and last wheth
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from arena_newton.eval.episode_signals import EpisodeSignals
 from arena_newton.eval.failure_stage import FailureStage
+from arena_newton.eval.interaction import INTERACTIONS, Interaction
 
-__all__ = ["FALLING", "Judged", "sees_at_start", "stage_of"]
+__all__ = ["BARS", "BAND", "Bars", "Judged", "near_bars", "sees_at_start", "stage_of", "waits_in_view"]
 
 
 class Judged(Protocol):
@@ -39,57 +43,116 @@ class Judged(Protocol):
         """It fell before the policy acted."""
 
     @property
+    def predicates(self) -> Mapping[str, int | None]:
+        """Predicate of its task → first tick at which it held; None where it never did."""
+
+    @property
     def signals(self) -> EpisodeSignals | None:
         """None where they were not kept."""
 
 
-TRACKING = 0.09
-"""Mean error of the leg joints from which on the tracker does not follow [rad]. Experts' successes have 0.036 to 0.069
-through `twist2` and `sonic`; with half the legs' excursions both have 0.10 to 0.13 (6 and 4 episodes each)."""
-LEANING = 0.60
-"""Tilt of a reference from which on no tracker can be blamed [rad]: the experts' is 0.05 to 0.08 here."""
+@dataclass(frozen=True)
+class Bars:
+    """Bars of the rules, each named as the signal that it is for."""
+
+    tracking_error: float = 0.09
+    """Mean error of the leg joints from which on the tracker does not follow [rad]. Experts' successes have 0.036 to
+    0.069 through `twist2` and `sonic`; with half the legs' excursions both have 0.10 to 0.13 (6, 4 episodes each)."""
+    reference_tilt: float = 0.60
+    """Tilt of a reference from which on no tracker can be blamed [rad]: the experts' is 0.05 to 0.08 here."""
+    engaged_ticks: float = 100
+    """Ticks for which a robot must stay slow near the object to have come for it: two seconds. A searching robot slows
+    down for about one (up to 56 ticks measured), where its way turns; one that has arrived stays (300 and more)."""
+    aligned_ticks: float = 100
+    """The same where the object can be touched without a step."""
+    moved: float = 0.25
+    """Distance from where it was touched first at which the object has moved away [m]."""
+    left: float = 1.1
+    """The same of a carried object, from where it was touched last, seen from above [m]: beyond `tasks.base.REACH`,
+    0.8 m. One that is dropped or put down wrongly is nearer: a box that falls from walking hands rolls up to 0.8 m."""
+    first_touch: float = 50
+    """A touch within so many ticks before a fall is a part of the fall: it takes about a second."""
+    stop_distance: float = 1.1
+    """A robot that stays near the object, once it is within the `Interaction`'s stance times this, stands where it can
+    touch it: who has arrived and sways about the border has not left the pose."""
+    stop_bearing: float = 1.1
+    """The same of the bearing."""
+
+
+BARS = Bars()
+BAND = 0.1
+"""A signal within this fraction of its bar is near it."""
 SEEN = 10
 """Pixels of 224 x 168 from which on the first picture shows the object, as in the check `visible`."""
-ENGAGED = 100
-"""Ticks for which a robot must stay slow near the object to have come for it: two seconds. A searching robot slows
-down for about one (up to 56 ticks measured), where its way turns; one that has arrived stays (300 and more)."""
-ALIGNED = 100
-"""The same where the object can be touched without a step."""
-MOVED = 0.25
-"""Distance from where it was touched first at which the object has moved away [m]."""
-CARRIED = ("pp_box", "double_desk")
-"""Tasks whose object moves with the hands; how far it has moved is measured from where they touched it last."""
-LEFT = 1.0
-"""Distance from there at which a carried object is left [m], seen from above: beyond `tasks.base.REACH`, 0.8 m. One
-that is dropped or put down wrongly is nearer: a box that falls from walking hands rolls up to 0.8 m."""
-REACHED_ONLY = ("vis_navi",)
-"""Tasks in which the object is only to be reached. A touch has no effect that could fail to come: a robot that set a
-foot on the area and does not stand in it with both has not come into the pose that is wanted."""
 ENDING = ("ball_out",)
 """Causes that end an episode: after these there was nothing to recover."""
-FALLING = 50
-"""A touch within so many ticks before a fall is a part of the fall: it takes about a second."""
+_OTHER = Interaction("", "", (), touch=0.0, stance=0.0)
+"""A task that this installation has no entry of; its folders are read all the same."""
+WAITS = 0.5
+"""Fraction of an episode for which a robot that waits stays slow near the object without a break, and of the looks that
+show it. Those that were seen to wait stayed 0.6 to 0.9 of it."""
 
 
-def stage_of(episode: Judged) -> FailureStage | None:
+def stage_of(episode: Judged, bars: Bars = BARS) -> FailureStage | None:
     """Stage at which an episode failed; None for a success, an error, and an episode without signals."""
     signals = episode.signals
     if signals is None or episode.outcome not in ("fall", "timeout"):
         return None
     if episode.startup_fall:
-        return FailureStage.TRACKER
+        return FailureStage.TRACKING
     fell = episode.outcome == "fall"
-    if signals.tracking_error > TRACKING and signals.reference_tilt < LEANING:
-        return FailureStage.TRACKER
-    if signals.first_touch is not None and not (fell and episode.steps - signals.first_touch < FALLING):
-        away = LEFT if episode.task in CARRIED else MOVED
+    if signals.tracking_error > bars.tracking_error and signals.reference_tilt < bars.reference_tilt:
+        return FailureStage.TRACKING
+    task = INTERACTIONS.get(episode.task, _OTHER)
+    touched = _touched(episode, signals, task)
+    if touched is not None and not (fell and episode.steps - touched < bars.first_touch):
+        away = bars.left if task.carried else bars.moved
         lost = signals.moved > away and not signals.touches_moved and episode.reason not in ENDING
         if fell or lost:
             return FailureStage.RECOVERY
-        return FailureStage.APPROACH if episode.task in REACHED_ONLY else FailureStage.CONTACT
-    if fell or signals.aligned_ticks >= ALIGNED:
+        return FailureStage.APPROACH if task.reached_only else FailureStage.CONTACT
+    engaged = signals.engaged_ticks >= bars.engaged_ticks
+    if fell or signals.aligned_ticks >= bars.aligned_ticks or (engaged and _in_pose(signals, task, bars)):
         return FailureStage.POSTURE
-    return FailureStage.APPROACH if signals.engaged_ticks >= ENGAGED else FailureStage.PERCEPTION
+    return FailureStage.APPROACH if engaged else FailureStage.PERCEPTION
+
+
+def _touched(episode: Judged, signals: EpisodeSignals, task: Interaction) -> int | None:
+    """Tick of the first touch; None where there was none, or the task's own predicate says that there was none."""
+    said = episode.predicates.get(task.predicate, signals.first_touch)
+    return None if said is None or signals.first_touch is None else max(said, signals.first_touch)
+
+
+def _in_pose(signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
+    """Whether it stayed, by a bar that is a little wider, where the object can be touched without a step."""
+    distance, bearing = signals.stop_distance, signals.stop_bearing
+    if distance is None or bearing is None:
+        return False
+    return distance <= bars.stop_distance * task.stance and bearing <= bars.stop_bearing * task.bearing
+
+
+def near_bars(episode: Judged) -> tuple[str, ...]:
+    """Signals within a tenth of a bar beyond which the stage would be another."""
+    stage, signals = stage_of(episode), episode.signals
+    if stage is None or signals is None:
+        return ()
+    found = []
+    for name in (field.name for field in dataclasses.fields(Bars)):
+        others = (dataclasses.replace(BARS, **{name: getattr(BARS, name) * (1.0 + by)}) for by in (-BAND, BAND))
+        if any(stage_of(episode, bars) != stage for bars in others):
+            found.append(name)
+    touch = INTERACTIONS.get(episode.task, _OTHER).touch
+    if stage is not FailureStage.TRACKING and abs(signals.reach_distance - touch) < BAND * touch:
+        found.append("reach_distance")
+    return tuple(found)
+
+
+def waits_in_view(episode: Judged) -> bool:
+    """Whether a robot that failed stayed slow near the object, which it had in view, for most of its episode."""
+    signals = episode.signals
+    if signals is None or episode.outcome != "timeout":
+        return False
+    return signals.engaged_ticks >= WAITS * episode.steps and signals.looks_seen >= WAITS * max(signals.looks, 1)
 
 
 def sees_at_start(signals: EpisodeSignals) -> bool:

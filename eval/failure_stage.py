@@ -20,5 +20,10 @@ class FailureStage(StrEnum):
     """The object is touched without the effect that the task wants."""
     RECOVERY = "recovery"
     """After a touch the robot falls, or does not follow an object that moved away."""
-    TRACKER = "tracker"
-    """The robot does not do what a plausible reference says."""
+    TRACKING = "tracking (legs)"
+    """The legs do not do what a plausible reference says."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> FailureStage | None:
+        """The stage's former name, in folders that were written before."""
+        return cls.TRACKING if value == "tracker" else None

@@ -19,8 +19,8 @@ import jinja2
 from markupsafe import Markup
 
 from arena_newton.eval.document import Document, trackers_of
-from arena_newton.eval.failure_rules import stage_of
-from arena_newton.eval.failure_text import SENTENCES, stage_bars
+from arena_newton.eval.failure_rules import near_bars, stage_of, waits_in_view
+from arena_newton.eval.failure_text import SENTENCES, WAITS, stage_bars
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.learned_row import ROW_FOLDER
 from arena_newton.eval.results import Results, RunRecord
@@ -303,8 +303,12 @@ class _Episode:
 
     @property
     def stage(self) -> str:
-        """Stage at which it failed; empty without one."""
-        return stage_of(self.record) or ""
+        """Stage at which it failed, and how it ended; empty without one."""
+        stage, near = stage_of(self.record), near_bars(self.record)
+        if stage is None:
+            return ""
+        ending = f", {WAITS}" if waits_in_view(self.record) else ""
+        return f"{stage}{ending}{f'; near its bar: {", ".join(near)}' if near else ''}"
 
     @property
     def error(self) -> str:

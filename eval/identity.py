@@ -38,20 +38,20 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
-_REPORTING = """__main__ action_map adversary bench bench_figure bench_learned bench_peers bench_policy bench_recording
-    bench_start bench_tick certify compare_command comparison comparison_page comparison_text config console contenders
-    cost_table detectable document door_comparison door_options engines episode_signals evaluated_cells failure_counts
-    failure_rules failure_text findings_text folder html_report identity journal learned_row learning_loop loop_report
-    loop_requirements matrix_cells mjlab_training options original_format pack_command pack_options paired_rows
-    paper_claims paper_numbers peer_camera peer_lerobot_eval peer_pairs peer_tracker_training picture_differences
-    placed_play placement_axes placement_files placement_map placement_options play_flags predicted_actions progress
-    rate_tests ray_actor ray_crew ray_run ray_suite recording records report rerecord results rounds sensitivity
-    shard_merge sharding signal_recorder slice_events slice_player stats success_film suite_call suite_estimate
-    suite_figures suite_file suite_folder suite_options suite_records suite_run suite_tables suite_timing table_entries
-    table_options table_text tables tables_command trainings trainings_table tsne_command whole_run wording
-    worst_placement"""
-_CHECKS = """agreement axes certificate claims context error_rates failures finding gradients inputs jobs legs machines
-    replays same_files sill solvable swap traces visible"""
+_REPORTING = """__main__ action_map adversary bench bench_figure bench_learned bench_peers bench_policy
+    bench_recording bench_start bench_tick certify compare_command comparison comparison_page comparison_text config
+    console contenders cost_table detectable document door_comparison door_options engines episode_signals
+    evaluated_cells failure_counts failure_rules failure_text findings_text folder html_report identity journal
+    learned_row learning_loop loop_report loop_requirements matrix_cells mjlab_training options original_format
+    own_tracker pack_command pack_options paired_rows paper_claims paper_numbers peer_camera peer_lerobot_eval
+    peer_pairs peer_tracker_training picture_differences placed_play placement_axes placement_files placement_map
+    placement_options play_flags predicted_actions progress rate_tests ray_actor ray_crew ray_run ray_suite recording
+    records report rerecord results rounds sensitivity shard_merge sharding signal_recorder slice_events slice_player
+    stats success_film suite_call suite_estimate suite_figures suite_file suite_folder suite_options suite_records
+    suite_run suite_tables suite_timing table_entries table_options table_text tables tables_command trainings
+    trainings_table tsne_command whole_run wording worst_placement"""
+_CHECKS = """agreement axes certificate claims closed_forms context error_rates failures finding gradients inputs
+    jobs labelled_failures legs lens machines replays rule_ticks same_files sill solvable swap traces visible"""
 _DATASETS = """__main__ assembly cleaning data_options dataset_bench episode_copies episode_figures inspection
     lerobot_dataset motion_source row_statistics sets source_videos verification video_checks"""
 _TRAINING = """__main__ act_family augmentation batching decoder_pool decoder_process demonstration_rows

@@ -303,6 +303,9 @@ class ReportOptions:
     """Print a table of successes per task, tracker and mode as Markdown, and write nothing."""
     json: bool = False
     """Print results.json instead of the table."""
+    own_tracker: str | None = None
+    """Of a swapped run with --failures and --actions: first play its actions through this tracker, the one that the
+    policy was trained with, into <out>/own; the report then says how many failures succeed so."""
 
 
 @dataclass(frozen=True)

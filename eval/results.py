@@ -9,7 +9,7 @@ from typing import NotRequired
 
 from arena_newton.errors import InputError
 from arena_newton.eval import rounds
-from arena_newton.eval.document import Document, Identity, Status, check_plan, read_document
+from arena_newton.eval.document import CONFIG_FILE, Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.failure_counts import FailureCell, failure_cells
 from arena_newton.eval.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.sharding import read_shard
@@ -18,6 +18,7 @@ from arena_newton.robot import TICK
 from arena_newton.text import plain_text
 
 __all__ = [
+    "OWN_FOLDER",
     "Results",
     "RunRecord",
     "changed_conditions",
@@ -26,9 +27,13 @@ __all__ = [
     "in_plan_order",
     "is_complete",
     "load_run",
+    "own_records",
     "results_json",
     "width_rule",
 ]
+
+OWN_FOLDER = "own"
+"""Folder inside a swapped run's: its actions through its policy's own tracker."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,18 @@ def load_run(folder: Path) -> RunRecord:
     records, _ = read_journal(folder / JOURNAL_FILE)
     check_plan(folder, records, document)
     return RunRecord(folder, document, in_plan_order(records))
+
+
+def own_records(folder: Path) -> list[EpisodeRecord]:
+    """Replays of a run's actions through its policy's own tracker (`own_tracker`); none where none were played.
+
+    Raises:
+        InputError: Their folder is damaged.
+    """
+    inside = folder / OWN_FOLDER
+    if inside.is_symlink() or not (inside / CONFIG_FILE).is_file():
+        return []
+    return load_run(inside).records
 
 
 def due_episodes(document: Document) -> int:
@@ -144,7 +161,7 @@ def results_json(run: RunRecord) -> Results:
         "cells": figures["cells"],
         "suites": figures["suites"],
     }
-    failures = failure_cells(run.records)
+    failures = failure_cells(run.records, own_records(run.folder))
     if failures:
         results["failures"] = failures
     if "shard" in run.document:

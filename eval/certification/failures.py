@@ -1,4 +1,4 @@
-"""Are failures labelled right? Scripted failures of each stage against what the rules of `failure_rules` say."""
+"""Are failures labelled right? Scripted failures of each stage, and real ones that two readers judged by eye."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from arena_newton.eval.certification.bodies import Body
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
+from arena_newton.eval.certification.labelled_failures import agreements, labelled_failures, labelled_sheets
 from arena_newton.eval.certification.sabotage import SABOTAGES
 from arena_newton.eval.failure_rules import stage_of
 from arena_newton.eval.failure_stage import FailureStage
@@ -16,7 +17,7 @@ from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.wording import markdown_table
 from arena_newton.intervals import wilson
 
-__all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion", "held_out"]
+__all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 
 LEAST = 0.8
 """Least precision and recall of each stage."""
@@ -25,19 +26,18 @@ ENOUGH = 20
 
 
 TUNED: Mapping[str, tuple[int, ...]] = {
-    "boxing": (0, 10),
-    "vis_navi": (0, 10, 500, 501, 502, 503, 504, 505, 700),
-    "football": (500, 501, 502, 503, 700, 701),
-    "sit_sofa": (500, 501, 502),
-    "open_door": (500, 700, 701),
-    "pp_box": (500, 700, 701),
-    "double_desk": (500, 700, 701),
+    "boxing": (0, 10, 700),
+    "vis_navi": (0, 10, 500, 501, 502, 503, 504, 505, 700, 900),
+    "football": (500, 501, 502, 503, 700, 701, 900),
+    "sit_sofa": (500, 501, 502, 700),
+    "open_door": (500, 700, 701, 900),
+    "pp_box": (0, 500, 700, 701, 900),
+    "double_desk": (500, 700, 701, 900),
 }
 """Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
-HELD_OUT = 700
-"""First group seed that the check plays: above all that were looked at ..."""
-HELD_OUT_OF: Mapping[str, int] = {"vis_navi": 900, "football": 900, "open_door": 900, "pp_box": 900, "double_desk": 900}
-"""... and the one of tasks in which a rule or threshold was changed after episodes from there on had been seen."""
+HELD_OUT = 1100
+"""First group seed that the check plays: above all that were looked at. Whoever changes a rule after episodes from here
+on were seen chooses another."""
 
 
 @dataclass(frozen=True)
@@ -72,16 +72,12 @@ def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Conf
     return Confusion(Counter((scripted, said) for scripted, said in pairs if said is not None))
 
 
-def held_out(task: str) -> int:
-    """First group seed that the check plays in a task."""
-    return HELD_OUT_OF.get(task, HELD_OUT)
-
-
 def failures(context: Context) -> CheckFinding:
-    """Let saboteurs fail, and compare what was scripted with what is said."""
+    """Let saboteurs fail, and compare what was scripted with what is said; count how often rules and readers agree."""
     tasks = [task for task in context.tasks if task in INTERACTIONS]
     if not tasks:
         return skipped(f"no signals are defined for {' '.join(context.tasks)}")
+    real = labelled_failures()
     pairs: dict[str, list[tuple[FailureStage, FailureStage | None]]] = {}
     notes, total = [], 0
     for task in tasks:
@@ -89,7 +85,7 @@ def failures(context: Context) -> CheckFinding:
             for name, sabotage in SABOTAGES.items():
                 if task in sabotage.without:
                     continue
-                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=held_out(task))
+                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT)
                 records = context.evaluate(cell)
                 found = [(sabotage.stage, stage_of(record)) for record in records]
                 pairs.setdefault(task, []).extend(found)
@@ -98,20 +94,27 @@ def failures(context: Context) -> CheckFinding:
                 if solved:
                     notes.append(f"{task} {tracker}, {name}: {solved} of {len(records)} episodes succeed all the same")
     for task in tasks:
-        looked_at = " ".join(str(seed) for seed in TUNED[task])
-        notes.append(
-            f"{task}: played from group seed {held_out(task)} on; thresholds and saboteurs were set on {looked_at}"
-        )
+        looked_at = " ".join(str(seed) for seed in TUNED.get(task, ())) or "none of its episodes"
+        notes.append(f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on {looked_at}")
     left_out = [task for task in context.tasks if task not in INTERACTIONS]
     notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
     matrices = {task: confusion(found) for task, found in pairs.items()}
     matrices |= {"all": confusion([pair for found in pairs.values() for pair in found])} if len(tasks) > 1 else {}
     below = [(f"{task}: {text}", shown) for task, matrix in matrices.items() for text, shown in _below(matrix)]
+    below += [
+        (f"real failures: {' and '.join(one.judges)} agree on {one.same} of {one.failures} ({one.part} numbers)", True)
+        for one in agreements(real)
+        if one.part != "even" and one.rate < LEAST  # on the even ones thresholds were set
+    ]
     verdict: Verdict = "fail" if any(shown for _, shown in below) else "note" if below else "pass"
     failed = sum(matrices[list(matrices)[-1]].counts.values())
     right = sum(matrices[list(matrices)[-1]].counts.get((stage, stage), 0) for stage in FailureStage)
-    summary = f"{right} of {failed} scripted failures get their stage ({total} episodes)"
-    sheets = tuple(_sheet(task, matrix) for task, matrix in matrices.items())
+    rates = ", ".join(f"{one.rate:.2f} {' with '.join(one.judges)}" for one in agreements(real) if one.part == "all")
+    summary = (
+        f"{right} of {failed} scripted failures get their stage ({total} episodes); of {len(real)} real ones judged by "
+        f"eye: {rates}"
+    )
+    sheets = (*(_sheet(task, matrix) for task, matrix in matrices.items()), *labelled_sheets(real))
     for sheet in sheets:
         print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
     return CheckFinding(verdict, summary, sheets, (*(text for text, _ in below), *notes))
@@ -156,5 +159,6 @@ def _sheet(task: str, matrix: Confusion) -> Sheet:
 
 BODIES: dict[str, Body] = {name: sabotage.body for name, sabotage in SABOTAGES.items()}
 """Bodies of the scripted failures by name, for `Context.bodies`."""
-CHECKS = (Check("failures", "Do failures get the stage at which they were scripted to happen?", failures),)
+QUESTION = "Do failures get the stage at which they were scripted to happen, and that two readers say?"
+CHECKS = (Check("failures", QUESTION, failures),)
 """This module's checks."""

@@ -353,8 +353,6 @@ class ClumsyExpert(MisledExpert):
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""
-        if self.handling:
-            self.sight.object_off = self.handling.believed(self.style)
         if self.env.spec.name == "football":
             far = self.style.uniform("beside", *BESIDE_GOAL)
             side = torch.where(self.style.coin("left"), math.pi, 0.0)
@@ -537,7 +535,7 @@ _MADE = (
     (FailureStage.POSTURE, "unbalanced", "expert that leans until it falls", _expert(UnbalancedExpert)),
     (FailureStage.CONTACT, "clumsy", "expert that touches without effect", _expert(ClumsyExpert)),
     (FailureStage.RECOVERY, "stubborn", "object that moves away unnoticed", _expert(StubbornExpert, RelocatingEnv)),
-    (FailureStage.TRACKER, "weakened", "tracker with weak legs", _weak),
+    (FailureStage.TRACKING, "weakened", "tracker with weak legs", _weak),
 )
 SABOTAGES: dict[str, Sabotage] = {
     name: Sabotage(stage, Body(name, title, equip), _NO_EFFECT if stage is FailureStage.CONTACT else ())

@@ -2,13 +2,15 @@
 
 import dataclasses
 import json
+from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from made_signals import UNTOUCHED, WELL, signals
 from rows import episodes, full, record
-from test_report import folder_with
+from test_report import document_of, folder_with
 
 from arena_newton import seeding, tasks, trackers
 from arena_newton.env import ArenaEnv
@@ -16,8 +18,15 @@ from arena_newton.errors import InputError
 from arena_newton.eval import report
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion, held_out
+from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion
 from arena_newton.eval.certification.failures import failures as check
+from arena_newton.eval.certification.labelled_failures import (
+    LABELLED,
+    LabelledFailure,
+    agreements,
+    labelled_failures,
+    labelled_sheets,
+)
 from arena_newton.eval.certification.sabotage import (
     HALTS,
     PERCHED,
@@ -28,15 +37,17 @@ from arena_newton.eval.certification.sabotage import (
 )
 from arena_newton.eval.certification.traces import StateTrace, first_difference
 from arena_newton.eval.failure_counts import failure_cells
-from arena_newton.eval.failure_rules import FALLING, sees_at_start, stage_of
+from arena_newton.eval.failure_rules import BARS, near_bars, sees_at_start, stage_of, waits_in_view
 from arena_newton.eval.failure_stage import FailureStage
 from arena_newton.eval.interaction import INTERACTIONS
 from arena_newton.eval.interaction_view import InteractionView
-from arena_newton.eval.journal import EpisodeRecord
-from arena_newton.eval.options import CertifyOptions
-from arena_newton.eval.results import load_run
+from arena_newton.eval.journal import EpisodeRecord, Journal, read_journal
+from arena_newton.eval.options import CertifyOptions, RunOptions
+from arena_newton.eval.own_tracker import own_options
+from arena_newton.eval.results import OWN_FOLDER, load_run
 from arena_newton.eval.run import Factories
 from arena_newton.eval.signal_recorder import SEEN, SignalRecorder
+from arena_newton.flags import parse_flags
 from arena_newton.policies.experts import ExpertPolicy, Sight
 from arena_newton.robot import DEFAULT_POSE, LEGS
 from arena_newton.rollout import Rollout
@@ -44,13 +55,13 @@ from arena_newton.tasks.football import BALL, GOAL, TOE
 from arena_newton.trackers.motions.commands import MotionCommand
 
 NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}
-BESIDE = UNTOUCHED | {"aligned_ticks": 0}
+BESIDE = UNTOUCHED | {"aligned_ticks": 0, "stop_distance": 0.9}
 
 
-def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reason="", **changes):
+def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reason="", predicates=None, **changes):
     """An ended episode."""
     ended = {"task": task, "outcome": outcome, "reason": reason, "steps": steps, "startup_fall": startup_fall}
-    return SimpleNamespace(**ended, signals=signals(**changes))
+    return SimpleNamespace(**ended, predicates=predicates or {}, signals=signals(**changes))
 
 
 @pytest.mark.parametrize(
@@ -60,8 +71,8 @@ def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reas
         ("approach", "timeout", BESIDE),
         ("posture", "timeout", UNTOUCHED),
         ("posture", "fall", NOT_NEAR),
-        ("posture", "fall", {"first_touch": 900 - FALLING + 1}),
-        ("recovery", "fall", {"first_touch": 900 - FALLING}),
+        ("posture", "fall", {"first_touch": 900 - int(BARS.first_touch) + 1}),
+        ("recovery", "fall", {"first_touch": 900 - int(BARS.first_touch)}),
         ("posture", "fall", UNTOUCHED | {"tracking_error": 0.4, "reference_tilt": 1.0}),
         ("contact", "timeout", {}),
         ("contact", "timeout", {"touches": 3, "moved": 0.4, "touches_moved": 1}),
@@ -70,14 +81,14 @@ def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reas
         ("contact", "timeout", {"moved": 4.0, "task": "football", "reason": "ball_out"}),
         ("recovery", "timeout", {"moved": 4.0, "task": "football"}),
         ("recovery", "fall", {"moved": 4.0, "task": "football"}),
-        ("contact", "timeout", {"moved": 0.9, "task": "pp_box"}),
-        ("recovery", "timeout", {"moved": 1.1, "task": "pp_box"}),
+        ("contact", "timeout", {"moved": 1.0, "task": "pp_box"}),
+        ("recovery", "timeout", {"moved": 1.2, "task": "pp_box"}),
         ("contact", "timeout", {"moved": 0.9, "task": "double_desk"}),
         ("recovery", "timeout", {"moved": 0.9, "task": "open_door"}),
         ("approach", "timeout", {"task": "vis_navi"}),
         ("recovery", "timeout", {"moved": 0.4, "task": "vis_navi"}),
-        ("tracker", "timeout", NOT_NEAR | {"tracking_error": 0.4, "tracking_worst": 0.6}),
-        ("tracker", "fall", UNTOUCHED | {"tracking_error": 0.4, "tracking_worst": 0.6}),
+        ("tracking (legs)", "timeout", NOT_NEAR | {"tracking_error": 0.4, "tracking_worst": 0.6}),
+        ("tracking (legs)", "fall", UNTOUCHED | {"tracking_error": 0.4, "tracking_worst": 0.6}),
     ],
 )
 def test_signals_name_a_stage(stage, outcome, changes):
@@ -90,7 +101,45 @@ def test_only_failures_with_signals_have_a_stage():
     assert stage_of(judged("success")) is None
     assert stage_of(judged("error")) is None
     assert stage_of(SimpleNamespace(outcome="fall", startup_fall=False, signals=None)) is None
-    assert stage_of(judged("fall", startup_fall=True)) == "tracker"
+    assert stage_of(judged("fall", startup_fall=True)) == "tracking (legs)"
+    assert FailureStage("tracker") is FailureStage.TRACKING  # in folders of before
+
+
+def test_a_touch_is_one_that_the_journal_knows():
+    """Where the task has a predicate of the touch, an episode without it has touched nothing; unknown, signals say."""
+    touched = {"task": "pp_box", "aligned_ticks": 300}
+    assert stage_of(judged(**touched, predicates={"approach": 40, "contact": 300})) == "contact"
+    assert stage_of(judged(**touched, predicates={"approach": 40, "contact": None})) == "posture"
+    assert stage_of(judged(**touched)) == "contact"  # a line of schema 1
+    assert stage_of(judged("fall", task="pp_box", predicates={"contact": 880})) == "posture"  # a part of the fall
+    assert stage_of(judged(predicates={"contact": None})) == "contact"  # Boxing's is its success
+    for task, spec in INTERACTIONS.items():
+        names = [one.name for one in tasks.get(task).predicates]
+        assert not spec.predicate or spec.predicate in names[:-1]
+
+
+def test_one_behaviour_beside_a_bar_has_one_name():
+    """A robot that stays near is held to a bar a tenth wider, and what lies within a tenth of its bar is told."""
+    stays = UNTOUCHED | {"task": "pp_box", "engaged_ticks": 1500, "stop_bearing": 0.1, "reach_distance": 0.2}
+    inside = judged(**stays | {"stop_distance": 0.39, "aligned_ticks": 900})
+    beside = judged(**stays | {"stop_distance": 0.47, "aligned_ticks": 0})
+    away = judged(**stays | {"stop_distance": 0.60, "aligned_ticks": 0})
+    assert [stage_of(one) for one in (inside, beside, away)] == ["posture", "posture", "approach"]
+    assert [near_bars(one) for one in (inside, beside, away)] == [(), ("stop_distance",), ()]
+    far = UNTOUCHED | {"aligned_ticks": 0, "stop_distance": 1.2, "reach_distance": 0.9}
+    assert near_bars(judged(**far | {"engaged_ticks": 96})) == ("engaged_ticks",)
+    assert near_bars(judged(**far | {"engaged_ticks": 80})) == () == near_bars(judged("success"))
+    assert near_bars(judged(**far | {"tracking_error": 0.084})) == ("tracking_error",)
+    assert near_bars(judged(**stays | {"stop_distance": 0.39, "reach_distance": 0.086})) == ("reach_distance",)
+
+
+def test_waiting_in_view_is_an_ending():
+    """It is told beside the stage of a robot that stays near what it sees for half of its episode, and of no other."""
+    waiting = {"engaged_ticks": 450, "looks": 10, "looks_seen": 5}
+    assert waits_in_view(judged(**waiting)) and stage_of(judged(**waiting)) == "contact"
+    assert not waits_in_view(judged(**waiting | {"engaged_ticks": 449}))
+    assert not waits_in_view(judged(**waiting | {"looks_seen": 4}))
+    assert not waits_in_view(judged("fall", **waiting)) and not waits_in_view(judged("success", **waiting))
 
 
 def test_a_line_holds_signals_only_if_they_were_kept():
@@ -163,13 +212,84 @@ def test_reports_show_stages_and_what_was_seen(tmp_path):
     assert "Failures by stage" not in (tmp_path / "b" / "report.html").read_text()
 
 
+def test_a_swapped_run_says_what_its_swap_made(tmp_path, capsys):
+    """Replays through the own tracker in the folder `own` count the failures that they solve, in every report."""
+    rows, folder = rows_with(*MIXED), tmp_path / "a"
+    run = load_run(folder_with(folder, rows, 60))
+    assert "own_tracker" not in report.write_reports(run)["failures"][0]
+    outcomes = ("timeout", "success", "success", "timeout", "error")  # of two failures one, and one that broke off
+    replays = [
+        row | {"tracker": "twist2", "outcome": o} for row, o in zip(episodes("boxing", (0,))[:5], outcomes, strict=True)
+    ]
+    folder_with(folder / OWN_FOLDER, replays, 60, tracker="twist2")
+    (cell,) = report.write_reports(run)["failures"]
+    assert cell["own_tracker"] == {"tracker": "twist2", "replayed": 2, "successes": 1}
+    said = "1 of 2 failures succeed with the same actions through their own tracker, twist2"
+    assert all(said in (folder / name).read_text() for name in ("report.md", "report.html"))
+
+
+def test_the_own_tracker_plays_the_same_episodes(tmp_path, capsys):
+    """The replay has the run's tasks, modes, seeds and physics; a run that has no actions is refused in a line."""
+    given = ["--tracker", "sonic", "--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco"]
+    (tmp_path / "a" / "actions").mkdir(parents=True)
+    options = parse_flags(RunOptions, [*given, "--failures", "--actions"], "run")
+    document = document_of(2) | {"options": dataclasses.asdict(options)}
+    (tmp_path / "a" / "config.json").write_text(json.dumps(document))
+    found = own_options(tmp_path / "a", "twist2")
+    assert (found.tracker, found.policy) == (("twist2",), f"replay:{tmp_path / 'a' / 'actions'}")
+    assert (found.task, found.seeds, found.repeats, found.engine) == (("boxing",), (3,), 2, "mujoco")
+    assert found.out == str(tmp_path / "a" / OWN_FOLDER) and not found.actions and not found.failures
+    (tmp_path / "b" / "actions").mkdir(parents=True)
+    kept_none = document | {"options": document["options"] | {"actions": False}}
+    (tmp_path / "b" / "config.json").write_text(json.dumps(kept_none))
+    for name, tracker, said in (
+        ("a", "sonic", "was played through it"),
+        ("b", "twist2", "holds no signals or no actions; play it with --failures --actions"),
+    ):
+        assert main(["report", str(tmp_path / name), "--own-tracker", tracker]) == 2
+        error = capsys.readouterr().err
+        assert f"error: --own-tracker {tracker}: " in error and said in error and error.count("\n") == 1
+
+
+def test_readers_and_rules_agree_as_often_as_is_counted(tmp_path):
+    """Agreement is counted for each pair of judges, even and odd numbers apart; an answer that is no stage is named."""
+    lines = [record(row | {"index": n}) for n, row in enumerate(rows_with(*MIXED[2:]), start=1)]
+    with Journal(tmp_path / "episodes.jsonl") as journal:
+        for line in lines:
+            journal.append(line)
+    answers = "number,reader 1,reader 2\n1,perception,perception\n2,approach,posture\n3,contact,tracker\n"
+    (tmp_path / "readers.csv").write_text(answers)
+    failures = labelled_failures(tmp_path)
+    assert failures[2].said == ("recovery", "contact", "tracking (legs)")
+    rates = {(one.judges, one.part): (one.same, one.failures) for one in agreements(failures)}
+    assert rates[("rules", "reader 1"), "all"] == (2, 3) and rates[("rules", "reader 1"), "even"] == (1, 1)
+    assert rates[("rules", "reader 2"), "odd"] == (1, 2) and rates[("reader 1", "reader 2"), "all"] == (1, 3)
+    sheets = labelled_sheets(failures)
+    assert sheets[1].rows[0] == ("perception", "1", "0", "0", "0", "0", "0") and len(sheets) == 3
+    (tmp_path / "readers.csv").write_text(answers.replace("posture", "posing"))
+    with pytest.raises(InputError, match="number 2"):
+        labelled_failures(tmp_path)
+    (tmp_path / "readers.csv").write_text(answers.rsplit("3,", 1)[0])
+    with pytest.raises(InputError, match="not those of"):
+        labelled_failures(tmp_path)
+
+
+def test_the_real_failures_are_at_hand():
+    """The set that the check counts has 60 failures and more, several of every task that the shipped policy does."""
+    kept, _ = read_journal(LABELLED / "episodes.jsonl")
+    strips = Path(__file__).parents[2] / "docs" / "failures_labelled"
+    assert len(labelled_failures()) == len(kept) >= 60
+    assert min(Counter(line.task for line in kept).values()) >= 6 and len({line.task for line in kept}) == 5
+    assert {file.stem for file in strips.glob("*.webp")} == {f"{line.index:02d}" for line in kept}
+
+
 def test_a_confusion_has_precision_and_recall():
     """Recall is of what was scripted, precision of what is said; what did not fail counts for neither."""
     a, b = FailureStage.APPROACH, FailureStage.CONTACT
     matrix = confusion([(a, a)] * 8 + [(a, b)] * 2 + [(b, b)] * 6 + [(b, None)] * 5)
     assert (matrix.recall(a), matrix.precision(a)) == (0.8, 1.0)
     assert (matrix.recall(b), matrix.precision(b)) == (1.0, 0.75)
-    assert matrix.recall(FailureStage.TRACKER) is None and matrix.precision(FailureStage.TRACKER) is None
+    assert matrix.recall(FailureStage.TRACKING) is None and matrix.precision(FailureStage.TRACKING) is None
 
 
 def played(signals_of):
@@ -179,6 +299,14 @@ def played(signals_of):
         return [judged(outcome, **changes) for outcome, changes in signals_of(cell.body)]
 
     return SimpleNamespace(tasks=("boxing", "football"), sample=("twist2",), evaluate=evaluate)
+
+
+@pytest.fixture
+def agreed(monkeypatch):
+    """Real failures on which readers and rules agree."""
+    same = [LabelledFailure(number, (FailureStage.CONTACT,) * 3) for number in range(1, 11)]
+    monkeypatch.setattr("arena_newton.eval.certification.failures.labelled_failures", lambda: same)
+    return same
 
 
 OF = {
@@ -192,14 +320,14 @@ OF = {
 }
 
 
-def test_the_check_fails_below_the_bar(capsys, monkeypatch):
+def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
     """Scripted failures with their stages pass; one kind that is mostly said to be another fails and is named."""
     monkeypatch.delitem(INTERACTIONS, "football")
     assert set(OF) == set(SABOTAGES)
     assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
     good = check(played(lambda body: OF[body] * 5))
     assert good.verdict == "pass" and good.summary.startswith("30 of 30")
-    assert "| perception |               5 |" in capsys.readouterr().out
+    assert "| perception      |               5 |" in capsys.readouterr().out
     assert good.sheets[0].rows[0] == ("perception", "5", "0", "0", "0", "0", "0", "1.00", "1.00")
     assert any("football" in note for note in good.notes)
     one = check(played(lambda body: OF[body] * 5 + OF["clumsy"] * (body == "misaimed")))
@@ -211,9 +339,16 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch):
         assert few.verdict == verdict and f"recall of approach is {3 * times} of {4 * times}" in few.notes[0]
         assert ("too few episodes" in few.notes[0]) is (verdict == "note")
     assert any("recall of perception" in note for note in bad.notes)
+    agreed[0:6:2] = [
+        LabelledFailure(number, (FailureStage.CONTACT, FailureStage.POSTURE, FailureStage.CONTACT))
+        for number in (1, 3, 5)
+    ]
+    unlike = check(played(lambda body: OF[body] * 5))
+    assert unlike.verdict == "fail" and "rules and reader 1 agree on 7 of 10 (all numbers)" in " ".join(unlike.notes)
+    assert "1.00 rules with reader 2" in unlike.summary
 
 
-def test_the_check_plays_episodes_that_nothing_was_set_on():
+def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
     """Its group seeds lie above all that were looked at, whatever their number, and a note says both."""
     cells = []
 
@@ -221,14 +356,18 @@ def test_the_check_plays_episodes_that_nothing_was_set_on():
         cells.append(cell)
         return [judged(outcome, **changes) for outcome, changes in OF[cell.body] * 5]
 
+    monkeypatch.setitem(INTERACTIONS, "push_bin", INTERACTIONS["boxing"])  # an entry, and nothing else
     found = check(SimpleNamespace(tasks=tuple(INTERACTIONS), sample=("twist2",), evaluate=evaluate))
     scripted = [(task, name) for task in INTERACTIONS for name, one in SABOTAGES.items() if task not in one.without]
-    assert set(TUNED) == set(INTERACTIONS) and [(cell.task, cell.body) for cell in cells] == scripted
+    assert [(cell.task, cell.body) for cell in cells] == scripted
+    assert f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none" in " ".join(
+        found.notes
+    )
     for task, looked_at in TUNED.items():
-        assert max(looked_at) < held_out(task)
-        said = f"{task}: played from group seed {held_out(task)} on; thresholds and saboteurs were set on "
+        assert max(looked_at) < HELD_OUT
+        said = f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on "
         assert said + " ".join(map(str, looked_at)) in found.notes
-    assert {(cell.task, cell.first_seed) for cell in cells} == {(task, held_out(task)) for task in TUNED}
+    assert {(cell.task, cell.first_seed) for cell in cells} == {(task, HELD_OUT) for task in INTERACTIONS}
 
 
 @pytest.mark.parametrize(("count", "seeds"), [(4, 1), (20, 1), (60, 3)])
