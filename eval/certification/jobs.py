@@ -113,7 +113,7 @@ def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequenc
     own = [FIRST] * (FIRST not in own and bool(set(own) & set(COMPARING))) + own
     pieces = [
         Piece(some, tuple(tasks), options.tracker, cores=not set(some) <= set(ONE_PLAN))
-        for some in (tuple(check for check in checks if check in kind) for kind in (ONE_PLAN, WHOLE))
+        for some in (tuple(check for check in checks if check in kind) for kind in (set(ONE_PLAN), set(WHOLE)))
         if some
     ]
     for number, task in enumerate(tasks):
