@@ -110,8 +110,9 @@ def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequenc
     cuda = resolve_engine("warp", None)[1] != "cpu"
     own = [check for check in checks if check not in (*ONE_PLAN, *WHOLE, *PLAYS_NOTHING)]
     own = [check for check in own if not _unnamed(options, check, cuda)]
-    own = [FIRST] * (FIRST not in own and bool(set(own) & set(COMPARING))) + own
-    pieces = [
+    if FIRST not in own and set(own) & set(COMPARING):
+        own.insert(0, FIRST)
+    pieces: list[Piece] = [
         Piece(some, tuple(tasks), options.tracker, cores=not set(some) <= set(ONE_PLAN))
         for some in (tuple(check for check in checks if check in kind) for kind in (set(ONE_PLAN), set(WHOLE)))
         if some

@@ -52,7 +52,8 @@ class _State:
     def seen_from(self, marker: Marker, point: np.ndarray) -> np.ndarray:
         """A point in a marker's frame [m]."""
         centre, turn = self.placed(marker)
-        return turn.T @ (point - centre)
+        seen: np.ndarray = turn.T @ (point - centre)
+        return seen
 
     @property
     def root(self) -> np.ndarray:
