@@ -76,7 +76,7 @@ def play_ahead(
     if options.quick:
         _work(options, _quick_pieces(options, tasks, checks), say)
         return
-    apart = [(tracker,) for tracker in options.tracker]
+    apart: list[tuple[str, ...]] = [(tracker,) for tracker in options.tracker]
     recorded = [Piece((FIRST,), (task,), some) for task in tasks for some in apart]
     if set(checks) & set(COMPARING):
         _work(options, recorded, say)
