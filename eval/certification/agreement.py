@@ -161,7 +161,7 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, She
             rows.append((task, tracker, *a.cells(), *b.cells(), f"{p:.3f}", f"{falls[0]} and {falls[1]}", f"{q:.3f}"))
     level = DIFFERENT / max(2 * len(tests), 1)
     apart = [f"{task} through {tracker}" for task, tracker, p, q in tests if min(p, q) < level]
-    bounds = {outcome: bound_of_difference(*counts, pairs) for outcome, counts in total.items()}
+    bounds = {outcome: bound_of_difference(counts[0], counts[1], pairs) for outcome, counts in total.items()}
     within = all(-MARGIN <= low and high <= MARGIN for low, high in bounds.values())
     far = any(mcnemar(*counts) < DIFFERENT and abs(counts[0] - counts[1]) > MARGIN * pairs for counts in total.values())
     this, where = context.options.engine, device_name(device)

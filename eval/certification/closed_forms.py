@@ -154,7 +154,8 @@ class Bench:
 
     def rows(self, name: str) -> np.ndarray:
         """A copy of an array of the physics, float64."""
-        return getattr(self.physics, name).numpy().astype(float)
+        values: np.ndarray = getattr(self.physics, name).numpy().astype(float)
+        return values
 
 
 def fall(bench: Bench) -> Iterator[Measurement]:
@@ -255,7 +256,11 @@ def drives(bench: Bench, damping: bool = True) -> Iterator[Measurement]:
     qpos[:, address] = rest + side * DEFLECTION
     lift = {scene.link(link.name): np.array([0.0, 0.0, link.mass * GRAVITY, 0.0, 0.0, 0.0]) for link in LINKS}
     carried = {body: np.tile(wrench, (physics.worlds, 1)) for body, wrench in lift.items()}
-    pairs = [(scene.link(link.name), scene.link(str(link.parent)), "XYZ".index(link.hinge.axis)) for link in links]
+    pairs = [
+        (scene.link(link.name), scene.link(str(link.parent)), "XYZ".index(link.hinge.axis))
+        for link in links
+        if link.hinge
+    ]
 
     def begin() -> None:
         own.start(qpos)
@@ -265,7 +270,8 @@ def drives(bench: Bench, damping: bool = True) -> Iterator[Measurement]:
         physics.set_active(own.every < 2)
 
     def bent() -> np.ndarray:
-        return (side * (own.rows("qpos")[:, address] - rest))[:2].mean(axis=0)
+        angles: np.ndarray = (side * (own.rows("qpos")[:, address] - rest))[:2].mean(axis=0)
+        return angles
 
     begin()
     angles = []

@@ -86,7 +86,7 @@ def play_ahead(
     if options.quick:
         _work(options, _quick_pieces(options, tasks, checks), say)
         return
-    apart = [(tracker,) for tracker in options.tracker]
+    apart: list[tuple[str, ...]] = [(tracker,) for tracker in options.tracker]
     recorded = [Piece((FIRST,), (task,), some) for task in tasks for some in apart]
     if set(checks) & set(COMPARING):
         _work(options, recorded, say)
@@ -120,10 +120,11 @@ def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequenc
     cuda = resolve_engine("warp", None)[1] != "cpu"
     own = [check for check in checks if check not in (*ONE_PLAN, *WHOLE, *PLAYS_NOTHING)]
     own = [check for check in own if not _unnamed(options, check, cuda)]
-    own = [FIRST] * (FIRST not in own and bool(set(own) & set(COMPARING))) + own
-    pieces = [
+    if FIRST not in own and set(own) & set(COMPARING):
+        own.insert(0, FIRST)
+    pieces: list[Piece] = [
         Piece(some, tuple(tasks), options.tracker, cores=not set(some) <= set(ONE_PLAN))
-        for some in (tuple(check for check in checks if check in kind) for kind in (ONE_PLAN, WHOLE))
+        for some in (tuple(check for check in checks if check in kind) for kind in (set(ONE_PLAN), set(WHOLE)))
         if some
     ]
     for number, task in enumerate(tasks):

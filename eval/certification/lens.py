@@ -86,16 +86,17 @@ def lens_of(env: ArenaEnv) -> tuple[float, float, int]:
     turn, local = np.zeros(9), np.zeros(9)
     mujoco.mju_quat2Mat(turn, env.physics.xquat.numpy()[0, frame.body_id].astype(float))
     mujoco.mju_quat2Mat(local, np.array(frame.quat, dtype=float))
-    turn, local = turn.reshape(3, 3), local.reshape(3, 3)
-    height = float(env.physics.xpos.numpy()[0, frame.body_id, 2] + (turn @ np.array(frame.pos))[2])
-    up = (turn @ local)[2]
+    body, own = turn.reshape(3, 3), local.reshape(3, 3)
+    height = float(env.physics.xpos.numpy()[0, frame.body_id, 2] + (body @ np.array(frame.pos))[2])
+    up = (body @ own)[2]
     x, y = 2.0 * (column + 0.5) / columns - 1.0, 1.0 - 2.0 * (row + 0.5) / rows
     away = distance[picked]
 
     def above(tangents: np.ndarray) -> np.ndarray:
         ray = np.stack([x * tangents[0], y * tangents[1], -np.ones_like(x)])
         ray /= np.linalg.norm(ray, axis=0)
-        return height / away + up @ ray
+        heights: np.ndarray = height / away + up @ ray
+        return heights
 
     found = least_squares(above, _tangents()).x
     return float(found[0]), float(found[1]), len(x)

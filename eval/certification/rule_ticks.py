@@ -52,7 +52,8 @@ class _State:
     def seen_from(self, marker: Marker, point: np.ndarray) -> np.ndarray:
         """A point in a marker's frame [m]."""
         centre, turn = self.placed(marker)
-        return turn.T @ (point - centre)
+        seen: np.ndarray = turn.T @ (point - centre)
+        return seen
 
     @property
     def root(self) -> np.ndarray:
@@ -69,7 +70,8 @@ class _State:
 def _matrix(quat: np.ndarray) -> np.ndarray:
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quat)
-    return matrix.reshape(3, 3)
+    turn: np.ndarray = matrix.reshape(3, 3)
+    return turn
 
 
 def _inside(point: np.ndarray, marker: Marker, axes: tuple[int, ...] = (0, 1, 2)) -> bool:
@@ -114,7 +116,7 @@ def _boxing(s: _State) -> bool:
     target = s.scene.marker(boxing.BOUNDS)
     reach = max(target.half) + 0.08
     palms = [s.placed(s.scene.frame(name))[0] for name in boxing.PALMS]
-    return min(np.linalg.norm(palm - s.placed(target)[0]) for palm in palms) <= reach
+    return bool(min(np.linalg.norm(palm - s.placed(target)[0]) for palm in palms) <= reach)
 
 
 def _vis_navi(s: _State) -> bool:
