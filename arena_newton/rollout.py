@@ -28,9 +28,9 @@ from arena_newton.interfaces import (
     World,
 )
 from arena_newton.kernels import tick as codes
+from arena_newton.policy_view import PolicyView
 from arena_newton.robot import TICK
 from arena_newton.text import counted
-from arena_newton.world_view import WorldView
 
 __all__ = ["Rollout", "ending"]
 
@@ -108,7 +108,7 @@ class Rollout:
             on_tick: Called each tick with the number of active worlds.
         """
         self.env, self.policy = env, policy
-        self._view = WorldView(env)
+        self._view = PolicyView(env)
         self.recorders: Sequence[Recorder] = [recorder] if isinstance(recorder, Recorder) else recorder
         self.disturbance, self.spawn, self.samples = disturbance, spawn, samples
         self.budget = max_steps or env.budget

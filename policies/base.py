@@ -101,7 +101,7 @@ class Policy:
         """
 
     def attach(self, env: World) -> None:
-        """Take a view of the worlds of the next episodes, to read (`arena_newton.world_view`).
+        """Take a view of the worlds of the next episodes, to read (`arena_newton.policy_view`).
 
         A policy that overrides this is privileged, and marked so in every result.
 

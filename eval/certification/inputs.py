@@ -106,8 +106,8 @@ class Heard:
         for name in ("reset", "prefill", "step"):
             setattr(tracker, name, self._listening(name, getattr(tracker, name)))
 
-    def _listening(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        def heard(*given: Any, **named: Any) -> Any:
+    def _listening(self, name: str, call: Callable[..., object]) -> Callable[..., object]:
+        def heard(*given: object, **named: object) -> object:
             kept = [_copied(part) for part in given], {key: _copied(part) for key, part in named.items()}
             answer = call(*given, **named)
             kept_answer = answer.clone() if isinstance(answer, torch.Tensor) else None
@@ -117,14 +117,14 @@ class Heard:
         return heard
 
 
-def _copied(part: Any) -> Any:
+def _copied(part: object) -> object:
     """A copy of a mask, or of the tensors of a command or state."""
     if isinstance(part, torch.Tensor):
         return part.clone()
     return None if part is None else type(part)(**{key: value.clone() for key, value in vars(part).items()})
 
 
-def _renewed(kept: dict[str, Any], part: Any) -> Any:
+def _renewed(kept: dict[str, object], part: object) -> object:
     """The copy as the same object at each call, as a tracker in a world is given its command and state."""
     if part is None or isinstance(part, torch.Tensor):
         return part

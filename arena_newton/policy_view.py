@@ -17,7 +17,7 @@ import warp as wp
 from arena_newton.errors import InputError
 from arena_newton.interfaces import World
 
-__all__ = ["WorldView"]
+__all__ = ["PolicyView"]
 
 OF_WORLD = "spec mode rules worlds device torch_device engine startup_ticks tick active budget camera_config".split()
 """Attributes of a `World` that a policy may read, besides `scene`, `physics`, the tracker's name and those that a class
@@ -62,7 +62,7 @@ def _readable(what: str, value: Any) -> Any:
     return value
 
 
-class WorldView(_Frozen):
+class PolicyView(_Frozen):
     """A `World` as policies are given it in `attach`."""
 
     def __init__(self, env: World):
