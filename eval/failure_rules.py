@@ -63,18 +63,22 @@ class Bars:
     engaged_ticks: float = 100
     """Ticks for which a robot must stay slow near the object to have come for it: two seconds. A searching robot slows
     down for about one (up to 56 ticks measured), where its way turns; one that has arrived stays (300 and more)."""
-    aligned_ticks: float = 100
-    """The same where the object can be touched without a step."""
+    aligned_ticks: float = 50
+    """The same where the object can be touched without a step: one second, in which an arm could have reached it. (The
+    two seconds of readers include when it is at the side, beyond the bearing of an `Interaction`.)"""
     moved: float = 0.25
     """Distance from where it was touched first at which the object has moved away [m]."""
     left: float = 1.1
     """The same of a carried object, from where it was touched last, seen from above [m]: beyond `tasks.base.REACH`,
     0.8 m. One that is dropped or put down wrongly is nearer: a box that falls from walking hands rolls up to 0.8 m."""
+    effect: float = 0.05
+    """Distance that a loose object moves at least by a touch that has an effect [m]: a fist that comes to rest at a box
+    shifts it by up to 0.02, one that squeezes it and loses it by 0.09 and more."""
     first_touch: float = 50
     """A touch within so many ticks before a fall is a part of the fall: it takes about a second."""
     stop_distance: float = 1.1
-    """A robot that stays near the object, once it is within the `Interaction`'s stance times this, stands where it can
-    touch it: who has arrived and sways about the border has not left the pose."""
+    """A robot that stays near the object for half of its episode, once it is within the `Interaction`'s stance times
+    this, stands where it can touch it: who has arrived and sways about the border has not left the pose."""
     stop_bearing: float = 1.1
     """The same of the bearing."""
 
@@ -106,13 +110,16 @@ def stage_of(episode: Judged, bars: Bars = BARS) -> FailureStage | None:
     task = INTERACTIONS.get(episode.task, _OTHER)
     touched = _touched(episode, signals, task)
     if touched is not None and not (fell and episode.steps - touched < bars.first_touch):
+        if _without_effect(episode, signals, task, bars):
+            return FailureStage.POSTURE
         away = bars.left if task.carried else bars.moved
         lost = signals.moved > away and not signals.touches_moved and episode.reason not in ENDING
         if fell or lost:
             return FailureStage.RECOVERY
         return FailureStage.APPROACH if task.reached_only else FailureStage.CONTACT
     engaged = signals.engaged_ticks >= bars.engaged_ticks
-    if fell or signals.aligned_ticks >= bars.aligned_ticks or (engaged and _in_pose(signals, task, bars)):
+    stays = engaged and signals.engaged_ticks >= WAITS * episode.steps
+    if fell or signals.aligned_ticks >= bars.aligned_ticks or (stays and _in_pose(signals, task, bars)):
         return FailureStage.POSTURE
     return FailureStage.APPROACH if engaged else FailureStage.PERCEPTION
 
@@ -121,6 +128,18 @@ def _touched(episode: Judged, signals: EpisodeSignals, task: Interaction) -> int
     """Tick of the first touch; None where there was none, or the task's own predicate says that there was none."""
     said = episode.predicates.get(task.predicate, signals.first_touch)
     return None if said is None or signals.first_touch is None else max(said, signals.first_touch)
+
+
+def _without_effect(episode: Judged, signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
+    """Whether a loose object stayed where it was when it was touched, and no later predicate of its task held.
+
+    Of a carried object that is still touched at the end how far it was pushed is not known: `moved` is 0.
+    """
+    held = task.carried and signals.moved == 0.0
+    if held or not task.loose or task.predicate not in episode.predicates or signals.moved >= bars.effect:
+        return False
+    names = list(episode.predicates)
+    return all(episode.predicates[name] is None for name in names[names.index(task.predicate) + 1 :])
 
 
 def _in_pose(signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:

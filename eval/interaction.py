@@ -48,6 +48,8 @@ class Interaction:
     """Distance of the root to the object [m] within which it is near: `tasks.base.REACH`, 0.8 m, and a long step."""
     carried: bool = False
     """It moves with the effectors: how far it has moved is seen from above, from where they touched it last."""
+    loose: bool = False
+    """It lies or stands free: a touch that has an effect moves it."""
     reached_only: bool = False
     """To touch it is all that is wanted: a touch has no effect that could fail to come."""
     slow: float = 0.20
@@ -68,7 +70,7 @@ INTERACTIONS: Mapping[str, Interaction] = {
     # The toe's distance is the one of the task's own `contact`. It is 0.12 m before the ankle and swings another 0.3 m
     # ahead while the other foot stands. The expert walks through the ball, and turns and steps back below 0.35 m/s.
     "football": Interaction(
-        BALL, BALL, KICKING, touch=KICK, stance=0.40, predicate="contact", bearing=0.8, slow=0.35, tip=TOE
+        BALL, BALL, KICKING, touch=KICK, stance=0.40, predicate="contact", bearing=0.8, loose=True, slow=0.35, tip=TOE
     ),
     # The origin of a pelvis that sits is 0.17 m above the box; a robot that comes down without weight stays some
     # centimetres higher. The expert goes down from 0.12 m in front of the edge. Cartons stand
@@ -82,12 +84,21 @@ INTERACTIONS: Mapping[str, Interaction] = {
     # A palm is 6 cm from the box when its fist squeezes it, and 0.16 m when it begins to close. The expert stands 0.22
     # to 0.30 m before the box. Episodes begin 0.9 m and more before it, which is not near yet.
     "pp_box": Interaction(
-        BOX, BOX, PALMS, touch=TOUCH, stance=0.45, predicate="contact", bearing=0.8, near=0.85, carried=True
+        BOX, BOX, PALMS, touch=TOUCH, stance=0.45, predicate="contact", bearing=0.8, near=0.85, carried=True, loose=True
     ),
     # The palm is 5 cm from the handle that it grasps and hovers 0.17 m above it. The expert stands 0.23 to 0.40 m from
     # the hammer. Episodes begin 0.82 m and more from it, which is not near yet.
     "double_desk": Interaction(
-        HAMMER, HAMMER, PALMS, touch=TOUCH, stance=0.40, predicate="contact", bearing=1.0, near=0.80, carried=True
+        HAMMER,
+        HAMMER,
+        PALMS,
+        touch=TOUCH,
+        stance=0.40,
+        predicate="contact",
+        bearing=1.0,
+        near=0.80,
+        carried=True,
+        loose=True,
     ),
 }
 """Task name → its first contact; tasks that are not here have no failure signals."""

@@ -48,6 +48,7 @@ class JudgeAgreement:
 
 
 JUDGES = ("rules", "reader 1", "reader 2")
+SAYS = ("the rules say", "reader 1 says", "reader 2 says")
 PARTS = {"even": (0,), "odd": (1,), "all": (0, 1)}
 """Part → remainders of the numbers by 2."""
 
@@ -90,14 +91,14 @@ def agreements(failures: Sequence[LabelledFailure]) -> list[JudgeAgreement]:
 
 
 def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Sheet]:
-    """The agreements, and for each reader what the rules say of the failures of a stage."""
+    """The agreements, and for each pair of judges what the one says of the failures of a stage that the other says."""
     rows = [
         (*one.judges, one.part, str(one.failures), str(one.same), f"{one.rate:.2f}") for one in agreements(failures)
     ]
     sheets = [Sheet("real failures: agreement", ("judge", "and", "numbers", "failures", "same", "rate"), tuple(rows))]
-    for column, reader in enumerate(JUDGES[1 : len(failures[0].said)], start=1):
-        counts = Counter((one.said[column], one.said[0]) for one in failures)
-        table = tuple((str(read), *(str(counts[read, said]) for said in FailureStage)) for read in FailureStage)
-        head = (reader, *(f"said {stage}" for stage in FailureStage))
-        sheets.append(Sheet(f"real failures: {reader} (rows) and what the rules say (columns)", head, table))
+    for a, b in itertools.combinations(range(len(failures[0].said)), 2):
+        counts = Counter((one.said[b], one.said[a]) for one in failures)
+        table = tuple((str(row), *(str(counts[row, said]) for said in FailureStage)) for row in FailureStage)
+        head = (JUDGES[b], *(f"said {stage}" for stage in FailureStage))
+        sheets.append(Sheet(f"real failures: {JUDGES[b]} (rows) and what {SAYS[a]} (columns)", head, table))
     return sheets
