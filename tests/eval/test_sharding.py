@@ -156,7 +156,7 @@ def test_list_shows_a_shard(capsys):
     """`list` prints the episodes of a shard with their numbers in the plan."""
     assert main(["list", *FLAGS, "--shard", "2/3"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("16 episodes, ") and "tell a policy" in lines[1]
+    assert lines[0].startswith("16 episodes, ") and "smallest difference" in lines[1]
     assert [int(line.split()[0]) for line in lines[2:]] == [e.index for e in plan("2/3")]
 
 

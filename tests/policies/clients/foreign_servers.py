@@ -4,6 +4,7 @@
 """
 
 import base64
+import dataclasses
 import io
 import json
 import threading
@@ -241,6 +242,8 @@ class SocketServer(Recorder):
             if isinstance(request, End):
                 self.note("end", request)
                 continue
+            if request.packed is not None:
+                request = dataclasses.replace(request, image=request.packed.unpacked(), packed=None)
             self.note("look", request)
             kind = self.fault(request)
             if kind == "text":

@@ -205,13 +205,13 @@ def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_pat
 
 
 def test_a_full_disk_is_one_error(dataset, tmp_path, capsys):
-    """What safetensors and the log cannot write is a message with the path and code 1; no part of it takes space."""
+    """What safetensors and the log cannot write is a message with the path and code 2; no part of it takes space."""
     out = tmp_path / "run"
     given = ["--dataset", str(dataset), "--recipe", "small", "--device", "cpu", "--steps", "1", "--out", str(out)]
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))  # bytes of a file; a write beyond fails
     try:
-        assert main(given) == 1
+        assert main(given) == 2
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     error = capsys.readouterr().err
