@@ -138,6 +138,9 @@ def test_who_passes_through_the_pose_has_not_come_into_it():
     assert stage_of(judged(**passes | {"engaged_ticks": 161, "aligned_ticks": 1})) == "approach"
     assert stage_of(judged(**passes | {"engaged_ticks": 161, "aligned_ticks": 61})) == "posture"
     assert stage_of(judged(**passes | {"engaged_ticks": 450, "aligned_ticks": 1})) == "posture"
+    strolls = passes | {"task": "football", "engaged_ticks": 161, "stop_bearing": 1.2}  # slow is a walk there
+    assert stage_of(judged(**strolls | {"aligned_ticks": 68})) == "approach"
+    assert stage_of(judged(**strolls | {"aligned_ticks": 105})) == "posture"
 
 
 def test_one_behaviour_beside_a_bar_has_one_name():
