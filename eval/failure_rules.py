@@ -63,9 +63,11 @@ class Bars:
     engaged_ticks: float = 100
     """Ticks for which a robot must stay slow near the object to have come for it: two seconds. A searching robot slows
     down for about one (up to 56 ticks measured), where its way turns; one that has arrived stays (300 and more)."""
-    aligned_ticks: float = 50
-    """The same where the object can be touched without a step: one second, in which an arm could have reached it. (The
-    two seconds of readers include when it is at the side, beyond the bearing of an `Interaction`.)"""
+    aligned_ticks: float = 60
+    """The same where the object can be touched without a step: longer than a searching robot slows down for, and long
+    enough to reach for it. In proportion longer where a faster walk is slow: Football's robots that aim badly walk past
+    the ball in up to 68. (The two seconds of readers include when it is at the side, beyond an `Interaction`'s
+    bearing.)"""
     moved: float = 0.25
     """Distance from where it was touched first at which the object has moved away [m]."""
     left: float = 1.1
@@ -119,7 +121,8 @@ def stage_of(episode: Judged, bars: Bars = BARS) -> FailureStage | None:
         return FailureStage.APPROACH if task.reached_only else FailureStage.CONTACT
     engaged = signals.engaged_ticks >= bars.engaged_ticks
     stays = engaged and signals.engaged_ticks >= WAITS * episode.steps
-    if fell or signals.aligned_ticks >= bars.aligned_ticks or (stays and _in_pose(signals, task, bars)):
+    aligned = signals.aligned_ticks >= bars.aligned_ticks * task.slow / _OTHER.slow
+    if fell or aligned or (stays and _in_pose(signals, task, bars)):
         return FailureStage.POSTURE
     return FailureStage.APPROACH if engaged else FailureStage.PERCEPTION
 

@@ -133,11 +133,14 @@ def test_a_touch_that_moves_nothing_has_not_reached_a_loose_object():
 
 
 def test_who_passes_through_the_pose_has_not_come_into_it():
-    """To stay there for a second is posture, to cross it in a spell nearby only for who stays for half the episode."""
+    """To stay there for 60 ticks is posture, to cross it in a spell nearby only for who stays for half the episode."""
     passes = UNTOUCHED | {"task": "open_door", "stop_distance": 0.12, "stop_bearing": 0.82}
     assert stage_of(judged(**passes | {"engaged_ticks": 161, "aligned_ticks": 1})) == "approach"
     assert stage_of(judged(**passes | {"engaged_ticks": 161, "aligned_ticks": 61})) == "posture"
     assert stage_of(judged(**passes | {"engaged_ticks": 450, "aligned_ticks": 1})) == "posture"
+    strolls = passes | {"task": "football", "engaged_ticks": 161, "stop_bearing": 1.2}  # slow is a walk there
+    assert stage_of(judged(**strolls | {"aligned_ticks": 68})) == "approach"
+    assert stage_of(judged(**strolls | {"aligned_ticks": 105})) == "posture"
 
 
 def test_one_behaviour_beside_a_bar_has_one_name():
