@@ -6,6 +6,7 @@ No number of the compiled model is read, so that a change of it anywhere between
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -60,6 +61,8 @@ BOUNCE = (-0.005, 0.03)
 step finds it (`ball.BALL_SPRING`)."""
 DROPS = (1.0, 3.0)
 """Heights of its falls [m]."""
+DIVERGED = 1e300
+"""What a world that diverged measures."""
 WORLDS = 12
 HIGH = 6.0
 """At this height [m] nothing touches what falls freely within a second."""
@@ -91,6 +94,10 @@ class Measurement(NamedTuple):
     def deviation(self) -> float:
         """As a part of what it is to be."""
         return self.measured / self.expected - 1.0
+
+    def finite(self) -> Measurement:
+        """The same as JSON can say it: a world that diverged measures a number beyond all bounds."""
+        return self if math.isfinite(self.measured) else self._replace(measured=DIVERGED)
 
     def said(self) -> str:
         """The number in words."""
@@ -423,7 +430,7 @@ def physics(context: Context) -> CheckFinding:
                 world_of(context, task, tracker, worlds=_worlds(engine, device), engine=engine, device=device),
             )
             try:
-                return [list(one) for one in measured_in(env, whole=whole)]
+                return [list(one.finite()) for one in measured_in(env, whole=whole)]
             finally:
                 env.close()
 

@@ -17,7 +17,7 @@ from arena_newton.eval.certification.bodies import BODIES, Body
 from arena_newton.eval.config import resolve
 from arena_newton.eval.folder import ResultsFolder
 from arena_newton.eval.identity import PACKAGE, config_hash, hash_paths, package_files
-from arena_newton.eval.journal import EpisodeRecord, write_atomic
+from arena_newton.eval.journal import ContradictionError, EpisodeRecord, write_atomic
 from arena_newton.eval.options import CertifyOptions, RunOptions
 from arena_newton.eval.plan import PROTOCOL_REPEATS
 from arena_newton.eval.records import Json
@@ -162,7 +162,11 @@ class Context:
         folder = ResultsFolder(Path(str(options.out)), config, versions())
         stored = folder.check()
         if stored is not None and "status" in stored and stored["status"]["state"] == "success":
-            return load_run(folder.path).records
+            records = load_run(folder.path).records
+            if len(records) != len(config.episodes):
+                lines = f"{len(records)} of {counted(len(config.episodes), 'planned episode')} are in the journal"
+                raise ContradictionError(f"{folder.path}: {lines} of a run that ended; it was changed by hand")
+            return records
         self.say(f"{said}: {counted(len(config.episodes), 'episode')}")
         with contextlib.redirect_stdout(io.StringIO()):  # its table is part of a larger one here
             code = run.execute(folder, self.factories if body is None else body.equip(self.factories))

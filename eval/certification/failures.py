@@ -21,6 +21,8 @@ __all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 
 LEAST = 0.8
 """Least precision and recall of each stage."""
+QUICK_FAILURES = 2
+"""Episodes of each kind, task and tracker under --quick."""
 ENOUGH = 20
 """From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
@@ -29,13 +31,13 @@ TUNED: Mapping[str, tuple[int, ...]] = {
     "boxing": (0, 10, 700),
     "vis_navi": (0, 10, 500, 501, 502, 503, 504, 505, 700, 800, 900),
     "football": (500, 501, 502, 503, 700, 701, 800, 801, 900),
-    "sit_sofa": (500, 501, 502, 700),
+    "sit_sofa": (500, 501, 502, 700, 1100, 1150),
     "open_door": (500, 700, 701, 800, 900),
     "pp_box": (0, 500, 700, 701, 900),
-    "double_desk": (500, 700, 701, 900),
+    "double_desk": (500, 700, 701, 900, 1100, 1150),
 }
 """Task → group seeds whose episodes were looked at when thresholds and saboteurs were set."""
-HELD_OUT = 1100
+HELD_OUT = 1200
 """First group seed that the check plays: above all that were looked at. Whoever changes a rule after episodes from here
 on were seen chooses another."""
 
@@ -85,7 +87,8 @@ def failures(context: Context) -> CheckFinding:
             for name, sabotage in SABOTAGES.items():
                 if task in sabotage.without:
                     continue
-                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT)
+                episodes = min(QUICK_FAILURES, context.episodes) if context.options.quick else None
+                cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT, episodes=episodes)
                 records = context.evaluate(cell)
                 found = [(sabotage.stage, stage_of(record)) for record in records]
                 pairs.setdefault(task, []).extend(found)

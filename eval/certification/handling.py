@@ -63,6 +63,6 @@ HANDLING: Mapping[str, Handling] = {
     "pp_box": Handling(blind=(150, 190), weak=0.4, short=(0.50, 0.62), halts=0.38, opens=(300, 450), apart=0.30),
     # To the robot's right the floor is free beside the desk. The hand grasps the hammer, and opens on the way to the
     # crate.
-    "double_desk": Handling(blind=(180, 180), weak=0.5, short=(0.42, 0.55), opens=(400, 600)),
+    "double_desk": Handling(blind=(180, 180), weak=0.5, short=(0.36, 0.46), opens=(400, 600)),
 }
 """Task name → what its saboteurs do."""

@@ -17,6 +17,7 @@ from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, score, skipped
 from arena_newton.eval.document import CONFIG_FILE
 from arena_newton.eval.folder import EPISODES
+from arena_newton.eval.identity import config_hash
 from arena_newton.eval.journal import EpisodeRecord
 from arena_newton.eval.options import RunOptions
 from arena_newton.eval.records import JsonObject
@@ -25,13 +26,11 @@ from arena_newton.files import file_label
 from arena_newton.foreign import read_arrays
 from arena_newton.text import counted, plain_text
 
-__all__ = ["CHECKS", "QUICK_REPLAYS", "SOLVED", "own_replay", "recorded"]
+__all__ = ["CHECKS", "SOLVED", "own_replay", "recorded"]
 
 SOLVED = 0.9
 """Success rate that an expert must not be significantly below: the Wilson interval reaches it. Of 60 episodes 50 do,
 of 4 three."""
-QUICK_REPLAYS = 1
-"""Episodes of each cell that are replayed through their own tracker under --quick; otherwise all are."""
 ENDING = "outcome reason steps margin predicates progress events startup_fall overflow".split()
 """Keys of the journal by which two episodes are the same."""
 RECORDED_TICKS = 200
@@ -59,9 +58,8 @@ def own_replay(
     records, where = context.evaluate(cell), f"{task} through {tracker} under {rules}"
     if not any(record.steps for record in records):
         return [], [f"{where}: nothing was recorded"]
-    episodes = min(QUICK_REPLAYS, context.episodes) if context.options.quick else None
     policy = f"replay:{context.path(cell) / 'actions'}"
-    again = CertifyCell(task, tracker, rules, policy=policy, label=f"replay-of-{tracker}", episodes=episodes)
+    again = CertifyCell(task, tracker, rules, policy=policy, label=f"replay-of-{tracker}")
     replayed = context.evaluate(again)
     if context.options.engine != "mujoco":
         won = score(replayed)
@@ -109,7 +107,9 @@ def _held(context: Context) -> list[str]:
     wrong = []
     for folder in _folders(context):
         try:
-            load_run(folder)
+            run = load_run(folder)
+            if config_hash(run.document["config"]) != run.document["config_hash"]:
+                raise InputError(f"{folder / CONFIG_FILE}: is not what its hash is of; it was changed by hand")
         except InputError as error:
             wrong.append(plain_text(str(error).replace(f"{context.folder}/", ""), 300))
     return wrong

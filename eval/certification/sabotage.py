@@ -44,7 +44,9 @@ __all__ = ["HALTS", "PERCHED", "SABOTAGES", "MisledExpert", "MisledSight", "Relo
 UNSEEN = (0.0, 0.0, 30.0)
 """Displacement of an object that nobody can see: in the sky, where no camera looks [m]."""
 ELSEWHERE = (2.4, 3.2)
-"""Distance of the place where a blind robot believes the object, drawn between these [m] ..."""
+"""Distance of the place where a blind robot believes the object, drawn between these [m]; a seat farther off, for its
+robots stand 0.9 m nearer to it than to the place, and who stops within two metres of the seat has come for it ..."""
+FARTHER = (3.0, 3.4)
 TOWARDS: Mapping[str, tuple[float, float]] = {"": (150, 190), "football": (-20, 20), "sit_sofa": (90, 150)}
 """... and its direction from the object, drawn between these [degrees from the x-axis]: where there is free floor."""
 SHORT = (0.55, 0.80)
@@ -250,7 +252,8 @@ class BlindExpert(MisledExpert):
         turn = self.style.uniform("to", math.radians(least), math.radians(most))
         if self.env.spec.name == "football":  # on the other half of the pitch
             turn = torch.where(self.sight.view.centre[:, 0] > 0.0, math.pi - turn, turn)
-        self.sight.object_off = self._elsewhere(_level(self.style.uniform("far", *ELSEWHERE), turn))
+        far = FARTHER if self.env.spec.name == "sit_sofa" else ELSEWHERE
+        self.sight.object_off = self._elsewhere(_level(self.style.uniform("far", *far), turn))
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
         """See `MisledExpert.overrule`."""

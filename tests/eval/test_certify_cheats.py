@@ -163,6 +163,20 @@ def journal_edited_with_care(monkeypatch, folder):
     edited(folder, steps=line["steps"] - 25, predicates=sooner)
 
 
+def journal_that_lost_a_line(monkeypatch, folder):
+    """An episode was taken out after the run had ended."""
+    (folder / "runs/football/twist2_paper_base/episodes.jsonl").write_text("")
+
+
+def journal_without_its_mark(monkeypatch, folder):
+    """The policy that takes the world itself is no longer called privileged."""
+    edited(folder, privileged=False)
+    path = folder / "runs/football/twist2_paper_base/config.json"
+    document = json.loads(path.read_text())
+    document["config"]["policy_facts"]["privileged"] = False
+    path.write_text(json.dumps(document))
+
+
 CHEATS = [
     ("solvable", teleporting_expert),
     ("solvable", expert_that_holds_the_clock),
@@ -173,6 +187,8 @@ CHEATS = [
     ("policy-inputs", policy_that_draws_the_placements_from_its_seed),
     ("journal", journal_with_edited_outcomes),
     ("journal", journal_edited_with_care),
+    ("journal", journal_that_lost_a_line),
+    ("journal", journal_without_its_mark),
 ]
 """The check that finds a cheat, and its patch: `cheat(monkeypatch, folder)` of a folder that is certified again."""
 
