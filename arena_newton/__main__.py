@@ -110,7 +110,11 @@ def _run(arguments: list[str]) -> int:
 
 def _rules(arguments: list[str]) -> int:
     if arguments:
-        raise InputError(f"rules {arguments[0]}: takes no arguments; it prints both rule sets as Markdown")
+        said = "takes no arguments; it prints both rule sets as Markdown"
+        if {*arguments} & {"-h", "--help"}:
+            print(f"usage: {PROG} rules\n\nrules {said}.")
+            return 0
+        raise InputError(f"rules {arguments[0]}: {said}")
     from arena_newton import rule_sets
 
     print(rule_sets.markdown(), end="")

@@ -1,7 +1,9 @@
 """What a policy is shown of the worlds that it plays in: everything to read, nothing to write.
 
-Arrays are copies, positions and velocities renewed before each look, so that what is written into them moves nothing;
-attributes cannot be set. A policy that gets hold of the world in another way is found by the replay of its actions.
+Arrays that it hands out are copies, positions and velocities renewed before each look, so that what is written into
+them moves nothing; attributes cannot be set. It keeps from accidents, not from intent: what lies deeper in an object
+that it hands out (handles, the compiled model's accessors, the stage) is the world's own. A policy that moves the world
+by it is found by the replay of its actions.
 """
 
 from __future__ import annotations

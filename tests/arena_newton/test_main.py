@@ -43,6 +43,7 @@ def test_every_command_explains_itself(command, capsys):
     """`--help` behind each command's words is the command's own and ends with 0."""
     if command.words == "rules":
         assert main(["rules"]) == 0 and "| `paper` | `released` |" in capsys.readouterr().out
+        assert main(["rules", "--help"]) == 0 and "takes no arguments" in capsys.readouterr().out
         return
     try:
         code = main([*command.words.split(), "--help"])
