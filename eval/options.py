@@ -436,9 +436,10 @@ class EngineOptions:
 
 @dataclass(frozen=True)
 class CertifyOptions:
-    """Prove the benchmark: solvable tasks that need legs, clean axes, agreeing engines, the price of a swapped tracker.
+    """Measure what the benchmark claims of itself: solvable tasks that need legs, clean axes, engines that agree.
 
-    Every check but `statistics` plays the tasks' experts. Exit code 0: no check fails; 1: one fails; 2: bad input.
+    The tasks' experts play in all checks but policy-inputs, execution, physics, camera and statistics. Exit code 0: no
+    check fails; 1: one fails; 2: bad input.
     """
 
     out: str = "results/certify"

@@ -390,12 +390,13 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     for d, sign in ((directions[1], 1.0), (directions[0], -1.0)):
         terms += _falls([swapped for pairs in alike[d].values() for _, swapped in pairs], sign)
     falls = trained_contrast(terms)
+    fell = counted(sum(sum(term.outcomes.values()) for term in terms), "fall")
     found.append(
         _result(
             "cross-GMT: asymmetric falls",
             "Swapped policies fall more often from SONIC to TWIST2 than in the other direction.",
             f"{points(means['sonic'][1] - means['twist2'][1])} points",
-            _said(falls, f"{len(both)} cells a direction") if both else _NO_SWAP,
+            f"{_said(falls, f'{len(both)} cells a direction')}; {fell} in all" if both else _NO_SWAP,
             _greater(falls),
         )
     )

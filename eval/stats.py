@@ -334,7 +334,8 @@ def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | N
     Returns:
         None where a stratum has a condition without an episode, or no episode that all which share some have.
     """
-    exact, middle, variance = Fraction(), 0.0, 0.0
+    exact = Fraction()
+    middles, variances = list[float](), list[float]()
     episodes = unpaired = 0
     for conditions in strata:
         blocks = _sharing(conditions)
@@ -351,8 +352,8 @@ def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | N
             shrunk = (total + both) / (n + 2)
             coin = math.fsum(weight * weight for weight in weights) / 4
             squares = math.fsum(times * (one - shrunk) ** 2 for one, times in sums)
-            variance += (squares + 2 * (coin + (both / 2 - shrunk) ** 2)) / (n + 2) ** 2
-            middle += (total + both * made / 2) / (n + made)
+            variances.append((squares + 2 * (coin + (both / 2 - shrunk) ** 2)) / (n + 2) ** 2)
+            middles.append((total + both * made / 2) / (n + made))
             for weight, outcomes in block:
                 exact += Fraction(weight) * Fraction(sum(map(outcomes.__getitem__, common)), n)
             episodes += n
@@ -361,7 +362,8 @@ def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | N
             return None
     if not strata:
         return None
-    error = math.sqrt(variance)
+    # Exactly rounded sums: the strata's order changes no bit.
+    middle, error = math.fsum(middles), math.sqrt(math.fsum(variances))
     low, high = within(strata, middle - intervals.Z95 * error, middle + intervals.Z95 * error)
     return Contrast(float(exact), low, high, middle, error, len(strata), episodes, unpaired)
 

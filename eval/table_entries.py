@@ -41,7 +41,7 @@ SEMANTIC_STRENGTH = (
 """Sentence of every table of numbers of semantic mode."""
 SEMANTIC_CHANGES = {
     "texture": "textures and colours in",
-    "shape": "the shape of something that is drawn and not touched in",
+    "shape": "the shape of a target that is drawn without a collider in",
     "clutter": "things that are added in",
 }
 """Change that semantic mode makes → words for it."""
@@ -126,7 +126,10 @@ def semantic_text() -> str:
     for change, words in SEMANTIC_CHANGES.items():
         named = [task_title(name) for name in suites()["ALL_AVG"] if tasks.get(name).semantic_change == change]
         parts += [f"{words} {', '.join(named)}"] if named else []
-    return f"Semantic mode changes looks, no object of a task: {'; '.join(parts)}."
+    return (
+        f"Semantic mode changes looks, and nothing that moves or collides in base mode: {'; '.join(parts)}. (Under "
+        "rules released what counts in VisNavi becomes a disc, too, and Football has a second ball.)"
+    )
 
 
 def percent(value: float, digits: int = 1) -> str:

@@ -101,17 +101,19 @@ def trained_contrast(terms: Sequence[RateTerm]) -> TrainedContrast | None:
     found = contrast(strata)
     if found is None:
         return None
-    total, measured = found.error**2, 0
-    squares = 0.0
+    # Exactly rounded sums: the order of the terms changes no bit.
+    variances, squared = [found.error**2], list[float]()
     for trainings in by_recipe.values():
         number = len(trainings)
         if number < ENOUGH:
-            total += sum(_declared(one) ** 2 for one in trainings.values())
+            variances += [_declared(one) ** 2 for one in trainings.values()]
             continue
         parts = [number * math.fsum(term.part for term in one) for one in trainings.values()]
         mean = math.fsum(parts) / number
         own = math.fsum((part - mean) ** 2 for part in parts) / (number - 1) / number
-        total, squares, measured = total + own, squares + own**2 / (number - 1), measured + 1
+        variances.append(own)
+        squared.append(own**2 / (number - 1))
+    total, squares = math.fsum(variances), math.fsum(squared)
     freedom = total**2 / squares if squares else math.inf
     half = (t.ppf(0.975, freedom) if squares else norm.ppf(0.975)) * math.sqrt(total)
     low, high = within(strata, found.middle - half, found.middle + half)
@@ -124,7 +126,7 @@ def trained_contrast(terms: Sequence[RateTerm]) -> TrainedContrast | None:
         freedom=freedom,
         episodes=found.episodes,
         trainings=sum(map(len, by_recipe.values())),
-        measured=measured,
+        measured=len(squared),
         recipes=len(by_recipe),
     )
 

@@ -344,8 +344,8 @@ class TaskSpec:
     """Episodes that start with things inside each other."""
     semantic_variant: ByRules[str] = field(default_factory=lambda: ByRules.same("semantic"))
     semantic_change: Literal["texture", "shape", "clutter"] | None = None
-    """Change that semantic mode of rule set `paper` makes: in textures and colours; in shapes that are drawn and not
-    touched; or by things that are added. The compiled model is else that of base mode. None: not said."""
+    """Change that semantic mode of rule set `paper` makes: in textures and colours; in shapes that are drawn
+    without a collider; or by things that are added. The compiled model is else that of base mode. None: not said."""
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""
     mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)

@@ -182,9 +182,12 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, She
     ]
     notes = [
         f"Engines are equivalent where the 95 % interval of the difference of their rates, all {pairs} pairs of the "
-        f"same episodes together, is within {percent(MARGIN)} on either side: {'; '.join(said)}. "
+        f"same episodes together, is within {percent(MARGIN)} on either side: {'; '.join(said)}. It has the upper "
+        "97.5 % bounds (Clopper and Pearson) of the pairs that only one engine wins, less 0 of the other's: wider than "
+        "the interval of `eval compare`, and sure to cover in 95 %. "
         f"They differ in a cell where p, that of McNemar's exact test, is below {level:.2g}: {DIFFERENT} over "
-        f"{2 * len(tests)} tests."
+        f"{2 * len(tests)} tests; all cells together where it is below {DIFFERENT} and the rates are more than "
+        f"{percent(MARGIN)} apart."
     ]
     notes += [f"{which}: the engines differ" for which in apart]
     verdict: Verdict = "fail" if apart or far else "pass" if within else "note"

@@ -1,5 +1,6 @@
 """The paper's findings tested on suites and counts: a training is the unit, and pages are those of their records."""
 
+import csv
 import itertools
 import os
 import re
@@ -15,7 +16,7 @@ from arena_newton.eval import findings_text, paper_claims
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.evaluated_cells import read_cells
 from arena_newton.eval.paper_numbers import paper_numbers
-from arena_newton.eval.stats import holm, paired_rates
+from arena_newton.eval.stats import contrast, holm, paired_rates, suites, wilson
 from arena_newton.eval.table_entries import SEMANTIC_STRENGTH, semantic_text
 from arena_newton.eval.tables_command import BEGIN, END
 from arena_newton.eval.trainings import DROP_SPREAD, MATCHED_SPREAD, SWAPPED_SPREAD
@@ -163,6 +164,69 @@ def test_pages_of_results_are_those_of_their_records(tmp_path, monkeypatch):
         assert (tmp_path / name).read_text() == (RESULTS / name).read_text(), name
     text = (RESULTS / "README.md").read_text()
     assert text.count(BEGIN) == text.count(END) == 1 and semantic_text() in text and SEMANTIC_STRENGTH in text
+
+
+def ends(both=0, only_first=0, only_second=0, neither=0):
+    """Outcomes of two conditions over the same episodes, from counts."""
+    kinds = [(True, True)] * both + [(True, False)] * only_first + [(False, True)] * only_second
+    kinds += [(False, False)] * neither
+    return [{n: kind[side] for n, kind in enumerate(kinds)} for side in (0, 1)]
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("cells*.csv")), ids=lambda path: path.stem)
+def test_published_intervals_are_those_of_their_counts(path):
+    """Every interval of ours in a published file is what the functions of today give for the counts in that file.
+
+    How episodes of several tasks or trackers pair is in no count: of these the middle is known, and the width is not.
+    """
+    rows = [row for row in csv.DictReader(path.open(newline="")) if row["source"] == "ours"]
+    single = {(r["table"], r["policy"], r["tracker"], r["task"]): r for r in rows if not r["task"].endswith("_AVG")}
+
+    def stratum(row, mode, task, weight):
+        """Conditions of a task in the tables of this mode; trackers that were pooled share the successes."""
+        table = row["table"]
+        if table == "perturbation":
+            table = "in_gmt" if mode == "base" else f"in_gmt_{mode}"
+        cell = single[table, row["policy"], row["tracker"], task]
+        number = len(row["tracker"].split("+"))
+        won, episodes = int(cell["successes"]), int(cell["episodes"]) // number
+        counts = [won // number + (k < won % number) for k in range(number)]
+        return [(weight / number, {n: n < count for n in range(episodes)}) for count in counts]
+
+    for row in rows:
+        names = suites().get(row["task"], (row["task"],))
+        known = [None, None]
+        if row["only_first"]:
+            first, second = int(row["only_first"]), int(row["only_second"])
+            both = int(row["successes"]) - second
+            pair = ends(both, first, second, int(row["pairs"]) - both - first - second)
+            found = contrast([[(1.0, pair[0]), (-1.0, pair[1])]])
+            assert float(row["drop"]) == pytest.approx(found.value, abs=1e-6), row
+            known[1] = found, True
+        elif row["drop"]:
+            strata = [
+                [
+                    *stratum(row, "base", task, 1 / len(names)),
+                    *stratum(row, row["mode"], task, -1 / len(names)),
+                ]
+                for task in names
+            ]
+            known[1] = contrast(strata), False
+        if len(names) == 1 and "+" not in row["tracker"]:
+            rate = wilson(int(row["successes"]), int(row["episodes"]))
+            assert [float(row["low"]), float(row["high"])] == pytest.approx(rate, abs=1e-5), row
+        else:
+            strata = [stratum(row, row["mode"], task, 1 / len(names)) for task in names]
+            known[0] = contrast(strata), "+" not in row["tracker"]
+        for found, (low, high), least in zip(known, (("low", "high"), ("drop_low", "drop_high")), (0, -1), strict=True):
+            if found is None:
+                continue
+            interval, width = [float(row[low]), float(row[high])], found[1]
+            assert least <= interval[0] <= interval[1] <= 1, row
+            if width:
+                assert interval == pytest.approx([found[0].low, found[0].high], abs=1e-5), row
+            elif interval[1] < 1:
+                assert sum(interval) / 2 == pytest.approx(found[0].middle, abs=1e-5), row
 
 
 def test_counts_say_what_episodes_said(made_suite, cells, tmp_path):

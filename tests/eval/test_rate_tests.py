@@ -24,8 +24,9 @@ from arena_newton.eval.rate_tests import (
     rate_test,
     stratified_test,
 )
-from arena_newton.eval.stats import contrast, mcnemar
+from arena_newton.eval.stats import contrast, mcnemar, suites
 from arena_newton.eval.suite_tables import suite_tables
+from arena_newton.eval.trainings import RateTerm, trained_contrast
 
 
 def test_paired_test_is_the_binomial_test():
@@ -161,6 +162,48 @@ def test_one_interval_of_a_difference(tmp_path):
     (pair,) = compare([Contender(cell.tracker, {("boxing",): cell.held()}) for cell in cells]).pairs
     found = pair.difference
     assert (entry.drop, entry.drop_low, entry.drop_high) == (found.value, found.low, found.high)
+
+
+def test_no_bit_of_an_interval_depends_on_the_order_of_tasks(tmp_path):
+    """Strata in any order give the same bits, and so do averages of tasks that a folder holds in another order."""
+    rng, names = random.Random(5), suites()["ALL_AVG"]
+    for _ in range(40):
+        strata = []
+        for size in rng.choices(range(7, 61), k=len(names)):
+            pair = [{n: rng.random() < 0.6 for n in range(size)} for _ in range(2)]
+            strata.append([(1 / len(names), pair[0]), (-1 / len(names), pair[1])])
+        assert len({contrast(rng.sample(strata, len(names))) for _ in range(5)}) == 1
+    terms = [
+        RateTerm(str(task), sign / 7, {n: rng.random() < 0.7 for n in range(20)}, (sign, task), (sign, task, number))
+        for task, sign in itertools.product(range(7), (0.2, -1.0))
+        for number in range(5 if sign > 0 else 1)
+    ]
+    assert len({trained_contrast(rng.sample(terms, len(terms))) for _ in range(20)}) == 1
+    cell = {"policy": "p", "family": "act", "trained_on": ("twist2",), "tracker": "twist2"}
+    cell |= {"labels": "v4", "latency": 0, "replan": None, "ensemble": False, "folder": tmp_path}
+    cells = [
+        EvaluatedCell(
+            **cell, task=task, trained_tasks=(task,), mode=mode, records=tuple(map(record, episodes(task, won)))
+        )
+        for mode in ("base", "visual")
+        for task, won in ((task, [rng.randrange(21) for _ in range(3)]) for task in names)
+    ]
+    drops = []
+    for order in (cells, cells[::-1], rng.sample(cells, len(cells))):
+        (table,) = [table for table in suite_tables(order, paper_numbers()) if table.name == "perturbation"]
+        whole = [entry for entry in table.entries if (entry.source, entry.mode) == ("ours", "visual")]
+        for entry in whole:
+            told = [
+                Contender(
+                    mode, {(c.task,): c.held() for c in order if c.mode == mode and c.task in suites()[entry.task]}
+                )
+                for mode in ("base", "visual")
+            ]
+            (pair,) = compare(told).pairs
+            found = pair.difference
+            assert (entry.drop, entry.drop_low, entry.drop_high) == (found.value, found.low, found.high)
+        drops.append({(entry.task, entry.drop, entry.drop_low, entry.drop_high) for entry in whole})
+    assert drops[0] == drops[1] == drops[2] and len(drops[0]) == 2
 
 
 def test_differences_tighten_with_episodes():
