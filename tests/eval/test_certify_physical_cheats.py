@@ -5,6 +5,7 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import pytest
 
@@ -110,6 +111,17 @@ CHEATS = [
     ("rules", "sit_sofa", rule_that_confirms_a_tick_early),
 ]
 """The check that finds a cheat, a task, and its patch."""
+
+
+def test_the_page_lists_every_cheat():
+    """docs/certify.md has a row for each cheat, with the checks that find it."""
+    page = (Path(__file__).parents[2] / "docs" / "certify.md").read_text()
+    table = page.split("`tests/eval/test_certify_physical_cheats.py`")[1].split("\n\n")[1]
+    rows = [re.findall(r"`([a-z]+)`", line) for line in table.splitlines()[2:]]
+    found = {}
+    for check, _, cheat in CHEATS:
+        found.setdefault(cheat, []).append(check)
+    assert sorted(rows) == sorted(found.values())
 
 
 @pytest.mark.parametrize(("check", "task"), sorted({row[:2] for row in CHEATS}))

@@ -234,6 +234,7 @@ def test_counts_say_what_episodes_said(made_suite, cells, tmp_path):
     assert main(["tables", str(made_suite), "--format", "csv", "--out", str(tmp_path)]) == 0
     assert main(["tables", str(tmp_path / "cells.csv"), "--out", str(tmp_path / "t")]) == 2
     told = {one.name: one for one in paper_claims.findings(read_cells([tmp_path / "cells.csv"]).cells, paper_numbers())}
+    assert told["cross-GMT: asymmetric falls"].ours.endswith(" falls in all")
     for one in paper_claims.findings(cells.cells, paper_numbers()):
         assert told[one.name].ours.split(" points")[0] == one.ours.split(" points")[0], one.name
     swap = [c for c in read_cells([tmp_path / "cells.csv"]).cells if (c.policy, c.task) == ("act v3.1", "football")]

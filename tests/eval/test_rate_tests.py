@@ -4,6 +4,7 @@ import itertools
 import math
 import random
 import time
+from types import SimpleNamespace
 
 import pytest
 from rows import episodes, record
@@ -386,6 +387,19 @@ def test_comparisons_keep_their_level_and_find_what_is_there():
         for points in (0, 20)
     )
     assert none.kind == "error" and much.kind == "power" and much.rate > 0.4 > none.rate
+
+
+def test_the_summary_names_the_spreads_that_its_intervals_are_held_to(monkeypatch):
+    """The line of `statistics` says up to which spread an interval must cover, where that is declared and measured."""
+    monkeypatch.setattr(error_rates, "COMPARISONS", 20)
+    found = error_rates._statistics(SimpleNamespace(options=SimpleNamespace(quick=False)))
+    held = [row for row in found.sheets[0].rows if row[2] == "coverage" and "trainings differ" in row[0]]
+    spreads = {
+        word: max(int(row[0].split()[-2]) for row in held if word in row[1]) for word in ("3 trainings", "declared")
+    }
+    assert f"differ by up to {spreads['3 trainings']} points where that is measured" in found.summary
+    assert f"{spreads['declared']} where it is declared" in found.summary
+    assert spreads["declared"] < spreads["3 trainings"]
 
 
 def test_a_test_that_errs_is_found_out(monkeypatch):
