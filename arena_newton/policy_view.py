@@ -1,4 +1,4 @@
-"""What a policy is shown of the worlds that it plays in: everything to read, nothing to write.
+"""View of the worlds that a policy plays in: everything to read, nothing to write.
 
 Arrays that it hands out are copies, positions and velocities renewed before each look, so that what is written into
 them moves nothing; attributes cannot be set. It keeps from accidents, not from intent: what lies deeper in an object

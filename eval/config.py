@@ -203,7 +203,7 @@ class RunConfig:
 
     @property
     def privileged(self) -> bool:
-        """Whether the policy takes the world itself; known when it was made."""
+        """The policy takes the world itself; known when it was made."""
         return bool((self.policy_facts or {}).get("privileged"))
 
     @property

@@ -283,7 +283,7 @@ def _trackers(one: _Gathered) -> list[str]:
 
 
 def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
-    """What makes runs no results of the benchmark, what differs although it need not, and what went wrong."""
+    """Conditions under which runs are no results of the benchmark, needless differences, and errors."""
     runs = {id(played.run): played.run for one in gathered for played in one.episodes}
     found = list(dict.fromkeys(said for run in runs.values() for said in changed_conditions(run)))
     for name in dict.fromkeys((*differ, *NOTED)):

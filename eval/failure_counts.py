@@ -62,7 +62,7 @@ class FailureCell(TypedDict):
 
 
 def episode_name(record: EpisodeRecord) -> EpisodeName:
-    """What identifies an episode across trackers."""
+    """Name of an episode that is the same across trackers."""
     return record.task, record.mode, record.group_seed, record.repeat
 
 

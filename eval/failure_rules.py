@@ -134,7 +134,7 @@ def _touched(episode: Judged, signals: EpisodeSignals, task: Interaction) -> int
 
 
 def _without_effect(episode: Judged, signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
-    """Whether a loose object stayed where it was when it was touched, and no later predicate of its task held.
+    """A loose object stayed where it was when it was touched, and no later predicate of its task held.
 
     Of a carried object that is still touched at the end how far it was pushed is not known: `moved` is 0.
     """
@@ -146,7 +146,7 @@ def _without_effect(episode: Judged, signals: EpisodeSignals, task: Interaction,
 
 
 def _in_pose(signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
-    """Whether it stayed, by a bar that is a little wider, where the object can be touched without a step."""
+    """It stayed, by a bar that is a little wider, where the object can be touched without a step."""
     distance, bearing = signals.stop_distance, signals.stop_bearing
     if distance is None or bearing is None:
         return False
@@ -170,7 +170,7 @@ def near_bars(episode: Judged) -> tuple[str, ...]:
 
 
 def waits_in_view(episode: Judged) -> bool:
-    """Whether a robot that failed stayed slow near the object, which it had in view, for most of its episode."""
+    """A robot that failed stayed slow near the object, which it had in view, for most of its episode."""
     signals = episode.signals
     if signals is None or episode.outcome != "timeout":
         return False

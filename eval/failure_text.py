@@ -43,7 +43,7 @@ def _endings(cell: FailureCell) -> tuple[int, int]:
 
 
 def _own(cell: FailureCell) -> str:
-    """How many failures the swap made; empty where nothing was played through another tracker."""
+    """Number of failures that the swap made; empty where nothing was played through another tracker."""
     own = cell.get("own_tracker")
     if own is None:
         return ""

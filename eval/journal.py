@@ -164,7 +164,7 @@ class ContradictionError(InputError):
 
 
 def contradiction(record: EpisodeRecord) -> str | None:
-    """What a line says against itself, so that it was not written as the episode ended; None where all fits."""
+    """Contradiction within a line, so that it was not written as the episode ended; None where all fits."""
     last = next(reversed(record.predicates.values()), None) if record.predicates else record.steps
     fell = next((event.tick for event in record.events if event.kind == "fall"), None)
     if record.outcome == "success":

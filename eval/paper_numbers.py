@@ -272,7 +272,7 @@ class PublishedRow:
     policy: str
     tracker: str
     source: str
-    """Where the numbers are from, with the date."""
+    """Source of the numbers, with the date."""
     simulator: str
     rates: Mapping[str, float]
     """By task, from 0 to 1."""

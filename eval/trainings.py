@@ -50,7 +50,7 @@ class RateTerm:
     training: Hashable
     """Key of the network."""
     swapped: bool = False
-    """Whether another tracker than that of the training executed it."""
+    """Another tracker than that of the training executed it."""
 
     @property
     def part(self) -> float:

@@ -146,7 +146,7 @@ names = POLICIES.names
 
 
 def is_privileged(policy: Policy) -> bool:
-    """Whether a policy takes the world itself, so that it knows more of an episode than state and picture show."""
+    """A policy takes the world itself, so that it knows more of an episode than state and picture show."""
     return getattr(policy.attach, "__func__", None) is not Policy.attach
 
 

@@ -72,7 +72,7 @@ def engines(context: Context) -> CheckFinding:
 
 
 def _same_start(context: Context, other: str, device: str) -> tuple[str, Sheet, list[str]]:
-    """What the first ticks say, in words, as a table and as faults."""
+    """Findings of the first ticks: in words, as a table and as faults."""
     rows, wrong, most = [], [], 0.0
     tracker = context.trackers[0]
     for task in context.tasks:
@@ -117,7 +117,7 @@ def first_ticks(context: Context, task: str, tracker: str, other: str, device: s
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two arrays are equal but for the last bit that float32 keeps."""
+    """Equality of two arrays but for the last bit that float32 keeps."""
     return one.shape == other.shape and np.allclose(one, other, rtol=1e-6, atol=1e-7)
 
 

@@ -47,7 +47,7 @@ SLIDES: Mapping[str, tuple[str, float, float]] = {
 }
 """Task → what slides on its floor, its mass [kg], and the height of its centre of mass above the floor [m]."""
 PULL = 1.05
-"""What slides is pulled with so much of the friction."""
+"""Pull on a sliding body, as a part of its friction."""
 MASS_TOLERANCE = (0.015, 0.035)
 """The same of one link's mass, and of that of a link lighter than ..."""
 LIGHT = 0.1
@@ -57,12 +57,12 @@ PUSH = 1.0
 DRIVE_TOLERANCE = 0.01
 """Of stiffness and damping of one joint's drive."""
 BOUNCE = (-0.005, 0.03)
-"""What a ball's coefficient of restitution may be off: its contact adds up to 0.025 with the depth at which a physics
+"""Allowed error of a ball's coefficient of restitution: its contact adds up to 0.025 with the depth at which a physics
 step finds it (`ball.BALL_SPRING`)."""
 DROPS = (1.0, 3.0)
 """Heights of its falls [m]."""
 DIVERGED = 1e300
-"""What a world that diverged measures."""
+"""Measurement of a world that diverged."""
 WORLDS = 12
 HIGH = 6.0
 """At this height [m] nothing touches what falls freely within a second."""
@@ -105,7 +105,7 @@ class Measurement(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the deviation is allowed."""
+        """The deviation is allowed."""
         return self.low <= self.measured - self.expected <= self.high
 
 
@@ -195,7 +195,7 @@ def weight(bench: Bench) -> Iterator[Measurement]:
 
 
 def masses(bench: Bench) -> Iterator[Measurement]:
-    """What each link weighs: pushed without a floor, the robot gains the momentum that the push gives.
+    """Masses of the links: pushed without a floor, the robot gains the momentum that the push gives.
 
     Whatever links and drives do among themselves, the links' accelerations under a push on one of them are a linear
     equation of their masses. Half the difference of a push to either side leaves gravity and second orders out.
@@ -397,7 +397,7 @@ def bounces(bench: Bench) -> Iterator[Measurement]:
 
 
 def measured_in(env: ArenaEnv, *, whole: bool = True) -> list[Measurement]:
-    """What is measured in the worlds of a task.
+    """Measurements in the worlds of a task.
 
     Args:
         env: Its worlds.

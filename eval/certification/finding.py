@@ -61,7 +61,7 @@ class CheckFinding:
     """What a reader must know besides the numbers: causes, exceptions, limits."""
     pictures: tuple[Picture, ...] = ()
     claim: str = ""
-    """What a reader must see in the line of the claim itself."""
+    """Words for the line of the claim itself."""
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def play_ahead(
 
 
 def _unnamed(options: CertifyOptions, check: str, cuda: bool) -> bool:
-    """Whether a check is one that without CUDA plays less where nobody has named it."""
+    """A check that without CUDA plays less where nobody has named it."""
     return check == BY_NAME and not (cuda or check in options.checks)
 
 

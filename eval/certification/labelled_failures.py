@@ -33,7 +33,7 @@ class LabelledFailure:
 
 @dataclass(frozen=True)
 class JudgeAgreement:
-    """How often two judges say the same stage."""
+    """Agreement of two judges on the stage."""
 
     judges: tuple[str, str]
     part: str

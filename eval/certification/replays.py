@@ -103,7 +103,7 @@ def _folders(context: Context) -> list[Path]:
 
 
 def _held(context: Context) -> list[str]:
-    """What journals and configurations of the folder say against themselves."""
+    """Contradictions within the journals and configurations of the folder."""
     wrong = []
     for folder in _folders(context):
         try:

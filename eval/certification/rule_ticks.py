@@ -33,7 +33,7 @@ EPISODES = (1, 4)
 
 
 class _State:
-    """What a rule reads of one world."""
+    """State of one world as a rule reads it."""
 
     def __init__(self, env: World, world: int):
         self.scene, self.physics, self.world = env.scene, cast("Physics", env.physics), world
@@ -63,7 +63,7 @@ class _State:
 
     @property
     def stands(self) -> bool:
-        """Whether the root is at 0.45 m or higher and the up-axis at 0.6 or more."""
+        """The root is at 0.45 m or higher and the up-axis at 0.6 or more."""
         return bool(self.root[2] >= 0.45 and _matrix(self.root[3:])[2, 2] >= 0.6)
 
 

@@ -386,7 +386,7 @@ class StubbornExpert(ClumsyExpert):
 
     env: RelocatingEnv
     left_at: Tensor | None = None
-    """Where a free object was when it was moved [m], shape [worlds, 3]."""
+    """Positions of a free object when it was moved [m], shape [worlds, 3]."""
 
     def mislead(self) -> None:
         """See `MisledExpert.mislead`."""

@@ -61,7 +61,7 @@ _LAYERS: Mapping[str, Mapping[str, str]] = {
 }
 """LeRobot's type of policy → field of its configuration → how the names of the layers begin that it counts or lists."""
 PARAMETER_COST = 10_000
-"""What a parameter counts at least, in numbers: modules take memory too."""
+"""Least count of a parameter, in numbers: modules take memory too."""
 SPARE = 2**26
 """Numbers that a network may be built with beyond twice its weights, in parts that it drops again: 256 MiB."""
 _SPREADS: Mapping[str, tuple[str, ...]] = {

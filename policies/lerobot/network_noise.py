@@ -23,7 +23,7 @@ class Draw:
     """Whose noise it is."""
 
     seed: int
-    """What the policy was given of the episode."""
+    """Seed that the policy was given of the episode."""
     look: int
     """Looks of the episode before this one."""
 

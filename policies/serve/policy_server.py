@@ -270,7 +270,7 @@ class PolicyServer:
         return self._wait_for(_Job("look", owner, look.session, self._fitted(look), Future(), held))
 
     def read[T](self, size: int, read: Callable[[], T]) -> T:
-        """What a message holds, read in its turn; a small one is read at once.
+        """Content of a message, read in its turn; a small one is read at once.
 
         Args:
             size: Bytes of the message.

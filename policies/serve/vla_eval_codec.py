@@ -90,7 +90,7 @@ def pack_message(
 
 
 def unpack_message(data: bytes | str) -> VlaEvalMessage:
-    """What a frame holds; packed pictures in it are left packed.
+    """Content of a frame; packed pictures in it are left packed.
 
     Raises:
         WireError: It is none.

@@ -40,7 +40,7 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
 
 
 def is_local(name: str) -> bool:
-    """Whether an address or name is this machine's own and no other machine's."""
+    """An address or name is this machine's own and no other machine's."""
     try:
         return ipaddress.ip_address(name).is_loopback
     except ValueError:
@@ -48,7 +48,7 @@ def is_local(name: str) -> bool:
 
 
 def names_this_machine(hosts: Sequence[str]) -> bool:
-    """Whether a request was sent to this machine by its own name.
+    """A request was sent to this machine by its own name.
 
     A browser sends the name of the web site, also where that name has been made to point here.
 
