@@ -80,7 +80,7 @@ def test_arguments_and_exit_codes_pass(tmp_path, capsys):
     assert main(["scenes", "validate", str(tmp_path / "none.usda")]) == 2
     assert main(["trackers", "evaluate"]) == 2
     assert main(["trackers", "motions", "inspect", str(tmp_path / "none.npz")]) == 2
-    assert main(["train", "--worlds", "0", "--device", "cpu"]) == 2
+    assert main(["train", "--worlds", "-1", "--device", "cpu"]) == 2
 
 
 def test_what_is_no_command_is_named(capsys):

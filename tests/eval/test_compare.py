@@ -118,7 +118,7 @@ def test_text_of_strangers_stays_text(tmp_path):
     compared(tmp_path, a, run_in(tmp_path / "b", (10, 5, 12)))
     page = (tmp_path / "out" / "compare.html").read_text()
     assert "<script" not in page and "&lt;script&gt;x|y" in page and "secret" not in page
-    assert r"\<script\>x\|y" in (tmp_path / "out" / "compare.md").read_text()
+    assert r"&lt;script\>x\|y" in (tmp_path / "out" / "compare.md").read_text()
 
 
 def test_other_seeds_are_compared_unpaired(tmp_path):
@@ -276,7 +276,7 @@ def test_a_plan_says_what_it_can_tell(capsys):
     """`eval list` prints the smallest difference of the plan's episodes below their number."""
     assert main(["list", "--task", "boxing", "football"]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("120 episodes") and "60 episodes of a cell 13 to 26.5 points, all 120" in said[1]
+    assert said[0].startswith("120 episodes") and "60 episodes per cell: 13 to 26.5 points, all 120" in said[1]
     assert main(["list", "--task", "boxing", "--seeds", "0", "--repeats", "2001"]) == 0
     assert capsys.readouterr().out.splitlines()[1].startswith("    0 boxing")  # too many to compute: no empty line
 

@@ -254,7 +254,8 @@ def test_errors_are_told_with_reasons(tmp_path, capsys):
     said = ["policy: HTTP 500\x1b[31m busy", "policy: HTTP 500 busy", "no answer"]
 
     gym_id = tasks.get("football").gym_id
-    broken = {seeding.episode_seed(gym_id, seed, repeat): said[repeat] for seed in (0, 1) for repeat in range(3)}
+    seeds = {(seed, repeat): seeding.episode_seed(gym_id, seed, repeat) for seed in (0, 1) for repeat in range(3)}
+    broken = {seeding.policy_seed(seed): said[repeat] for (_, repeat), seed in seeds.items()}
 
     class Failing(FakePolicy):
         def act(self, observation):
@@ -294,7 +295,8 @@ def test_environments_stand_in_configuration_and_journal(uninterrupted):
         f"{t} twist2 {m}" for t in ("football", "boxing") for m in ("base", "execution")
     ]
     facts = {"engine": "mujoco", "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}
-    assert all(value == facts for value in document["environments"].values())
+    found = [dict(value) for value in document["environments"].values()]
+    assert all(value.pop("processor") for value in found) and all(value == facts for value in found)
     assert document["config"]["tracker_facts"] == {"twist2": {"name": "twist2", "drive": "none"}}
     facts = document["config"]["policy_facts"]
     assert facts.pop("code") and facts == {"name": "expert"}

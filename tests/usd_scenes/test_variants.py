@@ -116,7 +116,10 @@ CHANGES = {
     ),
     "collider": (
         over("double radius = 0.25", "Ball", "Collider"),
-        ["object: /World/Ball/Collider: radius is 0.25, not 0.11"],
+        [
+            "drawn: /World/Ball: is drawn 0.22 x 0.22 x 0.22 m large, its colliders are 0.50 x 0.50 x 0.50 m",
+            "object: /World/Ball/Collider: radius is 0.25, not 0.11",
+        ],
     ),
     "new": ('def Cube "Stool" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', ["object: /World/Stool is new"]),
     "look": (over("float focalLength = 20", "WorldCamera") + 'def Cube "Seen" {}', []),
