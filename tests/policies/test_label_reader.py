@@ -37,7 +37,8 @@ class Table(Policy):
     name = "table"
 
     def __init__(self, labels, lengths):
-        self.table, self.lengths = labels, lengths
+        self.table = {seeding.policy_seed(seed): rows for seed, rows in labels.items()}
+        self.lengths = lengths
 
     def reset(self, seeds, tasks, mask=None):
         if mask is None or len(mask) == len(seeds):

@@ -15,6 +15,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
 from arena_newton.rollout import Rollout
+from arena_newton.seeding import policy_seed
 from tests.eval.eval_fakes import factories
 
 SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "3", "--seeds", "0"]
@@ -188,7 +189,7 @@ def test_episode_after_an_error_is_asked_for_its_first_action(rules):
         def act(self, observation):
             actions = np.tile(STAND_ACTION, (len(observation.state), 4, 1))
             actions[:, :, 9:38] += 0.05 * np.sin(10.0 * observation.state.numpy()[:, None, 6:35])
-            asked = observation.mask & (np.array(self.seeds) == 3)
+            asked = observation.mask & (np.array(self.seeds) == policy_seed(3))
             return policies.Chunk(actions, dict.fromkeys(np.flatnonzero(asked).tolist(), "no answer"))
 
     ends = []
