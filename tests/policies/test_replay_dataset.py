@@ -109,11 +109,11 @@ def test_the_same_seed_through_two_trackers(played, standing, tmp_path):
     info["arena"]["episodes"][0]["tracker"] = "sonic"
     policy = policies.get(f"replay:{write_dataset(tmp_path / 'set', standing, info=info)}#all")
     policy.attach(env)
-    policy.reset([seed], [env.spec.gym_id])
+    policy.reset([seeding.policy_seed(seed)], [env.spec.gym_id])
     assert len(policy.playing[0]) == len(standing[1])
-    policy.reset([seed + 1], [env.spec.gym_id])
+    policy.reset([seed], [env.spec.gym_id])
     answer = policy.act(SimpleNamespace(state=np.zeros((1, 64)), mask=np.array([True])))
-    assert "no recording of" in answer.errors[0] and str(seed + 1) in answer.errors[0]
+    assert "no recording of" in answer.errors[0]
 
 
 UNFIT = {
