@@ -1,4 +1,4 @@
-"""How often comparisons err and how often they find a difference, on synthetic episodes whose truth is known.
+"""Rates at which comparisons err and at which they find a difference, on synthetic episodes whose truth is known.
 
 Also how often intervals over trainings hold the truth, on synthetic recipes whose trainings differ by known amounts.
 """

@@ -1,4 +1,4 @@
-"""What differs between two episodes of one expert: numbers drawn from the seed that a policy is given of it."""
+"""Differences between two episodes of one expert: numbers drawn from the seed that a policy is given of it."""
 
 from __future__ import annotations
 

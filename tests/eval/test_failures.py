@@ -320,17 +320,14 @@ def test_a_confusion_has_precision_and_recall():
     assert matrix.recall(FailureStage.TRACKING) is None and matrix.precision(FailureStage.TRACKING) is None
 
 
-WHOLE = SimpleNamespace(quick=False)
-"""Options of a whole certification."""
-
-
 def played(signals_of):
     """A context of the check whose episodes of a sabotage have the signals that a function says."""
 
     def evaluate(cell):
         return [judged(outcome, **changes) for outcome, changes in signals_of(cell.body)]
 
-    return SimpleNamespace(tasks=("boxing", "football"), sample=("twist2",), evaluate=evaluate, options=WHOLE)
+    whole = SimpleNamespace(quick=False)
+    return SimpleNamespace(tasks=("boxing", "football"), sample=("twist2",), evaluate=evaluate, options=whole)
 
 
 @pytest.fixture
@@ -389,7 +386,8 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
         return [judged(outcome, **changes) for outcome, changes in OF[cell.body] * 5]
 
     monkeypatch.setitem(INTERACTIONS, "push_bin", INTERACTIONS["boxing"])  # an entry, and nothing else
-    found = check(SimpleNamespace(tasks=tuple(INTERACTIONS), sample=("twist2",), evaluate=evaluate, options=WHOLE))
+    context = vars(played(None)) | {"tasks": tuple(INTERACTIONS), "evaluate": evaluate}
+    found = check(SimpleNamespace(**context))
     scripted = [(task, name) for task in INTERACTIONS for name, one in SABOTAGES.items() if task not in one.without]
     assert [(cell.task, cell.body) for cell in cells] == scripted
     assert f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none" in " ".join(
