@@ -1,6 +1,8 @@
 """Runs of `eval` with servers of other protocols: one that dies stops the run, `resume` ends it with the same bytes."""
 
 import json
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +11,6 @@ from foreign_servers import Gr00tServer, SocketServer, facts
 
 from arena_newton import policies
 from arena_newton.eval.__main__ import main
-from arena_newton.interfaces import Verdict
 from tests.eval.eval_fakes import FakeEnv, factories
 
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
@@ -17,7 +18,7 @@ SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "4", "--seeds"
 
 
 class FollowingEnv(FakeEnv):
-    """Worlds that show their seed, and whose margin at the end is made of every action that they executed."""
+    """Worlds that show their seed, and whose margin is made of every action that they executed."""
 
     def __init__(self, task, **options):
         super().__init__(task, **options)
@@ -38,7 +39,8 @@ class FollowingEnv(FakeEnv):
         return super().step(action, worlds)
 
     def verdict(self, world):
-        return Verdict(margin=float(self.body[world]))
+        verdict = super().verdict(world)
+        return replace(verdict, margin=math.copysign(1.0 + float(self.body[world]), verdict.margin))
 
 
 def parts():
