@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from arena_newton import canonical, differentiable, policies, rule_sets, rules, tasks, trackers
+    from arena_newton import differentiable, policies, rule_sets, tasks, trackers
     from arena_newton.env import ArenaEnv
     from arena_newton.pictures.camera import Camera
     from arena_newton.pictures.recorder import EpisodeRecorder
@@ -24,10 +24,10 @@ __all__ = [
     "EpisodeRecorder",
     "Rollout",
     "__version__",
-    "canonical",
     "differentiable",
     "policies",
     "rule_sets",
+    "robot",
     "rules",
     "tasks",
     "trackers",

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton import __version__
-from arena_newton.command_line import exit_code
+from arena_newton.cli.command_line import exit_code
 from arena_newton.errors import InputError
 
 __all__ = ["COMMANDS", "Command", "main"]

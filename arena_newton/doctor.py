@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from arena_newton.command_line import exit_code
-from arena_newton.extras import EXTRAS
-from arena_newton.probe import faults
+from arena_newton.cli.command_line import exit_code
+from arena_newton.cli.extras import EXTRAS
+from arena_newton.files.probe import faults
 
 __all__ = ["Finding", "examine", "examine_extras", "main", "versions"]
 
@@ -152,7 +152,7 @@ def _devices() -> list[Finding]:
     try:
         import warp as wp
 
-        from arena_newton.quiet import quiet_warp
+        from arena_newton.cli.quiet import quiet_warp
 
         quiet_warp()
         devices = wp.get_cuda_devices()

@@ -15,28 +15,29 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton import robot as g1
 from arena_newton import rule_sets, tasks
-from arena_newton.canonical import STAND_ACTION, STATE_WIDTH
-from arena_newton.devices import resolve_engine
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeEvent, Observation, Spawn, Verdict
-from arena_newton.kernel_loading import loading
-from arena_newton.kernels import canonical, fall, reset
+from arena_newton.kernel_cache.kernel_loading import loading
+from arena_newton.kernels import canonical, reset
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
-from arena_newton.physics import make_physics
+from arena_newton.kernels.rules import fall
+from arena_newton.physics.devices import resolve_engine
+from arena_newton.physics.engines import make_physics
+from arena_newton.physics.scene import load_scene
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.scene import load_scene
+from arena_newton.robot import g1
+from arena_newton.robot.canonical import STAND_ACTION, STATE_WIDTH
 from arena_newton.tracking import TrackerLoop, WorldMask
 
 if TYPE_CHECKING:
     import newton
 
     from arena_newton.interfaces import Tracker
-    from arena_newton.robot import DriveGains
-    from arena_newton.rules import RuleSet
+    from arena_newton.robot.g1 import DriveGains
+    from arena_newton.rules.rule_types import RuleSet
     from arena_newton.tasks.base import Draws, Sample
 
 __all__ = ["STAND_ACTION", "ArenaEnv"]

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     import torch
     import warp as wp
 
+    from arena_newton.physics.scene import Scene
     from arena_newton.pictures.camera import Camera, WorldLights
     from arena_newton.pictures.settings import CameraConfig
-    from arena_newton.robot import DriveGains, PhysicsRate
-    from arena_newton.scene import Scene
+    from arena_newton.robot.g1 import DriveGains, PhysicsRate
     from arena_newton.tasks.base import TaskSpec
     from arena_newton.tracking import TrackerLoop
 
@@ -237,7 +237,7 @@ class Policy(Protocol):
 
 
 class Physics(Protocol):
-    """A batch of worlds that moves (`arena_newton.physics`): Warp arrays in MuJoCo's layout, one row per world."""
+    """A batch of worlds that moves (`arena_newton.physics.engines`): Warp arrays in MuJoCo's layout, a row a world."""
 
     engine: str
     worlds: int

@@ -13,9 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from arena_newton import seeding
-from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
+from arena_newton.files.text import counted
 from arena_newton.interfaces import (
     Chunk,
     Disturbance,
@@ -28,9 +27,10 @@ from arena_newton.interfaces import (
     World,
 )
 from arena_newton.kernels import tick as codes
-from arena_newton.policy_view import PolicyView
-from arena_newton.robot import TICK
-from arena_newton.text import counted
+from arena_newton.physics.policy_view import PolicyView
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
+from arena_newton.robot.g1 import TICK
+from arena_newton.rules import seeding
 
 __all__ = ["Rollout", "ending"]
 

@@ -1,7 +1,7 @@
 """The rule sets `paper` and `released`: assembled from the tasks, printed, hashed.
 
 `paper` is what the benchmark's paper says, made precise where it is silent; `released` is what its released code does.
-The numbers that belong to one task are in that task's file, the common ones in `arena_newton.rules`.
+The numbers that belong to one task are in that task's file, the common ones in `arena_newton.rules.rule_types`.
 """
 
 import dataclasses
@@ -9,8 +9,18 @@ import functools
 import sys
 
 from arena_newton import tasks
-from arena_newton.robot import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
-from arena_newton.rules import ByRules, CylinderRange, FallRule, PoseRange, Range, RuleSet, StartupRule, check_name, num
+from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+from arena_newton.rules.rule_types import (
+    ByRules,
+    CylinderRange,
+    FallRule,
+    PoseRange,
+    Range,
+    RuleSet,
+    StartupRule,
+    check_name,
+    num,
+)
 
 __all__ = ["get", "markdown", "names", "table", "text"]
 

@@ -19,17 +19,17 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton import robot as g1
-from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels import canonical
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
+from arena_newton.robot import g1
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 
 if TYPE_CHECKING:
-    from arena_newton.handles import RobotHandles
     from arena_newton.interfaces import Physics, Tracker
+    from arena_newton.tasks.handles import RobotHandles
 
 __all__ = ["TrackerLoop", "WorldMask"]
 

@@ -14,10 +14,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.flags import folders_named, parse_flags, user_path
 from arena_newton.errors import InputError
-from arena_newton.eval.door_options import DoorOptions
-from arena_newton.eval.options import (
+from arena_newton.eval.adapters.door_options import DoorOptions
+from arena_newton.eval.commands.pack_options import PackOptions
+from arena_newton.eval.plan.options import (
     BenchOptions,
     CertifyOptions,
     EngineOptions,
@@ -28,13 +30,11 @@ from arena_newton.eval.options import (
     RunMergeOptions,
     RunOptions,
 )
-from arena_newton.eval.pack_options import PackOptions
-from arena_newton.eval.placement_options import AdversaryOptions, SensitivityOptions
-from arena_newton.eval.suite_options import MatrixOptions
-from arena_newton.flags import folders_named, parse_flags, user_path
+from arena_newton.eval.plan.suite_options import MatrixOptions
+from arena_newton.eval.studies.placement_options import AdversaryOptions, SensitivityOptions
 
 if TYPE_CHECKING:
-    from arena_newton.eval.run import Factories
+    from arena_newton.eval.play.run import Factories
 
 __all__ = ["main"]
 
@@ -117,9 +117,9 @@ def _run(arguments: list[str], factories: Factories | None) -> int:
 def _execute(options: RunOptions, factories: Factories | None) -> int:
     """Run; what is wrong with flags or folder is found before the libraries of physics load, which takes seconds."""
     from arena_newton.doctor import versions
-    from arena_newton.eval.config import resolve
-    from arena_newton.eval.folder import ResultsFolder, results_folder
-    from arena_newton.eval.learned_row import row_options
+    from arena_newton.eval.folders.run_folder import ResultsFolder, results_folder
+    from arena_newton.eval.plan.config import resolve
+    from arena_newton.eval.reports.learned_row import row_options
 
     config = resolve(options)
     folder = ResultsFolder(results_folder(options.out, config.shard), config, versions())
@@ -131,10 +131,10 @@ def _execute(options: RunOptions, factories: Factories | None) -> int:
         beside.check()
     if config.flags.ray is not None:
         _before_ray()
-        from arena_newton.eval import ray_run
+        from arena_newton.eval.workers import ray_run
 
         return ray_run.execute(folder, factories, beside)
-    from arena_newton.eval.run import execute
+    from arena_newton.eval.play.run import execute
 
     return execute(folder, factories, beside)
 
@@ -147,10 +147,10 @@ def _before_ray() -> None:
 def _record(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(RecordOptions, arguments, f"{PROG} record")
     if options.source is not None:
-        from arena_newton.eval import rerecord
+        from arena_newton.eval.play import rerecord
 
         return rerecord.run(options, factories)
-    from arena_newton.eval.config import recording_run
+    from arena_newton.eval.plan.config import recording_run
 
     return _execute(recording_run(options), factories)
 
@@ -160,7 +160,7 @@ def _resume(arguments: list[str], factories: Factories | None) -> int:
         print(f"usage: {PROG} resume <out> [flags]; flags that change the results are refused\n")
         parse_flags(RunOptions, ["--help"], f"{PROG} resume <out>")
     folder = _folder(arguments, "resume")
-    from arena_newton.eval.folder import stored_options
+    from arena_newton.eval.folders.run_folder import stored_options
 
     stored = stored_options(folder)
     options = parse_flags(RunOptions, arguments, f"{PROG} resume", default=stored)
@@ -176,20 +176,21 @@ def _report(arguments: list[str], factories: Factories | None) -> int:
         parse_flags(ReportOptions, ["--help"], f"{PROG} report <out> [<out> ...]")
     folders = _folders(arguments, "report")
     options = parse_flags(ReportOptions, arguments, f"{PROG} report")
-    from arena_newton.eval import report, tables
-    from arena_newton.eval.learned_row import row_results
-    from arena_newton.eval.results import load_run
+    from arena_newton.eval.folders.results import load_run
+    from arena_newton.eval.reports import report
+    from arena_newton.eval.reports.learned_row import row_results
+    from arena_newton.eval.tables import run_table
 
     if options.table or len(folders) > 1:
         if options.json:
             raise InputError("--json: is of one folder, without --table")
         if options.own_tracker is not None:
             raise InputError("--own-tracker: is of one folder, without --table")
-        print(tables.joint_table([load_run(folder) for folder in folders]), end="")
+        print(run_table.joint_table([load_run(folder) for folder in folders]), end="")
         return 0
     (folder,) = folders
     if options.own_tracker is not None:
-        from arena_newton.eval.own_tracker import own_options
+        from arena_newton.eval.play.own_tracker import own_options
 
         failed = _execute(own_options(folder, options.own_tracker), factories)
         if failed:
@@ -213,7 +214,7 @@ def _merge(arguments: list[str], factories: Factories | None) -> int:
         arguments, "merge", PROG, noun="the folders of the shards", shown="<out> <out>... --out <new>"
     )
     options = parse_flags(RunMergeOptions, arguments, f"{PROG} merge")
-    from arena_newton.eval import shard_merge
+    from arena_newton.eval.workers import shard_merge
 
     return shard_merge.run(folders, options)
 
@@ -223,8 +224,8 @@ def _film(arguments: list[str], factories: Factories | None) -> int:
         parse_flags(FilmOptions, ["--help"], f"{PROG} film <out> [<out> ...]")
     folders = _folders(arguments, "film")
     options = parse_flags(FilmOptions, arguments, f"{PROG} film")
-    from arena_newton.eval import success_film
-    from arena_newton.eval.results import load_run
+    from arena_newton.eval.folders.results import load_run
+    from arena_newton.eval.reports import success_film
 
     for line in success_film.write([load_run(folder) for folder in folders], options):
         print(line)
@@ -236,16 +237,16 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
     if _wants_help(arguments):
         print(f"usage: {PROG} list [flags of run] [--json]; --json prints an array with one object per episode\n")
     options = parse_flags(RunOptions, [a for a in arguments if a != "--json"], f"{PROG} list")
-    from arena_newton.eval.config import resolve
-    from arena_newton.eval.detectable import detectable_text
-    from arena_newton.eval.progress import simulated
-    from arena_newton.text import counted
+    from arena_newton.eval.plan.config import resolve
+    from arena_newton.eval.reports.progress import simulated
+    from arena_newton.eval.statistics.detectable import detectable_text
+    from arena_newton.files.text import counted
 
     episodes = resolve(options).episodes
     if as_json:
-        from arena_newton.eval import plan
+        from arena_newton.eval.plan import episode_plan
 
-        rows = [json.dumps(plan.listed(episode), allow_nan=False) for episode in episodes]
+        rows = [json.dumps(episode_plan.listed(episode), allow_nan=False) for episode in episodes]
         print("[\n" + ",\n".join(rows) + "\n]")
         return 0
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
@@ -262,10 +263,10 @@ def _list(arguments: list[str], factories: Factories | None) -> int:
 
 def _loop(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(LoopOptions, arguments, f"{PROG} loop")
-    from arena_newton.eval.loop_requirements import check_libraries
+    from arena_newton.eval.loop.loop_requirements import check_libraries
 
     check_libraries(options.policy)  # before the libraries are loaded
-    from arena_newton.eval import learning_loop
+    from arena_newton.eval.loop import learning_loop
 
     return learning_loop.run(options, factories)
 
@@ -277,7 +278,7 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
         raise InputError(f"matrix: name the suite file: {PROG} matrix <suite.toml>")
     given = arguments.pop(0)
     options = parse_flags(MatrixOptions, arguments, f"{PROG} matrix")
-    from arena_newton.eval.suite_call import plan_call
+    from arena_newton.eval.suites.suite_call import plan_call
 
     call = plan_call(given, options)
     if options.dry_run:
@@ -288,59 +289,59 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
     if options.ray is not None:
         _before_ray()
     if options.estimate is not None:
-        from arena_newton.eval import suite_timing
+        from arena_newton.eval.bench import suite_timing
 
         return suite_timing.run(call, factories)
     if options.ray is not None:
-        from arena_newton.eval import ray_suite
+        from arena_newton.eval.suites import ray_suite
 
         return ray_suite.run(call, factories)
-    from arena_newton.eval import suite_run
+    from arena_newton.eval.suites import suite_run
 
     return suite_run.run(call, factories)
 
 
 def _sensitivity(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(SensitivityOptions, arguments, f"{PROG} sensitivity")
-    from arena_newton.extras import require
+    from arena_newton.cli.extras import require
 
     require("plots", "eval sensitivity", ("matplotlib",))
-    from arena_newton.eval import sensitivity
+    from arena_newton.eval.studies import sensitivity
 
     return sensitivity.run(options, factories)
 
 
 def _adversary(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(AdversaryOptions, arguments, f"{PROG} adversary")
-    from arena_newton.eval import adversary
+    from arena_newton.eval.studies import adversary
 
     return adversary.run(options, factories)
 
 
 def _bench(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
-    from arena_newton.eval import bench
+    from arena_newton.eval.bench import bench
 
     return bench.run(options)
 
 
 def _engines(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(EngineOptions, arguments, f"{PROG} engines")
-    from arena_newton.eval import engines
+    from arena_newton.eval.studies import engines
 
     return engines.run(options)
 
 
 def _doors(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(DoorOptions, arguments, f"{PROG} doors")
-    from arena_newton.eval import door_comparison
+    from arena_newton.eval.adapters import door_comparison
 
     return door_comparison.run(options)
 
 
 def _certify(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(CertifyOptions, arguments, f"{PROG} certify")
-    from arena_newton.eval import certify
+    from arena_newton.eval.commands import certify
 
     if options.quick and options.jobs == 1 and factories is None:
         options = dataclasses.replace(options, jobs=min(certify.QUICK_JOBS, len(os.sched_getaffinity(0))))
@@ -348,38 +349,38 @@ def _certify(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _tables(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.table_options import TablesOptions
+    from arena_newton.eval.commands.table_options import TablesOptions
 
     if _wants_help(arguments):
         parse_flags(TablesOptions, ["--help"], f"{PROG} tables <out> [<out> ...]")
     folders = _folders(arguments, "tables")
     options = parse_flags(TablesOptions, arguments, f"{PROG} tables")
-    from arena_newton.eval import tables_command
+    from arena_newton.eval.commands import tables_command
 
     return tables_command.run(folders, options)
 
 
 def _compare(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.table_options import CompareOptions
+    from arena_newton.eval.commands.table_options import CompareOptions
 
     if _wants_help(arguments):
         parse_flags(CompareOptions, ["--help"], f"{PROG} compare <out> [<out> ...]")
     folders = _folders(arguments, "compare")
     options = parse_flags(CompareOptions, arguments, f"{PROG} compare")
-    from arena_newton.eval import compare_command
+    from arena_newton.eval.commands import compare_command
 
     return compare_command.run(folders, options)
 
 
 def _tsne(arguments: list[str], factories: Factories | None) -> int:
-    from arena_newton.eval.table_options import TsneOptions
+    from arena_newton.eval.commands.table_options import TsneOptions
 
     options = parse_flags(TsneOptions, arguments, f"{PROG} tsne")
-    from arena_newton.extras import require
+    from arena_newton.cli.extras import require
 
     require("plots", "eval tsne")
     require("data", "eval tsne", ("pyarrow",))
-    from arena_newton.eval import tsne_command
+    from arena_newton.eval.commands import tsne_command
 
     return tsne_command.run(options)
 
@@ -391,7 +392,7 @@ def _pack(arguments: list[str], factories: Factories | None) -> int:
         raise InputError(f"pack: name the checkpoint, or the folder of a training: {PROG} pack <checkpoint>")
     given = user_path(arguments.pop(0))
     options = parse_flags(PackOptions, arguments, f"{PROG} pack")
-    from arena_newton.eval import pack_command
+    from arena_newton.eval.commands import pack_command
 
     return pack_command.run(given, options)
 

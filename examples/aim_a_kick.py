@@ -11,8 +11,8 @@ import argparse
 import torch
 
 from arena_newton import ArenaEnv, differentiable, trackers
-from arena_newton.kernels import success
-from arena_newton.physics_mujoco import MujocoPhysics
+from arena_newton.kernels.rules import success
+from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.tasks.football import BALL, FootballJudge
 
 

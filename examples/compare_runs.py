@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 
 from arena_newton.eval.__main__ import main as evaluate
-from arena_newton.eval.results import load_run
+from arena_newton.eval.folders.results import load_run
 
 
 def won(folder: Path) -> dict[tuple[str, str, int, int], bool]:

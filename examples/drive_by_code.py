@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Sequence
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
-from arena_newton.eval.plan import expand
+from arena_newton.eval.plan.episode_plan import expand
 from arena_newton.policies.base import Mask
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator

@@ -8,7 +8,7 @@ Shows: the environment, a tracker, a policy, a plan, a rollout, a recorder, and 
 import argparse
 
 from arena_newton import ArenaEnv, EpisodeRecorder, Rollout, policies, trackers
-from arena_newton.eval.plan import expand
+from arena_newton.eval.plan.episode_plan import expand
 
 
 def main() -> None:

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.eval.plan import expand
+from arena_newton.eval.plan.episode_plan import expand
 from arena_newton.policies.base import Mask
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.testing import check_policy
 
 

@@ -10,7 +10,7 @@ import argparse
 import torch
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
-from arena_newton.eval.plan import expand
+from arena_newton.eval.plan.episode_plan import expand
 from arena_newton.testing import check_tracker
 from arena_newton.trackers import RobotState, TrackerCommand
 

@@ -10,9 +10,10 @@ import argparse
 
 import torch
 
-from arena_newton import ArenaEnv, Rollout, canonical, differentiable, policies, trackers
-from arena_newton.eval.plan import expand
-from arena_newton.kernels import success
+from arena_newton import ArenaEnv, Rollout, differentiable, policies, trackers
+from arena_newton.eval.plan.episode_plan import expand
+from arena_newton.kernels.rules import success
+from arena_newton.robot import canonical
 from arena_newton.trackers.motions import kinematics
 
 WRISTS, JOINTS = ("left_wrist_yaw_link", "right_wrist_yaw_link"), canonical.ACTION["joint_pos"]

@@ -9,7 +9,7 @@ loses when the tracker is swapped is the price of the interface. Open loop, with
 import argparse
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
-from arena_newton.eval.plan import expand
+from arena_newton.eval.plan.episode_plan import expand
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 from arena_newton import ArenaEnv, Rollout, policies, trackers
-from arena_newton.eval.plan import expand
+from arena_newton.eval.plan.episode_plan import expand
 from arena_newton.usd_scenes import preview, validate
 
 LAYER = """#usda 1.0

@@ -105,8 +105,8 @@ class ReferencePose:
         Args:
             worlds: Number of worlds.
             device: Warp device.
-            canonical_to_mujoco: MuJoCo index of each of the 29 canonical joints (`robot.CANONICAL_TO_MUJOCO`).
-            tick: Control period [s] (`robot.TICK`).
+            canonical_to_mujoco: MuJoCo index of each of the 29 canonical joints (`g1.CANONICAL_TO_MUJOCO`).
+            tick: Control period [s] (`g1.TICK`).
             requires_grad: whether a `wp.Tape` differentiates through the arrays.
         """
 

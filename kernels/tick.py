@@ -169,7 +169,7 @@ class EpisodeLog:
     tick: wp.array
     """Ticks since step 0, negative in the start-up, shape [worlds]."""
     fall_trigger: wp.array
-    """Trigger of the first fall (`kernels.fall`), 0 before one, shape [worlds]."""
+    """Trigger of the first fall (`kernels.rules.fall`), 0 before one, shape [worlds]."""
     fall_tick: wp.array
     """Its tick, shape [worlds]."""
     event: wp.array

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arena_newton.cli.registry import Registry
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.interfaces import Chunk, Observation
-from arena_newton.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,7 +69,7 @@ class Policy:
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
     labels: str | None = None
-    """Protocol of its actions (`data.label_protocols`), where they are of one always; None: as `--labels` says."""
+    """Protocol of its actions (`data.readers.label_protocols`), if always the same; None: as `--labels` says."""
     realign: float = 0.0
     """Fraction of the gap between commanded and measured heading that is closed each tick, by who decodes v4."""
     chunk_size: int = 1
@@ -101,7 +101,7 @@ class Policy:
         """
 
     def attach(self, env: World) -> None:
-        """Take a view of the worlds of the next episodes, to read (`arena_newton.policy_view`).
+        """Take a view of the worlds of the next episodes, to read (`arena_newton.physics.policy_view`).
 
         A policy that overrides this is privileged, and marked so in every result.
 
@@ -135,7 +135,7 @@ POLICIES: Registry[Policy] = Registry(
         "expert": "arena_newton.policies.experts:from_spec",
         "learned": "arena_newton.policies.learned.learned_policy:from_spec",
         "lerobot": "arena_newton.policies.lerobot.checkpoint_policy:from_spec",
-        "remote": "arena_newton.policies.remote:from_spec",
+        "remote": "arena_newton.policies.remote.arena_client:from_spec",
         "replay": "arena_newton.policies.replay:from_spec",
         "stand": "arena_newton.policies.stand:from_spec",
     },

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH, STATE
-from arena_newton.data.label_protocols import LABELS, V4Decoder, protocol
+from arena_newton.data.readers.label_protocols import LABELS, V4Decoder, protocol
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
-from arena_newton.rotations import atan2
+from arena_newton.robot.canonical import ACTION_WIDTH, STATE
+from arena_newton.robot.rotations import atan2
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World

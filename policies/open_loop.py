@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arena_newton.canonical import ACTION, ACTION_WIDTH
 from arena_newton.policies.base import Chunk, Mask, Observation, Policy, world_mask
+from arena_newton.robot.canonical import ACTION, ACTION_WIDTH
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from arena_newton import tasks
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
 from arena_newton.errors import InputError
 
 __all__ = ["main"]
@@ -40,10 +40,10 @@ def _check(argv: Sequence[str]) -> int:
     if args.seeds is not None and (len(args.seeds) < 2 or len(set(args.seeds)) < len(args.seeds)):
         raise InputError(f"--seeds {' '.join(map(str, args.seeds))}: masks need at least 2 different ones")
 
+    from arena_newton.cli.quiet import quiet_warp
     from arena_newton.env import ArenaEnv
     from arena_newton.pictures.settings import CameraConfig
     from arena_newton.policies.base import get, is_privileged
-    from arena_newton.quiet import quiet_warp
     from arena_newton.testing import check_policy
     from arena_newton.testing.findings import table
     from arena_newton.testing.policy_conformance import SEEDS

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arena_newton import seeding
 from arena_newton import tasks as task_registry
-from arena_newton.data.dataset_files import PARQUET_BYTES
-from arena_newton.data.lerobot_reader import DatasetActions
+from arena_newton.data.readers.dataset_files import PARQUET_BYTES
+from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.errors import InputError
-from arena_newton.foreign import read_bytes
+from arena_newton.files.foreign import read_bytes
 from arena_newton.policies.base import Json, Mask
 from arena_newton.policies.open_loop import RecordedEpisodes
+from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
@@ -38,7 +38,7 @@ class ReplayDataset(RecordedEpisodes):
             episode: Number of the episode that every world plays, or `all`: to each its own, by task, mode and seed.
 
         Raises:
-            InputError: The dataset or the episode is unfit; see `data.lerobot_reader`.
+            InputError: The dataset or the episode is unfit; see `data.readers.lerobot_reader`.
         """
         super().__init__()
         self.where = f"--policy replay:{root}"

@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from arena_newton.canonical import STAND_ACTION
+from arena_newton.robot.canonical import STAND_ACTION
 
 
 def act(image: np.ndarray, state: np.ndarray, instruction: str, rng: np.random.Generator) -> np.ndarray:

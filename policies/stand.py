@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Observation, Policy
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 
 __all__ = ["StandPolicy", "from_spec"]
 

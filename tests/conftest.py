@@ -45,7 +45,7 @@ def small_heap():
 def football_native():
     """Football on native MuJoCo, three worlds."""
     from arena_newton import rule_sets
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
 
     return load_scene("football", worlds=3, device="cpu", native=True, rules=rule_sets.get("paper"))
 
@@ -54,7 +54,7 @@ def football_native():
 def football_warp():
     """Football on the Warp CPU backend, two worlds."""
     from arena_newton import rule_sets
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
 
     return load_scene("football", worlds=2, device="cpu", rules=rule_sets.get("paper"))
 

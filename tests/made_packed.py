@@ -6,9 +6,9 @@ import torch
 from safetensors.torch import save_file
 
 from arena_newton.policies.learned.act_network import ActNetwork, ActSizes
-from arena_newton.policies.learned.checkpoint_packing import pack
 from arena_newton.policies.learned.learned_card import PolicyCard
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.policies.train.checkpoint_packing import pack
 
 WIDTH = 16
 CHUNK = 5

@@ -22,11 +22,11 @@ import numpy as np
 import torch
 import tyro
 
-from arena_newton import robot as g1
 from arena_newton import rule_sets, trackers
-from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
+from arena_newton.robot import g1
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
 from arena_newton.trackers.evaluation.meter import FEET
 from arena_newton.trackers.evaluation.suite import Cell, clip_cells, tabulate

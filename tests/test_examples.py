@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton.extras import EXTRAS
+from arena_newton.cli.extras import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))

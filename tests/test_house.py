@@ -32,13 +32,13 @@ STARTS += ("trackers.train.__main__", "trackers.motions.__main__", "usd_scenes._
 STARTS += ("policies.train.__main__",)
 STARTS += ("trackers.tracker_check", "policies.policy_check", "policies.teleop.__main__", "policies.serve.__main__")
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
-PLANNING = ("eval.config", "eval.folder", *(f"tasks.{name}" for name in tasks.names()))
+PLANNING = ("eval.plan.config", "eval.folders.run_folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are
 imported by name."""
 LATE = {
     "arena_newton.doctor": "it reports libraries that do not import",
-    "arena_newton.probe": "its other process imports only the library that it tries",
-    "arena_newton.quiet": "light modules call it before they import Warp",
+    "arena_newton.files.probe": "its other process imports only the library that it tries",
+    "arena_newton.cli.quiet": "light modules call it before they import Warp",
 }
 """Other modules that import heavy libraries inside functions, and why."""
 OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
@@ -46,12 +46,12 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 MOST_ANY = 35
 ANY = {
     "arena_newton/differentiable/kernel_gradients.py": "a context of autograd keeps whatever it is given",
-    "arena_newton/foreign.py": "NumPy's dtypes",
+    "arena_newton/files/foreign.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
-    "arena_newton/policy_view.py": "a view has the attributes of what it shows",
-    "arena_newton/registry.py": "what a maker takes is its own business",
+    "arena_newton/physics/policy_view.py": "a view has the attributes of what it shows",
+    "arena_newton/cli/registry.py": "what a maker takes is its own business",
     "policies/base.py": "what a maker takes is its own business, and JSON",
-    "policies/remote.py": "options of the command line and JSON",
+    "policies/remote/arena_client.py": "options of the command line and JSON",
 }
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
 MOST_LINES = 600

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from arena_newton import robot as g1
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.errors import InputError
+from arena_newton.robot import g1
+from arena_newton.robot.canonical import STAND_ACTION
 from tests import oracle
 
 CLIPS = ("0807_yanjie_walk_002", "0807_yanjie_walk_003")

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arena_newton.cli.registry import Registry
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.registry import Registry
-from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE, DriveGains, PhysicsRate
+from arena_newton.robot.g1 import MUJOCO_JOINTS, TWIST2_DRIVE, DriveGains, PhysicsRate
 from arena_newton.trackers import interface
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
-from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
     from arena_newton.trackers.base import Tracker
@@ -150,7 +150,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     for entry in args.trackers:
         entry.make()  # refuses unfit files before anything is built
 
-    from arena_newton.physics import resolve_engine
+    from arena_newton.physics.engines import resolve_engine
     from arena_newton.trackers.evaluation import chart, tracker_report
     from arena_newton.trackers.evaluation.figures import Result
     from arena_newton.trackers.evaluation.inference_times import inference

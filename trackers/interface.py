@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from arena_newton.errors import InputError
-from arena_newton.robot import MUJOCO_JOINTS, DriveGains, PhysicsRate
+from arena_newton.robot.g1 import MUJOCO_JOINTS, DriveGains, PhysicsRate
 
 if TYPE_CHECKING:
     from arena_newton.trackers.front_end import FrontEnd

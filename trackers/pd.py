@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.robot import TWIST2_DRIVE
+from arena_newton.robot.g1 import TWIST2_DRIVE
 from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from torch import nn
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.robot import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, SONIC_DRIVE, PhysicsRate
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, SONIC_DRIVE, PhysicsRate
 from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, PartialNetwork, TrackerNetwork, folded, mlp, shrink_last

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
 from arena_newton.errors import InputError
 
 __all__ = ["main"]
@@ -38,8 +38,8 @@ def _check(argv: Sequence[str]) -> int:
     if args.worlds < 2:
         raise InputError(f"--worlds {args.worlds}: masks need at least 2")
 
-    from arena_newton.devices import resolve_engine
-    from arena_newton.quiet import quiet_warp
+    from arena_newton.cli.quiet import quiet_warp
+    from arena_newton.physics.devices import resolve_engine
     from arena_newton.testing import check_tracker
     from arena_newton.testing.findings import table
     from arena_newton.trackers.base import get

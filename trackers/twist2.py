@@ -17,8 +17,8 @@ from torch import nn
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
-from arena_newton.rotations import atan2
+from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
+from arena_newton.robot.rotations import atan2
 from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, folded, mlp, shrink_last

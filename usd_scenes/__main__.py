@@ -9,9 +9,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from arena_newton.command_line import exit_code
+from arena_newton.cli.command_line import exit_code
+from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
-from arena_newton.quiet import quiet_warp
 
 MODES = ("base", "semantic", "visual", "all")
 

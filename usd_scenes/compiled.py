@@ -17,10 +17,10 @@ import numpy as np
 from pxr import Usd, UsdPhysics
 
 from arena_newton import tasks
-from arena_newton.quiet import quiet_warp
+from arena_newton.cli.quiet import quiet_warp
 
 if TYPE_CHECKING:
-    from arena_newton.scene import Scene
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["Compiled", "Reported", "compiled", "compiled_changes", "lost_contacts", "own_compiled", "release"]
 
@@ -133,7 +133,7 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
     Raises:
         InputError: The scene cannot be built.
     """
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
 
     quiet_warp()
     # The importer repeats its remarks when the scene is built to be run.

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from arena_newton import limits
+from arena_newton.files import limits
 
 __all__ = ["Arc", "Contents", "count_prims"]
 

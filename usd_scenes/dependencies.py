@@ -20,8 +20,8 @@ from PIL import Image
 from pxr import Ar, Gf, Sdf, Tf
 
 import arena_newton
-from arena_newton import limits, probe
 from arena_newton.errors import InputError
+from arena_newton.files import limits, probe
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
 __all__ = ["LAYERS", "PACKAGE", "Dependencies", "Problem", "check_files", "collect", "layers", "probe_layers", "reason"]

@@ -9,11 +9,11 @@ import newton
 import numpy as np
 from PIL import Image, ImageDraw
 
-from arena_newton import robot as g1
 from arena_newton.errors import InputError
+from arena_newton.physics.scene import Scene, load_scene, scene_path
 from arena_newton.pictures.camera import Camera, WorldLights
-from arena_newton.rules import LightRange
-from arena_newton.scene import Scene, load_scene, scene_path
+from arena_newton.robot import g1
+from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import draw_light
 from arena_newton.usd_scenes.shapes import open_stage
 

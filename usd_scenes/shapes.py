@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdLux, UsdPhysics
 
-from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.files import limits
 from arena_newton.usd_scenes.dependencies import check_files, reason, search_context
 
 __all__ = ["check_buildable", "mesh_faults", "open_stage", "shape_faults", "type_faults"]

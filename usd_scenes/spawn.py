@@ -6,10 +6,11 @@ from pathlib import Path
 
 import mujoco
 
-from arena_newton import limits, rule_sets, tasks
-from arena_newton import robot as g1
-from arena_newton.rules import MODES
-from arena_newton.scene import Scene, load_scene, scene_path
+from arena_newton import rule_sets, tasks
+from arena_newton.files import limits
+from arena_newton.physics.scene import Scene, load_scene, scene_path
+from arena_newton.robot import g1
+from arena_newton.rules.rule_types import MODES
 from arena_newton.tasks import Draws, TaskSpec
 from arena_newton.usd_scenes.dependencies import Problem
 

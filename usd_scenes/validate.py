@@ -10,8 +10,9 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdUtils
 
-from arena_newton import limits, tasks
+from arena_newton import tasks
 from arena_newton.errors import InputError
+from arena_newton.files import limits
 from arena_newton.tasks import Required
 from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
 from arena_newton.usd_scenes.dependencies import (

@@ -8,10 +8,10 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from arena_newton.extras import require
+from arena_newton.cli.extras import require
 
 if TYPE_CHECKING:
-    from arena_newton.data.frame_reader import Frames
+    from arena_newton.data.readers.frame_reader import Frames
 
 __all__ = ["Frames"]
 
@@ -21,4 +21,4 @@ def __getattr__(name: str) -> object:
     if name != "Frames":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require("data", "data.Frames", ("pyarrow",))
-    return importlib.import_module("arena_newton.data.frame_reader").Frames
+    return importlib.import_module("arena_newton.data.readers.frame_reader").Frames

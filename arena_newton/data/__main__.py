@@ -7,8 +7,10 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from arena_newton.command_line import exit_code, program
-from arena_newton.data.data_options import (
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.extras import require
+from arena_newton.cli.flags import folders_named, parse_flags
+from arena_newton.data.datasets.data_options import (
     BuildOptions,
     CleanOptions,
     DatasetBenchOptions,
@@ -19,8 +21,6 @@ from arena_newton.data.data_options import (
     VerifyOptions,
 )
 from arena_newton.errors import InputError
-from arena_newton.extras import require
-from arena_newton.flags import folders_named, parse_flags
 
 __all__ = ["COMMANDS", "DataCommand", "main"]
 
@@ -37,7 +37,7 @@ class DataCommand:
     options: type
     """Dataclass of its flags."""
     work: str
-    """`module:function` in this room; takes the folders and the flags, returns an exit code."""
+    """`room.module:function`; takes the folders and the flags, returns an exit code."""
     extra: str | None = None
     """Extra that it needs."""
 
@@ -47,52 +47,52 @@ COMMANDS: dict[str, DataCommand] = {
         words="clean <recordings> [<recordings> ...] --out <folder>",
         purpose="drop rows that a stalled or jumping source spoiled",
         options=CleanOptions,
-        work="cleaning:clean",
+        work="datasets.cleaning:clean",
     ),
     "build": DataCommand(
         words="build <recordings> [<recordings> ...] --out <dataset>",
         purpose="make a LeRobot v3.0 dataset of recorded episodes",
         options=BuildOptions,
-        work="lerobot_dataset:build",
+        work="datasets.lerobot_dataset:build",
         extra="data",
     ),
     "verify": DataCommand(
         words="verify <dataset> [--recordings <recordings> ...]",
         purpose="check a dataset number by number and frame by frame, and against its recordings",
         options=VerifyOptions,
-        work="verification:verify",
+        work="checks.verification:verify",
         extra="data",
     ),
     "merge": DataCommand(
         words="merge <dataset> <dataset> [<dataset> ...] --out <dataset>",
         purpose="make one dataset of several; pictures are copied as they are",
         options=MergeOptions,
-        work="sets:merge",
+        work="datasets.sets:merge",
         extra="data",
     ),
     "split": DataCommand(
         words="split <datasets or recordings ...> --out-train <folder> --out-held-out <folder>",
         purpose="hold out episodes by their seeds",
         options=SplitOptions,
-        work="sets:split",
+        work="datasets.sets:split",
     ),
     "stats": DataCommand(
         words="stats <datasets or recordings ...>",
         purpose="print figures of episodes, and those unlike the others",
         options=StatsOptions,
-        work="episode_figures:stats",
+        work="checks.episode_figures:stats",
     ),
     "inspect": DataCommand(
         words="inspect <datasets or recordings ...> --out <page.html>",
         purpose="show episodes as one page: figures, phases, curves, film strips",
         options=InspectOptions,
-        work="inspection:inspect",
+        work="checks.inspection:inspect",
     ),
     "bench": DataCommand(
         words="bench <dataset> [--recordings <recordings> ...] | <recordings> --made 100",
         purpose="measure random reads, and the time that building and verifying take",
         options=DatasetBenchOptions,
-        work="dataset_bench:bench",
+        work="checks.dataset_bench:bench",
         extra="data",
     ),
 }

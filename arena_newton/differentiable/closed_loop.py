@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 import warp as wp
 
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.differentiable.kernel_gradients import ReferenceState
 from arena_newton.errors import InputError
 from arena_newton.kernels import tick as codes
+from arena_newton.robot.canonical import STAND_ACTION
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv

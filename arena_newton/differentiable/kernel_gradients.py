@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
+from arena_newton.cli.quiet import quiet_warp
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate
-from arena_newton.quiet import quiet_warp
-from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
-from arena_newton.streams import on_torch_stream
+from arena_newton.physics.streams import on_torch_stream
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, TICK
 
 __all__ = ["Recording", "ReferenceState", "recorded", "reference_step", "success_margin"]
 
@@ -146,7 +146,7 @@ def success_margin(launch: Callable[..., None], **arguments: object) -> torch.Te
     """The margin of a success predicate, differentiable in every floating-point tensor among the arguments.
 
     Args:
-        launch: A wrapper of `kernels.success`, such as `launch_football`.
+        launch: A wrapper of `kernels.rules.success`, such as `launch_football`.
         **arguments: Its arguments by name. Tensors (float32 or int32) stand for Warp arrays; boxes, numbers and Warp
             arrays pass through. Leave out the outputs and the counter: they are made here, the counter as zero.
 

@@ -16,14 +16,14 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton.ball import BALL
 from arena_newton.differentiable.kernel_gradients import recorded
 from arena_newton.errors import InputError
 from arena_newton.kernels.flight import launch_place_bodies, launch_trace_bodies
-from arena_newton.robot import TICK
+from arena_newton.physics.ball import BALL
+from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
-    from arena_newton.scene import Scene
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["RollingBall", "ball_flight", "damping_ratio"]
 

@@ -1,9 +1,10 @@
 """Ego, wrist and world cameras: all worlds in one batch, one light per world.
 
-Newton's `SensorCamera` has lights that are global to the sensor, so `kernels.lighting` shades albedo, normal and depth
-per world (formula and exposure are documented there). `kernels.raster` draws those three from triangles: on the
-football scene 3 times faster than the sensor's ray tracer on one CPU core, 5 times on an H200. `kernels.shadow` draws
-the same triangles along each distant light for its shadows: 5 ms for 1024 worlds on an H200, where rays took 62.
+Newton's `SensorCamera` has lights that are global to the sensor, so `lighting` (these are in `kernels.pictures`) shades
+albedo, normal and depth per world (formula and exposure are documented there). `raster` draws those three from
+triangles: on the football scene 3 times faster than the sensor's ray tracer on one CPU core, 5 times on an H200.
+`shadow` draws the same triangles along each distant light for its shadows: 5 ms for 1024 worlds on an H200, where rays
+took 62.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from newton.sensors import SensorCamera
 from pxr import Gf, Usd, UsdGeom, UsdLux
 
 from arena_newton.errors import InputError
-from arena_newton.kernels.lighting import launch_camera_poses, launch_shade
-from arena_newton.kernels.raster import launch_rasterize
-from arena_newton.kernels.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
+from arena_newton.kernels.pictures.lighting import launch_camera_poses, launch_shade
+from arena_newton.kernels.pictures.raster import launch_rasterize
+from arena_newton.kernels.pictures.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
 from arena_newton.pictures.settings import CameraConfig, Fit
 from arena_newton.pictures.triangles import srgb_to_linear, triangles
 
 if TYPE_CHECKING:
-    from arena_newton.scene import Scene
+    from arena_newton.physics.scene import Scene
     from arena_newton.tasks import LightDraw
 
 __all__ = ["CAMERA_PRIMS", "Buffers", "Camera", "CameraConfig", "WorldLights"]
@@ -462,7 +463,7 @@ class Camera:
             int64 [views, H, W] on the model's device, of the part of the picture that the lens fills (without the black
             bars of `fit="pad"`), with `samples` rows and columns per pixel.
         """
-        # A key's lower half is the triangle (`kernels.raster`); 0 is a pixel that no triangle reached.
+        # A key's lower half is the triangle (`kernels.pictures.raster`); 0 is a pixel that no triangle reached.
         keys = wp.to_torch(self.buffers.nearest.view(wp.int64))
         shapes: torch.Tensor = wp.to_torch(self._tracer.soup.shape)[keys & 0xFFFFFFFF].long()
         return torch.where(keys == 0, -1, shapes)

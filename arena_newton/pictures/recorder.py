@@ -23,7 +23,7 @@ from arena_newton.pictures import follow as following
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.settings import STRIP_SIZES, video_sizes
 from arena_newton.pictures.video import VideoWriter, caption, evenly, film_strip
-from arena_newton.robot import TICK
+from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import EpisodeResult, World

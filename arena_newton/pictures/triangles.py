@@ -9,7 +9,7 @@ from newton import Axis, GeoType, Mesh
 from newton.utils import load_texture, normalize_texture
 
 from arena_newton.errors import InputError
-from arena_newton.kernels.raster import Soup
+from arena_newton.kernels.pictures.raster import Soup
 
 __all__ = ["srgb_to_linear", "triangles"]
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from arena_newton import seeding
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import (
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import (
     MODES,
     ByRules,
     CylinderRange,
@@ -32,7 +32,7 @@ from arena_newton.rules import (
 )
 
 if TYPE_CHECKING:
-    from arena_newton.scene import Scene
+    from arena_newton.physics.scene import Scene
     from arena_newton.tasks.judge import Judge
 
 __all__ = [

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from arena_newton import seeding
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
     FACE_MINUS_Y,
     REACH,
@@ -22,8 +22,8 @@ from arena_newton.tasks.base import (
 from arena_newton.tasks.judge import PALMS, Judge, links, near, palms
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["PALMS", "TASK", "BoxingJudge", "BoxingRule"]
 
@@ -67,7 +67,7 @@ class BoxingJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         success.launch_boxing(
             physics.xpos,

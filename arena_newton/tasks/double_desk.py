@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
-from arena_newton.handles import BodyFrame
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
+from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.handles import BodyFrame
 from arena_newton.tasks.judge import Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["TASK", "DoubleDeskJudge", "DoubleDeskRule"]
 
@@ -92,7 +92,7 @@ class DoubleDeskJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         success.launch_double_desk(
             physics.xpos,

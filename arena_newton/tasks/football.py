@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from arena_newton.handles import BodyFrame
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
+from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.handles import BodyFrame
 from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["TASK", "FootballJudge", "FootballRule"]
 
@@ -95,7 +95,7 @@ class FootballJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         success.launch_football(
             physics.xpos,

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.handles import BodyFrame, Marker
 from arena_newton.interfaces import Predicate
 from arena_newton.tasks.base import IDENTITY, SUCCESS
+from arena_newton.tasks.handles import BodyFrame, Marker
 
 if TYPE_CHECKING:
     import warp as wp
 
     from arena_newton.kernels.boxes import Boxes
     from arena_newton.kernels.launching import Recorded
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["PALMS", "Condition", "Judge", "above", "bounding_box", "links", "near", "palms", "top"]
 
@@ -37,7 +37,7 @@ class Condition:
     """One measured quantity against a limit; a predicate holds where all of its conditions do."""
 
     kind: Literal["near", "clear", "angle", "toward", "away", "unlatched", "margin"]
-    """What is measured; `kernels.predicates` says what each kind compares."""
+    """What is measured; `kernels.rules.predicates` says what each kind compares."""
     limit: float = 0.0
     """In the unit of the kind."""
     points: Sequence[BodyFrame] = ()
@@ -103,7 +103,7 @@ def top(scene: Scene, prim: str) -> float:
 class Judge:
     """Success of every world, judged on the device once per tick.
 
-    A subclass binds prims of a built scene to a kernel of `kernels.success` in `decide`.
+    A subclass binds prims of a built scene to a kernel of `kernels.rules.success` in `decide`.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Judge:
         """Copy the conditions' table to the device."""
         import warp as wp
 
-        from arena_newton.kernels.predicates import KINDS, TERM
+        from arena_newton.kernels.rules.predicates import KINDS, TERM
 
         points: list[BodyFrame] = []
         boxes: list[Marker] = []
@@ -196,7 +196,7 @@ class Judge:
         return self.counters[-1]
 
     def outputs(self) -> dict[str, wp.array]:
-        """Keyword arguments that every kernel of `kernels.success` takes."""
+        """Keyword arguments that every kernel of `kernels.rules.success` takes."""
         return {"success": self.success, "margin": self.margin}
 
     def bind(self, physics: Physics) -> None:
@@ -219,7 +219,7 @@ class Judge:
         self._recorded()
 
     def _launch(self, physics: Physics) -> None:
-        from arena_newton.kernels.predicates import launch_predicates
+        from arena_newton.kernels.rules.predicates import launch_predicates
 
         self.decide(physics)
         launch_predicates(

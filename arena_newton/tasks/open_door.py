@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
+from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, palms
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["TASK", "DoorOpenRule", "DoorPassedRule", "OpenDoorJudge"]
 
@@ -85,7 +85,7 @@ class OpenDoorJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         common = {
             "root_qpos_adr": self.root,

@@ -6,16 +6,16 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from arena_newton.handles import BodyFrame, Marker
 from arena_newton.interfaces import Predicate
-from arena_newton.robot import TICK
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
+from arena_newton.robot.g1 import TICK
+from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.handles import ROBOT, BodyFrame, Marker
 from arena_newton.tasks.judge import Condition, Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["TASK", "PPBoxAnyDeckRule", "PPBoxJudge", "PPBoxOneDeckRule"]
 
@@ -96,8 +96,6 @@ class PPBoxJudge(Judge):
 
     def __init__(self, scene: Scene, rules: RuleSet):
         """Bind box, decks and robot."""
-        from arena_newton.scene import ROBOT
-
         self.rule: PPBoxAnyDeckRule | PPBoxOneDeckRule = rules.task("pp_box").success
         box, decks = bounding_box(scene, BOX), tuple(scene.marker(path) for path in DECKS)
         centre, half = BodyFrame(box.body_id, box.pos, IDENTITY), box.half[2]
@@ -129,7 +127,7 @@ class PPBoxJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         self.bind(physics)
         common = {"box": self.box, "decks": self.decks, **self.outputs()}

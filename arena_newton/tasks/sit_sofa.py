@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, num
+from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_MINUS_Y, REACH, ObjectSpec, Overlap, Required, TaskSpec, widened
 from arena_newton.tasks.judge import Condition, Judge, links, near
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["TASK", "SeatPressedRule", "SeatTouchedRule", "SitSofaJudge"]
 
@@ -116,7 +116,7 @@ class SitSofaJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         self.bind(physics)
         if isinstance(self.rule, SeatPressedRule):

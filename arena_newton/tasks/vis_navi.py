@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arena_newton import seeding
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
     FACE_PLUS_Y,
     REACH,
@@ -24,8 +24,8 @@ from arena_newton.tasks.base import (
 from arena_newton.tasks.judge import Judge, links, near
 
 if TYPE_CHECKING:
-    from arena_newton.physics import Physics
-    from arena_newton.scene import Scene
+    from arena_newton.physics.engines import Physics
+    from arena_newton.physics.scene import Scene
 
 __all__ = ["TASK", "VisNaviJudge", "VisNaviRule"]
 
@@ -79,7 +79,7 @@ class VisNaviJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels import success
+        from arena_newton.kernels.rules import success
 
         success.launch_vis_navi(
             physics.xpos,

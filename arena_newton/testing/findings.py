@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from arena_newton.errors import ArenaError
-from arena_newton.text import plain_text
+from arena_newton.files.text import plain_text
 
 __all__ = ["Promise", "CheckResult", "ConformanceError", "Violation", "json_object", "perform", "table"]
 

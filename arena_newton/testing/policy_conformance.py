@@ -14,12 +14,12 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from arena_newton import seeding
 from arena_newton import tasks as task_registry
-from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION, STATE_WIDTH, validate_action
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation, Policy, World
 from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE_WIDTH, validate_action
+from arena_newton.rules import seeding
 from arena_newton.testing.findings import (
     CheckResult,
     ConformanceError,

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 
-from arena_newton.canonical import MIMIC, MIMIC_WIDTH
 from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
-from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS, SPAWN_HEIGHT, TICK, DriveGains, PhysicsRate
+from arena_newton.robot.canonical import MIMIC, MIMIC_WIDTH
+from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS, SPAWN_HEIGHT, TICK, DriveGains, PhysicsRate
 from arena_newton.testing.findings import CheckResult, ConformanceError, Promise, Violation, json_object, perform
 
 __all__ = ["check_tracker"]

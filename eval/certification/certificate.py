@@ -14,11 +14,11 @@ from typing import TypedDict
 
 from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed, verdict_of
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
-from arena_newton.eval.html_report import FOLDER, page_template
-from arena_newton.eval.journal import write_atomic
-from arena_newton.eval.records import JsonObject
-from arena_newton.eval.wording import escaped
-from arena_newton.text import counted
+from arena_newton.eval.records.journal import write_atomic
+from arena_newton.eval.records.schema import JsonObject
+from arena_newton.eval.reports.html_report import FOLDER, page_template
+from arena_newton.eval.reports.wording import escaped
+from arena_newton.files.text import counted
 
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 

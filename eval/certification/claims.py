@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from arena_newton.eval.certification.finding import Check, CheckFinding, Verdict
-from arena_newton.text import counted
+from arena_newton.files.text import counted
 
 __all__ = ["CLAIMS", "Claim", "ClaimFinding", "claimed", "verdict_of"]
 

@@ -9,20 +9,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from arena_newton import seeding, tasks
+from arena_newton import tasks
 from arena_newton.doctor import versions
 from arena_newton.errors import InputError
-from arena_newton.eval import run
-from arena_newton.eval.certification.bodies import BODIES, Body
-from arena_newton.eval.config import resolve
-from arena_newton.eval.folder import ResultsFolder
-from arena_newton.eval.identity import PACKAGE, config_hash, hash_paths, package_files
-from arena_newton.eval.journal import ContradictionError, EpisodeRecord, write_atomic
-from arena_newton.eval.options import CertifyOptions, RunOptions
-from arena_newton.eval.plan import PROTOCOL_REPEATS
-from arena_newton.eval.records import Json
-from arena_newton.eval.results import load_run
-from arena_newton.text import counted
+from arena_newton.eval.certification.stand_ins.bodies import BODIES, Body
+from arena_newton.eval.folders.results import load_run
+from arena_newton.eval.folders.run_folder import ResultsFolder
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
+from arena_newton.eval.plan.options import CertifyOptions, RunOptions
+from arena_newton.eval.play import run
+from arena_newton.eval.records.identity import PACKAGE, config_hash, hash_paths, package_files
+from arena_newton.eval.records.journal import ContradictionError, EpisodeRecord, write_atomic
+from arena_newton.eval.records.schema import Json
+from arena_newton.files.text import counted
+from arena_newton.rules import seeding
 
 __all__ = ["CertifyCell", "Context", "with_expert"]
 

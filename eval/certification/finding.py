@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from arena_newton.eval.stats import paired_rates
-from arena_newton.intervals import wilson
+from arena_newton.cli.intervals import wilson
+from arena_newton.eval.statistics.stats import paired_rates
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
-    from arena_newton.eval.journal import EpisodeRecord
+    from arena_newton.eval.records.journal import EpisodeRecord
 
 __all__ = [
     "Check",

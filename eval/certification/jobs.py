@@ -16,9 +16,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from arena_newton.devices import resolve_engine
-from arena_newton.eval.certification.agreement import BATCHED_TASKS
-from arena_newton.eval.options import CertifyOptions
+from arena_newton.eval.certification.checks.agreement import BATCHED_TASKS
+from arena_newton.eval.plan.options import CertifyOptions
+from arena_newton.physics.devices import resolve_engine
 
 __all__ = ["Piece", "command_line", "flags", "play_ahead"]
 

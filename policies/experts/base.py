@@ -20,8 +20,8 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation
 from arena_newton.policies.base import Json, Mask, Policy, world_mask
 from arena_newton.policies.experts.style import Style
-from arena_newton.robot import TICK
-from arena_newton.rotations import heading
+from arena_newton.robot.g1 import TICK
+from arena_newton.robot.rotations import heading
 from arena_newton.trackers.motions.commands import COLUMNS, MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 

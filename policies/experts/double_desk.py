@@ -28,7 +28,16 @@ from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, along, passing
-from arena_newton.rotations import atan2, heading, quat_apply, quat_from_yaw, quat_multiply, rotate_xy, turn, wrap_angle
+from arena_newton.robot.rotations import (
+    atan2,
+    heading,
+    quat_apply,
+    quat_from_yaw,
+    quat_multiply,
+    rotate_xy,
+    turn,
+    wrap_angle,
+)
 from arena_newton.tasks.double_desk import HAMMER, INSIDE, LEFT_DESK, RIGHT_DESK, SILL
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.kinematics import HAND_POINT

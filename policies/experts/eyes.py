@@ -12,7 +12,7 @@ from torch import Tensor
 
 from arena_newton.errors import InputError
 from arena_newton.policies.experts.base import Sight
-from arena_newton.rotations import quat_apply, quat_conjugate, quat_multiply
+from arena_newton.robot.rotations import quat_apply, quat_conjugate, quat_multiply
 
 __all__ = ["Eyes", "hidden", "silhouette"]
 

@@ -20,7 +20,7 @@ from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import Floor
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, along
-from arena_newton.rotations import atan2, rotate_xy
+from arena_newton.robot.rotations import atan2, rotate_xy
 from arena_newton.tasks.football import BALL, GOAL
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.navigate import NavigationLimits

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from arena_newton.policies.experts.base import Sight
 from arena_newton.policies.experts.phases import select
-from arena_newton.robot import ARMS, MUJOCO_JOINTS
-from arena_newton.rotations import atan2, matrix_from_quat, quat_conjugate, quat_multiply, rotate_xy
+from arena_newton.robot.g1 import ARMS, MUJOCO_JOINTS
+from arena_newton.robot.rotations import atan2, matrix_from_quat, quat_conjugate, quat_multiply, rotate_xy
 from arena_newton.trackers.motions.kinematics import HAND_POINT
 
 __all__ = ["WRISTS", "Palms", "Wrists", "wrist_angles"]

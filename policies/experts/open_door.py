@@ -21,7 +21,7 @@ from arena_newton.policies.experts.hands import Palms
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import BEYOND, Walk, along, passing
-from arena_newton.rotations import heading, rotate_xy, turn, wrap_angle
+from arena_newton.robot.rotations import heading, rotate_xy, turn, wrap_angle
 from arena_newton.tasks.open_door import DOORWAY, HANDLE, LEAF
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.navigate import NavigationLimits

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from arena_newton.rotations import atan2, rotate_xy
+from arena_newton.robot.rotations import atan2, rotate_xy
 
 __all__ = ["BLOCKED", "Floor", "Paths", "footprint", "plan", "signed_distance"]
 

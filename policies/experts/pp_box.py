@@ -22,7 +22,7 @@ from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, along, beyond, paced, passing
-from arena_newton.rotations import heading, matrix_from_quat, quat_from_yaw, rotate_xy, wrap_angle
+from arena_newton.robot.rotations import heading, matrix_from_quat, quat_from_yaw, rotate_xy, wrap_angle
 from arena_newton.tasks.pp_box import BOX, DECKS, TABLE
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.navigate import NavigationCommand, NavigationLimits

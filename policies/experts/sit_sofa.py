@@ -20,7 +20,7 @@ from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import CLEARANCES, Floor, footprint, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk
-from arena_newton.rotations import heading, rotate_xy, wrap_angle
+from arena_newton.robot.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.sit_sofa import CARTONS, SEAT
 from arena_newton.trackers.motions.commands import MotionCommand

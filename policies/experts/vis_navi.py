@@ -19,7 +19,7 @@ from arena_newton.policies.experts.phases import select
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import paced
-from arena_newton.rotations import atan2, heading, rotate_xy
+from arena_newton.robot.rotations import atan2, heading, rotate_xy
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.vis_navi import SIGN
 from arena_newton.trackers.motions.commands import MotionCommand

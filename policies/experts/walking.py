@@ -8,7 +8,7 @@ from torch import Tensor
 from arena_newton.policies.experts.base import Sight
 from arena_newton.policies.experts.phases import select
 from arena_newton.policies.experts.planning import Floor, plan
-from arena_newton.rotations import rotate_xy, wrap_angle
+from arena_newton.robot.rotations import rotate_xy, wrap_angle
 from arena_newton.trackers.motions.navigate import NavigationCommand, NavigationLimits, Navigator
 
 __all__ = ["BEYOND", "Walk", "along", "beyond", "paced", "passing"]

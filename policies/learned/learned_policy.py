@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Observation, Policy, world_mask
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.learned.act_network import ActNetwork
 from arena_newton.policies.learned.card_check import check_facts, check_weights
 from arena_newton.policies.learned.packed_checkpoint import FRONT, STATE, TASK_VECTOR, Spread, read_act_checkpoint
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 
 __all__ = ["LearnedPolicy", "from_spec"]
 

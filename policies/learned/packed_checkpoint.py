@@ -14,12 +14,12 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
-from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.errors import InputError
-from arena_newton.foreign import check_size, file_digest, read_bytes
+from arena_newton.files.foreign import check_size, file_digest, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
 from arena_newton.policies.lerobot.checkpoint_tensors import check_spread
+from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 __all__ = [
     "PROCESSOR_FILES",

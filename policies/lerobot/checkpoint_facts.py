@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
-from arena_newton.data.label_protocols import protocol
+from arena_newton.data.readers.label_protocols import protocol
 from arena_newton.errors import InputError
-from arena_newton.files import replace_atomically
+from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.text import plain_text
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.text import plain_text
 
 __all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder"]
 
@@ -39,7 +39,7 @@ class CheckpointFacts:
     """How a policy's pictures and actions are meant, and where it comes from."""
 
     labels: str = "v3.1"
-    """Protocol of its actions (`data.label_protocols`)."""
+    """Protocol of its actions (`data.readers.label_protocols`)."""
     realign: float = 0.0
     """Fraction of the gap between the commanded and the measured heading that is closed each tick; of v4 only."""
     width: int = 224

@@ -167,7 +167,7 @@ def _own_encoders(checkpoint: PolicyCheckpoint) -> Iterator[None]:
         return
     from transformers.initialization import no_init_weights
 
-    from arena_newton.policies.train.encoder_sources import checkpoint_encoders  # imports transformers
+    from arena_newton.policies.lerobot.encoder_sources import checkpoint_encoders  # imports transformers
 
     with checkpoint_encoders(checkpoint.folder), no_init_weights():
         yield

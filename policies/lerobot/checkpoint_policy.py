@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, hub_name, world_mask
 from arena_newton.policies.lerobot.checkpoint_network import PolicyNetwork
@@ -23,6 +22,7 @@ from arena_newton.policies.lerobot.checkpoint_reader import (
 from arena_newton.policies.lerobot.chunk_memory import ChunkMemory
 from arena_newton.policies.lerobot.hub_folder import fetched
 from arena_newton.policies.lerobot.network_noise import NOISE_RULE, Draw
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 
 __all__ = ["ENSEMBLE_TICKS", "LeRobotPolicy", "from_spec"]
 

@@ -19,10 +19,9 @@ from pathlib import Path
 import draccus
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
-from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
-from arena_newton.extras import require
-from arena_newton.foreign import check_size, file_digest, read_bytes
+from arena_newton.files.foreign import check_size, file_digest, read_bytes
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
@@ -33,6 +32,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import (
 )
 from arena_newton.policies.lerobot.checkpoint_tensors import check_family, check_layers, check_statistics
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON, PicturePreparation
+from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 __all__ = [
     "FAMILY_TYPES",

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from arena_newton.canonical import ACTION_WIDTH
+from arena_newton.robot.canonical import ACTION_WIDTH
 
 __all__ = ["ChunkMemory"]
 

@@ -51,7 +51,7 @@ class TrainingRecipe:
     network: Mapping[str, object] = field(default_factory=dict)
     """Fields of LeRobot's configuration of the policy, without those of optimizer and schedule."""
     labels: str = "v3.1"
-    """Protocol of the actions that are learned (`data.label_protocols`)."""
+    """Protocol of the actions that are learned (`data.readers.label_protocols`)."""
     realign: float = 0.0
     """Fraction of the gap from the commanded to the measured heading that execution closes each tick; of v4 only."""
     steps: int = 100_000

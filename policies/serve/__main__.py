@@ -8,12 +8,12 @@ import sys
 import threading
 from collections.abc import Sequence
 
-from arena_newton.command_line import exit_code, program
-from arena_newton.extras import require
-from arena_newton.flags import parse_flags
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.extras import require
+from arena_newton.cli.flags import parse_flags
 from arena_newton.policies.base import check_spec
+from arena_newton.policies.protocols.ports import bind
 from arena_newton.policies.serve.serve_options import ServeOptions
-from arena_newton.policies.teleop.ports import bind
 
 __all__ = ["main"]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from arena_newton.errors import InputError
-from arena_newton.policies.teleop.ports import names_this_machine
+from arena_newton.policies.protocols.ports import names_this_machine
 
 __all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "DoorGuard", "same_token"]
 

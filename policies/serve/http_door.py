@@ -23,7 +23,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 
 from arena_newton.errors import ArenaError
-from arena_newton.policies.serve.arena_codec import (
+from arena_newton.files.text import plain_text
+from arena_newton.policies.protocols.arena_codec import (
     CLIENT_HEADER,
     pack_begun,
     pack_chunk,
@@ -33,12 +34,11 @@ from arena_newton.policies.serve.arena_codec import (
     unpack_begin,
     unpack_look,
 )
+from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
 from arena_newton.policies.serve.http_robots import HttpRobot, HttpRobots
-from arena_newton.policies.serve.policy_messages import Begin, Look
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
-from arena_newton.policies.serve.raw_arrays import MAX_FRAME
-from arena_newton.text import plain_text
 
 __all__ = ["HttpDoor"]
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from arena_newton.policies.serve.arena_codec import CLIENT_HEADER
+from arena_newton.policies.protocols.arena_codec import CLIENT_HEADER
 from arena_newton.policies.serve.policy_server import Refused
 
 __all__ = ["HttpRobot", "HttpRobots"]

@@ -25,20 +25,20 @@ import numpy as np
 import torch
 
 from arena_newton import tasks
-from arena_newton.canonical import ACTION_WIDTH, IDENTITY_ROT6D, STATE_WIDTH
-from arena_newton.data.label_protocols import action_names, protocol
-from arena_newton.data.layouts import state_names
+from arena_newton.data.datasets.layouts import state_names
+from arena_newton.data.readers.label_protocols import action_names, protocol
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.files.text import plain_text
 from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy, PolicyUnavailable
-from arena_newton.policies.serve.handshake import RATE, ServedFacts, ServedPicture
+from arena_newton.policies.protocols.handshake import RATE, ServedFacts, ServedPicture
+from arena_newton.policies.protocols.packed_picture import PackedPicture
+from arena_newton.policies.protocols.picture_fit import fitted_picture
+from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.serve.message_readers import MessageReaders
-from arena_newton.policies.serve.packed_picture import PackedPicture
-from arena_newton.policies.serve.picture_fit import fitted_picture
-from arena_newton.policies.serve.policy_messages import Begin, Look
-from arena_newton.policies.serve.wire_error import WireError
-from arena_newton.text import plain_text
+from arena_newton.robot.canonical import ACTION_WIDTH, IDENTITY_ROT6D, STATE_WIDTH
 
 __all__ = ["Answer", "PolicyServer", "Refused", "ServerCounts"]
 

@@ -14,13 +14,13 @@ from arena_newton import tasks
 from arena_newton.errors import InputError, naming
 from arena_newton.policies.base import Policy, get
 from arena_newton.policies.label_reader import read_by
-from arena_newton.policies.remote_address import ServerAddress
+from arena_newton.policies.protocols.ports import bind, is_local
+from arena_newton.policies.remote.address import ServerAddress
 from arena_newton.policies.serve.door_guard import ACCESS_TOKEN_VARIABLE, DoorGuard
 from arena_newton.policies.serve.http_door import HttpDoor
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.policies.serve.websocket_doors import WebsocketDoor
-from arena_newton.policies.teleop.ports import bind, is_local
 
 __all__ = ["make_policy", "open_door", "serve_policy"]
 

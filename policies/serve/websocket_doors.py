@@ -25,14 +25,14 @@ from websockets.http11 import Response
 from websockets.sync.server import ServerConnection
 
 from arena_newton.errors import ArenaError
-from arena_newton.policies.serve import openpi_codec, vla_eval_codec
-from arena_newton.policies.serve.arena_codec import pack_config, pack_failure
+from arena_newton.files.text import plain_text
+from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.arena_codec import pack_config, pack_failure
+from arena_newton.policies.protocols.policy_messages import Begin, End, Look
+from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
-from arena_newton.policies.serve.policy_messages import Begin, End, Look
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 from arena_newton.policies.serve.websocket_listener import WebsocketListener
-from arena_newton.text import plain_text
 
 __all__ = ["WebsocketDoor", "WebsocketProtocol"]
 

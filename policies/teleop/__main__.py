@@ -9,11 +9,11 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.extras import require
+from arena_newton.cli.flags import parse_flags
 from arena_newton.errors import InputError
-from arena_newton.extras import require
-from arena_newton.flags import parse_flags
-from arena_newton.policies.teleop.ports import bind
+from arena_newton.policies.protocols.ports import bind
 from arena_newton.policies.teleop.teleop_options import BrowserOptions, RedisOptions
 
 __all__ = ["COMMANDS", "TeleopCommand", "main"]

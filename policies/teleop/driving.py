@@ -17,8 +17,8 @@ import torch
 from arena_newton.errors import InputError
 from arena_newton.policies.experts.base import REALIGN
 from arena_newton.policies.teleop.source import Control
-from arena_newton.robot import TICK
-from arena_newton.rotations import heading_np
+from arena_newton.robot.g1 import TICK
+from arena_newton.robot.rotations import heading_np
 from arena_newton.trackers.motions.commands import CHANNELS, COLUMNS, neutral_row
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 from arena_newton.trackers.motions.kinematics import neutral_stance

@@ -9,21 +9,22 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from arena_newton import rule_sets, seeding, tasks, trackers
-from arena_newton.data.new_folder import held_folder
+from arena_newton import rule_sets, tasks, trackers
+from arena_newton.cli.quiet import quiet_warp
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
+from arena_newton.files.new_folder import held_folder
 from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
+from arena_newton.policies.protocols.ports import bind
 from arena_newton.policies.teleop.browser import BrowserSource
 from arena_newton.policies.teleop.driving import RANGES
 from arena_newton.policies.teleop.page_server import PageServer, new_token
-from arena_newton.policies.teleop.ports import bind
 from arena_newton.policies.teleop.source import Source
 from arena_newton.policies.teleop.teleop_options import BrowserOptions, SessionOptions
 from arena_newton.policies.teleop.teleop_session import TeleopSession
 from arena_newton.policies.teleop.world_view import PERIOD, WorldView
-from arena_newton.quiet import quiet_warp
-from arena_newton.rules import MODES
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import MODES
 
 __all__ = ["drive", "drive_by_browser", "make_world", "session_facts"]
 

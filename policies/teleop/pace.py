@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from arena_newton.robot import TICK
+from arena_newton.robot.g1 import TICK
 
 __all__ = ["Pace", "TimedPicture"]
 

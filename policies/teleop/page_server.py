@@ -27,10 +27,10 @@ from websockets.sync.server import ServerConnection
 from websockets.typing import Origin
 
 from arena_newton.errors import InputError
+from arena_newton.policies.protocols.ports import LOCAL, names_this_machine
 from arena_newton.policies.serve.door_guard import DoorGuard, same_token
 from arena_newton.policies.serve.websocket_listener import WebsocketListener, part
 from arena_newton.policies.teleop.driving import Held, read_held
-from arena_newton.policies.teleop.ports import LOCAL, names_this_machine
 
 __all__ = ["PageServer", "new_token"]
 

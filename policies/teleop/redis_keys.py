@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.robot import HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT, MUJOCO_JOINTS
+from arena_newton.robot.g1 import HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT, MUJOCO_JOINTS
 
 __all__ = [
     "ACTION_BODY",

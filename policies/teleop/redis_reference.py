@@ -13,11 +13,11 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION, MIMIC, MIMIC_WIDTH, STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.policies.teleop import redis_keys as keys
-from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
-from arena_newton.rotations import (
+from arena_newton.robot.canonical import ACTION, MIMIC, MIMIC_WIDTH, STAND_ACTION
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, TICK
+from arena_newton.robot.rotations import (
     heading,
     matrix_from_quat,
     quat_apply,

@@ -19,14 +19,14 @@ from PIL import Image
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from arena_newton.canonical import HAND_CLOSED
 from arena_newton.errors import InputError
+from arena_newton.files.text import plain_text
 from arena_newton.policies.teleop import redis_keys as keys
 from arena_newton.policies.teleop.redis_reference import Reference
 from arena_newton.policies.teleop.source import Control, Telemetry, Wish
-from arena_newton.robot import HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT, HAND_OPEN
-from arena_newton.rotations import roll_pitch
-from arena_newton.text import plain_text
+from arena_newton.robot.canonical import HAND_CLOSED
+from arena_newton.robot.g1 import HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT, HAND_OPEN
+from arena_newton.robot.rotations import roll_pitch
 
 __all__ = ["RedisSource", "connect"]
 

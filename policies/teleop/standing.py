@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.robot import TICK
-from arena_newton.rotations import heading, matrix_from_quat, quat_from_rot6d, quat_from_yaw
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import TICK
+from arena_newton.robot.rotations import heading, matrix_from_quat, quat_from_rot6d, quat_from_yaw
 
 __all__ = ["SECONDS", "Stander", "between"]
 

@@ -14,9 +14,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton import seeding
-from arena_newton.canonical import STAND_ACTION, validate_action
-from arena_newton.data.demonstration import DemonstrationRecorder
+from arena_newton.data.recording.demonstration import DemonstrationRecorder
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeResult
 from arena_newton.kernels import tick as codes
@@ -24,7 +22,9 @@ from arena_newton.pictures.camera import Camera
 from arena_newton.policies.teleop.pace import Pace, TimedPicture
 from arena_newton.policies.teleop.source import Telemetry, Wish
 from arena_newton.policies.teleop.standing import Stander
-from arena_newton.robot import TICK
+from arena_newton.robot.canonical import STAND_ACTION, validate_action
+from arena_newton.robot.g1 import TICK
+from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from arena_newton.command_line import exit_code, program
-from arena_newton.extras import require
-from arena_newton.flags import parse_flags
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.extras import require
+from arena_newton.cli.flags import parse_flags
 from arena_newton.policies.train.policy_options import (
     PolicyTrainOptions,
     TeachableOptions,

@@ -18,10 +18,10 @@ import torch
 
 from arena_newton.errors import ArenaError
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
-from arena_newton.policies.train import families
-from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, read_rows, statistics
-from arena_newton.policies.train.feature_scaling import Stats
-from arena_newton.policies.train.frame_store import FrameStore, load_frames, made_frames, made_statistics
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames.demonstration_rows import VECTOR_KEY, read_rows, statistics
+from arena_newton.policies.train.frames.feature_scaling import Stats
+from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames, made_frames, made_statistics
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_options import TrainingBenchOptions

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.policies.train.policy_model import TrainableModel
+from arena_newton.policies.train.families.policy_model import TrainableModel
 
 __all__ = ["check_compiler", "compile_networks", "compiler_errors", "uncompiled"]
 

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from arena_newton.cli.flags import Several
 from arena_newton.errors import InputError
-from arena_newton.flags import Several
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
 __all__ = ["PolicyTrainOptions", "TeachableOptions", "TrainingBenchOptions", "check_numbers", "check_teachable"]

@@ -17,9 +17,9 @@ import torch
 
 from arena_newton.errors import ArenaError
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
-from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.families.policy_model import TrainableModel
+from arena_newton.policies.train.frames.batching import BatchMaker, RowOrder, step_seed
 from arena_newton.policies.train.network_compiler import compile_networks, compiler_errors, uncompiled
-from arena_newton.policies.train.policy_model import TrainableModel
 
 __all__ = ["PolicyTrainer"]
 

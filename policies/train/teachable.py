@@ -11,19 +11,20 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton import seeding, tasks, trackers
+from arena_newton import tasks, trackers
+from arena_newton.cli.intervals import wilson
+from arena_newton.cli.quiet import quiet_warp
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
-from arena_newton.files import replace_atomically
+from arena_newton.files.own_files import replace_atomically
 from arena_newton.interfaces import EpisodeResult, Tracker, World
-from arena_newton.intervals import wilson
 from arena_newton.policies.base import Chunk, Observation, Policy
 from arena_newton.policies.experts.base import Sight
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.recipes.training_recipe import REALIGN
 from arena_newton.policies.train.teachable_network import PoseNetwork, fitted, pose_features, read_demonstrations
-from arena_newton.quiet import quiet_warp
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
     from arena_newton.policies.train.policy_options import TeachableOptions

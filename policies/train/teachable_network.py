@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from arena_newton.canonical import ACTION_WIDTH, STATE_WIDTH
-from arena_newton.data.episode import EpisodeFile, episode_files
-from arena_newton.data.label_protocols import encode_v4
+from arena_newton.data.readers.label_protocols import encode_v4
+from arena_newton.data.recording.episode import EpisodeFile, episode_files
 from arena_newton.errors import InputError
-from arena_newton.rotations import heading
+from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
+from arena_newton.robot.rotations import heading
 
 __all__ = ["Demonstrations", "PoseNetwork", "fitted", "pose_features", "read_demonstrations"]
 

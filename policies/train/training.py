@@ -15,21 +15,21 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.files.text import counted
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe, with_pretrained
-from arena_newton.policies.train import families
-from arena_newton.policies.train.batching import BatchMaker
-from arena_newton.policies.train.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
-from arena_newton.policies.train.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.families.policy_model import TrainableModel
+from arena_newton.policies.train.frames.batching import BatchMaker
+from arena_newton.policies.train.frames.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
+from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
-from arena_newton.policies.train.policy_model import TrainableModel
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
 from arena_newton.policies.train.training_state import TrainingProgress, check_new, last_checkpoint, restore
-from arena_newton.text import counted
 
 __all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
 

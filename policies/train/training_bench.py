@@ -16,10 +16,10 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.own_processes import environment
+from arena_newton.files.own_processes import environment
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
-from arena_newton.policies.train import families
-from arena_newton.policies.train.demonstration_rows import CAMERA_KEY, read_rows, statistics
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames.demonstration_rows import CAMERA_KEY, read_rows, statistics
 from arena_newton.policies.train.measured_training import READY, WARM_STEPS, SpeedFigure, bench_recipe
 from arena_newton.policies.train.training import chosen_device, fast_kernels
 

@@ -8,8 +8,8 @@ import torch
 
 from arena_newton import tasks
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
-from arena_newton.policies.train import families
-from arena_newton.policies.train.frame_store import made_statistics
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames.frame_store import made_statistics
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import checkpoint_bytes
 from arena_newton.policies.train.policy_options import PolicyTrainOptions

@@ -11,7 +11,7 @@ from pathlib import Path
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from arena_newton.files import replace_atomically
+from arena_newton.files.own_files import replace_atomically
 
 __all__ = ["COLUMNS", "LOG_FILE", "TrainingLog"]
 

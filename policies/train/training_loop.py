@@ -15,8 +15,9 @@ from pathlib import Path
 import torch
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
-from arena_newton.data.new_folder import held_folder
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.files.new_folder import held_folder
+from arena_newton.files.text import counted
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
@@ -29,7 +30,6 @@ from arena_newton.policies.train.training_state import (
     remove_older,
     write_checkpoint,
 )
-from arena_newton.text import counted
 
 __all__ = ["Processes", "TrainingLoop"]
 

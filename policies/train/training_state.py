@@ -30,7 +30,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
-from arena_newton.files import PARTIAL, replace_atomically
+from arena_newton.files.own_files import PARTIAL, replace_atomically
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 

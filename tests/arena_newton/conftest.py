@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import warp as wp
 
-from arena_newton import rules, tasks
+from arena_newton import tasks
+from arena_newton.rules import rule_types
 from arena_newton.tasks.judge import Judge
 
 LAYER = """#usda 1.0
@@ -28,7 +29,7 @@ over "World"
 
 
 @dataclasses.dataclass(frozen=True)
-class Ringing(rules.SuccessRule):
+class Ringing(rule_types.SuccessRule):
     """How often the bell must ring."""
 
     times: int = 3
@@ -68,10 +69,10 @@ def bell(tmp_path):
             requires=(tasks.Required("/World/Bell", "marker"),),
             scene=folder / "scene.usda",
             objects=(),
-            steps=rules.ByRules.same(100),
-            success=rules.ByRules.same(Ringing()),
+            steps=rule_types.ByRules.same(100),
+            success=rule_types.ByRules.same(Ringing()),
             judge=BellJudge,
-            semantic_variant=rules.ByRules.same("base"),
+            semantic_variant=rule_types.ByRules.same("base"),
         )
     )
     yield "bell"

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from arena_newton import rule_sets
-from arena_newton.ball import BALL, BALL_SKIN, SKIN_HEIGHT, ball_solref, set_restitution
-from arena_newton.physics import make_physics
-from arena_newton.robot import PhysicsRate
-from arena_newton.scene import load_scene
+from arena_newton.physics.ball import BALL, BALL_SKIN, SKIN_HEIGHT, ball_solref, set_restitution
+from arena_newton.physics.engines import make_physics
+from arena_newton.physics.scene import load_scene
+from arena_newton.robot.g1 import PhysicsRate
 
 HEIGHTS = np.array([0.3, 1.0, 3.0])
 """[m]."""

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from arena_newton.robot import DEFAULT_POSE
-from arena_newton.scene import load_scene
+from arena_newton.physics.scene import load_scene
+from arena_newton.robot.g1 import DEFAULT_POSE
 
 
 @pytest.fixture(scope="module")

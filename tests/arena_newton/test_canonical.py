@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from arena_newton import canonical
 from arena_newton.errors import InputError
+from arena_newton.robot import canonical
 
 
 def neutral(*shape: int) -> np.ndarray:

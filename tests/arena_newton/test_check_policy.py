@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from arena_newton import policies, trackers
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies import Chunk, Policy, world_mask
 from arena_newton.policies.serve_example import Handler, Server
+from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.testing import ConformanceError, check_policy
 
 NAMES = "attributes chunk seeds reset asks rows batch observation errors describe close".split()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from arena_newton import trackers
-from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
+from arena_newton.robot.g1 import TWIST2_DRIVE, PhysicsRate
 from arena_newton.testing import ConformanceError, check_tracker
 from arena_newton.trackers import Tracker
 

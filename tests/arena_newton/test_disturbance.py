@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.disturbance import ActionNoise, noise_series
-from arena_newton.noise_levels import NoiseLevels
-from arena_newton.robot import TICK
+from arena_newton.data.recording.disturbed_execution import ActionNoise, noise_series
+from arena_newton.data.recording.noise_levels import NoiseLevels
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import TICK
 
 LEVELS = NoiseLevels()
 

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton import doctor, extras, policies, probe, trackers
+from arena_newton import doctor, policies, trackers
 from arena_newton.__main__ import main
-from arena_newton.canonical import STAND_ACTION
+from arena_newton.cli import extras
+from arena_newton.files import probe
+from arena_newton.robot.canonical import STAND_ACTION
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,7 +9,7 @@ from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeEvent
 from arena_newton.kernels import tick as codes
-from arena_newton.robot import SONIC_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+from arena_newton.robot.g1 import SONIC_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 from arena_newton.tasks.football import FootballJudge
 
 

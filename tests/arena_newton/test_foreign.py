@@ -9,9 +9,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.foreign import file_digest, read_arrays, read_bytes
+from arena_newton.files import limits
+from arena_newton.files.foreign import file_digest, read_arrays, read_bytes
 
 
 def member(shape, dtype="<f8", data=b"") -> bytes:

@@ -8,8 +8,7 @@ import pytest
 import torch
 import warp as wp
 
-from arena_newton import ArenaEnv, canonical, trackers
-from arena_newton.ball import BALL
+from arena_newton import ArenaEnv, trackers
 from arena_newton.differentiable import (
     ReferenceState,
     RollingBall,
@@ -19,7 +18,9 @@ from arena_newton.differentiable import (
     reference_step,
 )
 from arena_newton.errors import InputError
-from arena_newton.robot import TICK
+from arena_newton.physics.ball import BALL
+from arena_newton.robot import canonical
+from arena_newton.robot.g1 import TICK
 
 FOOTBALL = RollingBall(radius=0.11, mass=0.43, friction=0.7, restitution=0.1)
 ON_GROUND = [0.0, 0.0, 0.11]

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from arena_newton.interrupts import Uninterrupted
+from arena_newton.files.interrupts import Uninterrupted
 
 
 def test_a_signal_waits_for_the_end_of_the_block():

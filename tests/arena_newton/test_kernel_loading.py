@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton import kernel_links, kernel_loading, kernel_rehearsal
-from arena_newton.scene import load_scene
+from arena_newton.kernel_cache import kernel_links, kernel_loading, kernel_rehearsal
+from arena_newton.physics.scene import load_scene
 
 SCRIPT = """
 import hashlib, json, sys
 import torch, warp
 from arena_newton import kernel_loading, trackers
-from arena_newton.canonical import STAND_ACTION
+from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.quiet import quiet_warp
+from arena_newton.cli.quiet import quiet_warp
 quiet_warp()
 kernel_loading.MOST_THREADS = int(sys.argv[2])
 camera = CameraConfig(width=64, height=64)
@@ -43,7 +43,7 @@ BEGINNING = """
 import json, threading
 import warp as wp
 from arena_newton import kernel_loading
-from arena_newton.quiet import quiet_warp
+from arena_newton.cli.quiet import quiet_warp
 quiet_warp()
 begun, plain = [], wp.Device._init_streams
 def counted(device):
@@ -277,7 +277,7 @@ def test_ctrl_c_while_threads_are_waited_for_changes_nothing(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(kernel_loading, "MOST_THREADS", 2)
-    monkeypatch.setattr(kernel_loading, "kernel_modules", lambda engine, **kind: ("arena_newton.kernels.fall",))
+    monkeypatch.setattr(kernel_loading, "kernel_modules", lambda engine, **kind: ("arena_newton.kernels.rules.fall",))
     monkeypatch.setattr(kernel_loading, "_loaded", set())
     monkeypatch.setattr(kernel_loading.ThreadPoolExecutor, "shutdown", interrupted)
     with pytest.raises(KeyboardInterrupt), kernel_loading.loading("mujoco", "cpu", camera=False):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from arena_newton.__main__ import COMMANDS, main
-from arena_newton.command_line import exit_code
+from arena_newton.cli.command_line import exit_code
 from arena_newton.eval import __main__ as evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,10 +21,10 @@ def test_every_program_of_the_package_has_a_command():
     """What `python -m` runs has a command; builders, examples, processes of commands and front doors aside."""
     doors = {
         "arena_newton/__main__.py",
-        "arena_newton/probe.py",
-        "arena_newton/data/film_process.py",
-        "eval/mjlab_training.py",
-        "policies/train/decoder_process.py",
+        "arena_newton/files/probe.py",
+        "arena_newton/data/recording/film_process.py",
+        "eval/bench/mjlab_training.py",
+        "policies/train/frames/decoder_process.py",
         "policies/train/measured_training.py",
         "trackers/__main__.py",
         "usd_scenes/g1/build.py",
@@ -123,7 +123,7 @@ def test_a_command_ends_without_a_search_for_garbage():
     """Garbage is looked for rarely, and what a command leaves is frozen at the interpreter's end: both take seconds."""
     code = (
         "import atexit, gc\n"
-        "from arena_newton.command_line import exit_code\n"
+        "from arena_newton.cli.command_line import exit_code\n"
         "before = gc.get_freeze_count()\n"
         "atexit.register(lambda: print(gc.get_freeze_count() > before + 1000))\n"
         "assert exit_code(lambda: None) == exit_code(lambda: 0) == 0\n"
@@ -137,7 +137,7 @@ def test_a_crash_of_native_code_names_the_line():
     """A program that dies in a kernel or a driver leaves the Python lines of its threads on the error stream."""
     crash = (
         "import ctypes\n"
-        "from arena_newton.command_line import exit_code\n"
+        "from arena_newton.cli.command_line import exit_code\n"
         "def work():\n    ctypes.string_at(0)\n"
         "exit_code(work)\n"
     )

@@ -8,10 +8,10 @@ import pytest
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval import stats
 from arena_newton.eval.__main__ import main as eval_main
-from arena_newton.eval.config import resolve
-from arena_newton.eval.options import RunOptions
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.statistics import stats
 from arena_newton.usd_scenes.__main__ import main as scenes_main
 from arena_newton.usd_scenes.build import parts
 from arena_newton.usd_scenes.skeleton import write
@@ -77,7 +77,7 @@ def test_its_scene_and_its_code_are_part_of_a_runs_identity(bell, monkeypatch):
         layer.write("# heavier\n")
     second = identity(bell)["foreign_tasks"]
     assert second[bell]["code"] == first[bell]["code"] and second[bell]["scene"] != first[bell]["scene"]
-    monkeypatch.setattr("arena_newton.eval.identity.own_code", lambda part: "0123456789ab")
+    monkeypatch.setattr("arena_newton.eval.records.identity.own_code", lambda part: "0123456789ab")
     assert identity(bell)["foreign_tasks"][bell]["code"] != first[bell]["code"]
 
 

@@ -6,10 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from arena_newton import robot as g1
-from arena_newton import rule_sets, seeding, tasks
-from arena_newton.rules import MODES
-from arena_newton.scene import ROBOT, Scene, load_scene
+from arena_newton import rule_sets, tasks
+from arena_newton.physics.scene import Scene, load_scene
+from arena_newton.robot import g1
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import MODES
+from arena_newton.tasks.handles import ROBOT
 
 ALLOWED = 0.01
 """Penetration that physics undoes unseen [m]."""

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import arena_newton
-from arena_newton.own_processes import environment
+from arena_newton.files.own_processes import environment
 
 
 def test_a_process_finds_this_package(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from arena_newton.extras import require
+from arena_newton.cli.extras import require
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = ("kernels", "trackers", "policies", "eval", "usd_scenes")
@@ -97,7 +97,7 @@ def test_what_is_imported_is_a_dependency():
     # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
     known = {*sys.stdlib_module_names, "arena_newton", "tensordict"}
     # Run by the interpreter of that other program, never imported.
-    theirs = {"eval/mjlab_training.py": {"mjlab"}}
+    theirs = {"eval/bench/mjlab_training.py": {"mjlab"}}
     for folder in ("arena_newton", *FLOORS):
         for path in (ROOT / folder).rglob("*.py"):
             allowed = known | theirs.get(path.resolve().relative_to(ROOT).as_posix(), set())

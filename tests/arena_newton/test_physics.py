@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 
 from arena_newton.errors import InputError
-from arena_newton.physics import make_physics, resolve_engine
-from arena_newton.robot import DEFAULT_POSE, PhysicsRate
-from arena_newton.scene import load_scene
+from arena_newton.physics.engines import make_physics, resolve_engine
+from arena_newton.physics.scene import load_scene
+from arena_newton.robot.g1 import DEFAULT_POSE, PhysicsRate
 
 
 def _standing(physics):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton import robot as g1
 from arena_newton import rule_sets, tasks
-from arena_newton.scene import load_scene
+from arena_newton.physics.scene import load_scene
+from arena_newton.robot import g1
 
 
 class Bench:

@@ -14,7 +14,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, EpisodeEvent, Predicate, Recorder
 from arena_newton.policies.base import Policy
 from arena_newton.policies.lerobot.chunk_memory import ChunkMemory
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.football import FootballJudge
 

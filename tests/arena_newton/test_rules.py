@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton import rule_sets, rules, tasks
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
+from arena_newton.rules import rule_types
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "rules.md"
 
@@ -50,7 +51,7 @@ def test_unknown_names_are_refused():
     with pytest.raises(InputError, match="football"):
         rule_sets.get("paper").hash_for(["golf"])
     with pytest.raises(InputError, match="typo: unknown, choose paper or released"):
-        rules.ByRules(1, 2).of("typo")
+        rule_types.ByRules(1, 2).of("typo")
 
 
 ORIGINAL = {  # budgets of the paper and of the launch scripts; the robot's position [m] and yaw [deg] at the start
@@ -133,7 +134,7 @@ def test_the_hash_of_a_run_is_that_of_its_tasks():
     assert dataclasses.replace(paper, tasks=others).hash_for(used) == first
     own = tuple(dataclasses.replace(t, max_steps=1) if t.task in used else t for t in paper.tasks)
     assert dataclasses.replace(paper, tasks=own).hash_for(used) != first
-    assert dataclasses.replace(paper, fall=rules.FallRule(at_once=False)).hash_for(used) != first
+    assert dataclasses.replace(paper, fall=rule_types.FallRule(at_once=False)).hash_for(used) != first
     assert rule_sets.get("released").hash_for(used) != first
     assert paper.hash_for(tasks.names()) == paper.hash != first
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import arena_newton
-from arena_newton import rotations
-from arena_newton.rotations import atan2, heading, wrap_angle
+from arena_newton.robot import rotations
+from arena_newton.robot.rotations import atan2, heading, wrap_angle
 
 ROWS = (1, 5, 20, 31, 32, 33, 60, 128)
 """torch computes blocks of 32 angles otherwise than what is left over."""

@@ -5,7 +5,8 @@ import zlib
 import numpy as np
 import pytest
 
-from arena_newton import seeding, tasks
+from arena_newton import tasks
+from arena_newton.rules import seeding
 
 FOOTBALL = tasks.get("football").gym_id
 DOUBLE_DESK = tasks.get("double_desk").gym_id

@@ -7,9 +7,10 @@ import random
 import numpy as np
 import pytest
 
-from arena_newton import rule_sets, seeding, tasks
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.rules import MODES, PoseRange
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import MODES, PoseRange
 from arena_newton.tasks.base import light_direction, widened
 
 PAPER, RELEASED = rule_sets.get("paper"), rule_sets.get("released")
@@ -252,7 +253,7 @@ def stage_of(task: str):
     """The task's stage."""
     from pxr import Usd
 
-    from arena_newton.scene import scene_path
+    from arena_newton.physics.scene import scene_path
 
     return Usd.Stage.Open(str(scene_path(task)))
 
@@ -294,7 +295,7 @@ def test_latch_stays_released_until_reset():
     """The handle releases at its angle, letting go does not lock again, a reset locks the masked worlds only."""
     import warp as wp
 
-    from arena_newton.kernels import latch
+    from arena_newton.kernels.rules import latch
 
     release = math.radians(-20.0)
     qpos = wp.zeros((3, 2), dtype=wp.float32, device="cpu")
@@ -338,7 +339,7 @@ over "World"
 
 def test_a_box_of_several_solids_is_judged_whole(tmp_path):
     """P&PBox's centre and half sizes are those of the box around all its solids, here a cube and a wider lid."""
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
 
     layer = tmp_path / "lid.usda"
     layer.write_text(LID.format(scene="arena_newton/usd_scenes/pp_box/scene.usda"))
@@ -354,7 +355,7 @@ def test_a_box_of_several_solids_is_judged_whole(tmp_path):
 
 def test_the_pelvis_alone_counts_as_two_on_the_sofa():
     """`released` lists the pelvis with its contour, which the original's robot carries as a body in its place."""
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
 
     scene = load_scene("sit_sofa", device="cpu", native=True)
     counted = tasks.get("sit_sofa").judge(scene, RELEASED).touching.numpy().tolist()
@@ -364,7 +365,7 @@ def test_the_pelvis_alone_counts_as_two_on_the_sofa():
 @pytest.mark.parametrize(("variant", "rule_set", "ring"), [("semantic", RELEASED, True), ("semantic", PAPER, False)])
 def test_only_released_reads_the_ring_as_a_disc(variant, rule_set, ring):
     """The semantic sign's zone is a disc for `released`, its bounding box for `paper`."""
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
 
     scene = load_scene("vis_navi", variant=variant, device="cpu", native=True)
     assert tasks.get("vis_navi").judge(scene, rule_set).round is ring

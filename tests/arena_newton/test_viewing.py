@@ -13,12 +13,12 @@ import zstandard
 from pxr import Usd, UsdGeom, UsdUtils
 
 from arena_newton import trackers
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeResult
-from arena_newton.robot import TICK
-from arena_newton.viewing import EVERY, SCENE, FailureRecorder, WorldViewer
+from arena_newton.pictures.viewing import EVERY, SCENE, FailureRecorder, WorldViewer
+from arena_newton.robot.canonical import STAND_ACTION
+from arena_newton.robot.g1 import TICK
 
 WORLDS, TICKS = 2, 10
 

@@ -1,6 +1,6 @@
 """Signals for tests: those of an episode that went well, with some changed."""
 
-from arena_newton.eval.episode_signals import EpisodeSignals
+from arena_newton.eval.records.episode_signals import EpisodeSignals
 
 WELL = {
     "looks": 9,

@@ -5,18 +5,12 @@ import json
 from rows import full, record
 from test_report import document_of
 
-from arena_newton import seeding, tasks
-from arena_newton.eval.journal import Journal
-from arena_newton.eval.stats import suites
-from arena_newton.eval.suite_records import (
-    SUITE_FILE,
-    CellEvent,
-    SuiteCell,
-    SuitePlan,
-    event_line,
-    journal_file,
-    suite_json,
-)
+from arena_newton import tasks
+from arena_newton.eval.records.document import SUITE_FILE
+from arena_newton.eval.records.journal import Journal
+from arena_newton.eval.statistics.stats import suites
+from arena_newton.eval.suites.suite_records import CellEvent, SuiteCell, SuitePlan, event_line, journal_file, suite_json
+from arena_newton.rules import seeding
 
 HOI, HSI = suites()["HOI_AVG"], suites()["HSI_AVG"]
 SEEDS, REPEATS = (0, 1, 2), 20

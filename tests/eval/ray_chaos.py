@@ -19,7 +19,7 @@ from pathlib import Path
 from ray_nodes import Nodes
 from test_shard_merge import contents
 
-from arena_newton.eval.shard_merge import merge
+from arena_newton.eval.workers.shard_merge import merge
 
 EVAL = [sys.executable, "-m", "arena_newton.eval"]
 

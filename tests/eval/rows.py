@@ -1,7 +1,8 @@
 """Journal lines for tests: some keys are given, the others are filled in as a run would."""
 
-from arena_newton import seeding, tasks
-from arena_newton.eval.journal import SCHEMA, EpisodeRecord
+from arena_newton import tasks
+from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord
+from arena_newton.rules import seeding
 
 
 def episodes(task, per_seed, repeats=20, falls=0, index=0):

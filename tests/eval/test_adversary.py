@@ -10,8 +10,8 @@ import pytest
 from eval_fakes import FakeEnv, factories
 
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.placement_axes import Axis
-from arena_newton.eval.worst_placement import score_of, search, worst_of
+from arena_newton.eval.studies.placement_axes import Axis
+from arena_newton.eval.studies.worst_placement import score_of, search, worst_of
 from arena_newton.interfaces import EpisodeResult, Verdict
 from arena_newton.kernels import tick as codes
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
-from arena_newton.eval.bench_tick import network_seconds
-from arena_newton.eval.options import BenchOptions
-from arena_newton.policies.train.resnet_weights import find_resnet
+from arena_newton.eval.bench import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
+from arena_newton.eval.bench.bench_tick import network_seconds
+from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.policies.lerobot.resnet_weights import find_resnet
 
 
 def figures_of(options):

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval import bench_learned, bench_policy, bench_start
-from arena_newton.eval.options import BenchOptions
+from arena_newton.eval.bench import bench_learned, bench_policy, bench_start
+from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import families, pi05_family
+from arena_newton.policies.train.families import families, pi05_family
 from tests.made_packed import packed
 
 

@@ -10,14 +10,14 @@ import shutil
 import pytest
 import warp as wp
 
-from arena_newton import seeding
 from arena_newton.env import ArenaEnv
-from arena_newton.eval import certify
-from arena_newton.eval.certification import solvable
-from arena_newton.eval.options import CertifyOptions
-from arena_newton.eval.recordings import ActionRecorder
+from arena_newton.eval.certification.checks import solvable
+from arena_newton.eval.commands import certify
+from arena_newton.eval.folders.recordings import ActionRecorder
+from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.policies.experts.base import ExpertPolicy
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 from arena_newton.trackers.twist2 import Twist2Tracker
 
 HONEST = ("journal", "recording", "policy-inputs", "tracker-inputs")

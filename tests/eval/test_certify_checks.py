@@ -7,19 +7,20 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import rule_sets, seeding, tasks, trackers
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.eval import certify
-from arena_newton.eval.certification import agreement, axes, visible
-from arena_newton.eval.certification.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
+from arena_newton import rule_sets, tasks, trackers
+from arena_newton.eval.certification.checks import agreement, axes, visible
+from arena_newton.eval.certification.checks.swap import retention
+from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell
 from arena_newton.eval.certification.finding import Score, Sheet, discordant
-from arena_newton.eval.certification.swap import retention
-from arena_newton.eval.certification.traces import first_difference, play
-from arena_newton.eval.options import CertifyOptions
-from arena_newton.eval.run import Factories
+from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
+from arena_newton.eval.commands import certify
+from arena_newton.eval.plan.options import CertifyOptions
+from arena_newton.eval.play.run import Factories
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.robot import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
+from arena_newton.rules import seeding
 
 SEEDS = [seeding.episode_seed(tasks.get("boxing").gym_id, 0, repeat) for repeat in range(300)]
 
@@ -281,7 +282,7 @@ def test_a_tiny_real_certification(tmp_path, capsys):
 
 def test_touches_of_the_sill_are_counted_per_episode():
     """Every tick with a force counts for the episode that its world runs, ticks of worlds at rest for none."""
-    from arena_newton.eval.certification.sill import Treads
+    from arena_newton.eval.certification.checks.sill import Treads
 
     force = np.zeros(2)
     model = SimpleNamespace(geom_bodyid=np.array([0, 1, 2]))

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton import physics_batch, scene
-from arena_newton.eval import certify
-from arena_newton.eval.certification import closed_forms
-from arena_newton.eval.options import CertifyOptions
-from arena_newton.kernels import success
+from arena_newton.eval.certification.checks import closed_forms
+from arena_newton.eval.commands import certify
+from arena_newton.eval.plan.options import CertifyOptions
+from arena_newton.kernels.rules import success
+from arena_newton.physics import batch, scene
 from arena_newton.pictures.camera import Camera
 
 
@@ -32,14 +32,14 @@ def one_engine(monkeypatch):
 
 def compiled(monkeypatch, change):
     """Change the models that episodes step, each as it is made."""
-    made = physics_batch._at_rate
+    made = batch._at_rate
 
     def cheat(*given):
         model = made(*given)
         change(model)
         return model
 
-    monkeypatch.setattr(physics_batch, "_at_rate", cheat)
+    monkeypatch.setattr(batch, "_at_rate", cheat)
 
 
 def gravity_less_3_percent(monkeypatch):
@@ -74,10 +74,8 @@ def weaker_drives(monkeypatch):
 
 def livelier_ball(monkeypatch):
     """Its coefficient of restitution is higher by 0.05."""
-    given = physics_batch.set_restitution
-    monkeypatch.setattr(
-        physics_batch, "set_restitution", lambda scene, e, dt, *models: given(scene, e + 0.05, dt, *models)
-    )
+    given = batch.set_restitution
+    monkeypatch.setattr(batch, "set_restitution", lambda scene, e, dt, *models: given(scene, e + 0.05, dt, *models))
 
 
 def wider_camera(monkeypatch):

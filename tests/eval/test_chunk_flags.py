@@ -12,12 +12,12 @@ from test_report import document_of
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.config import recording_run, resolve
-from arena_newton.eval.options import RecordOptions, RunOptions
-from arena_newton.eval.recording import disturbance_of, facts_of
-from arena_newton.eval.results import RunRecord, load_run
-from arena_newton.eval.tables import joint_table
-from arena_newton.eval.wording import replay_command
+from arena_newton.eval.folders.results import RunRecord, load_run
+from arena_newton.eval.plan.config import recording_run, resolve
+from arena_newton.eval.plan.options import RecordOptions, RunOptions
+from arena_newton.eval.play.recording import disturbance_of, facts_of
+from arena_newton.eval.reports.wording import replay_command
+from arena_newton.eval.tables.run_table import joint_table
 from arena_newton.interfaces import Chunk
 
 PLAIN = ["--task", "boxing", "--seeds", "0", "--repeats", "3", "--worlds", "2", "--max-steps", "50"]

@@ -13,12 +13,12 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton import rule_sets, tasks
-from arena_newton.command_line import exit_code
+from arena_newton.cli.command_line import exit_code
 from arena_newton.errors import InputError
-from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.config import resolve
-from arena_newton.eval.options import RunOptions
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play import run
 from arena_newton.policies.learned import learned_card
 from arena_newton.tasks import football
 
@@ -325,8 +325,8 @@ def test_broken_variant_is_one_line(command, tmp_path, capsys):
 
 def test_identity_covers_scenes_and_code():
     """Scenes and code count by content, so that a resumed run cannot mix two worlds."""
-    from arena_newton.eval import config
-    from arena_newton.eval.options import RunOptions
+    from arena_newton.eval.plan import config
+    from arena_newton.eval.plan.options import RunOptions
 
     identity = config.resolve(RunOptions(task=("football",))).identity()
     assert len(identity["code"]) == len(identity["scenes"]) == 12

@@ -15,11 +15,11 @@ from rows import episodes
 from test_report import folder_with
 
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.comparison import Contender, compare
-from arena_newton.eval.comparison_text import difference_text, p_text, verdict
-from arena_newton.eval.sharding import Shard, dealt
-from arena_newton.eval.stats import Contrast, mcnemar, wilson
-from arena_newton.eval.suite_records import CellEvent, event_line
+from arena_newton.eval.records.sharding import Shard, dealt
+from arena_newton.eval.statistics.comparison import Contender, compare
+from arena_newton.eval.statistics.stats import Contrast, mcnemar, wilson
+from arena_newton.eval.suites.suite_records import CellEvent, event_line
+from arena_newton.eval.tables.comparison_text import difference_text, p_text, verdict
 
 
 def run_in(folder, per_seed, *, task="football", tracker="t", policy="p", strips=False, rules="paper", **config):

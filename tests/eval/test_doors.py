@@ -13,13 +13,13 @@ from lerobot.scripts.lerobot_eval import eval_main
 
 from arena_newton import policies
 from arena_newton.errors import InputError
-from arena_newton.eval import door_comparison
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.door_comparison import DoorEpisode, DoorPlay, compare_doors, door_table
-from arena_newton.eval.door_options import DOOR_NAMES, DoorOptions
-from arena_newton.eval.lerobot_env import ArenaNewtonEnv
-from arena_newton.eval.lerobot_env.labelled_worlds import V4VectorEnv
-from arena_newton.eval.picture_differences import picture_rows, picture_table
+from arena_newton.eval.adapters import door_comparison
+from arena_newton.eval.adapters.door_comparison import DoorEpisode, DoorPlay, compare_doors, door_table
+from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
+from arena_newton.eval.adapters.lerobot_env import ArenaNewtonEnv
+from arena_newton.eval.adapters.lerobot_env.labelled_worlds import V4VectorEnv
+from arena_newton.eval.adapters.picture_differences import picture_rows, picture_table
 from arena_newton.policies.replay import ReplayEpisodes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies" / "checkpoints"))
@@ -28,7 +28,7 @@ from made_checkpoints import SIDE, facts, save
 TASKS = ("boxing", "vis_navi")
 TICKS = 8
 """Step budget of an episode: more than a chunk."""
-PLUGIN = ["--env.discover_packages_path=arena_newton.eval.lerobot_env", "--env.type=arena_newton"]
+PLUGIN = ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
 
 
 @pytest.fixture(scope="module")

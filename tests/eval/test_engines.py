@@ -5,8 +5,8 @@ import json
 import pytest
 
 from arena_newton.errors import InputError
-from arena_newton.eval import engines
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.studies import engines
 
 
 def test_fisher_known_values():

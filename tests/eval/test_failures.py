@@ -12,22 +12,23 @@ from made_signals import UNTOUCHED, WELL, signals
 from rows import episodes, full, record
 from test_report import document_of, folder_with
 
-from arena_newton import seeding, tasks, trackers
+from arena_newton import tasks, trackers
+from arena_newton.cli.flags import parse_flags
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
-from arena_newton.eval import report
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.failures import HELD_OUT, LEAST, TUNED, confusion
-from arena_newton.eval.certification.failures import failures as check
-from arena_newton.eval.certification.labelled_failures import (
+from arena_newton.eval.certification.checks.failures import HELD_OUT, LEAST, TUNED, confusion
+from arena_newton.eval.certification.checks.failures import failures as check
+from arena_newton.eval.certification.checks.labelled_failures import (
     LABELLED,
     LabelledFailure,
     agreements,
     labelled_failures,
     labelled_sheets,
 )
-from arena_newton.eval.certification.sabotage import (
+from arena_newton.eval.certification.checks.traces import StateTrace, first_difference
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.stand_ins.sabotage import (
     HALTS,
     PERCHED,
     SABOTAGES,
@@ -35,22 +36,22 @@ from arena_newton.eval.certification.sabotage import (
     RelocatingEnv,
     WeakTracker,
 )
-from arena_newton.eval.certification.traces import StateTrace, first_difference
-from arena_newton.eval.failure_counts import failure_cells
-from arena_newton.eval.failure_rules import BARS, near_bars, sees_at_start, stage_of, waits_in_view
-from arena_newton.eval.failure_stage import FailureStage
-from arena_newton.eval.interaction import INTERACTIONS
-from arena_newton.eval.interaction_view import InteractionView
-from arena_newton.eval.journal import EpisodeRecord, Journal, read_journal
-from arena_newton.eval.options import CertifyOptions, RunOptions
-from arena_newton.eval.own_tracker import own_options
-from arena_newton.eval.results import OWN_FOLDER, load_run
-from arena_newton.eval.run import Factories
-from arena_newton.eval.signal_recorder import SEEN, SignalRecorder
-from arena_newton.flags import parse_flags
+from arena_newton.eval.folders.failure_counts import failure_cells
+from arena_newton.eval.folders.failure_rules import BARS, near_bars, sees_at_start, stage_of, waits_in_view
+from arena_newton.eval.folders.failure_stage import FailureStage
+from arena_newton.eval.folders.results import OWN_FOLDER, load_run
+from arena_newton.eval.plan.interaction import INTERACTIONS
+from arena_newton.eval.plan.options import CertifyOptions, RunOptions
+from arena_newton.eval.play.interaction_view import InteractionView
+from arena_newton.eval.play.own_tracker import own_options
+from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.signal_recorder import SEEN, SignalRecorder
+from arena_newton.eval.records.journal import EpisodeRecord, Journal, read_journal
+from arena_newton.eval.reports import report
 from arena_newton.policies.experts import ExpertPolicy, Sight
-from arena_newton.robot import DEFAULT_POSE, LEGS
+from arena_newton.robot.g1 import DEFAULT_POSE, LEGS
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 from arena_newton.tasks.football import BALL, GOAL, TOE
 from arena_newton.trackers.motions.commands import MotionCommand
 
@@ -334,7 +335,7 @@ def played(signals_of):
 def agreed(monkeypatch):
     """Real failures on which readers and rules agree."""
     same = [LabelledFailure(number, (FailureStage.CONTACT,) * 3) for number in range(1, 11)]
-    monkeypatch.setattr("arena_newton.eval.certification.failures.labelled_failures", lambda: same)
+    monkeypatch.setattr("arena_newton.eval.certification.checks.failures.labelled_failures", lambda: same)
     return same
 
 

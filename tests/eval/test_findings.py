@@ -12,14 +12,14 @@ import pytest
 from made_suites import HOI, HSI, cell_of, outcomes, write_suite
 
 from arena_newton.errors import InputError
-from arena_newton.eval import findings_text, paper_claims
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.evaluated_cells import read_cells
-from arena_newton.eval.paper_numbers import paper_numbers
-from arena_newton.eval.stats import contrast, holm, paired_rates, suites, wilson
-from arena_newton.eval.table_entries import SEMANTIC_STRENGTH, semantic_text
-from arena_newton.eval.tables_command import BEGIN, END
-from arena_newton.eval.trainings import DROP_SPREAD, MATCHED_SPREAD, SWAPPED_SPREAD
+from arena_newton.eval.commands.tables_command import BEGIN, END
+from arena_newton.eval.statistics.stats import contrast, holm, paired_rates, suites, wilson
+from arena_newton.eval.statistics.trainings import DROP_SPREAD, MATCHED_SPREAD, SWAPPED_SPREAD
+from arena_newton.eval.tables import findings_text, paper_claims
+from arena_newton.eval.tables.evaluated_cells import read_cells
+from arena_newton.eval.tables.paper_numbers import paper_numbers
+from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 

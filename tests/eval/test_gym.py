@@ -11,13 +11,15 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from watched import Table, WatchedEnv
 
-from arena_newton import seeding, tasks, trackers
-from arena_newton.canonical import STAND_ACTION
+from arena_newton import tasks, trackers
 from arena_newton.errors import InputError
-from arena_newton.eval import gym, plan
-from arena_newton.eval.gym import ArenaVectorEnv
+from arena_newton.eval.adapters import gym
+from arena_newton.eval.adapters.gym import ArenaVectorEnv
+from arena_newton.eval.plan import episode_plan
 from arena_newton.policies import get
+from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 
 BLIND = {"engine": "mujoco", "device": "cpu", "image_size": None}
 """Worlds on the CPU without pictures."""
@@ -58,7 +60,7 @@ def wild(tick, worlds):
 
 def planned(task, count, **options):
     """The first episodes of the plan."""
-    return plan.expand([task], trackers=["twist2"], policy="table", seeds=[0], repeats=count, **options)
+    return episode_plan.expand([task], trackers=["twist2"], policy="table", seeds=[0], repeats=count, **options)
 
 
 def rollout(task, count, worlds, policy, recorder=(), tracker="twist2", max_steps=None):
@@ -310,7 +312,7 @@ def test_seeds_make_episodes(make):
     assert (info["seed"] >= gym.PROTOCOL_EPISODES).all()
     _, info = env.reset(seed=[7, None])
     assert info["seed"].tolist() == [7, 8]
-    five = plan.expand(["football"], trackers=["twist2"], policy="table", seeds=[1], repeats=5)
+    five = episode_plan.expand(["football"], trackers=["twist2"], policy="table", seeds=[1], repeats=5)
     assert info["episode_seed"].tolist() == [five[2].episode_seed, five[3].episode_seed]
     first, _ = env.reset(seed=7)
     again, _ = env.reset(seed=7)

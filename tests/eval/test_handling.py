@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import seeding, tasks, trackers
-from arena_newton.canonical import ACTION, STAND_ACTION
+from arena_newton import tasks, trackers
 from arena_newton.env import ArenaEnv
-from arena_newton.eval.certification.handling import HANDLING
-from arena_newton.eval.certification.sabotage import (
+from arena_newton.eval.certification.stand_ins.handling import HANDLING
+from arena_newton.eval.certification.stand_ins.sabotage import (
     BENT,
     GROWS,
     KNEES,
@@ -25,12 +24,14 @@ from arena_newton.eval.certification.sabotage import (
     UnbalancedExpert,
     WeakTracker,
 )
-from arena_newton.eval.interaction import INTERACTIONS
-from arena_newton.eval.run import Factories
-from arena_newton.eval.signal_recorder import SignalRecorder
+from arena_newton.eval.plan.interaction import INTERACTIONS
+from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.policies.experts import Sight
 from arena_newton.policies.experts.style import Style
-from arena_newton.rotations import matrix_from_quat, quat_from_rot6d
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.rotations import matrix_from_quat, quat_from_rot6d
+from arena_newton.rules import seeding
 from arena_newton.trackers.motions.commands import MotionCommand
 
 WORLDS = 2

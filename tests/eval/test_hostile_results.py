@@ -12,8 +12,9 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton import doctor
-from arena_newton.eval import config, identity
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.plan import config
+from arena_newton.eval.records import identity
 
 COUNT = 160
 """Mutated files a reader."""

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from arena_newton.errors import InputError
-from arena_newton.eval import identity
-from arena_newton.eval.config import resolve
-from arena_newton.eval.options import RunOptions
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.records import identity
 from arena_newton.rule_sets import get
 
 TASKS = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
@@ -32,8 +32,9 @@ def modules():
 
 
 def excluded(name):
-    """Whether the list of exceptions names a module or a folder above it."""
-    return any(part.as_posix() in identity.UNHASHED for part in (Path(name), *Path(name).parents))
+    """Whether a module lies in one of the exceptions, or is a command line."""
+    rooms = [part.as_posix() for part in Path(name).parents]
+    return Path(name).name == "__main__.py" or any(room in identity.UNHASHED for room in rooms)
 
 
 def test_every_module_counts():
@@ -49,7 +50,13 @@ def test_every_module_counts():
         after = identity.hash_paths(identity.PACKAGE, files, touched.__getitem__)
         assert (after == before) == excluded(name), name
     counted = names(files)
-    for name in ("usd_scenes/g1/links.py", "eval/plan.py", "eval/run.py", "env.py", "policies/experts/vis_navi.py"):
+    for name in (
+        "usd_scenes/g1/links.py",
+        "eval/plan/episode_plan.py",
+        "eval/play/run.py",
+        "env.py",
+        "policies/experts/vis_navi.py",
+    ):
         assert name in counted
 
 
@@ -62,16 +69,30 @@ def test_a_new_module_anywhere_counts(tmp_path):
         (tmp_path / name).write_text("")
         assert identity.code_hash(tmp_path) != before
         before = identity.code_hash(tmp_path)
-    for name in ("trackers/train/ppo.py", "eval/report.py", "__pycache__/env.py", "notes.md"):
+    for name in ("trackers/train/ppo.py", "eval/reports/report.py", "__pycache__/env.py", "notes.md"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
     assert identity.code_hash(tmp_path) == before
 
 
+def test_the_exceptions_are_rooms():
+    """Each of them is a folder with modules, so that a file follows its room."""
+    for room in identity.UNHASHED:
+        assert list((identity.PACKAGE / room).glob("*.py")), room
+
+
+def test_a_module_that_moves_changes_its_standing(tmp_path):
+    """The same module is hashed in a room that decides episodes and is not in a room that reports."""
+    for room, counts in (("eval/play", True), ("eval/reports", False), ("eval/plan", True), ("policies/train", False)):
+        root = tmp_path / room.replace("/", "_")
+        (root / room).mkdir(parents=True)
+        empty = identity.code_hash(root)
+        (root / room / "moved.py").write_text("")
+        assert (identity.code_hash(root) != empty) == counts
+
+
 def test_the_exceptions_move_nothing():
-    """No hashed module imports an exception of trackers; of eval's only the run uses those that keep and report."""
-    used = "config console folder journal options progress recording records report results rounds viewing".split()
-    used += ["episode_signals", "signal_recorder", "whole_run"]
+    """Only the rooms of plan and play import exceptions, and of these only what is stored, kept and reported."""
     for name, file in modules().items():
         if excluded(name):
             continue
@@ -82,15 +103,10 @@ def test_the_exceptions_move_nothing():
             elif isinstance(node, ast.ImportFrom) and node.module:
                 found = [f"{node.module}.{alias.name}" for alias in node.names]
             for imported in found:
-                path = imported.removeprefix("arena_newton.").replace(".", "/")
-                for part in (Path(path), *Path(path).parents):
-                    if (
-                        imported.startswith("arena_newton.")
-                        and f"{part}.py" in identity.UNHASHED
-                        or str(part) in identity.UNHASHED
-                    ):
-                        assert name in ("eval/run.py", "eval/recordings.py", "eval/plan.py"), (name, imported)
-                        assert part.name in used, (name, imported)
+                path = Path(imported.removeprefix("arena_newton.").replace(".", "/"))
+                for room in {part.as_posix() for part in (path, *path.parents)} & set(identity.UNHASHED):
+                    assert Path(name).parent.as_posix() in ("eval/plan", "eval/play"), (name, imported)
+                    assert room in ("eval/records", "eval/folders", "eval/reports", "eval/statistics"), (name, imported)
 
 
 def test_scenes_of_the_run_count():

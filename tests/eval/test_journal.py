@@ -9,8 +9,8 @@ import pytest
 import rows
 
 from arena_newton.errors import InputError
-from arena_newton.eval import journal as module
-from arena_newton.eval.journal import Journal, StorageError, read_journal, write_atomic
+from arena_newton.eval.records import journal as module
+from arena_newton.eval.records.journal import Journal, StorageError, read_journal, write_atomic
 
 ROWS = rows.episodes("football", (1, 0, 0))
 

@@ -6,9 +6,9 @@ import pytest
 
 from arena_newton import trackers
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.lasting_env import EnvironmentKeeper
-from arena_newton.eval.run import Factories
-from arena_newton.eval.suite_records import read_suite
+from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.play.run import Factories
+from arena_newton.eval.suites.suite_records import read_suite
 
 SUITE = """
 [defaults]

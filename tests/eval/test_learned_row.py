@@ -10,11 +10,11 @@ from eval_fakes import FakePolicy, factories
 
 from arena_newton import policies
 from arena_newton.errors import InputError
-from arena_newton.eval import run
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.config import resolve
-from arena_newton.eval.folder import stored_options
-from arena_newton.eval.options import RunOptions
+from arena_newton.eval.folders.run_folder import stored_options
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play import run
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.learned.learned_card import read_card
 from tests.made_packed import checkpoint, packed

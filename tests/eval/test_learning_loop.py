@@ -16,12 +16,12 @@ import torch
 from safetensors.torch import save_file
 
 from arena_newton.errors import InputError
-from arena_newton.eval import learning_loop, loop_report
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.learning_loop import LOOP_FILE, LoopParts, resolved
-from arena_newton.eval.loop_report import StageRecord
-from arena_newton.eval.options import LoopOptions
-from arena_newton.eval.results import load_run
+from arena_newton.eval.folders.results import load_run
+from arena_newton.eval.loop import learning_loop, loop_report
+from arena_newton.eval.loop.learning_loop import LOOP_FILE, LoopParts, resolved
+from arena_newton.eval.loop.loop_report import StageRecord
+from arena_newton.eval.plan.options import LoopOptions
 from tests.fuzz.mutants import damaged
 
 FLAGS = ["--small", "--task", "boxing", "--tracker", "pd", "--engine", "mujoco", "--device", "cpu", "--episodes", "2"]
@@ -38,7 +38,7 @@ def kill():
     os.kill(os.getpid(), signal.SIGKILL)
 
 if at == "record":
-    from arena_newton.eval.journal import Journal
+    from arena_newton.eval.records.journal import Journal
     append = Journal.append
     Journal.append = lambda self, record: (append(self, record), kill())
 if at == "build":

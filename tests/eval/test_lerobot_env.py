@@ -19,16 +19,17 @@ from lerobot.scripts.lerobot_eval import eval_main
 from watched import Table, WatchedEnv
 
 from arena_newton import trackers
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.errors import InputError
-from arena_newton.eval import gym, plan
-from arena_newton.eval.gym import ArenaVectorEnv
-from arena_newton.eval.lerobot_env import ArenaNewtonEnv
+from arena_newton.eval.adapters import gym
+from arena_newton.eval.adapters.gym import ArenaVectorEnv
+from arena_newton.eval.adapters.lerobot_env import ArenaNewtonEnv
+from arena_newton.eval.plan import episode_plan
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies import Chunk, Policy, get
+from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
 
-PLUGIN = "--env.discover_packages_path=arena_newton.eval.lerobot_env"
+PLUGIN = "--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env"
 SIDE = 64
 """Width and height of pictures [px]; the least that video encoders take."""
 CHUNK = 5
@@ -102,7 +103,7 @@ def rollout(task, count, policy, recorder=(), max_steps=None):
     camera = policy.camera if policy.needs_image else None
     env = WatchedEnv(task, tracker=trackers.get("twist2"), worlds=count, engine="mujoco", device="cpu", camera=camera)
     WatchedEnv.history.clear()
-    episodes = plan.expand([task], trackers=["twist2"], policy="test", seeds=[0], repeats=count)
+    episodes = episode_plan.expand([task], trackers=["twist2"], policy="test", seeds=[0], repeats=count)
     results = Rollout(env, policy, episodes, recorder=recorder, max_steps=max_steps).run()
     hashes = dict(WatchedEnv.history)
     WatchedEnv.history.clear()
@@ -232,6 +233,6 @@ def test_what_a_rollout_asks():
 def test_the_plug_in_is_light():
     """Its import loads neither physics nor renderer, so that LeRobot's help and checks do not wait for them."""
     heavy = {"warp", "newton", "mujoco", "pxr"}
-    code = f"import sys, arena_newton.eval.lerobot_env; print({heavy} & set(sys.modules))"
+    code = f"import sys, arena_newton.eval.adapters.lerobot_env; print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "set()", done.stderr

@@ -14,9 +14,9 @@ from eval_fakes import FakeEnv, FakePolicy, factories
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.matrix_cells import dealt, expand_cells, parse_only, run_options, selected
-from arena_newton.eval.suite_file import SHIPPED, read_suite_file
-from arena_newton.eval.suite_records import load_cell, read_events, read_suite
+from arena_newton.eval.suites.matrix_cells import dealt, expand_cells, parse_only, run_options, selected
+from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file
+from arena_newton.eval.suites.suite_records import load_cell, read_events, read_suite
 
 SUITE = """
 name = "small"

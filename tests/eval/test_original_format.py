@@ -7,8 +7,8 @@ import pytest
 from rows import episodes, made
 
 from arena_newton.errors import InputError
-from arena_newton.eval.original_format import SUMMARY_COLUMNS, final_csv, write_original
-from arena_newton.files import file_label
+from arena_newton.eval.folders.original_format import SUMMARY_COLUMNS, final_csv, write_original
+from arena_newton.files.own_files import file_label
 
 GYM = {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"}
 

@@ -8,9 +8,9 @@ import pytest
 from rows import episodes, record
 
 from arena_newton.errors import InputError
-from arena_newton.eval.paper_numbers import FAMILIES, FOLDER, TRAINING_SETS, paper_numbers, read_paper
-from arena_newton.eval.stats import contrast, holm, mcnemar, paired_rates, pooled, population_std, suites
-from arena_newton.rules import MODES
+from arena_newton.eval.statistics.stats import contrast, holm, mcnemar, paired_rates, pooled, population_std, suites
+from arena_newton.eval.tables.paper_numbers import FAMILIES, FOLDER, TRAINING_SETS, paper_numbers, read_paper
+from arena_newton.rules.rule_types import MODES
 
 FILES = ("in_gmt.csv", "cross_gmt.csv", "merge_all.csv")
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton.eval import peer_camera
-from arena_newton.eval.options import BenchOptions
+from arena_newton.eval.bench import peer_camera
+from arena_newton.eval.plan.options import BenchOptions
 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="draws 1024 worlds there")

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from arena_newton.errors import ArenaError
-from arena_newton.eval import peer_lerobot_eval
-from arena_newton.eval.options import BenchOptions
-from arena_newton.eval.peer_lerobot_eval import lerobot_eval_figures
+from arena_newton.eval.bench import peer_lerobot_eval
+from arena_newton.eval.bench.peer_lerobot_eval import lerobot_eval_figures
+from arena_newton.eval.plan.options import BenchOptions
 
 
 class _Programs:

@@ -8,7 +8,7 @@ import pytest
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.eval import plan
+from arena_newton.eval.plan import episode_plan
 
 KEYS = ["task", "mode", "rules", "group_seed", "repeat", "episode_seed", "object_seed", "sampled", "placed", "light"]
 KEYS += ["max_steps"]
@@ -16,7 +16,7 @@ KEYS += ["max_steps"]
 
 def expand(*names: str, **changes):
     """A plan with the default tracker and policy."""
-    return plan.expand(names or ("all",), **({"trackers": ("pd",), "policy": "stand"} | changes))
+    return episode_plan.expand(names or ("all",), **({"trackers": ("pd",), "policy": "stand"} | changes))
 
 
 def test_full_protocol():
@@ -49,7 +49,7 @@ def test_one_seed_for_every_mode_and_rule_set():
 
 def test_listing_holds_the_recorded_draws():
     """`list --json` shows the original's samples and their world poses, as plain JSON."""
-    (row,) = map(plan.listed, expand("double_desk", seeds=(0,), repeats=1))
+    (row,) = map(episode_plan.listed, expand("double_desk", seeds=(0,), repeats=1))
     assert list(row) == KEYS
     assert json.loads(json.dumps(row)) == row
     assert row["sampled"]["hammer"]["yaw"] == pytest.approx(-0.317236, abs=5e-7)
@@ -57,7 +57,7 @@ def test_listing_holds_the_recorded_draws():
     assert row["placed"]["basket"]["position"] == pytest.approx([-3.573021, -0.122363, 0.745], abs=5e-7)
     assert row["placed"]["hammer"]["prim"] == "/World/Hammer"
     assert row["light"] is None
-    (row,) = map(plan.listed, expand("double_desk", seeds=(0,), repeats=1, rules="released"))
+    (row,) = map(episode_plan.listed, expand("double_desk", seeds=(0,), repeats=1, rules="released"))
     assert row["placed"]["basket"]["position"] == pytest.approx([-2.83573, -0.10122, 0.75245], abs=5e-6)
     assert row["light"]["direction"] == [0.0, 0.0, -1.0]
 
@@ -66,7 +66,7 @@ def test_listing_holds_the_recorded_draws():
 def test_every_episode_lists_as_json(rules):
     """Every task in every mode lists all its objects; visual mode lists its light."""
     modes = ("base", "execution", "semantic", "visual")
-    rows = [plan.listed(e) for e in expand(modes=modes, rules=rules, seeds=(2,), repeats=2)]
+    rows = [episode_plan.listed(e) for e in expand(modes=modes, rules=rules, seeds=(2,), repeats=2)]
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     for row in rows:
         records = {o.record for o in tasks.get(row["task"]).objects}
@@ -114,7 +114,7 @@ def test_planning_imports_no_heavy_package():
 def test_weights_of_the_package_count():
     """Without --checkpoint a run's identity holds the hash of the weights that come with the package."""
     from arena_newton import trackers
-    from arena_newton.eval import config
+    from arena_newton.eval.plan import config
 
     path = trackers.shipped_weights("twist2")
     assert path is not None
@@ -128,7 +128,7 @@ def test_weights_of_the_package_count():
 def test_two_files_and_folders_as_checkpoint(tmp_path):
     """SONIC's two files, or the folder that holds them, are one checkpoint; a missing one of them is named."""
     from arena_newton.errors import InputError
-    from arena_newton.eval import config
+    from arena_newton.eval.plan import config
 
     for name in ("model_encoder.onnx", "model_decoder.onnx"):
         (tmp_path / name).write_bytes(name.encode())

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from arena_newton.eval.progress import Progress, duration, kernels_to_compile
+from arena_newton.eval.reports.progress import Progress, duration, kernels_to_compile
 
 
 class Clock:

@@ -10,13 +10,17 @@ import pytest
 from rows import episodes, record
 from scipy.stats import binomtest, fisher_exact, hypergeom
 
-from arena_newton.eval.certification import error_rates
-from arena_newton.eval.comparison import Contender, compare
-from arena_newton.eval.comparison_page import beta_density
-from arena_newton.eval.detectable import MOST_PAIRS, POWER, STEP, detectable_difference, detectable_text, paired_power
-from arena_newton.eval.evaluated_cells import EvaluatedCell
-from arena_newton.eval.paper_numbers import paper_numbers
-from arena_newton.eval.rate_tests import (
+from arena_newton.eval.certification.checks import error_rates
+from arena_newton.eval.statistics.comparison import Contender, compare
+from arena_newton.eval.statistics.detectable import (
+    MOST_PAIRS,
+    POWER,
+    STEP,
+    detectable_difference,
+    detectable_text,
+    paired_power,
+)
+from arena_newton.eval.statistics.rate_tests import (
     LARGEST_BOSCHLOO,
     PairedCounts,
     UnpairedCounts,
@@ -25,9 +29,12 @@ from arena_newton.eval.rate_tests import (
     rate_test,
     stratified_test,
 )
-from arena_newton.eval.stats import contrast, mcnemar, suites
-from arena_newton.eval.suite_tables import suite_tables
-from arena_newton.eval.trainings import RateTerm, trained_contrast
+from arena_newton.eval.statistics.stats import contrast, mcnemar, suites
+from arena_newton.eval.statistics.trainings import RateTerm, trained_contrast
+from arena_newton.eval.tables.comparison_page import beta_density
+from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.paper_numbers import paper_numbers
+from arena_newton.eval.tables.suite_tables import suite_tables
 
 
 def test_paired_test_is_the_binomial_test():
@@ -404,14 +411,16 @@ def test_the_summary_names_the_spreads_that_its_intervals_are_held_to(monkeypatc
 
 def test_a_test_that_errs_is_found_out(monkeypatch):
     """A test that quarters its p breaks its level in the same simulation."""
-    monkeypatch.setattr("arena_newton.eval.comparison.stratified_test", lambda strata: stratified_test(strata) / 4)
+    monkeypatch.setattr(
+        "arena_newton.eval.statistics.comparison.stratified_test", lambda strata: stratified_test(strata) / 4
+    )
     assert any(not tally.holds for tally in error_rates.tallies(150, episodes=20))
 
 
 def test_an_interval_of_episodes_alone_is_found_out(monkeypatch):
     """An interval that leaves out how much trainings differ does not cover them in the same simulation."""
-    monkeypatch.setattr("arena_newton.eval.trainings.MATCHED_SPREAD", 0.0)
-    monkeypatch.setattr("arena_newton.eval.trainings.ENOUGH", 99)
+    monkeypatch.setattr("arena_newton.eval.statistics.trainings.MATCHED_SPREAD", 0.0)
+    monkeypatch.setattr("arena_newton.eval.statistics.trainings.ENOUGH", 99)
     held = {t.what: t.holds for t in error_rates.tallies(60) if t.case == "2 recipes, trainings differ by 20 points"}
     assert len(held) == 4 and not held["interval over 3 trainings, one task, covers"]
 

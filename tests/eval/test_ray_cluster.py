@@ -13,7 +13,7 @@ from test_matrix import SUITE, journals
 from test_shard_merge import contents
 
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.shard_merge import merge
+from arena_newton.eval.workers.shard_merge import merge
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray_nodes import RAY, Nodes, actors, descendants, free_port, kill_all, wait_for  # noqa: E402  # its psutil comes with Ray

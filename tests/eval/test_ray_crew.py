@@ -11,17 +11,17 @@ from eval_fakes import factories
 
 from arena_newton import doctor
 from arena_newton.errors import InputError
-from arena_newton.eval.config import resolve
-from arena_newton.eval.folder import ResultsFolder
-from arena_newton.eval.options import RunOptions
-from arena_newton.eval.run import RunStopped, check_parts
-from arena_newton.eval.slice_events import Broke, Built, Node, Opened, Ticks
+from arena_newton.eval.folders.run_folder import ResultsFolder
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play.run import RunStopped, check_parts
+from arena_newton.eval.workers.slice_events import Broke, Built, Node, Opened, Ticks
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval import ray_crew  # noqa: E402
-from arena_newton.eval.ray_crew import Crew, Done, Job, Lease, Lost  # noqa: E402
+from arena_newton.eval.workers import ray_crew  # noqa: E402
+from arena_newton.eval.workers.ray_crew import Crew, Done, Job, Lease, Lost  # noqa: E402
 
 
 class Ref:
@@ -241,6 +241,7 @@ def test_other_code_or_versions_are_refused(crew_of):
 
 def test_the_driver_loads_no_physics():
     """What deals episodes out runs on a machine without GPU or simulator: neither torch nor Warp is imported."""
-    program = "import sys, arena_newton.eval.ray_run\nprint(*{'torch', 'warp', 'newton', 'mujoco'} & set(sys.modules))"
+    heavy = "{'torch', 'warp', 'newton', 'mujoco'}"
+    program = f"import sys, arena_newton.eval.workers.ray_run\nprint(*{heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.split() == []

@@ -3,20 +3,22 @@
 import pytest
 from eval_fakes import FakePolicy, factories
 
-from arena_newton import devices, doctor, extras
+from arena_newton import doctor
+from arena_newton.cli import extras
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.config import resolve
-from arena_newton.eval.folder import ResultsFolder
-from arena_newton.eval.journal import Journal, read_journal
-from arena_newton.eval.options import RunOptions
-from arena_newton.eval.run import RunStopped, check_parts
-from arena_newton.eval.slice_events import Ended, Slice
-from arena_newton.eval.slice_player import play
-from arena_newton.eval.whole_run import begun, progress_of
+from arena_newton.eval.folders.run_folder import ResultsFolder
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play.run import RunStopped, check_parts
+from arena_newton.eval.play.whole_run import begun, progress_of
+from arena_newton.eval.records.journal import Journal, read_journal
+from arena_newton.eval.workers.slice_events import Ended, Slice
+from arena_newton.eval.workers.slice_player import play
+from arena_newton.physics import devices
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
-from arena_newton.eval import ray_run  # noqa: E402
-from arena_newton.eval.ray_crew import Done, Job, Lost, Member  # noqa: E402
+from arena_newton.eval.workers import ray_run  # noqa: E402
+from arena_newton.eval.workers.ray_crew import Done, Job, Lost, Member  # noqa: E402
 
 PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine": "mujoco", "worlds": 4, "ray": ()}
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from test_matrix import SUITE, journals
 
-from arena_newton.eval.suite_records import read_suite
+from arena_newton.eval.suites.suite_records import read_suite
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray_nodes import Nodes, wait_for  # noqa: E402  # its psutil comes with Ray
@@ -46,9 +46,9 @@ def play(cluster, out, *flags):
 
 CREW = """
 import sys
-from arena_newton.eval.config import resolve
-from arena_newton.eval.options import RunOptions
-from arena_newton.eval.ray_crew import Crew, in_cluster
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.workers.ray_crew import Crew, in_cluster
 address, gpus, number = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 with in_cluster((address,)):
     crew = Crew(resolve(RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)), 8, None)

@@ -17,15 +17,16 @@ from test_shard_merge import contents
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.shard_merge import merge
-from arena_newton.eval.suite_records import load_cell, read_suite
+from arena_newton.eval.suites.suite_records import load_cell, read_suite
+from arena_newton.eval.workers.shard_merge import merge
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval import ray_crew, ray_run, ray_suite  # noqa: E402
-from arena_newton.eval.ray_actor import EpisodeActor  # noqa: E402
-from arena_newton.eval.slice_events import Node  # noqa: E402
+from arena_newton.eval.suites import ray_suite  # noqa: E402
+from arena_newton.eval.workers import ray_crew, ray_run  # noqa: E402
+from arena_newton.eval.workers.ray_actor import EpisodeActor  # noqa: E402
+from arena_newton.eval.workers.slice_events import Node  # noqa: E402
 
 
 class Answer:

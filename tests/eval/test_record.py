@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from arena_newton import policies
-from arena_newton.data import demonstration, film_pool
-from arena_newton.data.episode import EpisodeFile, episode_files
-from arena_newton.eval import recording
+from arena_newton.data.recording import demonstration, film_pool
+from arena_newton.data.recording.episode import EpisodeFile, episode_files
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.journal import read_journal
-from arena_newton.eval.results import load_run
-from arena_newton.eval.run import Factories
+from arena_newton.eval.folders.results import load_run
+from arena_newton.eval.play import recording
+from arena_newton.eval.play.run import Factories
+from arena_newton.eval.records.journal import read_journal
 from arena_newton.pictures.camera import Camera
 from arena_newton.pictures.settings import CameraConfig
 

@@ -4,12 +4,12 @@ import random
 
 import pytest
 
-from arena_newton import seeding
 from arena_newton.errors import InputError
-from arena_newton.eval import plan, rounds
-from arena_newton.eval.config import recorded_cameras, recording_run, resolve
-from arena_newton.eval.options import RecordOptions, RunOptions
-from arena_newton.eval.recording import outcome_lines
+from arena_newton.eval.plan import episode_plan, rounds
+from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
+from arena_newton.eval.plan.options import RecordOptions, RunOptions
+from arena_newton.eval.play.recording import outcome_lines
+from arena_newton.rules import seeding
 
 
 def played(group, succeeds, keep, order=lambda batch: batch):
@@ -64,7 +64,7 @@ def test_seeds_of_demonstrations_are_no_evaluation_seeds():
     seeds = [episode.episode_seed for episode in config.episodes]
     assert len(seeds) == 7 * 100 and len(set(seeds)) == len(seeds)
     assert {seeding.seed_range(seed) for seed in seeds} == {seeding.DEMONSTRATION}
-    evaluated = plan.expand(["all"], trackers=["twist2"], policy="expert", seeds=range(20), repeats=20)
+    evaluated = episode_plan.expand(["all"], trackers=["twist2"], policy="expert", seeds=range(20), repeats=20)
     assert {seeding.seed_range(episode.episode_seed) for episode in evaluated} == {seeding.EVALUATION}
     assert all(episode.episode_seed < 1 << 31 for episode in evaluated) and min(seeds) >= 1 << 31
     other = resolve(recording_run(RecordOptions(episodes=50, seed_series=1, engine="mujoco", device="cpu")))

@@ -10,10 +10,10 @@ import torch
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval import __main__ as command_line
-from arena_newton.eval.recordings import ActionRecorder
-from arena_newton.files import PARTIAL
+from arena_newton.eval.folders.recordings import ActionRecorder
+from arena_newton.files.own_files import PARTIAL
 from arena_newton.interfaces import Observation
-from arena_newton.seeding import policy_seed
+from arena_newton.rules.seeding import policy_seed
 
 RUN = ["--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco", "--max-steps", "50", "--worlds", "2"]
 

@@ -16,11 +16,11 @@ from rows import episodes, made, record
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.eval import report
-from arena_newton.eval.journal import Journal
-from arena_newton.eval.results import RunRecord, load_run, results_json
-from arena_newton.eval.stats import error_reasons, wilson
-from arena_newton.eval.wording import REMOTE, replay_command, rules_that_ran
+from arena_newton.eval.folders.results import RunRecord, load_run, results_json
+from arena_newton.eval.records.journal import Journal
+from arena_newton.eval.reports import report
+from arena_newton.eval.reports.wording import REMOTE, replay_command, rules_that_ran
+from arena_newton.eval.statistics.stats import error_reasons, wilson
 
 
 def document_of(planned, **config):

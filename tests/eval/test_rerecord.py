@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from arena_newton.data.episode import EpisodeFile, episode_files, write_episode
+from arena_newton.data.recording.episode import EpisodeFile, episode_files, write_episode
 from arena_newton.eval.__main__ import main
 
 CPU = ["--engine", "mujoco", "--device", "cpu"]

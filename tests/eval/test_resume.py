@@ -15,14 +15,15 @@ from types import SimpleNamespace
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
 
-from arena_newton import doctor, seeding, tasks
+from arena_newton import doctor, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval import journal as journal_module
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.config import resolve
-from arena_newton.eval.folder import ResultsFolder
-from arena_newton.eval.options import RunOptions
+from arena_newton.eval.folders.run_folder import ResultsFolder
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.records import journal as journal_module
 from arena_newton.policies.base import PolicyUnavailable
+from arena_newton.rules import seeding
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")

@@ -11,13 +11,13 @@ import pytest
 from rows import episodes, full, record
 
 from arena_newton.errors import InputError
-from arena_newton.eval import journal
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.journal import SCHEMA, EpisodeRecord, Journal, read_journal
-from arena_newton.eval.plan import expand
-from arena_newton.eval.records import Fit
-from arena_newton.eval.results import load_run
-from arena_newton.eval.run import _record
+from arena_newton.eval.folders.results import load_run
+from arena_newton.eval.plan.episode_plan import expand
+from arena_newton.eval.play.run import _record
+from arena_newton.eval.records import journal
+from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, read_journal
+from arena_newton.eval.records.schema import Fit
 from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
 JOURNALS = Path(__file__).parent / "journals"

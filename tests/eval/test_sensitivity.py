@@ -10,7 +10,7 @@ from eval_fakes import FakeEnv, factories
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.placement_axes import axes_of, chosen, moved
+from arena_newton.eval.studies.placement_axes import axes_of, chosen, moved
 from arena_newton.interfaces import Verdict
 from arena_newton.kernels import tick as codes
 

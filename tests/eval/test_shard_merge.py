@@ -8,12 +8,13 @@ import shutil
 import pytest
 from eval_fakes import factories
 
-from arena_newton import doctor, rule_sets, seeding, tasks
+from arena_newton import doctor, rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval import shard_merge
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.results import load_run
-from arena_newton.eval.shard_merge import merge
+from arena_newton.eval.folders.results import load_run
+from arena_newton.eval.workers import shard_merge
+from arena_newton.eval.workers.shard_merge import merge
+from arena_newton.rules import seeding
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")

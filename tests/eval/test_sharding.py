@@ -12,11 +12,11 @@ from eval_fakes import factories
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.config import resolve
-from arena_newton.eval.options import RunOptions
-from arena_newton.eval.sharding import Shard, dealt, parse_shard
-from arena_newton.eval.suite_call import plan_call
-from arena_newton.eval.suite_options import MatrixOptions
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.plan.suite_options import MatrixOptions
+from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
+from arena_newton.eval.suites.suite_call import plan_call
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "visual", "--repeats", "4"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rows import episodes, record
 
-from arena_newton.eval.stats import (
+from arena_newton.eval.statistics.stats import (
     aggregate,
     cell,
     error_reasons,

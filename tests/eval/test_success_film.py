@@ -7,8 +7,8 @@ from PIL import Image
 from rows import episodes
 from test_report import folder_with, recorded
 
-from arena_newton.eval import success_film
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.reports import success_film
 from arena_newton.pictures.video import VideoWriter, film_strip
 
 SIZE = (80, 48)

@@ -9,9 +9,9 @@ import pytest
 from eval_fakes import FakeEnv, factories
 from test_matrix import SUITE
 
-from arena_newton.eval import suite_timing
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.suite_estimate import CellSize, MeasuredCell, Slowdown, drawn, suite_time
+from arena_newton.eval.bench import suite_timing
+from arena_newton.eval.bench.suite_estimate import CellSize, MeasuredCell, Slowdown, drawn, suite_time
 
 KINDS = (("act", "base"), ("act", "visual"), ("dp", "base"))
 COST = {("act", "base"): 0.01, ("act", "visual"): 0.02, ("dp", "base"): 0.05}

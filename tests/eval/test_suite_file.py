@@ -6,13 +6,13 @@ import random
 
 import pytest
 
-from arena_newton.data.label_protocols import LABELS
+from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.matrix_cells import check_policies, expand_cells
-from arena_newton.eval.suite_file import LABELS as KNOWN_LABELS
-from arena_newton.eval.suite_file import SHIPPED, read_suite_file, suite_path
-from arena_newton.eval.suite_records import (
+from arena_newton.eval.suites.matrix_cells import check_policies, expand_cells
+from arena_newton.eval.suites.suite_file import LABELS as KNOWN_LABELS
+from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file, suite_path
+from arena_newton.eval.suites.suite_records import (
     CellEvent,
     SuiteCell,
     SuitePlan,

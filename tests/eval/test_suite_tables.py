@@ -13,14 +13,14 @@ import pytest
 from made_suites import cell_of, outcomes, plan, write_cell, write_suite
 
 from arena_newton.errors import InputError
-from arena_newton.eval import table_text
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.evaluated_cells import read_cells
-from arena_newton.eval.paper_numbers import paper_numbers, published, read_paper
-from arena_newton.eval.stats import contrast, holm, mcnemar, wilson
-from arena_newton.eval.suite_records import SUITE_FILE
-from arena_newton.eval.suite_tables import suite_tables
-from arena_newton.eval.table_entries import (
+from arena_newton.eval.records.document import SUITE_FILE
+from arena_newton.eval.statistics.stats import contrast, holm, mcnemar, wilson
+from arena_newton.eval.tables import table_text
+from arena_newton.eval.tables.evaluated_cells import read_cells
+from arena_newton.eval.tables.paper_numbers import paper_numbers, published, read_paper
+from arena_newton.eval.tables.suite_tables import suite_tables
+from arena_newton.eval.tables.table_entries import (
     SEMANTIC_STRENGTH,
     SuiteTable,
     interval_text,
@@ -190,7 +190,7 @@ def test_families_are_compared_on_the_same_episodes(tables):
 
 def test_a_mode_that_the_paper_lacks_changes_no_other_table(cells, tables, monkeypatch):
     """A further mode gets its table; the paper's numbers are read as ever, and the profile says that it lacks it."""
-    monkeypatch.setattr("arena_newton.rules.MODES", ("base", "execution", "semantic", "visual", "dynamics"))
+    monkeypatch.setattr("arena_newton.rules.rule_types.MODES", ("base", "execution", "semantic", "visual", "dynamics"))
     further = [dataclasses.replace(c, mode="dynamics") for c in cells.cells if c.mode == "visual"]
     found = {t.name: t for t in suite_tables([*cells.cells, *further], read_paper())}
     assert set(found) == {*tables, "in_gmt_dynamics"}

@@ -6,10 +6,10 @@ from test_report import document_of, folder_with
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.results import RunRecord, load_run
-from arena_newton.eval.stats import aggregate, wilson
-from arena_newton.eval.table_entries import SEMANTIC_STRENGTH, semantic_text
-from arena_newton.eval.tables import joint_table
+from arena_newton.eval.folders.results import RunRecord, load_run
+from arena_newton.eval.statistics.stats import aggregate, wilson
+from arena_newton.eval.tables.run_table import joint_table
+from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
 
 
 def run_of(tmp_path, name, rows, **config):

@@ -7,12 +7,12 @@ import random
 import pytest
 from eval_fakes import factories
 
+from arena_newton.cli.intervals import wilson
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.report import notes
-from arena_newton.eval.results import load_run, results_json
-from arena_newton.eval.rounds import LOOK_EVERY, WidthRule, due
-from arena_newton.eval.shard_merge import merge
-from arena_newton.intervals import wilson
+from arena_newton.eval.folders.results import load_run, results_json
+from arena_newton.eval.plan.rounds import LOOK_EVERY, WidthRule, due
+from arena_newton.eval.reports.report import notes
+from arena_newton.eval.workers.shard_merge import merge
 
 RUN = ["run", "--engine", "mujoco", "--task", "football", "boxing"]
 

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.files import limits
 
 NUMBERS = (b"-1", b"0", b"1e308", b"nan", b"inf", b"-99999999999", b"4294967296", b"1e-320", b"", b"(", b"[[", b"]")
 WORDS = (
@@ -283,8 +283,8 @@ def datasets(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tup
     sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
     from original_dataset import write_dataset
 
-    from arena_newton.canonical import STAND_ACTION
-    from arena_newton.data.lerobot_reader import DatasetActions
+    from arena_newton.data.readers.lerobot_reader import DatasetActions
+    from arena_newton.robot.canonical import STAND_ACTION
 
     episodes = [{"task": "boxing", "mode": "base", "tracker": "twist2", "episode_seed": n} for n in range(2)]
     root = write_dataset(folder / "set", [np.tile(STAND_ACTION, (20, 1))] * 2, info={"arena": {"episodes": episodes}})
@@ -383,7 +383,7 @@ def onnx(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[s
 def safetensors(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
     import torch
 
-    from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
+    from arena_newton.robot.g1 import TWIST2_DRIVE, PhysicsRate
     from arena_newton.trackers.front_end import residual_form
     from arena_newton.trackers.inference import weights_file
     from arena_newton.trackers.interface import get
@@ -414,7 +414,7 @@ def shards(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple
     from eval_fakes import factories
 
     from arena_newton.eval.__main__ import main
-    from arena_newton.eval.shard_merge import merge
+    from arena_newton.eval.workers.shard_merge import merge
 
     folders = [folder / name for name in ("a", "b")]
     for number, out in enumerate(folders, start=1):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton.kernels import success
+from arena_newton.kernels.rules import success
 
 wp.config.quiet = True
 

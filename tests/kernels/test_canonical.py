@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton import robot
 from arena_newton.kernels import canonical
+from arena_newton.robot import g1
 
 TICK = 0.02
 
@@ -15,9 +15,7 @@ def _array(values, device, dtype=wp.float32):
 
 
 def _reference(worlds, device):
-    return canonical.ReferencePose.allocate(
-        worlds, device, canonical_to_mujoco=robot.CANONICAL_TO_MUJOCO, tick=robot.TICK
-    )
+    return canonical.ReferencePose.allocate(worlds, device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK)
 
 
 class Runtime:
@@ -47,8 +45,8 @@ class Runtime:
         turn = np.angle(np.exp(1j * (yaw - self.yaw)))
         mimic = np.zeros(35)
         mimic[:6] = action[0] / TICK, action[1] / TICK, action[2], roll, pitch, turn / TICK
-        for name, value in zip(robot.CANONICAL_JOINTS, action[9:38], strict=True):
-            mimic[6 + robot.MUJOCO_JOINTS.index(name)] = value
+        for name, value in zip(g1.CANONICAL_JOINTS, action[9:38], strict=True):
+            mimic[6 + g1.MUJOCO_JOINTS.index(name)] = value
         self.target, self.yaw, self.z, self.joints = goal, yaw, action[2], action[9:38]
         return np.array([*self.xy, action[2]]), goal, velocity, mimic
 

@@ -8,9 +8,10 @@ import pytest
 import torch
 import warp as wp
 
-from arena_newton import robot
 from arena_newton.differentiable import ReferenceState, reference_step, success_margin
-from arena_newton.kernels import canonical, success
+from arena_newton.kernels import canonical
+from arena_newton.kernels.rules import success
+from arena_newton.robot import g1
 
 WORLDS = 64
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -50,9 +51,7 @@ def _state(device, twin, rng):
     qpos = np.zeros((WORLDS, 7), np.float32)
     qpos[:, :3] = rng.normal(size=(WORLDS, 3))
     qpos[:, 3:] = twin.random_quats(rng, WORLDS, tilt=0.3)
-    ref = canonical.ReferencePose.allocate(
-        WORLDS, device, canonical_to_mujoco=robot.CANONICAL_TO_MUJOCO, tick=robot.TICK
-    )
+    ref = canonical.ReferencePose.allocate(WORLDS, device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK)
     ones = wp.full(WORLDS, 1, dtype=wp.int32, device=device)
     canonical.launch_reset_reference(ref, wp.array(qpos, dtype=wp.float32, device=device), 0, ones)
     return ref, ones
@@ -69,7 +68,7 @@ def _action(device, twin, rng):
 
 # Rates are differences over one tick of 0.02 s; weighed by it they are of order one.
 WEIGHT = torch.ones(35)
-WEIGHT[[0, 1, 5]] = robot.TICK
+WEIGHT[[0, 1, 5]] = g1.TICK
 
 
 @pytest.mark.parametrize("limit_deg", [0.0, 26.0])
@@ -115,8 +114,8 @@ def test_reference_step_gradients_have_the_known_ones(device, twin):
     (grad,) = torch.autograd.grad(mimic[:, 0].sum(), action, retain_graph=True)
     torch.testing.assert_close(grad[:, 0], torch.full_like(grad[:, 0], 50.0))
     assert not grad[:, 1:].any()
-    canonical_knee = robot.CANONICAL_JOINTS.index("left_knee_joint")
-    (grad,) = torch.autograd.grad(mimic[:, 6 + robot.MUJOCO_JOINTS.index("left_knee_joint")].sum(), action)
+    canonical_knee = g1.CANONICAL_JOINTS.index("left_knee_joint")
+    (grad,) = torch.autograd.grad(mimic[:, 6 + g1.MUJOCO_JOINTS.index("left_knee_joint")].sum(), action)
     assert grad[:, 9 + canonical_knee].eq(1).all() and grad.sum() == WORLDS
 
 

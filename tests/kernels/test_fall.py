@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton.kernels import fall
+from arena_newton.kernels.rules import fall
 
 RULE = {"soft_tilt_deg": 60.0, "hard_tilt_deg": 75.0, "force_threshold": 50.0, "confirm_ticks": 5}
 CRITICAL = [1, 4]

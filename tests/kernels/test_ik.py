@@ -5,9 +5,9 @@ import pytest
 import torch
 import warp as wp
 
-from arena_newton import rotations
 from arena_newton.kernels import ik
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot import rotations
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.trackers.motions import kinematics
 
 WORLDS = 24

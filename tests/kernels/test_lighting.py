@@ -5,7 +5,7 @@ import pytest
 
 wp = pytest.importorskip("warp")
 
-from arena_newton.kernels import lighting, shadow  # noqa: E402
+from arena_newton.kernels.pictures import lighting, shadow  # noqa: E402
 
 EXPOSURE, BOUNCE, AMBIENT, DIRECT = 1.0 / 1700.0, 0.45, 0.2, 0.5
 

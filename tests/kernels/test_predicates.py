@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton.kernels import predicates
-from arena_newton.kernels.predicates import ANGLE, AWAY, CLEAR, MARGIN, NEAR, TOWARD, UNLATCHED
+from arena_newton.kernels.rules import predicates
+from arena_newton.kernels.rules.predicates import ANGLE, AWAY, CLEAR, MARGIN, NEAR, TOWARD, UNLATCHED
 
 
 def distance(point, marker, xpos, xquat, twin, horizontal):

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from arena_newton.kernels import raster, shadow
+from arena_newton.kernels.pictures import raster, shadow
 
 
 def srgb(value):

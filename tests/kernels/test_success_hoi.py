@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from arena_newton.kernels import success
+from arena_newton.kernels.rules import success
 
 WORLDS, BODIES = 400, 8
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 
-from arena_newton.robot import CANONICAL_JOINTS
+from arena_newton.robot.g1 import CANONICAL_JOINTS
 
 ACTION_NAMES = [
     *("action.root_ref_base_local_xy_delta.x", "action.root_ref_base_local_xy_delta.y", "action.root_z"),

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.experts.base import ExpertPolicy, Sight
 from arena_newton.policies.experts.eyes import Eyes, hidden, silhouette
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 from arena_newton.tasks.boxing import BOUNDS
 from tests.policies.test_experts import pose
 

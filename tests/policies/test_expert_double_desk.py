@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
-from arena_newton.canonical import ACTION
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.double_desk import LONGEST, MOST_ROLL, RIGHT_ROLL, SILL_STEP, DoubleDeskExpert
 from arena_newton.policies.experts.style import Style
-from arena_newton.robot import CANONICAL_JOINTS
+from arena_newton.robot.canonical import ACTION
+from arena_newton.robot.g1 import CANONICAL_JOINTS
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 
 SEED, EPISODES = 904, (0, 1)
 """Two episodes that no number of the expert was tuned on."""

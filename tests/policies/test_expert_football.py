@@ -5,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.football import CLEAR, LANE, FootballExpert
 from arena_newton.policies.experts.style import Style
+from arena_newton.robot.rotations import rotate_xy
 from arena_newton.rollout import Rollout
-from arena_newton.rotations import rotate_xy
+from arena_newton.rules import seeding
 from arena_newton.tasks.football import GOAL
 
 GOAL_MIDDLE, GOAL_HALF = (0.05, 4.03, 0.925), (2.55, 1.0, 0.925)

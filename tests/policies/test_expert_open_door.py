@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.open_door import (
     AJAR,
@@ -25,8 +25,9 @@ from arena_newton.policies.experts.open_door import (
     OpenDoorExpert,
 )
 from arena_newton.policies.experts.style import Style
+from arena_newton.robot.rotations import rotate_xy
 from arena_newton.rollout import Rollout
-from arena_newton.rotations import rotate_xy
+from arena_newton.rules import seeding
 from arena_newton.tasks.open_door import DOORWAY, HANDLE, LEAF
 
 PIVOT = (0.43, -0.065)

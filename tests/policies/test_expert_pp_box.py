@@ -7,14 +7,15 @@ import pytest
 import torch
 from recorded_actions import Actions
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts import pp_box
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.pp_box import LONGEST, PPBoxExpert, pose_before
 from arena_newton.policies.experts.style import Style
-from arena_newton.robot import TICK
+from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 from arena_newton.tasks.pp_box import BOX
 
 STILL = 6

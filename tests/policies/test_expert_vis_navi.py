@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.experts.vis_navi import FEET, HELD
-from arena_newton.robot import DEFAULT_POSE, TICK
+from arena_newton.robot.g1 import DEFAULT_POSE, TICK
+from arena_newton.rules import seeding
 from tests.policies.test_experts import pose
 
 WORLDS = 6

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, tasks, trackers
-from arena_newton.canonical import validate_action
+from arena_newton import policies, tasks, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Observation
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.canonical import validate_action
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 
 EPISODES = {"boxing": (0, 21), "vis_navi": (4, 15)}
 """Short episodes of the protocol: both bags, both hands; a way to each side of the beams."""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import policies, seeding, trackers
-from arena_newton.data.label_protocols import encode_v4
+from arena_newton import policies, trackers
+from arena_newton.data.readers.label_protocols import encode_v4
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
@@ -15,6 +15,7 @@ from arena_newton.interfaces import Recorder
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import V4Policy, read_by
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 
 
 class Acted(Recorder):

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from arena_newton import policies
-from arena_newton.canonical import validate_action
 from arena_newton.errors import InputError
 from arena_newton.policies import Observation
 from arena_newton.policies.replay import ReplayPolicy
-from arena_newton.robot import DEFAULT_POSE, MUJOCO_TO_CANONICAL, TICK
+from arena_newton.robot.canonical import validate_action
+from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions import Clip, load_clip
 from arena_newton.trackers.motions.playback import clip_actions
 from tests.conftest import SHARED

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import robot
-from arena_newton.data.label_protocols import V4, V4Decoder
+from arena_newton.data.readers.label_protocols import V4, V4Decoder
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import V4Policy, measured_yaw
-from arena_newton.rotations import matrix_from_quat, quat_from_euler
+from arena_newton.robot import g1
+from arena_newton.robot.rotations import matrix_from_quat, quat_from_euler
 
 RATE = 0.05
 """Fraction of the gap that is closed each tick, large so that a short episode shows it."""
@@ -61,7 +61,7 @@ def test_the_measured_heading_is_that_of_the_state():
 def test_the_gap_closes_by_its_fraction_each_tick():
     """After k ticks (1 - fraction)^k of the gap at the measurement is left, the short way around."""
     decoder = V4Decoder(2, realign=RATE)
-    decoder.decode(labels(torch.full((2, 1), 3.0 / robot.TICK)))
+    decoder.decode(labels(torch.full((2, 1), 3.0 / g1.TICK)))
     decoder.measure(torch.tensor([2.5, -3.0]))
     done = yaws(decoder.decode(labels(torch.zeros(2, 30))))
     left = (1.0 - RATE) ** torch.arange(1, 31, dtype=torch.float64)
@@ -118,7 +118,7 @@ def test_a_loop_with_drift_stays_near_the_robot(length):
         for _ in range(400 // length):
             seen = SimpleNamespace(state=state_of([robot_yaw]), mask=np.ones(1, bool))
             commanded = yaws(policy.act(seen).actions)[0, -1].item()
-            robot_yaw += length * (0.5 * robot.TICK - DRIFT)
+            robot_yaw += length * (0.5 * g1.TICK - DRIFT)
         left[realign] = abs((commanded - robot_yaw + np.pi) % (2.0 * np.pi) - np.pi)
     assert left[0.0] == pytest.approx(400 * DRIFT, rel=1e-3)
     assert left[RATE] == pytest.approx(DRIFT / RATE, abs=DRIFT * length)  # where as much is closed as is added
@@ -139,4 +139,4 @@ def test_a_look_is_compared_with_the_heading_of_its_own_tick(late):
         seen = SimpleNamespace(state=state_of([commanded[-1 - late]]), mask=np.ones(1, bool))
         commanded += yaws(policy.act(seen).actions)[0].tolist()
     turned = np.diff(commanded[late:])
-    assert np.allclose(turned, 0.5 * robot.TICK, atol=1e-6)
+    assert np.allclose(turned, 0.5 * g1.TICK, atol=1e-6)

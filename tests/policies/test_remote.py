@@ -17,7 +17,7 @@ import torch
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.policies import Observation, PolicyUnavailable
-from arena_newton.policies.remote import MAX_CHUNK, MAX_FAILURES, TOKEN_VARIABLE, RemotePolicy
+from arena_newton.policies.remote.arena_client import MAX_CHUNK, MAX_FAILURES, TOKEN_VARIABLE, RemotePolicy
 
 CHUNK = 4
 

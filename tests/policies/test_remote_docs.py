@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import canonical, policies, robot, tasks
+from arena_newton import policies, tasks
 from arena_newton.env import STAND_ACTION
 from arena_newton.policies import Observation
-from arena_newton.policies.remote import MAX_CHUNK, MAX_FAILURES, MAX_REPLY, ROBOT_TYPE, TOKEN_VARIABLE, RemotePolicy
+from arena_newton.policies.remote.arena_client import (
+    MAX_CHUNK,
+    MAX_FAILURES,
+    MAX_REPLY,
+    ROBOT_TYPE,
+    TOKEN_VARIABLE,
+    RemotePolicy,
+)
+from arena_newton.robot import canonical, g1
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "policies.md").read_text()
@@ -41,13 +49,13 @@ def observation(worlds):
 def test_joint_table():
     """Every joint stands at its index in state and action, with its angle in the standing action."""
     rows = table("joint")
-    assert [row[0] for row in rows] == list(robot.CANONICAL_JOINTS)
+    assert [row[0] for row in rows] == list(g1.CANONICAL_JOINTS)
     for k, (_, position, velocity, action, standing) in enumerate(rows):
         assert int(position) == canonical.STATE["joint_pos"].start + k
         assert int(velocity) == canonical.STATE["joint_vel"].start + k
         assert int(action) == canonical.ACTION["joint_pos"].start + k
         assert np.float32(standing) == STAND_ACTION[int(action)]
-        assert canonical.element_name(int(action)) == f"joint_pos[{robot.CANONICAL_JOINTS[k]}]"
+        assert canonical.element_name(int(action)) == f"joint_pos[{g1.CANONICAL_JOINTS[k]}]"
 
 
 def test_state_and_action_tables():

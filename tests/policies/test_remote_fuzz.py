@@ -11,10 +11,10 @@ import time
 import numpy as np
 import pytest
 
-from arena_newton.canonical import validate_action
 from arena_newton.errors import InputError
 from arena_newton.policies import Observation
-from arena_newton.policies.remote import RemotePolicy
+from arena_newton.policies.remote.arena_client import RemotePolicy
+from arena_newton.robot.canonical import validate_action
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from arena_newton import policies, trackers
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve_example import Handler, Server
+from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
-from arena_newton.seeding import policy_seed
+from arena_newton.rules.seeding import policy_seed
 from tests.eval.eval_fakes import factories
 
 SHORT = ["--engine", "mujoco", "--task", "football", "--repeats", "3", "--seeds", "0"]

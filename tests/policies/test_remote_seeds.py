@@ -12,7 +12,7 @@ import pytest
 from arena_newton import trackers
 from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.policies import Observation
-from arena_newton.policies.remote import RemotePolicy
+from arena_newton.policies.remote.arena_client import RemotePolicy
 from arena_newton.rollout import Rollout
 
 CHUNK = 4

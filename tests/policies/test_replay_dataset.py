@@ -10,15 +10,17 @@ pytest.importorskip("pyarrow", reason="needs the extra [data]")
 
 from original_dataset import ACTION_NAMES, features, write_dataset
 
-from arena_newton import extras, policies, seeding, trackers
-from arena_newton.canonical import STAND_ACTION
-from arena_newton.data.label_protocols import encode_v4
-from arena_newton.data.lerobot_reader import DatasetActions
+from arena_newton import policies, trackers
+from arena_newton.cli import extras
+from arena_newton.data.readers.label_protocols import encode_v4
+from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.interfaces import Recorder
+from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 
 V4 = {"robot_type": "unitree_g1_gmt_cmd_v4", "vla_protocol": {"version": "4"}}
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from arena_newton import robot as g1
+from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
-from arena_newton.intervals import wilson
+from arena_newton.robot import g1
 from arena_newton.trackers.evaluate import main
 from arena_newton.trackers.evaluation import chart
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
@@ -72,7 +72,7 @@ def test_draws_of_a_cell_do_not_depend_on_the_others():
 
 def test_wilson_is_the_interval_of_the_benchmark():
     """Rates get the interval that the benchmark's own tables use."""
-    from arena_newton.eval import stats
+    from arena_newton.eval.statistics import stats
 
     for successes, trials in ((0, 64), (1, 64), (40, 64), (64, 64)):
         assert wilson(successes, trials) == pytest.approx(stats.wilson(successes, trials))
@@ -202,7 +202,7 @@ def _exact_follower(name: str):
     import mujoco
 
     from arena_newton import rule_sets
-    from arena_newton.scene import load_scene
+    from arena_newton.physics.scene import load_scene
     from arena_newton.trackers.motions.frames import actions_to_motion
 
     cell = next(c for c in suite("full") if c.name == name)

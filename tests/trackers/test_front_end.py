@@ -5,7 +5,7 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
-from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
+from arena_newton.robot.g1 import MUJOCO_JOINTS, TWIST2_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand, base
 from arena_newton.trackers.front_end import ActionForm, residual_form
 from arena_newton.trackers.inference import weights_file

@@ -12,7 +12,7 @@ import tyro
 from torch import nn
 
 from arena_newton.errors import InputError
-from arena_newton.robot import PhysicsRate
+from arena_newton.robot.g1 import PhysicsRate
 from arena_newton.trackers import interface, sonic, twist2
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.figures import Result, figures

@@ -2,7 +2,7 @@
 
 import torch
 
-from arena_newton.rotations import atan2
+from arena_newton.robot.rotations import atan2
 from arena_newton.trackers.inference.quadratic import Quadratic
 from arena_newton.trackers.sonic import DOWN, IDENTITY_6D, RELATIVE_AND_DOWN, ROT6D
 from arena_newton.trackers.twist2 import TILT_TERMS, UPRIGHT

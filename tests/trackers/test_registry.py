@@ -9,7 +9,7 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
-from arena_newton.robot import MUJOCO_JOINTS, TWIST2_DRIVE
+from arena_newton.robot.g1 import MUJOCO_JOINTS, TWIST2_DRIVE
 from arena_newton.trackers import base
 
 

@@ -6,7 +6,7 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
-from arena_newton.robot import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
+from arena_newton.robot.g1 import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.front_end import NetworkTracker
 from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicNet, SonicTracker

@@ -6,7 +6,7 @@ import torch
 from onnx_files import twist2_like
 
 from arena_newton import trackers
-from arena_newton.robot import DEFAULT_POSE, TWIST2_DRIVE
+from arena_newton.robot.g1 import DEFAULT_POSE, TWIST2_DRIVE
 from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.twist2 import OBSERVATION, Twist2Tracker
 

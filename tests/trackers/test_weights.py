@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
-from arena_newton.robot import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
+from arena_newton.robot.g1 import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
 from arena_newton.trackers import RobotState, TrackerCommand, base
 from arena_newton.trackers.front_end import residual_form
 from arena_newton.trackers.inference import weights_file

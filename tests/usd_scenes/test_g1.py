@@ -8,7 +8,7 @@ import newton
 import numpy as np
 import pytest
 
-from arena_newton.robot import HAND_JOINTS, MUJOCO_JOINTS
+from arena_newton.robot.g1 import HAND_JOINTS, MUJOCO_JOINTS
 
 ORACLE = Path(__file__).parents[2] / ".." / "shared" / "reference" / "g1"
 WITH_HANDS = ORACLE / "g1_sim2sim_29dof_with_hands.xml"

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton import robot as g1
 from arena_newton import rule_sets, tasks
-from arena_newton.physics import make_physics
-from arena_newton.scene import load_scene
+from arena_newton.physics.engines import make_physics
+from arena_newton.physics.scene import load_scene
+from arena_newton.robot import g1
 from arena_newton.usd_scenes.build import build_all, parts
 from arena_newton.usd_scenes.lab.build import BALL_RADIUS, PARKED, SUPPORTS
 
@@ -60,7 +60,7 @@ def test_the_lab_is_built_but_is_no_task():
 
 def test_committed_layer_is_what_the_author_writes(tmp_path):
     """The committed scene is the author's output, byte for byte."""
-    from arena_newton.scene import scene_path
+    from arena_newton.physics.scene import scene_path
 
     (written,) = build_all(tmp_path, ["lab"])
     assert written.read_text() == scene_path("lab").read_text()

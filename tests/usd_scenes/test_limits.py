@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from pxr import Sdf, Usd
 
-from arena_newton import limits
 from arena_newton.errors import InputError
+from arena_newton.files import limits
 from arena_newton.usd_scenes.validate import check_files, layers, validate
 
 HEAD = '#usda 1.0\n(\n    defaultPrim = "A"\n)\n'

@@ -8,7 +8,7 @@ import pytest
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.scene import Scene, load_scene
+from arena_newton.physics.scene import Scene, load_scene
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.build import FOLDER, build_all
 from arena_newton.usd_scenes.textures import TEXTURES, write_all

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from arena_newton import rule_sets, tasks
-from arena_newton.eval.table_entries import semantic_text, task_title
-from arena_newton.scene import SCENES, load_scene
+from arena_newton.eval.tables.table_entries import semantic_text, task_title
+from arena_newton.physics.scene import SCENES, load_scene
 
 TASKS = tuple(name for name in tasks.names() if tasks.get(name).suite == "HSI")
 OBSTACLES = tuple(f"/World/{kind}_{letter}" for kind in ("Beam", "Block") for letter in "abc")

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.scene import load_scene
+from arena_newton.files import limits
+from arena_newton.physics.scene import load_scene
 from arena_newton.usd_scenes.shapes import check_buildable, open_stage
 from arena_newton.usd_scenes.validate import validate
 

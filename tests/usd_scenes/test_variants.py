@@ -11,7 +11,7 @@ import pytest
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.scene import SCENES, load_scene
+from arena_newton.physics.scene import SCENES, load_scene
 from arena_newton.usd_scenes.__main__ import main
 from arena_newton.usd_scenes.spawn import penetrations
 from arena_newton.usd_scenes.validate import differences, layers, task_of, validate

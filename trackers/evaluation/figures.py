@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from arena_newton.intervals import wilson
+from arena_newton.cli.intervals import wilson
 from arena_newton.trackers import interface
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.suite_rollout import Outcome, Plan

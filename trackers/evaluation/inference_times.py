@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 
 from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.g1 import DEFAULT_POSE
 
 __all__ = ["GPU_WORLDS", "inference"]
 

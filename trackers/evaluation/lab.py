@@ -15,9 +15,9 @@ import torch
 import warp as wp
 
 from arena_newton import rule_sets
-from arena_newton.physics import make_physics, resolve_engine
-from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.scene import Scene, load_scene
+from arena_newton.physics.engines import make_physics, resolve_engine
+from arena_newton.physics.scene import Scene, load_scene
+from arena_newton.robot.g1 import DriveGains, PhysicsRate
 from arena_newton.trackers.motions.library import FIXTURES
 
 __all__ = ["Lab", "Start", "WorldKind", "variant"]

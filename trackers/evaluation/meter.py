@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from arena_newton import robot as g1
-from arena_newton.rotations import heading, rotate_xy, wrap_angle
+from arena_newton.robot import g1
+from arena_newton.robot.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton import robot as g1
 from arena_newton import rule_sets
 from arena_newton.errors import ArenaError
 from arena_newton.interfaces import Tracker
-from arena_newton.rotations import heading
+from arena_newton.robot import g1
+from arena_newton.robot.rotations import heading
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
 from arena_newton.trackers.evaluation.meter import Meter, TickReference
 from arena_newton.trackers.evaluation.suite import Cell, Tables, tabulate

@@ -10,7 +10,7 @@ import numpy as np
 from arena_newton.interfaces import Tracker
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.video import film_strip
-from arena_newton.robot import TICK
+from arena_newton.robot.g1 import TICK
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.lab import Lab
 from arena_newton.trackers.evaluation.suite_rollout import Settings, make_plan, play

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from arena_newton.intervals import wilson
+from arena_newton.cli.intervals import wilson
 from arena_newton.trackers.evaluation.figures import Figure, Result, figures
 
 __all__ = ["COLUMNS", "cell_rows", "document", "figure_table", "markdown", "write"]

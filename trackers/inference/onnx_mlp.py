@@ -17,9 +17,9 @@ import onnx
 import torch
 from torch.nn import functional
 
-from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.foreign import read_bytes
+from arena_newton.files import limits
+from arena_newton.files.foreign import read_bytes
 
 __all__ = ["OnnxNetwork", "load", "read"]
 

@@ -14,8 +14,8 @@ import numpy as np
 import onnxruntime
 import torch
 
-from arena_newton import limits, probe
 from arena_newton.errors import InputError
+from arena_newton.files import limits, probe
 from arena_newton.trackers.inference import onnx_mlp
 from arena_newton.trackers.inference.blocks import session_options
 

@@ -20,11 +20,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load as decode
 from safetensors.torch import save as encode
 
-from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.files import replace_atomically
-from arena_newton.foreign import read_bytes
-from arena_newton.robot import TICK, DriveGains, PhysicsRate
+from arena_newton.files import limits
+from arena_newton.files.foreign import read_bytes
+from arena_newton.files.own_files import replace_atomically
+from arena_newton.robot.g1 import TICK, DriveGains, PhysicsRate
 from arena_newton.trackers import base, interface
 from arena_newton.trackers.inference.networks import TrackerNetwork
 from arena_newton.trackers.interface import JOINTS, ActionForm

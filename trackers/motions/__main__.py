@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
-from arena_newton.quiet import quiet_warp
 
 if TYPE_CHECKING:
     from arena_newton.trackers.motions.formats import ReadOptions
@@ -166,7 +166,7 @@ def _render(args: argparse.Namespace) -> None:
 
 
 def _generate(args: argparse.Namespace) -> None:
-    from arena_newton.physics import resolve_engine
+    from arena_newton.physics.engines import resolve_engine
     from arena_newton.trackers.motions import programs
     from arena_newton.trackers.motions.library import MotionLibrary
 

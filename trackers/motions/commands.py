@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from arena_newton.errors import InputError
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.trackers.motions.kinematics import Stance, neutral_stance
 
 __all__ = [

@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from arena_newton.errors import InputError
-from arena_newton.files import replace_atomically
+from arena_newton.files.own_files import replace_atomically
 from arena_newton.pictures.video import GAP, LABEL_HEIGHT, VideoWriter
-from arena_newton.robot import TICK
+from arena_newton.robot.g1 import TICK
 from arena_newton.trackers.motions.library import MotionLibrary
 from arena_newton.trackers.motions.render import ClipRenderer
 

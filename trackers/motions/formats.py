@@ -19,11 +19,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from arena_newton import limits
 from arena_newton.errors import InputError
-from arena_newton.foreign import numbers, read_arrays, read_bytes
-from arena_newton.robot import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
-from arena_newton.text import counted
+from arena_newton.files import limits
+from arena_newton.files.foreign import numbers, read_arrays, read_bytes
+from arena_newton.files.text import counted
+from arena_newton.robot.g1 import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions.frames import actions_to_motion
 from arena_newton.trackers.motions.kinematics import forward
 from arena_newton.trackers.motions.library import FORMAT, UNKNOWN, MotionLibrary

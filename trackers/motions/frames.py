@@ -13,9 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from arena_newton.canonical import ACTION, ACTION_WIDTH, HAND_CLOSED, MIMIC, MIMIC_WIDTH
-from arena_newton.robot import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, TICK
-from arena_newton.rotations import (
+from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, HAND_CLOSED, MIMIC, MIMIC_WIDTH
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, TICK
+from arena_newton.robot.rotations import (
     heading,
     matrix_from_quat,
     quat_apply,

@@ -15,13 +15,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from arena_newton.canonical import ACTION_WIDTH
 from arena_newton.errors import InputError
 from arena_newton.kernels import footwork, gait, ik
 from arena_newton.kernels.launching import record
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
-from arena_newton.rotations import rotate_xy
-from arena_newton.streams import on_torch_stream
+from arena_newton.physics.streams import on_torch_stream
+from arena_newton.robot.canonical import ACTION_WIDTH
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
+from arena_newton.robot.rotations import rotate_xy
 from arena_newton.trackers.motions.commands import (
     CHANNELS,
     COLUMNS,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS
-from arena_newton.rotations import matrix_from_quat_np, quat_apply, quat_multiply
+from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS
+from arena_newton.robot.rotations import matrix_from_quat_np, quat_apply, quat_multiply
 from arena_newton.usd_scenes.g1.links import LINKS
 
 __all__ = ["HAND_POINT", "LINK_NAMES", "SOLE_CENTRE", "SOLE_HEIGHT", "Chain", "Poses", "Stance", "chain", "forward"]
@@ -146,7 +146,7 @@ class Stance:
 
 @functools.cache
 def neutral_stance() -> Stance:
-    """Numbers of `robot.DEFAULT_POSE`, whose feet are flat when the pelvis is upright."""
+    """Numbers of `g1.DEFAULT_POSE`, whose feet are flat when the pelvis is upright."""
     poses = forward(
         torch.zeros(3, dtype=torch.float64),
         torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64),

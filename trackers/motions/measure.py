@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from arena_newton.robot import MUJOCO_JOINTS, TICK
-from arena_newton.rotations import quat_apply
+from arena_newton.robot.g1 import MUJOCO_JOINTS, TICK
+from arena_newton.robot.rotations import quat_apply
 from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
 from arena_newton.usd_scenes.g1.links import LINKS

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from arena_newton.rotations import atan2, rotate_xy, wrap_angle
+from arena_newton.robot.rotations import atan2, rotate_xy, wrap_angle
 
 __all__ = ["NavigationCommand", "NavigationLimits", "Navigator", "steer"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.robot import TICK
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import TICK
 from arena_newton.trackers.motions.frames import motion_actions
 from arena_newton.trackers.motions.load import Clip, resample
 

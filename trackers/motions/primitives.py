@@ -16,7 +16,7 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.kernels.footwork import kick_seconds
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.trackers.motions.commands import CHANNELS, COLUMNS, COMMAND_WIDTH, MotionCommand, neutral_row
 
 __all__ = [

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.robot import TICK
-from arena_newton.rotations import atan2, heading, rotate_xy
+from arena_newton.robot.g1 import TICK
+from arena_newton.robot.rotations import atan2, heading, rotate_xy
 from arena_newton.trackers.motions import primitives as p
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT

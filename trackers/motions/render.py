@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from arena_newton import robot as g1
 from arena_newton.errors import InputError
+from arena_newton.physics.scene import load_scene
 from arena_newton.pictures.camera import Camera, WorldLights
-from arena_newton.rotations import heading_np, quat_from_yaw_np
-from arena_newton.scene import load_scene
+from arena_newton.robot import g1
+from arena_newton.robot.rotations import heading_np, quat_from_yaw_np
 from arena_newton.tasks import LightDraw
 from arena_newton.trackers.motions.library import FIXTURES, SUPPORTS, MotionLibrary
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from arena_newton.command_line import exit_code, program
+from arena_newton.cli.command_line import exit_code, program
 from arena_newton.errors import InputError
 from arena_newton.trackers.train.train_options import CurveOptions, ExportCommand, TrainOptions, check
 
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return
         options = tyro.cli(TrainOptions, args=arguments, prog=PROG)
         check(options)  # before the libraries are loaded
-        from arena_newton.quiet import quiet_warp
+        from arena_newton.cli.quiet import quiet_warp
         from arena_newton.trackers.train.session import train
 
         quiet_warp()

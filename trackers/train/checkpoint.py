@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files import replace_atomically
+from arena_newton.files.own_files import replace_atomically
 
 __all__ = ["Card", "Checkpoint", "TrainingPart"]
 

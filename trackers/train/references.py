@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton import rotations
+from arena_newton.robot import rotations
 from arena_newton.trackers.motions import kinematics
 
 if TYPE_CHECKING:

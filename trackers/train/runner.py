@@ -21,7 +21,7 @@ from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.logger import DeviceLogger, IterationTimes
 from arena_newton.trackers.train.ppo import TrackerPPO
-from arena_newton.trackers.train.rewards import maximum
+from arena_newton.trackers.train.terms.rewards import maximum
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import TrainOptions, runner_config
 

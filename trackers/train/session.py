@@ -27,9 +27,9 @@ from arena_newton.trackers.motions.formats import read_library
 from arena_newton.trackers.motions.library import MotionLibrary
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.export import export
-from arena_newton.trackers.train.rewards import configured, maximum
 from arena_newton.trackers.train.runner import TrackerRunner
 from arena_newton.trackers.train.simulation import share_stream
+from arena_newton.trackers.train.terms.rewards import configured, maximum
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import (
     CPU_WORLDS,

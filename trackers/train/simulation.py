@@ -12,8 +12,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton.robot import DriveGains, PhysicsRate
-from arena_newton.scene import load_scene
+from arena_newton.physics.scene import load_scene
+from arena_newton.robot.g1 import DriveGains, PhysicsRate
 from arena_newton.trackers.motions.library import FIXTURES
 from arena_newton.trackers.train.references import KEY_LINKS
 from arena_newton.trackers.train.train_options import TrainOptions

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 
 from arena_newton.errors import ArenaError
-from arena_newton.robot import TICK
-from arena_newton.trackers.train.measurement import TickMeasurement
+from arena_newton.robot.g1 import TICK
+from arena_newton.trackers.train.terms.measurement import TickMeasurement
 
 __all__ = ["ERRORS", "Tally", "TrainingError"]
 

@@ -17,19 +17,19 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from arena_newton import rotations
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
-from arena_newton.robot import DEFAULT_POSE, TICK
-from arena_newton.trackers.train import critic, events
+from arena_newton.robot import rotations
+from arena_newton.robot.g1 import DEFAULT_POSE, TICK
 from arena_newton.trackers.train.graphs import captured
-from arena_newton.trackers.train.measurement import TickMeasurement
 from arena_newton.trackers.train.references import FEET, KEY_LINKS, Frame, ReferenceBank
-from arena_newton.trackers.train.rewards import REWARDS, TERMINATION_REWARD, Term
 from arena_newton.trackers.train.sampling import ClipSampler
 from arena_newton.trackers.train.simulation import Simulation
 from arena_newton.trackers.train.tally import Tally
-from arena_newton.trackers.train.terminations import TERMINATIONS, Bound
+from arena_newton.trackers.train.terms import critic, events
+from arena_newton.trackers.train.terms.measurement import TickMeasurement
+from arena_newton.trackers.train.terms.rewards import REWARDS, TERMINATION_REWARD, Term
+from arena_newton.trackers.train.terms.terminations import TERMINATIONS, Bound
 from arena_newton.trackers.train.train_options import TrainOptions
 
 if TYPE_CHECKING:

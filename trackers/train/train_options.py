@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from arena_newton.cli.flags import Several
 from arena_newton.errors import InputError
-from arena_newton.flags import Several
 from arena_newton.trackers.interface import names
 
 __all__ = [

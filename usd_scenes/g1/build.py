@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
-from arena_newton.rotations import matrix_from_quat_np
+from arena_newton.robot.rotations import matrix_from_quat_np
 from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.g1.links import LINKS, PALM_OFFSET, Link
 from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Block, Loft, Rod, grid, merge

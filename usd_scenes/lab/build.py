@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pxr import Usd
 
-from arena_newton.robot import SPAWN_HEIGHT
+from arena_newton.robot.g1 import SPAWN_HEIGHT
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.football.build import BALL_MASS, BALL_RADIUS, ball
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from arena_newton import robot
+from arena_newton.robot import g1
 from tests.arena_newton.data.made_episodes import make_episode
 
 ROWS = 40
@@ -26,7 +26,7 @@ def consistent_episode(folder, rows=ROWS, *, repeat=0, heading=0.3, **more):
         -np.sin(pitch),
     )
     state[:, 1], state[:, 3] = -np.sin(turned), np.cos(turned)
-    order = [robot.MUJOCO_JOINTS.index(name) for name in robot.CANONICAL_JOINTS]
+    order = [g1.MUJOCO_JOINTS.index(name) for name in g1.CANONICAL_JOINTS]
     state[:, 6:35], state[:, 35:] = joints[:, order], speeds[:, order]
     fingers = rng.normal(0, 0.1, (rows, 14)).astype(np.float32)
     root = np.zeros((rows, 7), np.float32)

@@ -4,13 +4,14 @@ import json
 
 import numpy as np
 
-from arena_newton import seeding, tasks
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.data.demonstration import FPS
-from arena_newton.data.episode import SCHEMA_VERSION, vision, write_episode
-from arena_newton.data.image_statistics import VALUES, add_picture
+from arena_newton import tasks
+from arena_newton.data.recording.demonstration import FPS
+from arena_newton.data.recording.episode import SCHEMA_VERSION, vision, write_episode
+from arena_newton.data.recording.image_statistics import VALUES, add_picture
 from arena_newton.pictures.video import VideoWriter
-from arena_newton.robot import CANONICAL_TO_MUJOCO
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO
+from arena_newton.rules import seeding
 
 
 def pictures(rows, size, seed):

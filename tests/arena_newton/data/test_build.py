@@ -28,20 +28,22 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
 from lerobot.datasets.video_utils import StreamingVideoEncoder  # noqa: E402
 
 import arena_newton  # noqa: E402
-from arena_newton import robot, seeding, trackers  # noqa: E402
-from arena_newton.data import lerobot_dataset  # noqa: E402
+from arena_newton import trackers  # noqa: E402
 from arena_newton.data.__main__ import main  # noqa: E402
-from arena_newton.data.demonstration import DemonstrationRecorder  # noqa: E402
-from arena_newton.data.episode import EpisodeFile, episode_files  # noqa: E402
-from arena_newton.data.frame_reader import OpenVideo  # noqa: E402
-from arena_newton.data.label_protocols import encode_v4  # noqa: E402
-from arena_newton.data.layouts import LAYOUTS  # noqa: E402
-from arena_newton.data.lerobot_dataset import FinishedVideos, choose, write_dataset  # noqa: E402
+from arena_newton.data.datasets import lerobot_dataset  # noqa: E402
+from arena_newton.data.datasets.layouts import LAYOUTS  # noqa: E402
+from arena_newton.data.datasets.lerobot_dataset import FinishedVideos, choose, write_dataset  # noqa: E402
+from arena_newton.data.readers.frame_reader import OpenVideo  # noqa: E402
+from arena_newton.data.readers.label_protocols import encode_v4  # noqa: E402
+from arena_newton.data.recording.demonstration import DemonstrationRecorder  # noqa: E402
+from arena_newton.data.recording.episode import EpisodeFile, episode_files  # noqa: E402
 from arena_newton.env import ArenaEnv  # noqa: E402
 from arena_newton.errors import ArenaError, InputError  # noqa: E402
 from arena_newton.pictures.settings import CameraConfig  # noqa: E402
 from arena_newton.policies.stand import StandPolicy  # noqa: E402
+from arena_newton.robot import g1  # noqa: E402
 from arena_newton.rollout import Rollout  # noqa: E402
+from arena_newton.rules import seeding  # noqa: E402
 from tests.arena_newton.data import made_episodes  # noqa: E402
 from tests.arena_newton.data.consistent import ROWS, consistent_episode  # noqa: E402
 
@@ -400,7 +402,7 @@ def test_layout_sonic(recordings, tmp_path):
     ]
     joints = dict(zip(names, item["observation.state"].tolist(), strict=True))
     measured = episode.array("robot_qpos_before_decimation")[5]
-    for name, value in zip(robot.MUJOCO_JOINTS, measured, strict=True):
+    for name, value in zip(g1.MUJOCO_JOINTS, measured, strict=True):
         assert joints[name] == pytest.approx(value, abs=1e-7)
     assert joints["left_hand_index_0_joint"] == pytest.approx(episode.array("arena_qpos")[5, 29], abs=1e-7)
     w, x, y, z = item["observation.root_orientation"].tolist()

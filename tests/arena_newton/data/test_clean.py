@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from made_episodes import make_episode
 
-from arena_newton import seeding
 from arena_newton.data.__main__ import main
-from arena_newton.data.cleaning import RULES, Rows, broken_rules
-from arena_newton.data.episode import EpisodeFile
+from arena_newton.data.datasets.cleaning import RULES, Rows, broken_rules
+from arena_newton.data.recording.episode import EpisodeFile
+from arena_newton.rules import seeding
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
 from mutants import damaged

@@ -6,7 +6,7 @@ import time
 import pytest
 import torch
 
-from arena_newton.data.encoding import Encoders, PictureSlots
+from arena_newton.data.recording.encoding import Encoders, PictureSlots
 
 
 @pytest.mark.parametrize("threads", [0, 1, 3])

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from arena_newton import policies, seeding, trackers
-from arena_newton.data.demonstration import DemonstrationRecorder, episode_label
-from arena_newton.data.episode import (
+from arena_newton import policies, trackers
+from arena_newton.data.recording.demonstration import DemonstrationRecorder, episode_label
+from arena_newton.data.recording.episode import (
     CAMERAS,
     FIELDS,
     EpisodeFile,
@@ -24,6 +24,7 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.rollout import Rollout
+from arena_newton.rules import seeding
 from tests.fuzz.mutants import damaged
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.data.encoding import FilmThreads, Pictured
-from arena_newton.data.film_pool import FilmPool
+from arena_newton.data.recording.encoding import FilmThreads, Pictured
+from arena_newton.data.recording.film_pool import FilmPool
 
 WORLDS, TICKS, SIZE = 5, 14, 64
 CPU = torch.device("cpu")
@@ -22,8 +22,8 @@ CHILD = """
 import sys, time
 import torch
 from pathlib import Path
-from arena_newton.data.encoding import Pictured
-from arena_newton.data.film_pool import FilmPool
+from arena_newton.data.recording.encoding import Pictured
+from arena_newton.data.recording.film_pool import FilmPool
 pool = FilmPool(2, 1)
 pool.bind({"front": Pictured(2, 64, 64, False)}, torch.device("cpu"))
 reels = [pool.open(pool.join(), Path(sys.argv[1]) / f"{n}.mp4", Path(sys.argv[1]) / f"{n}.raw", 50) for n in range(2)]

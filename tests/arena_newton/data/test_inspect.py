@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from made_episodes import make_episode
 
-from arena_newton.canonical import ACTION, STAND_ACTION
 from arena_newton.data.__main__ import main
-from arena_newton.data.episode_figures import FIGURES, figures
-from arena_newton.data.motion_source import Motion
+from arena_newton.data.checks.episode_figures import FIGURES, figures
+from arena_newton.data.datasets.motion_source import Motion
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
 from mutants import damaged

@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.canonical import ACTION, ACTION_WIDTH, STAND_ACTION
-from arena_newton.data.label_protocols import LABELS, V4, V4Decoder, action_names, decode_v4, encode_v4, protocol
-from arena_newton.data.layouts import described_protocol
+from arena_newton.data.datasets.layouts import described_protocol
+from arena_newton.data.readers.label_protocols import (
+    LABELS,
+    V4,
+    V4Decoder,
+    action_names,
+    decode_v4,
+    encode_v4,
+    protocol,
+)
 from arena_newton.errors import InputError
-from arena_newton.robot import TICK
-from arena_newton.rotations import matrix_from_quat, quat_from_euler
+from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, STAND_ACTION
+from arena_newton.robot.g1 import TICK
+from arena_newton.robot.rotations import matrix_from_quat, quat_from_euler
 
 
 def actions_of(yaw: np.ndarray, roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:

@@ -16,9 +16,9 @@ import pyarrow.parquet
 from made_episodes import make_episode
 
 from arena_newton.data.__main__ import main
-from arena_newton.data.dataset_files import DatasetFiles
-from arena_newton.data.episode import EpisodeFile
-from arena_newton.data.sets import held_out
+from arena_newton.data.datasets.sets import held_out
+from arena_newton.data.readers.dataset_files import DatasetFiles
+from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.pictures.video import VideoWriter
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
@@ -95,7 +95,7 @@ def test_seeds_of_evaluations_among_others_are_told(built, tmp_path, capsys):
 
 def test_merged_passes_verify(built, tmp_path, capsys):
     """`data verify` finds no fault in a merged set, nor in either side of a split."""
-    pytest.importorskip("arena_newton.data.verification")
+    pytest.importorskip("arena_newton.data.checks.verification")
     out = tmp_path / "merged"
     assert main(["merge", str(built / "a"), str(built / "b"), "--out", str(out)]) == 0
     train, held = tmp_path / "train", tmp_path / "held"

@@ -9,14 +9,14 @@ import time
 
 import pytest
 
-from arena_newton.data.new_folder import LOCK, held_folder, link, new_folder, scratch_folder
 from arena_newton.errors import InputError
-from arena_newton.files import PARTIAL
+from arena_newton.files.new_folder import LOCK, held_folder, link, new_folder, scratch_folder
+from arena_newton.files.own_files import PARTIAL
 
 SLOW = """
 import sys, time
 from pathlib import Path
-from arena_newton.data.new_folder import new_folder
+from arena_newton.files.new_folder import new_folder
 with new_folder(Path(sys.argv[1])) as folder:
     (folder / "half").write_text("half")
     print("writing", flush=True)

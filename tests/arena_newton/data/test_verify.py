@@ -17,15 +17,15 @@ pytest.importorskip("pyarrow")
 import pyarrow as pa  # noqa: E402
 import pyarrow.parquet as pq  # noqa: E402
 
-from arena_newton.data import video_checks  # noqa: E402
 from arena_newton.data.__main__ import main  # noqa: E402
-from arena_newton.data.data_options import VerifyOptions  # noqa: E402
-from arena_newton.data.dataset_files import DatasetFiles  # noqa: E402
-from arena_newton.data.episode import EpisodeFile, episode_files  # noqa: E402
-from arena_newton.data.layouts import LAYOUTS  # noqa: E402
-from arena_newton.data.lerobot_dataset import choose, write_dataset  # noqa: E402
-from arena_newton.data.verification import rebuilt_state, verify  # noqa: E402
-from arena_newton.data.video_checks import CameraVideos, DatasetMismatch, check_videos  # noqa: E402
+from arena_newton.data.checks import video_checks  # noqa: E402
+from arena_newton.data.checks.verification import rebuilt_state, verify  # noqa: E402
+from arena_newton.data.checks.video_checks import CameraVideos, DatasetMismatch, check_videos  # noqa: E402
+from arena_newton.data.datasets.data_options import VerifyOptions  # noqa: E402
+from arena_newton.data.datasets.layouts import LAYOUTS  # noqa: E402
+from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset  # noqa: E402
+from arena_newton.data.readers.dataset_files import DatasetFiles  # noqa: E402
+from arena_newton.data.recording.episode import EpisodeFile, episode_files  # noqa: E402
 from arena_newton.errors import ArenaError  # noqa: E402
 from arena_newton.pictures.video import VideoWriter  # noqa: E402
 from tests.arena_newton.data import made_episodes  # noqa: E402
@@ -141,7 +141,7 @@ def test_rows_of_next_to_no_bytes_are_not_read(dataset, monkeypatch):
     zeros = {"action": pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(rows * 40, np.float32)), 40)}
     pq.write_table(pa.table(zeros).slice(0, rows // 8), dataset / DATA)
     assert (dataset / DATA).stat().st_size < 100_000
-    monkeypatch.setattr("arena_newton.limits.ROWS_MEMORY", 2**25)
+    monkeypatch.setattr("arena_newton.files.limits.ROWS_MEMORY", 2**25)
     monkeypatch.setattr(pq.ParquetFile, "read", lambda *a, **k: pytest.fail("read"))
     with pytest.raises(ArenaError, match="file-000.parquet: its rows take more than 32 MiB of memory"):
         DatasetFiles(dataset).columns(dataset / DATA, ("action",))

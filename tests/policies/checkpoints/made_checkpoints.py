@@ -12,10 +12,10 @@ from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTa
 from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import CLIPConfig, CLIPModel, PreTrainedTokenizerFast
 
-from arena_newton.canonical import STAND_ACTION
-from arena_newton.data.label_protocols import encode_v4
+from arena_newton.data.readers.label_protocols import encode_v4
 from arena_newton.policies import Observation
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.robot.canonical import STAND_ACTION
 
 SIDE = 64
 """Width and height of pictures [px]."""

@@ -10,8 +10,9 @@ from lerobot.scripts.lerobot_eval import eval_main
 from made_checkpoints import SIDE, facts, save
 
 from arena_newton import trackers
-from arena_newton.eval import gym, plan
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.adapters import gym
+from arena_newton.eval.plan import episode_plan
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.rollout import Rollout
@@ -42,12 +43,12 @@ def test_a_v4_checkpoint_through_lerobot_eval(fast, realign, tmp_path, monkeypat
         "boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", camera=policy.camera
     )
     WatchedEnv.history.clear()
-    episodes = plan.expand(["boxing"], trackers=["twist2"], policy="test", seeds=[0], repeats=2)
+    episodes = episode_plan.expand(["boxing"], trackers=["twist2"], policy="test", seeds=[0], repeats=2)
     results = Rollout(env, read_by(policy, "v4"), episodes, max_steps=TICKS).run()
     ours = dict(WatchedEnv.history)
     env.close()
     WatchedEnv.history.clear()
-    flags = ["--env.discover_packages_path=arena_newton.eval.lerobot_env", "--env.type=arena_newton"]
+    flags = ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
     flags += ["--env.task=boxing", "--env.engine=mujoco", "--env.device=cpu", f"--env.image_width={SIDE}"]
     flags += [f"--env.image_height={SIDE}", f"--env.episode_length={TICKS}", "--env.labels=v4"]
     flags += [f"--env.realign={realign}", f"--env.look_ticks={policy.chunk_size}", f"--policy.path={fast}"]

@@ -15,7 +15,7 @@ from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.lerobot.checkpoint_reader import FAMILY_TYPES
 from arena_newton.policies.lerobot.checkpoint_tensors import check_family
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train.families import build
+from arena_newton.policies.train.families.families import build
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "train"))
 from made_stats import made_stats

@@ -18,12 +18,13 @@ from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
 from arena_newton.policies import Observation
-from arena_newton.policies.learned import checkpoint_packing, learned_card
-from arena_newton.policies.learned.checkpoint_packing import pack, packed_digest, training_command
+from arena_newton.policies.learned import learned_card
 from arena_newton.policies.learned.learned_card import CARD_FILE, PolicyCard, read_card
 from arena_newton.policies.learned.learned_policy import LearnedPolicy
 from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
+from arena_newton.policies.train import checkpoint_packing
+from arena_newton.policies.train.checkpoint_packing import pack, packed_digest, training_command
 from tests.fuzz.mutants import damaged
 
 TASKS = ("boxing", "vis_navi")

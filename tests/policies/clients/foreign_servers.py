@@ -18,15 +18,15 @@ import zmq
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.data.label_protocols import action_names
-from arena_newton.data.layouts import state_names
+from arena_newton.data.datasets.layouts import state_names
+from arena_newton.data.readers.label_protocols import action_names
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies import Chunk, Observation, Policy, world_mask
-from arena_newton.policies.serve import openpi_codec, vla_eval_codec
-from arena_newton.policies.serve.handshake import ServedFacts, ServedPicture
-from arena_newton.policies.serve.packed_arrays import OPENPI_KEYS, pack
-from arena_newton.policies.serve.policy_messages import Begin, End
+from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.handshake import ServedFacts, ServedPicture
+from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack
+from arena_newton.policies.protocols.policy_messages import Begin, End
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
 
 CHUNK = 4
 SIZE = 64

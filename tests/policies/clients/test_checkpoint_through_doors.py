@@ -10,12 +10,12 @@ import torch
 from foreign_servers import MODALITIES, Gr00tServer, facts
 
 from arena_newton import policies, trackers
-from arena_newton.data.label_protocols import V4, action_names
+from arena_newton.data.readers.label_protocols import V4, action_names
 from arena_newton.env import ArenaEnv
 from arena_newton.policies import Observation
 from arena_newton.policies.label_reader import read_by
+from arena_newton.policies.protocols.handshake import ServedPicture
 from arena_newton.policies.serve.door_guard import DoorGuard
-from arena_newton.policies.serve.handshake import ServedPicture
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import make_policy, open_door
 from arena_newton.policies.serve.serve_options import ServeOptions

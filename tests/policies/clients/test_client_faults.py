@@ -15,8 +15,8 @@ from foreign_servers import Gr00tServer, HttpServer, SocketServer, facts, observ
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.policies import PolicyUnavailable
-from arena_newton.policies.remote_address import TOKEN_VARIABLE
-from arena_newton.policies.remote_client import MAX_FAILURES
+from arena_newton.policies.remote.address import TOKEN_VARIABLE
+from arena_newton.policies.remote.client import MAX_FAILURES
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 

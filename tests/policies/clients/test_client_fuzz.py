@@ -9,11 +9,11 @@ import pytest
 from foreign_servers import CHUNK, MODALITIES, Gr00tServer, SocketServer, answer, facts, gr00t_packed, npy, observation
 
 from arena_newton import policies
-from arena_newton.canonical import ACTION, validate_action
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.policies.remote_gr00t import pack_gr00t, read_modalities, unpack_gr00t
-from arena_newton.policies.serve import openpi_codec, vla_eval_codec
-from arena_newton.policies.serve.packed_arrays import OPENPI_KEYS, pack
+from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack
+from arena_newton.policies.remote.gr00t_client import pack_gr00t, read_modalities, unpack_gr00t
+from arena_newton.robot.canonical import ACTION, validate_action
 from tests.fuzz.mutants import damaged
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")

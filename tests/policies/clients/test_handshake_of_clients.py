@@ -13,14 +13,14 @@ import pytest
 from foreign_servers import CHUNK, MODALITIES, SIZE, Gr00tServer, HttpServer, SocketServer, facts, observation
 
 from arena_newton import policies
-from arena_newton.data.label_protocols import V4, action_names
+from arena_newton.data.readers.label_protocols import V4, action_names
 from arena_newton.errors import InputError
 from arena_newton.policies.label_reader import V4Policy
-from arena_newton.policies.remote_address import DOORS, read_address
-from arena_newton.policies.remote_gr00t import read_modalities
-from arena_newton.policies.remote_websocket import http_page
-from arena_newton.policies.serve.handshake import ServedPicture, read_facts
-from arena_newton.policies.serve.wire_error import WireError
+from arena_newton.policies.protocols.handshake import ServedPicture, read_facts
+from arena_newton.policies.protocols.wire_error import WireError
+from arena_newton.policies.remote.address import DOORS, read_address
+from arena_newton.policies.remote.gr00t_client import read_modalities
+from arena_newton.policies.remote.websocket import http_page
 
 NAMES = tuple(action_names("v3.1"))
 
@@ -214,7 +214,7 @@ def test_batched_server():
     """A server whose metadata says `batched` is asked once for all worlds that ask, along a leading axis."""
     import msgpack
 
-    from arena_newton.policies.serve.packed_arrays import OPENPI_KEYS, pack, unpack
+    from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack, unpack
 
     class Batched(SocketServer):
         def openpi(self, socket):

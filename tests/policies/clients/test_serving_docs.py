@@ -3,14 +3,14 @@
 import re
 from pathlib import Path
 
-from arena_newton.canonical import ACTION, STATE
-from arena_newton.policies.remote_address import DOORS, TOKEN_VARIABLE
-from arena_newton.policies.remote_client import MAX_FAILURES, MAX_REPLY
-from arena_newton.policies.remote_gr00t import Gr00tPolicy
-from arena_newton.policies.remote_openpi import ROBOARENA_IMAGE_KEY, OpenpiPolicy
-from arena_newton.policies.remote_vla_eval import VlaEvalPolicy
-from arena_newton.policies.serve import openpi_codec
-from arena_newton.policies.serve.handshake import RATE, ServedFacts, expected_facts
+from arena_newton.policies.protocols import openpi_codec
+from arena_newton.policies.protocols.handshake import RATE, ServedFacts, expected_facts
+from arena_newton.policies.remote.address import DOORS, TOKEN_VARIABLE
+from arena_newton.policies.remote.client import MAX_FAILURES, MAX_REPLY
+from arena_newton.policies.remote.gr00t_client import Gr00tPolicy
+from arena_newton.policies.remote.openpi_client import ROBOARENA_IMAGE_KEY, OpenpiPolicy
+from arena_newton.policies.remote.vla_eval_client import VlaEvalPolicy
+from arena_newton.robot.canonical import ACTION, STATE
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "serving.md").read_text().split("## Asking other servers")[1].split("\n## ")[0]

@@ -11,9 +11,9 @@ import pytest
 from foreign_servers import observation
 
 from arena_newton import policies
-from arena_newton.canonical import STAND_ACTION, validate_action
 from arena_newton.errors import InputError
-from arena_newton.policies.remote_address import read_address
+from arena_newton.policies.remote.address import read_address
+from arena_newton.robot.canonical import STAND_ACTION, validate_action
 from tests.fuzz.mutants import damaged
 
 

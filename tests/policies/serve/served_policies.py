@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from websockets.sync.client import connect
 
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy, world_mask
+from arena_newton.policies.protocols.policy_messages import Look
 from arena_newton.policies.serve.door_guard import DoorGuard
-from arena_newton.policies.serve.policy_messages import Look
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import open_door
 from arena_newton.policies.serve.serve_options import ServeOptions
+from arena_newton.robot.canonical import STAND_ACTION
 
 
 class Remembers(Policy):

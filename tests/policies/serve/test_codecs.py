@@ -15,17 +15,16 @@ import pytest
 from PIL import Image
 from served_policies import look, state
 
-from arena_newton.canonical import STATE_WIDTH
 from arena_newton.errors import InputError
-from arena_newton.policies.serve import arena_codec, openpi_codec, vla_eval_codec
-from arena_newton.policies.serve.handshake import (
+from arena_newton.policies.protocols import arena_codec, openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.handshake import (
     ServedFacts,
     ServedPicture,
     compare_facts,
     expected_facts,
     read_facts,
 )
-from arena_newton.policies.serve.packed_arrays import (
+from arena_newton.policies.protocols.packed_arrays import (
     MAX_DEPTH,
     MAX_OBJECTS,
     MAX_TEXT,
@@ -34,9 +33,10 @@ from arena_newton.policies.serve.packed_arrays import (
     pack,
     unpack,
 )
-from arena_newton.policies.serve.policy_messages import Begin, End, Look
-from arena_newton.policies.serve.raw_arrays import MAX_FRAME
-from arena_newton.policies.serve.wire_error import WireError
+from arena_newton.policies.protocols.policy_messages import Begin, End, Look
+from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
+from arena_newton.policies.protocols.wire_error import WireError
+from arena_newton.robot.canonical import STATE_WIDTH
 
 ONE, NONE = "0000803f", "00000000"
 STATE_HEX = ONE + NONE * 2 + ONE + NONE * 60

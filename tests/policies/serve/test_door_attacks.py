@@ -17,9 +17,10 @@ import msgpack
 import pytest
 from served_policies import Remembers, look, state, together
 
-from arena_newton.policies.serve import door_guard, message_readers, openpi_codec, vla_eval_codec
-from arena_newton.policies.serve.arena_codec import unpack_look
-from arena_newton.policies.serve.wire_error import WireError
+from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.arena_codec import unpack_look
+from arena_newton.policies.protocols.wire_error import WireError
+from arena_newton.policies.serve import door_guard, message_readers
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 

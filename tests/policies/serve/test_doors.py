@@ -13,10 +13,11 @@ from served_policies import Fails, Remembers, TurnsV4, look, state, together
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from arena_newton.policies.label_reader import read_by
-from arena_newton.policies.serve import arena_codec, openpi_codec, policy_server, vla_eval_codec
-from arena_newton.policies.serve.policy_messages import Begin, End
+from arena_newton.policies.protocols import arena_codec, openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.policy_messages import Begin, End
+from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
+from arena_newton.policies.serve import policy_server
 from arena_newton.policies.serve.policy_server import Refused
-from arena_newton.policies.serve.raw_arrays import MAX_FRAME
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from served_policies import Fails, Remembers, TurnsV4, look, state, together
 
-from arena_newton.data.label_protocols import decode_v4
+from arena_newton.data.readers.label_protocols import decode_v4
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import read_by
-from arena_newton.policies.serve.picture_fit import fitted_picture
-from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.protocols.picture_fit import fitted_picture
+from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
-from arena_newton.policies.serve.wire_error import WireError
 
 
 @pytest.fixture

@@ -19,15 +19,15 @@ from served_policies import Remembers, TurnsV4, look, state
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from arena_newton.canonical import STAND_ACTION
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Observation
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.policies.remote import RemotePolicy
-from arena_newton.policies.serve import openpi_codec
+from arena_newton.policies.protocols import openpi_codec
+from arena_newton.policies.remote.arena_client import RemotePolicy
 from arena_newton.policies.serve.__main__ import main
 from arena_newton.policies.serve.serve_command import _first_task, make_policy, serve_policy
 from arena_newton.policies.serve.serve_options import ServeOptions
+from arena_newton.robot.canonical import STAND_ACTION
 
 
 @pytest.mark.parametrize(
@@ -258,6 +258,6 @@ def test_a_missing_extra(capsys, monkeypatch):
 
 def test_a_bare_installation_reads_handshakes():
     """The HTTP client's codec and the handshake import neither msgpack nor websockets."""
-    code = "import sys, arena_newton.policies.serve.arena_codec, arena_newton.policies.serve.handshake; "
+    code = "import sys, arena_newton.policies.protocols.arena_codec, arena_newton.policies.protocols.handshake; "
     code += "sys.exit(bool({'msgpack', 'websockets'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

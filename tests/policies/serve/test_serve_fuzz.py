@@ -8,10 +8,10 @@ import pytest
 from served_policies import Remembers, look
 from websockets.exceptions import ConnectionClosed
 
-from arena_newton.policies.serve import arena_codec, openpi_codec, vla_eval_codec
-from arena_newton.policies.serve.handshake import expected_facts
-from arena_newton.policies.serve.policy_messages import Begin, End
-from arena_newton.policies.serve.wire_error import WireError
+from arena_newton.policies.protocols import arena_codec, openpi_codec, vla_eval_codec
+from arena_newton.policies.protocols.handshake import expected_facts
+from arena_newton.policies.protocols.policy_messages import Begin, End
+from arena_newton.policies.protocols.wire_error import WireError
 from tests.fuzz.mutants import damaged
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")

@@ -14,7 +14,7 @@ from made_checkpoints import SIDE, facts, save
 from arena_newton.interfaces import Observation
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
-from arena_newton.policies.serve.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Look
 from arena_newton.policies.serve.serve_command import make_policy
 from arena_newton.policies.serve.serve_options import ServeOptions
 

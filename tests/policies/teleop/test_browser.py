@@ -20,13 +20,13 @@ from chromium import READY, Chromium, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from arena_newton.data.episode import EpisodeFile
+from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.errors import InputError
+from arena_newton.policies.protocols.ports import LOCAL, bind
 from arena_newton.policies.teleop import __main__ as command
 from arena_newton.policies.teleop.browser import DEAD_MAN
 from arena_newton.policies.teleop.driving import RANGES, Held
 from arena_newton.policies.teleop.page_server import TAKEN_OVER, UNFIT, PageServer, new_token
-from arena_newton.policies.teleop.ports import LOCAL, bind
 
 FOREIGN = "http://evil.example"
 """A web site in another tab."""

@@ -18,8 +18,7 @@ from redis.backoff import NoBackoff
 from redis.retry import Retry
 
 from arena_newton import trackers
-from arena_newton.canonical import ACTION, MIMIC
-from arena_newton.data.episode import EpisodeFile
+from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.policies.teleop import redis_keys as keys
@@ -29,8 +28,9 @@ from arena_newton.policies.teleop.redis_reference import GmrReference, Limits, M
 from arena_newton.policies.teleop.redis_source import MOST_LINES, STALE, RedisSource, connect
 from arena_newton.policies.teleop.source import Telemetry
 from arena_newton.policies.teleop.teleop_session import TeleopSession
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT, TICK
-from arena_newton.rotations import heading, quat_apply, quat_from_rot6d, quat_from_yaw, quat_multiply, roll_pitch
+from arena_newton.robot.canonical import ACTION, MIMIC
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT, TICK
+from arena_newton.robot.rotations import heading, quat_apply, quat_from_rot6d, quat_from_yaw, quat_multiply, roll_pitch
 from arena_newton.trackers.motions.commands import COLUMNS, neutral_row
 from arena_newton.trackers.motions.generator import ReferenceGenerator
 

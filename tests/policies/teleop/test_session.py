@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import seeding, trackers
-from arena_newton.canonical import ACTION, STAND_ACTION
-from arena_newton.data.episode import EpisodeFile
+from arena_newton import trackers
+from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
@@ -19,7 +18,9 @@ from arena_newton.policies.teleop.source import Telemetry, Wish
 from arena_newton.policies.teleop.standing import SECONDS, Stander
 from arena_newton.policies.teleop.teleop_options import BrowserOptions
 from arena_newton.policies.teleop.teleop_session import TeleopSession
-from arena_newton.robot import DEFAULT_POSE, TICK
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import DEFAULT_POSE, TICK
+from arena_newton.rules import seeding
 
 FASTEST = np.full(40, 0.06, np.float32)
 """Largest change of an action in a tick: 3 rad/s of a joint or of a column of the orientation ..."""

@@ -2,7 +2,7 @@
 
 import torch
 
-from arena_newton.policies.train.policy_model import TrainableModel
+from arena_newton.policies.train.families.policy_model import TrainableModel
 
 STATE, ACTION = 64, 40
 

@@ -8,8 +8,10 @@ from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from arena_newton.errors import InputError
+from arena_newton.policies.lerobot import pretrained_weights
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import families, measured_training, pretrained_weights, training
+from arena_newton.policies.train import measured_training, training
+from arena_newton.policies.train.families import families
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
 from tests.policies.train.small_dataset import info
 

@@ -11,8 +11,9 @@ from torch._inductor.utils import fresh_cache
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
-from arena_newton.policies.train import families, network_compiler, training
+from arena_newton.policies.train import network_compiler, training
 from arena_newton.policies.train.__main__ import main
+from arena_newton.policies.train.families import families
 from arena_newton.policies.train.policy_options import UNCOMPILED, PolicyTrainOptions
 from arena_newton.policies.train.training import train
 from tests.policies.train import narrow_network

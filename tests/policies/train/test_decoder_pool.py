@@ -17,10 +17,10 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.policies.train import decoder_pool
-from arena_newton.policies.train.decoder_pool import DecoderPool, decoding_processes
-from arena_newton.policies.train.demonstration_rows import read_rows
-from arena_newton.policies.train.frame_store import episode_films, load_frames
+from arena_newton.policies.train.frames import decoder_pool
+from arena_newton.policies.train.frames.decoder_pool import DecoderPool, decoding_processes
+from arena_newton.policies.train.frames.demonstration_rows import read_rows
+from arena_newton.policies.train.frames.frame_store import episode_films, load_frames
 from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset
 
 CPU = torch.device("cpu")
@@ -173,9 +173,9 @@ def test_ctrl_c_leaves_nothing(rows):
 
 def test_processes_end_with_a_training_that_is_killed(rows):
     """`kill -9` of whoever asked for pictures leaves no process."""
-    root = Path(decoder_pool.__file__).parents[3]
+    root = Path(decoder_pool.__file__).parents[4]
     code = (
-        "import time; from arena_newton.policies.train.decoder_pool import DecoderPool\n"
+        "import time; from arena_newton.policies.train.frames.decoder_pool import DecoderPool\n"
         "pool = DecoderPool(64, 64, threads=1, processes=2)\n"
         "print(*(one.process.pid for one in pool._workers), flush=True)\ntime.sleep(600)"
     )
@@ -235,9 +235,9 @@ def test_words_of_an_interpreters_start_are_no_messages(rows, tmp_path, monkeypa
 
 def test_processes_start_where_the_standard_input_is_closed():
     """Whoever started the training may have closed its input: memory is not in its position."""
-    root = Path(decoder_pool.__file__).parents[3]
+    root = Path(decoder_pool.__file__).parents[4]
     code = (
-        "import os; os.close(0)\nfrom arena_newton.policies.train.decoder_pool import DecoderPool\n"
+        "import os; os.close(0)\nfrom arena_newton.policies.train.frames.decoder_pool import DecoderPool\n"
         "with DecoderPool(64, 64, threads=1, processes=1) as pool:\n    assert pool._fd > 2\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), *filter(None, sys.path)])}

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import families
+from arena_newton.policies.train.families import families
 from tests.policies.train.made_stats import made_batch, made_stats
 
 if not torch.cuda.is_available():

@@ -7,7 +7,7 @@ from torchvision.models import resnet18
 
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import families
+from arena_newton.policies.train.families import families
 from tests.policies.train.made_stats import made_batch, made_stats
 from tests.policies.train.stock_lerobot import opened, raw_observation
 

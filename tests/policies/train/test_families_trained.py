@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
-from arena_newton.policies.train.encoder_sources import checkpoint_encoders
+from arena_newton.policies.lerobot.encoder_sources import checkpoint_encoders
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.training import train
 from tests.policies.train.stock_lerobot import opened

@@ -12,15 +12,16 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from arena_newton.data import Frames
-from arena_newton.data.label_protocols import encode_v4
-from arena_newton.data.lerobot_reader import DatasetActions
+from arena_newton.data.readers.label_protocols import encode_v4
+from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
-from arena_newton.policies.train import families, frame_store
-from arena_newton.policies.train.augmentation import gathered_pictures
-from arena_newton.policies.train.batching import BatchMaker, RowOrder, step_seed
-from arena_newton.policies.train.demonstration_rows import read_rows, statistics
-from arena_newton.policies.train.frame_store import load_frames, made_frames
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames import frame_store
+from arena_newton.policies.train.frames.augmentation import gathered_pictures
+from arena_newton.policies.train.frames.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.frames.demonstration_rows import read_rows, statistics
+from arena_newton.policies.train.frames.frame_store import load_frames, made_frames
 from arena_newton.policies.train.network_memory import SIZES, network_bytes
 from arena_newton.policies.train.training import camera_fit
 from tests.fuzz.mutants import damaged

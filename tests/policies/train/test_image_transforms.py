@@ -6,11 +6,12 @@ from lerobot.transforms import ImageTransformsConfig
 from torchvision.transforms.v2 import functional
 
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES, recipe
-from arena_newton.policies.train import augmentation, families
-from arena_newton.policies.train.augmentation import gathered_pictures
-from arena_newton.policies.train.batching import BatchMaker
-from arena_newton.policies.train.frame_store import made_frames, made_statistics
-from arena_newton.policies.train.image_transforms import (
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames import augmentation
+from arena_newton.policies.train.frames.augmentation import gathered_pictures
+from arena_newton.policies.train.frames.batching import BatchMaker
+from arena_newton.policies.train.frames.frame_store import made_frames, made_statistics
+from arena_newton.policies.train.frames.image_transforms import (
     CHOSEN,
     RANGES,
     TRANSLATION,

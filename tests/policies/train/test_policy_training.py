@@ -26,7 +26,6 @@ from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import (
-    families,
     measured_training,
     training,
     training_bench,
@@ -35,8 +34,9 @@ from arena_newton.policies.train import (
     training_state,
 )
 from arena_newton.policies.train.__main__ import main
-from arena_newton.policies.train.batching import BatchMaker
-from arena_newton.policies.train.frame_store import made_frames
+from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames.batching import BatchMaker
+from arena_newton.policies.train.frames.frame_store import made_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import chosen_recipe, train

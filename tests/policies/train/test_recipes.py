@@ -16,7 +16,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from arena_newton.data.label_protocols import LABELS
+from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES, TrainingRecipe, paper_file, recipe
 

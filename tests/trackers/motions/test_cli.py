@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.trackers.motions import kinematics, programs
 from arena_newton.trackers.motions.__main__ import main
 from arena_newton.trackers.motions.film import picked_frames

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import rotations
 from arena_newton.errors import InputError
-from arena_newton.robot import CANONICAL_TO_MUJOCO
+from arena_newton.robot import rotations
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO
 from arena_newton.trackers.motions import frames, kinematics, measure
 from arena_newton.trackers.motions.formats import ReadOptions, read_file, read_library
 from arena_newton.trackers.motions.library import MotionLibrary
@@ -185,7 +185,7 @@ def test_defects(tmp_path):
 
 
 def standing(height: float, ticks: int = 40) -> MotionLibrary:
-    from arena_newton.robot import DEFAULT_POSE
+    from arena_newton.robot.g1 import DEFAULT_POSE
 
     pos = np.tile([0.0, 0.0, kinematics.neutral_stance().height + height], (ticks, 1))
     quat, joints = np.tile([1.0, 0, 0, 0], (ticks, 1)), np.tile(DEFAULT_POSE, (ticks, 1))

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate, launch_reset_reference
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
 from arena_newton.trackers.motions import commands, kinematics
 from arena_newton.trackers.motions.commands import CHANNELS, COMMAND_WIDTH, LIMITED_COLUMNS, MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import rotations
-from arena_newton.robot import DEFAULT_POSE, MUJOCO_JOINTS
+from arena_newton.robot import rotations
+from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS
 from arena_newton.trackers.motions import kinematics
 
 

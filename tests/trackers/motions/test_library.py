@@ -5,10 +5,10 @@ import pytest
 import torch
 import warp as wp
 
-from arena_newton import rotations
 from arena_newton.errors import InputError
 from arena_newton.kernels.canonical import ReferencePose, launch_integrate, launch_reset_reference
-from arena_newton.robot import CANONICAL_TO_MUJOCO, TICK
+from arena_newton.robot import rotations
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, TICK
 from arena_newton.trackers.motions import frames
 from arena_newton.trackers.motions.library import MIRROR_JOINTS, MIRROR_SIGNS, MotionLibrary
 from arena_newton.trackers.motions.load import Clip

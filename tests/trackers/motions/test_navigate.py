@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from arena_newton.rotations import heading, rotate_xy, wrap_angle
+from arena_newton.robot.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, steer
 
 DT = 0.02

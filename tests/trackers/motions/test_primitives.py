@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.robot import TICK
+from arena_newton.robot.g1 import TICK
 from arena_newton.trackers.motions import kinematics, primitives, programs
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.generator import ReferenceGenerator

@@ -71,8 +71,8 @@ from arena_newton.kernels.gait import (
     WALK_HEIGHT,
     WALK_PITCH,
 )
-from arena_newton.robot import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
-from arena_newton.rotations import quat_from_euler, rotate_xy, wrap_by_remainder
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
+from arena_newton.robot.rotations import quat_from_euler, rotate_xy, wrap_by_remainder
 from arena_newton.trackers.motions.commands import (
     CHANNELS,
     COLUMNS,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.robot import DEFAULT_POSE
+from arena_newton.robot.g1 import DEFAULT_POSE
 from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import MotionLibrary
 

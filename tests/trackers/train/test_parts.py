@@ -7,17 +7,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from arena_newton import rotations
 from arena_newton.errors import InputError
+from arena_newton.robot import rotations
 from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.train import __main__ as command_line
-from arena_newton.trackers.train import events, session
-from arena_newton.trackers.train.measurement import TickMeasurement
+from arena_newton.trackers.train import session
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
-from arena_newton.trackers.train.rewards import REWARDS, configured, maximum
 from arena_newton.trackers.train.sampling import ClipSampler
 from arena_newton.trackers.train.tally import Tally, TrainingError
-from arena_newton.trackers.train.terminations import TERMINATIONS
+from arena_newton.trackers.train.terms import events
+from arena_newton.trackers.train.terms.measurement import TickMeasurement
+from arena_newton.trackers.train.terms.rewards import REWARDS, configured, maximum
+from arena_newton.trackers.train.terms.terminations import TERMINATIONS
 
 
 @pytest.fixture(scope="module")

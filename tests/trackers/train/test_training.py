@@ -16,20 +16,21 @@ import torch
 import tyro
 from PIL import Image
 
-from arena_newton import rotations
 from arena_newton.errors import InputError
-from arena_newton.robot import TWIST2_DRIVE, PhysicsRate
+from arena_newton.robot import rotations
+from arena_newton.robot.g1 import TWIST2_DRIVE, PhysicsRate
 from arena_newton.trackers import base, interface, train
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.train import __main__ as command_line
-from arena_newton.trackers.train import events, session
+from arena_newton.trackers.train import session
 from arena_newton.trackers.train.checkpoint import Card, Checkpoint
-from arena_newton.trackers.train.critic import CRITIC
 from arena_newton.trackers.train.export import export
-from arena_newton.trackers.train.rewards import Term
 from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
 from arena_newton.trackers.train.tally import TrainingError
+from arena_newton.trackers.train.terms import events
+from arena_newton.trackers.train.terms.critic import CRITIC
+from arena_newton.trackers.train.terms.rewards import Term
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.twist2 import Twist2Tracker

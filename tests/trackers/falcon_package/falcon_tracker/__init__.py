@@ -10,7 +10,7 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
-from arena_newton.robot import DriveGains, PhysicsRate
+from arena_newton.robot.g1 import DriveGains, PhysicsRate
 from arena_newton.trackers.front_end import ActionForm, FrontEnd, NetworkTracker, column, store
 from arena_newton.trackers.inference.onnx_session import OnnxSession
 

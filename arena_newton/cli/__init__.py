@@ -1,0 +1,1 @@
+"""Command lines: flags from dataclasses, registries of names, extras, exit codes."""

@@ -1,0 +1,1 @@
+"""Checks of recordings and datasets: verification, inspection, statistics, speed."""

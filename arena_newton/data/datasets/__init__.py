@@ -1,0 +1,1 @@
+"""LeRobot datasets: built of recordings, merged, split and read."""

@@ -1,0 +1,82 @@
+"""The MP4 of an episode's camera: what its fields say about it, checked against the file without decoding it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+
+from arena_newton.data.recording.episode import EpisodeFile, vision
+from arena_newton.data.recording.image_statistics import VALUES
+from arena_newton.errors import InputError
+
+__all__ = ["SourceVideo", "source_video"]
+
+
+@dataclass(frozen=True)
+class SourceVideo:
+    """A finished video of a camera."""
+
+    path: Path
+    width: int
+    height: int
+    fps: float
+    codec: Mapping[str, object]
+    """Codec and its options, as used."""
+    histogram: np.ndarray
+    """Pixels of all frames by channel and value, before they were encoded, int64, shape [3, 256]."""
+
+    @property
+    def kind(self) -> str:
+        """What must be the same in all videos of a camera."""
+        options = " ".join(f"{name} {value}" for name, value in self.codec.items())
+        return f"{self.width}x{self.height} {options}"
+
+
+def source_video(episode: EpisodeFile, camera: str) -> SourceVideo:
+    """The video of a camera.
+
+    Raises:
+        InputError: It is missing, is not what the fields say, or has another number of frames than there are rows.
+    """
+    path = episode.video(camera)
+    size = episode.array(f"arena_{vision(camera, 'size')}", 2)
+    histogram = episode.array(f"arena_{vision(camera, 'histogram')}", 3, VALUES)
+    fps = float(episode.array(vision(camera, "rgb_video_fps")))
+    found = SourceVideo(
+        path, int(size[0]), int(size[1]), fps, episode.json(f"arena_{vision(camera, 'codec')}"), histogram
+    )
+    indices = episode.array(vision(camera, "frame_indices"), episode.rows)
+    if not np.array_equal(indices, np.arange(episode.rows)):
+        raise InputError(f"{episode.path}: {vision(camera, 'frame_indices')} is not 0 to {episode.rows - 1}")
+    if (np.asarray(histogram) < 0).any() or set(histogram.sum(axis=1)) != {episode.rows * found.width * found.height}:
+        raise InputError(f"{episode.path}: arena_{vision(camera, 'histogram')} does not count {episode.rows} pictures")
+    _check(found, episode.rows)
+    return found
+
+
+def _check(video: SourceVideo, rows: int) -> None:
+    """Count its frames, which are packets of the file."""
+    try:
+        with av.open(str(video.path)) as container:
+            stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise ValueError("no decoder")
+            about = stream.codec_context.width, stream.codec_context.height, stream.codec_context.codec.canonical_name
+            rate = float(stream.average_rate or 0)
+            frames = sum(packet.size > 0 for packet in container.demux(stream))
+    except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
+        raise InputError(f"{video.path}: not a readable video ({type(error).__name__})") from error
+    if frames != rows:
+        raise InputError(f"{video.path}: has {frames} frames, the episode has {rows} rows")
+    even = video.width + video.width % 2, video.height + video.height % 2
+    if about[:2] != even or about[2] != video.codec.get("vcodec"):
+        raise InputError(
+            f"{video.path}: is {about[0]}x{about[1]} {about[2]}, its episode says {video.width}x{video.height} "
+            f"{video.codec.get('vcodec')}"
+        )
+    if abs(rate - video.fps) > 1e-3:
+        raise InputError(f"{video.path}: has {rate:g} frames per second, its episode says {video.fps:g}")

@@ -1,0 +1,1 @@
+"""Compiled kernels: loaded side by side while an environment is built."""

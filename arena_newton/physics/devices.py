@@ -1,0 +1,68 @@
+"""Which engine and device a run gets; asked while it is planned, so Warp is loaded only where a GPU is looked for."""
+
+from pathlib import Path
+
+from arena_newton.cli.quiet import quiet_warp
+from arena_newton.errors import InputError
+
+__all__ = ["cluster_engine", "resolve_engine"]
+
+NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
+"""Folder with an entry per GPU that the driver of this machine knows."""
+
+
+def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
+    """Engine and device for `auto`, checked against what this machine has.
+
+    Raises:
+        InputError: Unknown engine, or a device that this machine does not have.
+    """
+    if engine not in {"auto", "mujoco", "warp"}:
+        raise InputError(f"--engine {engine}: unknown, choose auto, mujoco or warp")
+    if device == "cpu" or (engine == "mujoco" and device is None):
+        return ("warp" if engine == "warp" else "mujoco"), "cpu"
+    if device is not None and not device.startswith("cuda"):
+        raise InputError(f"--device {device}: unknown, choose cpu, cuda or cuda:N")
+    import warp as wp
+
+    quiet_warp()
+    cuda = wp.is_cuda_available()
+    if device is not None:
+        if not cuda:
+            raise InputError(f"--device {device}: no CUDA device on this machine, use --device cpu")
+        if device != "cuda" and device not in {d.alias for d in wp.get_cuda_devices()}:
+            raise InputError(f"--device {device}: no such device, this machine has {wp.get_cuda_device_count()}")
+        if engine == "mujoco":
+            raise InputError(f"--device {device}: engine mujoco runs on the CPU, use --engine warp for CUDA")
+    if engine == "auto":
+        engine = "warp" if cuda else "mujoco"
+    return engine, device or ("cuda:0" if cuda else "cpu")
+
+
+def cluster_engine(engine: str, device: str | None, gpus: float | None) -> tuple[str, str]:
+    """Engine and device of processes of a cluster, which each see the GPUs that it gave them; Warp is not loaded.
+
+    Args:
+        engine: `auto`: warp where GPUs are asked for, or where this machine has one.
+        device: The number of a GPU is of no account.
+        gpus: GPUs of each process; None: the user leaves it open.
+
+    Raises:
+        InputError: Unknown engine or device.
+    """
+    resolve_engine(engine, "cpu")
+    cuda = device is not None and device.startswith("cuda")
+    if not cuda and device not in (None, "cpu"):
+        raise InputError(f"--device {device}: unknown, choose cpu, cuda or cuda:N")
+    if engine == "mujoco" and (cuda or gpus):
+        given = f"--device {device}" if cuda else f"--ray-gpus {gpus:g}"
+        raise InputError(f"{given}: engine mujoco runs on the CPU, use --engine warp for CUDA")
+    if device == "cpu" and gpus:
+        raise InputError(f"--ray-gpus {gpus:g}: contradicts --device cpu")
+    if cuda or gpus or (device is None and (engine == "warp" or (engine == "auto" and _has_gpu()))):
+        return "warp", "cuda:0"
+    return ("warp" if engine == "warp" else "mujoco"), "cpu"
+
+
+def _has_gpu() -> bool:
+    return NVIDIA_DEVICES.is_dir() and any(NVIDIA_DEVICES.iterdir())

@@ -1,0 +1,1 @@
+"""Value types of a rule set, and the seeds of an episode."""

@@ -1,0 +1,1 @@
+"""Evaluation through the interfaces of others: Gymnasium, LeRobot's environment, served protocols."""

@@ -1,0 +1,210 @@
+"""What LeRobot's command line knows of our worlds: flags, features, and how a batch is made."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+
+from arena_newton import tasks as task_registry
+from arena_newton.cli.flags import user_path
+from arena_newton.errors import InputError
+from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds, policy_worlds
+from arena_newton.pictures.settings import Fit
+from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+__all__ = ["CAMERAS", "ArenaNewtonEnv", "DropRepeated"]
+
+LABELS = ("v3.1", "v4")
+"""Label protocols, `data.readers.label_protocols.LABELS`."""
+FPS = 50
+"""Ticks per second."""
+CAMERAS = {"front": "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
+"""Name in datasets (the original's) → camera of the scene."""
+REPEATED = (f"observation.{OBS_STATE}", f"observation.{OBS_ENV_STATE}")
+"""What LeRobot makes of observations that have a dataset's name already."""
+FITS = ("pad", "native")
+"""`pictures.settings.Fit`."""
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class DropRepeated(ObservationProcessorStep):  # type: ignore[misc]  # LeRobot's classes are Any to a type checker
+    """Drops what is observed under a dataset's name, for `--eval.recording`; policies get it as `observation.state`."""
+
+    def observation(self, observation: dict[str, object]) -> dict[str, object]:
+        """The observation without its second copies of state and task vector."""
+        return {key: value for key, value in observation.items() if key not in REPEATED}
+
+    def transform_features(self, features: dict[str, object]) -> dict[str, object]:
+        """Features are those of the policy already."""
+        return features
+
+
+@EnvConfig.register_subclass("arena_newton")
+@dataclass
+class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
+    """Worlds of one task, or of several one after the other; `--env.<field>` on LeRobot's command line."""
+
+    task: str | None = "vis_navi"
+    """Task name, several with commas between, or `all`."""
+    fps: int = FPS
+    """Ticks per second; the world has no other."""
+    tracker: str = "twist2"
+    """Tracker that executes actions."""
+    checkpoint: str | None = None
+    """Its weights; those of the package when none are named."""
+    mode: str = "base"
+    """`base`, `execution`, `semantic` or `visual`."""
+    rules: str = "paper"
+    """Rule set."""
+    engine: str = "auto"
+    """`auto`, `mujoco` or `warp`."""
+    device: str | None = None
+    """Device of the worlds and of the tracker, such as `cpu` or `cuda:0`."""
+    variant_file: str | None = None
+    """USD layer instead of the one task's own scene."""
+    fast_physics: bool = False
+    """Use the tracker's fast physics rate."""
+    cameras: str = "front"
+    """Observed cameras, with commas between: front, left_wrist, right_wrist, world."""
+    image_width: int | None = None
+    """Width of pictures [px]; the policy's, or 224."""
+    image_height: int | None = None
+    """Height of pictures [px]; the policy's, or 224."""
+    fit: Fit | None = None
+    """`pad` or `native`: how the camera's 4:3 picture goes into another size; the policy's, or `pad`."""
+    episode_length: int | None = None
+    """Cap on the step budget of the rule set [ticks]."""
+    labels: str | None = None
+    """Protocol of the policy's actions: v3.1, or v4, which is decoded per world; the policy's, or v3.1."""
+    realign: float | None = None
+    """Of v4: fraction of the gap between commanded and measured heading that is closed each tick; the policy's."""
+    look_ticks: int | None = None
+    """Of v4: ticks between two looks of the policy, at which `realign` measures the heading: its n_action_steps."""
+    task_vector: str | None = None
+    """Tasks in the order of the one-hot vector that the policy is given, with commas between; the policy's, or none."""
+    episodes: str | None = None
+    """Folder that gets what LeRobot's files leave out: a line per episode, and its actions for `replay:`."""
+
+    def __post_init__(self) -> None:
+        """Take over what the policy of `--policy.path` says of itself, and name the features.
+
+        Raises:
+            InputError: An unknown task, camera or protocol, a number that is out of range, another number of ticks
+                per second than the world has, or a damaged file of the policy.
+        """
+        if self.fps != FPS:
+            raise InputError(f"--env.fps {self.fps}: the world has {FPS} ticks per second")
+        if self.max_parallel_tasks != 1:  # threads would break captured CUDA graphs
+            raise InputError(
+                f"--env.max_parallel_tasks {self.max_parallel_tasks}: tasks run one after the other, use 1"
+            )
+        said = policy_worlds()
+        if said.source is not None:
+            logger.info("%s says %s; flags that are given count more", said.source, said.sentence)
+        worlds = self.policy_worlds = PolicyWorlds(
+            labels=said.labels if self.labels is None else self.labels,
+            realign=said.realign if self.realign is None else self.realign,
+            look_ticks=said.look_ticks if self.look_ticks is None else self.look_ticks,
+            task_vector=said.task_vector if self.task_vector is None else _names(self.task_vector),
+            width=said.width if self.image_width is None else self.image_width,
+            height=said.height if self.image_height is None else self.image_height,
+            fit=said.fit if self.fit is None else self.fit,
+        )
+        if worlds.labels not in LABELS:
+            raise InputError(f"--env.labels {worlds.labels}: unknown, choose from {', '.join(LABELS)}")
+        if worlds.fit not in FITS:
+            raise InputError(f"--env.fit {worlds.fit}: unknown, choose from {', '.join(FITS)}")
+        if not 0.0 <= worlds.realign <= 1.0:
+            raise InputError(f"--env.realign {worlds.realign}: expected 0 to 1")
+        if worlds.look_ticks < 1:
+            raise InputError(f"--env.look_ticks {worlds.look_ticks}: expected at least 1")
+        for task in self.tasks:
+            task_registry.get(task)
+            if worlds.task_vector and task not in worlds.task_vector:
+                raise InputError(f"--env.task {task}: the policy was trained on {', '.join(worlds.task_vector)}")
+        shape = (worlds.height, worlds.width, 3)
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_WIDTH,)),
+            OBS_STATE: PolicyFeature(FeatureType.STATE, (STATE_WIDTH,)),
+            **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
+        }
+        if worlds.task_vector:
+            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (len(worlds.task_vector),))
+        self.features_map = {key: key for key in self.features}
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Task names."""
+        names = _names(self.task or "")
+        if not names:
+            raise InputError("--env.task: nothing named, at least one task is needed")
+        return task_registry.names() if names == ("all",) else names
+
+    @property
+    def prims(self) -> dict[str, str]:
+        """Name in datasets → camera of the scene."""
+        names = _names(self.cameras)
+        for name in names:
+            if name not in CAMERAS:
+                raise InputError(f"--env.cameras {name}: unknown, choose from {', '.join(CAMERAS)}")
+        return {name: CAMERAS[name] for name in names}
+
+    @property
+    def gym_kwargs(self) -> dict[str, object]:
+        """Options of `arena_newton.eval.adapters.gym.ArenaVectorEnv`.
+
+        The start-up is inside the reset, so that a policy is first asked at step 0; ended worlds are frozen until
+        LeRobot's next rollout. The state has its name of datasets too: a recording of LeRobot has columns by it.
+        """
+        return {
+            "tracker": self.tracker,
+            "checkpoint": self.checkpoint,
+            "mode": self.mode,
+            "rules": self.rules,
+            "engine": self.engine,
+            "device": self.device,
+            "variant_file": self.variant_file,
+            "fast_physics": self.fast_physics,
+            "image_size": (self.policy_worlds.width, self.policy_worlds.height),
+            "fit": self.policy_worlds.fit,
+            "cameras": self.prims,
+            "state_keys": ("agent_pos", OBS_STATE),
+            "instruction": False,
+            "settle": "reset",
+            "autoreset_mode": "disabled",
+            "max_episode_steps": self.episode_length,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """One batch of worlds per task, as {task: {0: batch}}.
+
+        Args:
+            n_envs: Worlds in a batch, LeRobot's `--eval.batch_size`.
+            use_async_envs: Ignored: the worlds of a batch are simulated at once, in this process.
+        """
+        from arena_newton.eval.adapters.lerobot_env.labelled_worlds import make_worlds
+
+        folder = None if self.episodes is None else user_path(self.episodes)
+        made: dict[str, dict[int, VectorEnv]] = {}
+        for task in self.tasks:
+            made[task] = {0: make_worlds(task, n_envs, self.policy_worlds, folder, self.gym_kwargs)}
+        return made
+
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """What changes observations before the policy's own processors, and actions after them."""
+        return PolicyProcessorPipeline(steps=[DropRepeated()]), PolicyProcessorPipeline(steps=[])
+
+
+def _names(given: str) -> tuple[str, ...]:
+    """What is named with commas between."""
+    return tuple(name.strip() for name in given.split(",") if name.strip())

@@ -1,0 +1,1 @@
+"""Measures of speed, of this product and beside other programs."""

@@ -1,0 +1,150 @@
+"""``bench --peers lerobot_eval``: a learned policy's episodes by our runner and by stock `lerobot-eval`."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import warp as wp
+
+from arena_newton.cli.extras import require
+from arena_newton.cli.flags import user_path
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
+from arena_newton.eval.folders.recordings import OUTCOMES_FILE
+from arena_newton.eval.folders.results import load_run
+from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
+from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.files.own_processes import environment
+from arena_newton.policies.learned.learned_card import SHIPPED, shipped_card
+from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
+
+__all__ = ["lerobot_eval_figures"]
+
+BAR = 5.0
+"""Least ratio of episodes per second."""
+CUDA_EPISODES, CPU_EPISODES = 60, 2
+"""Episodes with CUDA and without, where the bar is not judged."""
+TASK = "vis_navi"
+"""Task of the episodes."""
+CLOCK = ("started_at", "finished_at")
+"""When an episode of our journal began and ended."""
+
+
+@dataclass(frozen=True)
+class _Played:
+    """What a command did."""
+
+    seconds: float
+    """From the first episode's start to the last one's end [s]."""
+    command_seconds: float
+    """From the command's start to its end [s]."""
+    solved: int
+    """Episodes that succeeded."""
+
+    @property
+    def text(self) -> str:
+        return f"{self.seconds:.1f} s of {self.command_seconds:.1f} s, {self.solved} solved"
+
+
+def lerobot_eval_figures(options: BenchOptions) -> Iterator[BenchFigure]:
+    """Episodes per second of the whole commands: what one of them loads or compiles beforehand counts too."""
+    cuda = bool(wp.is_cuda_available())
+    episodes = options.peers_episodes or (CUDA_EPISODES if cuda else CPU_EPISODES)
+    name = f"{episodes} VisNavi episodes, learned policy / lerobot-eval, episodes/s"
+    if options.policy_checkpoint is None and shipped_card() is None:
+        reason = "not measured: no policy comes with this package; name a checkpoint by --policy-checkpoint"
+        yield BenchFigure(name, BAR, "x", False, None, reason)
+        return
+    try:
+        require("data", "eval bench --peers lerobot_eval")
+    except InputError as error:  # the other pairs of `all` need no such library
+        yield BenchFigure(name, BAR, "x", False, None, f"not measured: {error}")
+        return
+    checkpoint = SHIPPED if options.policy_checkpoint is None else user_path(options.policy_checkpoint)
+    checkpoint = checkpoint_folder(checkpoint, "--policy-checkpoint")
+    rounds, plays, notes = [], [], []
+    for _ in range(options.peers_rounds):
+        with tempfile.TemporaryDirectory() as made:
+            folder = Path(made)
+            ours_play = _ours(options, checkpoint, episodes, cuda, folder / "ours")
+            peer_play = _peer(options, checkpoint, episodes, cuda, folder / "peer")
+        rounds.append((episodes / ours_play.command_seconds, episodes / peer_play.command_seconds))
+        plays.append(peer_play.seconds / ours_play.seconds)
+        notes.append(f"{ours_play.text} / {peer_play.text}")
+    ours, peer, ratio = median_speeds(rounds)
+    cap = f", {options.peers_steps} steps at most" if options.peers_steps else ""
+    note = f"{ours:.3f} / {peer:.3f} episodes/s, median of {len(rounds)} ratios; "
+    note += f"without start and end {statistics.median(plays):.2f} x; {'; '.join(notes)}"
+    note += f"; {versions('lerobot_eval')}"
+    if not cuda:
+        note = f"{NEEDS_CUDA}{ratio:.2f} x, {note}"
+    # The bar is for whole episodes, as many as the protocol's.
+    judged = cuda and episodes == CUDA_EPISODES and not options.peers_steps
+    if cuda and not judged:
+        note = f"not judged (the bar is for {CUDA_EPISODES} whole episodes): {ratio:.2f} x, {note}"
+    figure = BenchFigure(name + cap, BAR, "x", False, ratio if judged else None, note)
+    yield add_to_history(options, "lerobot_eval", figure, (ours, peer, ratio), "episodes/s", device_name())
+
+
+def _ours(options: BenchOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
+    """Play them by `eval run`."""
+    spec = "learned" if options.policy_checkpoint is None else f"lerobot:{checkpoint}"
+    groups, rest = divmod(episodes, PROTOCOL_REPEATS)
+    seeds, repeats = (list(range(groups)), PROTOCOL_REPEATS) if groups and not rest else ([0], episodes)
+    line = [sys.executable, "-P", "-m", "arena_newton.eval", "run", "--task", TASK, "--tracker", "twist2"]
+    line += ["--policy", spec, "--seeds", *map(str, seeds), "--repeats", str(repeats), "--worlds", str(episodes)]
+    line += ["--engine", "warp" if cuda else "mujoco", "--device", "cuda" if cuda else "cpu", "--out", str(folder)]
+    if options.peers_steps:
+        line += ["--max-steps", str(options.peers_steps)]
+    seconds = _timed("eval run", line, (0, 1))
+    records = load_run(folder).records
+    if len(records) != episodes:
+        raise ArenaError(f"eval run: {len(records)} episodes instead of {episodes}")
+    # Of one machine and one batch: the clock of the records is the same.
+    began, ended = ([datetime.fromisoformat(str(getattr(one, name))) for one in records] for name in CLOCK)
+    played = (max(ended) - min(began)).total_seconds()
+    return _Played(played, seconds, sum(one.outcome == "success" for one in records))
+
+
+def _peer(options: BenchOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
+    """Play them by `lerobot-eval`, which counts the seconds itself once its environment is built."""
+    engine, device = ("warp", "cuda") if cuda else ("mujoco", "cpu")
+    line = [sys.executable, "-P", "-m", "lerobot.scripts.lerobot_eval"]
+    line += ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
+    line += [f"--env.task={TASK}", "--env.tracker=twist2", f"--env.engine={engine}", f"--env.device={device}"]
+    line += [f"--env.episodes={folder}", f"--policy.path={checkpoint}", f"--policy.device={device}", "--seed=0"]
+    # One batch, as many worlds as on our side.
+    line += [f"--eval.n_episodes={episodes}", f"--eval.batch_size={episodes}", f"--output_dir={folder / 'lerobot'}"]
+    if options.peers_steps:
+        line += [f"--env.episode_length={options.peers_steps}"]
+    seconds = _timed("lerobot-eval", line, (0,))
+    played = (folder / OUTCOMES_FILE).read_text().splitlines()
+    if len(played) != episodes:
+        raise ArenaError(f"lerobot-eval: {len(played)} episodes instead of {episodes}")
+    info = json.loads((folder / "lerobot" / "eval_info.json").read_text())
+    solved = sum(json.loads(one)["outcome"] == "success" for one in played)
+    return _Played(float(info["overall"]["eval_s"]), seconds, solved)
+
+
+def _timed(name: str, command: Sequence[str], allowed: Sequence[int]) -> float:
+    """Seconds of a program from its start to its end."""
+    began = time.perf_counter()
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(), check=False
+    )
+    seconds = time.perf_counter() - began
+    if done.returncode not in allowed:
+        said = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+        last = said[-1][:300] if said else "it said nothing"
+        raise ArenaError(f"{name} ended with code {done.returncode}: {last}")
+    return seconds

@@ -1,0 +1,109 @@
+"""Are legs needed? The experts with their legs frozen, and with a base that glides in place of legs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+
+from arena_newton.eval.certification.checks.replays import recorded
+from arena_newton.eval.certification.context import CertifyCell, Context
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet, Verdict, pooled_score, score
+from arena_newton.files.text import counted
+
+__all__ = ["CHECKS", "GLIDES"]
+
+GLIDES: Mapping[str, str] = {
+    "football": (
+        "the rule asks where the ball goes, not how: the feet that hang from the gliding base meet it as a bumper "
+        "would, and push it into the goal at the speed of the base. Only a kick is a matter of legs"
+    ),
+    "pp_box": (
+        "the box is on a table and the only empty deck is 0.67 m high, at hip height: arms alone lift the box, hold it "
+        "and set it down, and a base that rolls carries it there. Only a lower deck would ask for a crouch"
+    ),
+    "open_door": (
+        "lever, leaf and doorway are met by hands and body: a base that rolls presses, leans and drives through, and "
+        "the doorway has no sill"
+    ),
+    "boxing": (
+        "the target's centre is 0.75 to 0.85 m high and counts from 0.13 m away, and a pelvis that glides at 0.8 m has "
+        "its shoulders 0.3 m above that: the arms alone reach down to it, from wherever the base rolls"
+    ),
+    "vis_navi": (
+        "the rule asks for both ankle links inside the area's box and an upright robot; legs that hang still from a "
+        "gliding base are carried over the floor into it. It tests navigation; feet only by what they bump into"
+    ),
+}
+"""Task that a gliding base can solve → why. A base on wheels is not what the rules forbid: they read where hands, feet
+and things are, not how the robot came there."""
+SHOWN = 2
+"""Film strips of each task that the page shows."""
+
+
+def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, tuple[Picture, ...]]:
+    """Successes of the experts with a body by task, the table of them, and pictures of those successes."""
+    rows, pictures, found = [], [], {}
+    for tracker in context.sample:
+        for task in context.tasks:
+            cell = CertifyCell(task, tracker, body=body, strip=True)
+            whole, records = score(context.evaluate(recorded(context, task, tracker))), context.evaluate(cell)
+            one = score(records)
+            found[task] = found.get(task, 0) + one.successes
+            falls = sum(record.outcome == "fall" for record in records)
+            reached = sum(record.progress or 0.0 for record in records) / max(len(records), 1)
+            rows.append((task, tracker, *one.cells(), str(falls), f"{reached:.2f}", whole.cells()[0]))
+            for record, path in context.strips(cell, "success")[:SHOWN]:
+                which = f"{task} through {tracker}, seed {record.group_seed} repeat {record.repeat}"
+                pictures.append(Picture(f"{which}, {context.bodies[body].title}: success at step {record.steps}", path))
+    head = ("task", "tracker", "successes", "95 % interval", "falls", "mean progress", "with legs")
+    return found, Sheet(f"Experts with {context.bodies[body].title}", head, tuple(rows)), tuple(pictures)
+
+
+def _broken(context: Context, body: str) -> tuple[str, ...]:
+    """Why zero successes would say nothing: episodes ended as errors, or nobody solves the task with legs either."""
+    said = []
+    for tracker, task in itertools.product(context.sample, context.tasks):
+        records = context.evaluate(CertifyCell(task, tracker, body=body, strip=True))
+        errors = sum(record.outcome == "error" for record in records)
+        said += [f"{task} through {tracker}: {errors} episodes ended as errors"] * bool(errors)
+        if not score(context.evaluate(recorded(context, task, tracker))).successes:
+            said.append(f"{task} through {tracker}: the expert does not solve it with legs either")
+    return tuple(said)
+
+
+def frozen(context: Context) -> CheckFinding:
+    """Play every task with legs that only stand."""
+    found, sheet, pictures = _without_legs(context, "frozen")
+    solved = {task: count for task, count in found.items() if count}
+    broken = _broken(context, "frozen")
+    total = len(context.sample) * len(context.tasks) * context.episodes
+    summary = f"{sum(found.values())} successes in {total} episodes with the legs frozen in the standing posture"
+    notes = tuple(f"{task}: {count} successes with frozen legs, see the pictures" for task, count in solved.items())
+    return CheckFinding("fail" if solved or broken else "pass", summary, (sheet,), (*broken, *notes), pictures)
+
+
+def gliding(context: Context) -> CheckFinding:
+    """Play every task with a base that glides."""
+    found, sheet, pictures = _without_legs(context, "gliding")
+    whole = pooled_score(
+        [score(context.evaluate(recorded(context, task, tracker))) for tracker in context.sample for task in found]
+    )
+    solved = {task: count for task, count in found.items() if count}
+    unknown = [task for task in solved if task not in GLIDES]
+    needed = [task for task in found if task not in solved]
+    summary = f"{sum(found.values())} successes with a gliding base, {whole.successes} with legs; 0 in: "
+    summary += " ".join(needed) or "none"
+    notes = [f"{task}, {count} successes: {GLIDES[task]}." for task, count in solved.items() if task in GLIDES]
+    notes += [f"{task}, {solved[task]} successes: no reason is known, see the pictures." for task in unknown]
+    broken = _broken(context, "gliding")
+    notes += broken
+    verdict: Verdict = "fail" if unknown or broken else "note" if solved else "pass"
+    claim = f"a gliding base solves {len(solved)} of {counted(len(found), 'task')}"
+    return CheckFinding(verdict, summary, (sheet,), tuple(notes), pictures, claim)
+
+
+CHECKS = (
+    Check("frozen-legs", "Do the experts score 0 when their legs only stand?", frozen),
+    Check("gliding-base", "Do they score 0 with a base that glides in place of legs, or is it known why not?", gliding),
+)
+"""This module's checks."""

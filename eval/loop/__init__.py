@@ -1,0 +1,1 @@
+"""Learning loop: record, build, train, evaluate, report."""

@@ -1,0 +1,1 @@
+"""Plan of an evaluation: which episodes are due, and options resolved once. Nothing is built, nothing runs."""

@@ -1,0 +1,1 @@
+"""Episodes played in this process: environments, recorders and the flow of a run."""

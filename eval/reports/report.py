@@ -1,0 +1,227 @@
+"""Tables and reports of a run, derived from its configuration and journal alone; no wall-clock time enters them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+from arena_newton.eval.folders.original_format import write_original
+from arena_newton.eval.folders.results import Results, RunRecord, changed_conditions, results_json, width_rule
+from arena_newton.eval.plan.rounds import LOOK_EVERY
+from arena_newton.eval.records.journal import write_atomic
+from arena_newton.eval.reports import html_report
+from arena_newton.eval.reports.failure_text import failures_markdown
+from arena_newton.eval.reports.learned_row import ROW_FOLDER, row_results
+from arena_newton.eval.reports.wording import (
+    environment_facts,
+    escaped,
+    markdown_table,
+    media_of,
+    plain,
+    rules_that_ran,
+    tasks_of,
+)
+from arena_newton.eval.statistics.stats import ResultCell, Suite, error_reasons, outside_suites
+from arena_newton.files.text import counted
+from arena_newton.robot.g1 import TICK
+
+__all__ = ["notes", "table", "write_reports"]
+
+_COLUMNS = """task tracker policy mode episodes successes falls startup_falls timeouts errors
+    sr sr_seed_std ci95_low ci95_high afr mean_steps""".split()
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f}"
+
+
+def _cell_text(cell: ResultCell) -> list[str]:
+    low_high = "-" if cell["ci95"] is None else f"{100 * cell['ci95'][0]:.1f} to {100 * cell['ci95'][1]:.1f}"
+    running = cell["falls"] - cell["startup_falls"]
+    return [
+        *map(plain, (cell["task"], cell["tracker"], cell["policy"], cell["mode"])),
+        str(cell["episodes"]),
+        f"{_percent(cell['sr'])} ± {_percent(cell['sr_seed_std'])}",
+        low_high,
+        _percent(cell["afr"]),
+        f"{running} + {cell['startup_falls']}",
+        str(cell["timeouts"]),
+        str(cell["errors"]),
+        "-" if cell["mean_steps"] is None else f"{cell['mean_steps']:.1f}",
+    ]
+
+
+_HEAD = ["task", "tracker", "policy", "mode", "n", "SR % ± seed std", "95 % CI", "AFR %"]
+_HEAD += ["falls running + at start", "timeouts", "errors", "mean steps"]
+
+
+def _suite_text(suite: Suite) -> list[str]:
+    return [
+        *map(plain, (suite["suite"], suite["tracker"], suite["policy"], suite["mode"])),
+        str(suite["episodes"]),
+        f"{_percent(suite['sr'])} ± {_percent(suite['sr_std'])}",
+        "",
+        _percent(suite["afr"]),
+        str(suite["falls"]),
+        "",
+        str(suite["errors"]),
+        "",
+    ]
+
+
+def _cells(results: Results, beside: Results | None) -> list[ResultCell]:
+    return [*results["cells"], *(beside["cells"] if beside is not None else [])]
+
+
+def _rows(results: Results, beside: Results | None) -> list[list[str]]:
+    cells = [_cell_text(cell) for cell in _cells(results, beside)]
+    return cells + [_suite_text(suite) for suite in results["suites"]]
+
+
+def table(results: Results, beside: Results | None = None) -> str:
+    """The result table as Markdown with aligned columns; it is also what the command line prints.
+
+    `beside` are the results of `learned_row`, whose cells come after the run's own.
+    """
+    return markdown_table(_HEAD, _rows(results, beside), left=4)
+
+
+def table_csv(results: Results) -> str:
+    """The cells as CSV, rates as fractions."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    for cell in results["cells"]:
+        low, high = cell["ci95"] or (None, None)
+        row = {key: plain(value) if isinstance(value, str) else value for key, value in cell.items()}
+        writer.writerow(row | {"ci95_low": low, "ci95_high": high})
+    return text.getvalue()
+
+
+_STATES = {
+    "started": "The run has not ended: it is going on, or it was killed.",
+    "cancelled": "The run was cancelled.",
+    "error": "The run ended with an error",
+    "partial": "Joined from shards of which some were missing or unfinished.",
+}
+
+
+def notes(run: RunRecord, results: Results) -> list[str]:
+    """What a reader of the table must know besides it."""
+    found = []
+    if run.status is not None and run.status["state"] != "success":
+        found.append(_STATES[run.status["state"]] + (f": {run.status['error']}" if run.status["error"] else ""))
+    if "shard" in results:
+        plan = counted(run.document["planned"], "episode")
+        found.append(f"Shard {results['shard']} of a plan of {plan}: no result before all are merged.")
+    if not results["complete"]:
+        found.append(f"Incomplete: {results['finished']} of {results['planned']} episodes are finished.")
+    errors = sum(cell["errors"] for cell in results["cells"])
+    if errors:
+        found.append(f"{counted(errors, 'episode')} ended with an error. They count as episodes without success.")
+    overflows = sum(cell["overflows"] for cell in results["cells"])
+    if overflows:
+        found.append(f"In {counted(overflows, 'episode')} a contact or constraint buffer overflowed.")
+    outside = outside_suites(cell["task"] for cell in results["cells"])
+    if outside:
+        found.append(f"The averages are those of the paper's seven tasks; not in them: {' '.join(outside)}.")
+    if "seed_range" in results["config"]:
+        noise = " and disturbed execution" if results["config"].get("disturbance") else ""
+        found.append(f"Demonstrations with seeds of their own range{noise}: no benchmark result.")
+    beside = row_results(run)
+    if beside is not None:
+        more = "" if beside["complete"] else f", of which {beside['finished']} of {beside['planned']} are finished"
+        found.append(
+            f"The episodes of policy learned{more}, their strips and a report of their own are in {ROW_FOLDER}/."
+        )
+    rule = width_rule(results["config"])
+    if rule is not None:
+        found.append(
+            f"Said before the first episode: a row ends when its interval is at most {100 * rule.width:g} points "
+            f"wide, looked at every {LOOK_EVERY} episodes, or after {rule.most}."
+        )
+    late, replan = results["config"].get("latency_ticks", 0), results["config"].get("replan")
+    if late:
+        found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's look.")
+    if replan:
+        found.append(f"The policy looks again after {counted(replan, 'action')} of each chunk.")
+    if results["config"].get("ensemble"):
+        found.append("At each tick the mean of all chunks that cover it is executed.")
+    return found + changed_conditions(run)
+
+
+def _code(text: object) -> str:
+    """The same as code."""
+    return f"`{plain(text).replace('`', "'")}`"
+
+
+def _markdown(run: RunRecord, results: Results) -> str:
+    lines = [f"# HumanoidArena results {escaped(results['config_hash'])}", ""]
+    lines += [f"> {escaped(note)}" for note in notes(run, results)]
+    lines += [f"> The scene is a variant: {escaped(text)}" for text in run.document.get("variant_changes", [])]
+    lines += ["", table(results, row_results(run))]
+    lines += [
+        "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
+        "seed rates pooled); the interval is Wilson's; AFR is falls per episode; falls at start happened while the",
+        "tracker settled.",
+        "",
+    ]
+    lines += failures_markdown(results.get("failures", []))
+    reasons = error_reasons(run.records)
+    if reasons:
+        lines += ["## Errors", "", "| reason | message | episodes |", "|---|---|---:|"]
+        lines += [f"| {escaped(r['reason'])} | {escaped(r['message'])} | {r['count']} |" for r in reasons]
+        lines += ["", "Run them again, in this folder: `python -m arena_newton.eval resume . --retry-errors`", ""]
+    strips = [(r, media_of(r)) for r in run.records if media_of(r)]
+    if strips:
+        lines += ["## Recordings", ""]
+        strips.sort(key=lambda entry: entry[0].outcome == "success")
+        lines += [
+            f"- {escaped(r.task)} {escaped(r.mode)} seed {escaped(r.group_seed)} repeat "
+            f"{escaped(r.repeat)} ({escaped(r.outcome)}): "
+            + ", ".join(f"[{name}]({path})" for name, path in media.items())
+            for r, media in strips
+        ]
+        lines += [""]
+    for name, facts in run.document.get("environments", {}).items():
+        lines += [f"## What ran: {escaped(name)}", ""]
+        lines += [f"- {escaped(key)}: {_code(value)}" for key, value in environment_facts(facts)] + [""]
+    lines += ["## Configuration", ""]
+    lines += [f"- {escaped(key)}: {_code(value)}" for key, value in run.config.items()]
+    tasks = tasks_of(run.config, run.records)
+    lines += ["", f"## Rule set {_code(run.config['rules'])}", ""]
+    lines += [f"- {escaped(item)}: {_code(text)}" for item, text in rules_that_ran(run.document["rule_set"], tasks)]
+    return "\n".join(lines) + "\n"
+
+
+def _html(run: RunRecord, results: Results) -> str:
+    reasons = error_reasons(run.records)
+    beside = row_results(run)
+    rows, cells = _rows(results, beside), len(_cells(results, beside))
+    return html_report.page(
+        run, results, notes=notes(run, results), head=_HEAD, rows=rows, cells=cells, reasons=reasons
+    )
+
+
+def write_reports(run: RunRecord) -> Results:
+    """Write results.json, table.md, table.csv, report.md, report.html and original/ into the folder.
+
+    Returns:
+        The content of results.json.
+    """
+    results = results_json(run)
+    write_atomic(run.folder / "results.json", json.dumps(results, indent=2) + "\n")
+    write_atomic(run.folder / "table.md", table(results, row_results(run)))
+    write_atomic(run.folder / "table.csv", table_csv(results))
+    write_atomic(run.folder / "report.md", _markdown(run, results))
+    write_atomic(run.folder / "report.html", _html(run, results))
+    if "seed_range" not in run.config:  # the original's files are of evaluations
+        write_original(
+            run.folder / "original",
+            run.records,
+            gym_ids=run.document["gym_ids"],
+            seeds=run.config["seeds"],
+            repeats=run.config["repeats"],
+        )
+    return results

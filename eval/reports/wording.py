@@ -1,0 +1,158 @@
+"""Words and addresses that the reports share: a run's recordings, rules, environments and commands.
+
+Whatever comes from a results folder is text here: nothing in a journal can become an element, and media are linked only
+as plain names in `videos/` and `strips/`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+
+from arena_newton import tasks as specs
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.records.document import Identity
+from arena_newton.eval.records.journal import EpisodeRecord
+from arena_newton.eval.records.schema import Json
+from arena_newton.files.text import plain_text
+
+__all__ = [
+    "MEDIA",
+    "environment_facts",
+    "escaped",
+    "markdown_table",
+    "media_of",
+    "plain",
+    "replay_command",
+    "rules_that_ran",
+    "safe_media",
+    "tasks_of",
+]
+
+MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head camera", "world": "world camera"}
+"""Media of an episode that the page knows → what they show."""
+REPLAYED = ("policy", "checkpoint", "labels", "replan", "rules", "drive", "engine", "device", "variant", "max_steps")
+"""Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
+REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
+"""Flags that belong to a policy server → their defaults; others are named in the command."""
+
+_NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"
+_PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
+
+
+def plain(value: object) -> str:
+    """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
+    return plain_text(value, None, mark="\ufffd")
+
+
+def escaped(text: object) -> str:
+    """Text of a results folder as Markdown that stays text, also where a backslash does not keep a tag shut."""
+    shown = re.sub(r"([\\`*\[\]>|])", r"\\\1", re.sub(r"&(?=#?\w+;)", "&amp;", plain(text)))
+    return re.sub(r"<(?=[A-Za-z/!?]|$)", "&lt;", shown)
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A Markdown table with aligned columns, the first `left` of them flush left; cells are texts and stay so."""
+    lines = [list(head), *([escaped(text) for text in row] for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
+
+    def row(cells: Sequence[str]) -> str:
+        padded = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
+        return f"| {' | '.join(padded)} |"
+
+    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
+    return "\n".join([row(head), rule, *map(row, lines[1:])]) + "\n"
+
+
+def safe_media(path: object) -> str | None:
+    """A recording's path if it is a plain name in `videos/` or `strips/`, None otherwise."""
+    return path if isinstance(path, str) and _PATH.fullmatch(path) else None
+
+
+def media_of(record: EpisodeRecord) -> dict[str, str]:
+    """An episode's recordings that the page knows, by name."""
+    given = record.media or {}
+    found = {name: safe_media(given.get(name)) for name in MEDIA}
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: object = None) -> str:
+    """The command line that plays an episode again, the last one of its seed's that it plays.
+
+    `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
+    """
+    words: list[object] = ["python", "-m", "arena_newton.eval"]
+    series = options.get("series")
+    words += ["record"] if series is not None else []
+    words += ["--task", record.task, "--mode", record.mode, "--tracker", record.tracker]
+    if series is not None:
+        words += ["--seed-series", record.group_seed, "--episodes", record.repeat + 1]
+        words += [] if options.get("disturb") is True else ["--no-disturb"]
+    else:
+        words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
+    for name in REPLAYED:
+        value = options.get(name)
+        if value not in (None, "", "auto"):
+            words += ["--" + name.replace("_", "-"), value]
+    for name, default in REMOTE.items() if plain(options.get("policy")).startswith("remote:") else ():
+        value = options.get(name, default)
+        if value is True:
+            words += ["--" + name.replace("_", "-")]
+        elif value is not False and value != default:
+            words += ["--" + name.replace("_", "-"), value]
+    late, scale = options.get("latency_ticks"), options.get("disturb_scale")
+    words += ["--latency-ticks", late] if late else []
+    words += ["--ensemble"] if options.get("ensemble") is True else []
+    words += ["--disturb-scale", scale] if series is not None and scale not in (None, 1.0) else []
+    words += ["--worlds", worlds] if worlds is not None else []
+    words += ["--fast-physics"] if options.get("fast_physics") is True else []
+    words += [] if series is not None else ["--video", "--strip"]
+    return " ".join(shlex.quote(plain(word)) for word in words)
+
+
+def environment_facts(facts: Mapping[str, Json]) -> list[tuple[str, str]]:
+    """What an environment said of itself, in words: engine, physics rate, drive, start-up and the rest."""
+    left = dict(facts)
+    found: list[tuple[str, str]] = [(name, plain(left.pop(name))) for name in ("engine", "device") if name in left]
+    dt, substeps = left.pop("physics_dt", None), left.pop("substeps", None)
+    if isinstance(dt, int | float) and not isinstance(dt, bool):
+        found.append(("physics", f"{1e3 * dt:g} ms" + (f" × {plain(substeps)}" if substeps is not None else "")))
+    if "drive" in left:
+        found.append(("drive", plain(left.pop("drive"))))
+    if "startup_ticks" in left:
+        found.append(("start-up", f"{plain(left.pop('startup_ticks'))} ticks"))
+    return found + [(plain(name), plain(value)) for name, value in left.items()]
+
+
+def tasks_of(config: Identity, records: Sequence[EpisodeRecord]) -> list[str]:
+    """Names of a run's tasks: those of its configuration, or those of its records where that names none."""
+    named = config.get("task")
+    return [plain(name) for name in (named if named is not None else dict.fromkeys(r.task for r in records))]
+
+
+def rules_that_ran(rule_set: Mapping[str, str], tasks: Sequence[str]) -> list[tuple[str, str]]:
+    """The rows of a rule set that speak of the tasks of a run, or of all tasks."""
+    known = {name: specs.get(name) for name in specs.names()}
+    owners = {item: name for name, spec in known.items() for item, _ in spec.rules.paper.success.notes()}
+    records = {name: {o.record for o in spec.objects} for name, spec in known.items()}
+    ours = set(tasks) & set(known)
+    ours |= {record for name in ours for record in records[name]}
+    others = {*known, *(record for found in records.values() for record in found)} - ours
+    rows = []
+    for item, said in rule_set.items():
+        named = {*re.findall(r"\w+", plain(item)), owners.get(plain(item), "")} & set(known)
+        if named and not named & set(tasks):
+            continue
+        text = plain(said).replace("see the ranges below", "ranges: docs/rules.md")
+        # A remark on other tasks alone is left out; lists of tasks or of their objects keep what belongs to the run.
+        for remark in re.findall(r" \([^()]*\)", text):
+            named_here = set(re.findall(r"\w+", remark)) & set(known)
+            text = text.replace(remark, "") if named_here and not named_here & set(tasks) else text
+        parts = text.split(", ")
+        if all(part.split(" ")[0] in ours | others for part in parts):
+            parts = [part for part in parts if part.split(" ")[0] in ours]
+        if parts:
+            rows.append((plain(item), ", ".join(parts)))
+    return rows

@@ -1,0 +1,1 @@
+"""Studies that choose placements or compare actions: sensitivity, adversary, t-SNE, engines."""

@@ -1,0 +1,167 @@
+"""Episodes at placements that a study chooses instead of the seed, in one batch of worlds, with common random numbers.
+
+At every placement the same episode seeds are played: what the study leaves open (other objects, light, noise of the
+policy) is drawn alike, so that two placements differ by the placement alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from arena_newton import rule_sets
+from arena_newton import tasks as task_specs
+from arena_newton.cli.quiet import quiet_warp
+from arena_newton.errors import InputError
+from arena_newton.eval.plan.config import RunConfig, resolve
+from arena_newton.eval.plan.episode_plan import Episode
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play.run import Factories, check_parts, make_env
+from arena_newton.eval.studies.placement_axes import Axis, axes_of, chosen, moved
+from arena_newton.eval.studies.placement_options import PlacementOptions
+from arena_newton.interfaces import EpisodeResult, Planned, World
+from arena_newton.rollout import Rollout
+
+__all__ = ["MOST_EPISODES", "PlacedEpisode", "PlacedWorlds", "placement_run"]
+
+MOST_EPISODES = 200_000
+"""Episodes of one study, as of one run."""
+MOST_WORLDS = 65_536
+"""Worlds of one batch."""
+
+
+@dataclass(frozen=True)
+class PlacedEpisode:
+    """One episode at one placement."""
+
+    values: tuple[float, ...]
+    """Value of each axis."""
+    point: int
+    """Number of the placement."""
+    episode: Episode
+    """What else is played there: seed, mode, budget."""
+
+    @property
+    def episode_seed(self) -> int:
+        """Seed of everything that the axes leave open."""
+        return self.episode.episode_seed
+
+
+def placement_run(options: PlacementOptions) -> tuple[RunConfig, tuple[Axis, ...]]:
+    """The run behind a study, checked: one task, tracker and mode, and its axes.
+
+    Raises:
+        InputError: A flag is unfit.
+    """
+    if not options.task:
+        raise InputError("--task: name the task whose placements are moved")
+    if options.task == "all":
+        raise InputError("--task all: name one task; each has axes of its own")
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected at least 0")
+    if options.repeats < 1:
+        raise InputError(f"--repeats {options.repeats}: expected at least 1")
+    if not 1 <= options.worlds <= MOST_WORLDS:
+        raise InputError(f"--worlds {options.worlds}: expected 1 to {MOST_WORLDS:,}")
+    config = resolve(
+        RunOptions(
+            task=(options.task,),
+            tracker=(options.tracker,),
+            checkpoint=options.checkpoint,
+            policy=options.policy,
+            labels=options.labels,
+            replan=options.replan,
+            ensemble=options.ensemble,
+            latency_ticks=options.latency_ticks,
+            mode=(options.mode,),
+            rules=options.rules,
+            seeds=(options.seed,),
+            repeats=options.repeats,
+            worlds=options.worlds,
+            engine=options.engine,
+            device=options.device,
+            fast_physics=options.fast_physics,
+            max_steps=options.max_steps,
+        )
+    )
+    task = config.flags.task[0]
+    axes = axes_of(rule_sets.get(options.rules).task(task), options.mode)
+    if not axes:
+        raise InputError(f"--task {task}: draws no placement in mode {options.mode}")
+    return config, chosen(axes, options.axes, task) if options.axes else axes
+
+
+class PlacedWorlds:
+    """The environment and the policy of a study; a context that releases both."""
+
+    def __init__(self, config: RunConfig, axes: Sequence[Axis], factories: Factories | None = None):
+        """Check policy and tracker; the environment is built at the first play.
+
+        Raises:
+            InputError: The policy or the tracker cannot do this.
+        """
+        quiet_warp()
+        self._factories = factories or Factories()
+        self.config, self.policy = check_parts(config, self._factories)
+        self.axes = tuple(axes)
+        task = config.flags.task[0]
+        self._spec, self._rules = task_specs.get(task), rule_sets.get(config.flags.rules).task(task)
+        self._env: World | None = None
+
+    def __enter__(self) -> PlacedWorlds:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.policy.close()
+        if self._env is not None:
+            self._env.close()
+
+    def placed(
+        self, points: Sequence[tuple[float, ...]], first: int = 0, episodes: Sequence[Episode] | None = None
+    ) -> list[PlacedEpisode]:
+        """Every episode seed of the study at every placement.
+
+        Args:
+            points: Placements, one value per axis each.
+            first: Number of the first of them.
+            episodes: Other episodes than the study's own.
+        """
+        return [
+            PlacedEpisode(point, number, episode)
+            for number, point in enumerate(points, start=first)
+            for episode in (self.config.episodes if episodes is None else episodes)
+        ]
+
+    def play(
+        self,
+        episodes: Sequence[PlacedEpisode],
+        on_finish: Callable[[EpisodeResult], None] | None = None,
+        on_tick: Callable[[int], None] | None = None,
+    ) -> list[EpisodeResult]:
+        """Play episodes; results are in their order, whatever order they end in.
+
+        Args:
+            episodes: What to play.
+            on_finish: Called with each result as it ends.
+            on_tick: Called each tick with the number of active worlds.
+        """
+        flags = self.config.flags
+        if self._env is None:
+            worlds = min(flags.worlds, len(episodes))
+            self._env = make_env(self.config, self._factories, self.config.episodes[0], worlds)
+        return Rollout(
+            self._env,
+            self.policy,
+            episodes,
+            max_steps=self.config.episodes[0].max_steps,
+            latency=flags.latency_ticks,
+            samples=self._samples,
+            on_finish=on_finish,
+            on_tick=on_tick,
+        ).run()
+
+    def _samples(self, placed: Planned) -> dict[str, dict[str, float]]:
+        assert isinstance(placed, PlacedEpisode)
+        mode = self.config.flags.mode[0]
+        drawn = self._spec.sample(placed.episode_seed, mode, self._rules)
+        return moved(drawn, self.axes, placed.values, self._rules, mode)

@@ -1,0 +1,168 @@
+"""What a study of placements writes: one row per episode as they end, and one per placement."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from arena_newton.errors import InputError
+from arena_newton.eval.records.journal import StorageError, write_atomic
+from arena_newton.eval.studies.placed_play import PlacedEpisode
+from arena_newton.eval.studies.placement_axes import Axis
+from arena_newton.interfaces import EpisodeResult
+from arena_newton.robot.g1 import TICK
+
+__all__ = ["PlacedRows", "PointTally", "point_rows", "study_folder", "tallies"]
+
+EPISODES = "episodes.csv"
+"""Name of the file with one row per episode."""
+
+
+@dataclass(frozen=True)
+class PointTally:
+    """What the episodes at one placement came to."""
+
+    values: tuple[float, ...]
+    """Value of each axis."""
+    episodes: int
+    successes: int
+    falls: int
+    errors: int
+    """Episodes that say nothing about the policy; they are in no rate and no margin."""
+    mean_margin: float
+    """Mean over the others of the margin at their ends [m]; NaN without any."""
+    least_margin: float
+    """The smallest of these margins [m]; NaN without any."""
+    success_s: float
+    """Mean time that the successes took [s]; NaN without any."""
+
+    @property
+    def judged(self) -> int:
+        """Episodes without an error."""
+        return self.episodes - self.errors
+
+    @property
+    def rate(self) -> float:
+        """Successes of the judged episodes; NaN without any."""
+        return self.successes / self.judged if self.judged else math.nan
+
+    def where(self, axes: Sequence[Axis]) -> str:
+        """The placement in words."""
+        told = zip(axes, self.values, strict=True)
+        return ", ".join(f"{axis.name} {value:.3g} {axis.unit}".rstrip() for axis, value in told)
+
+
+def tallies(results: Sequence[EpisodeResult]) -> list[PointTally]:
+    """One per placement, in the order of the placements."""
+    by_point: dict[int, list[EpisodeResult]] = {}
+    for result in results:
+        by_point.setdefault(result.episode.point, []).append(result)
+    return [_tally(by_point[point]) for point in sorted(by_point)]
+
+
+def _tally(results: Sequence[EpisodeResult]) -> PointTally:
+    outcomes = [result.outcome for result in results]
+    margins = [result.margin for result in results if result.outcome != "error" and math.isfinite(result.margin)]
+    times = [result.steps * TICK for result in results if result.outcome == "success"]
+    return PointTally(
+        values=results[0].episode.values,
+        episodes=len(results),
+        successes=outcomes.count("success"),
+        falls=outcomes.count("fall"),
+        errors=outcomes.count("error"),
+        mean_margin=math.fsum(margins) / len(margins) if margins else math.nan,
+        least_margin=min(margins, default=math.nan),
+        success_s=math.fsum(times) / len(times) if times else math.nan,
+    )
+
+
+def study_folder(out: str | None, *words: str) -> Path:
+    """A new folder for a study.
+
+    Args:
+        out: What --out says.
+        *words: What its usual name below `results` is made of.
+
+    Raises:
+        InputError: It exists.
+        StorageError: It cannot be made.
+    """
+    usual = Path("results") / "_".join(re.sub(r"[^\w.-]+", "-", word) for word in words)
+    folder = Path(out).expanduser() if out is not None else usual
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise InputError(f"--out {folder}: exists; name another folder") from None
+    except OSError as error:
+        raise StorageError(f"--out {folder}: cannot be made ({error.strerror})") from None
+    return folder
+
+
+class PlacedRows:
+    """`episodes.csv`: a row is on the disk as soon as its episode has ended; `close` puts them in the plan's order."""
+
+    def __init__(self, folder: Path, axes: Sequence[Axis]):
+        """Begin the file."""
+        self._path, self._axes = folder / EPISODES, tuple(axes)
+        self._results: list[EpisodeResult] = []
+        self._file: TextIO | None = None
+        try:
+            self._file = self._path.open("x", encoding="utf-8", newline="")
+        except OSError as error:
+            raise StorageError(f"{self._path}: cannot be written ({error.strerror})") from None
+        self._put(self._file, [self._head()])
+
+    def add(self, result: EpisodeResult) -> None:
+        """Write an episode's row."""
+        self._results.append(result)
+        if self._file is not None:
+            self._put(self._file, [self._row(result)])
+
+    def close(self) -> None:
+        """Write all rows again, in the order of placements and seeds: the same bytes for any number of worlds."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+        ordered = sorted(self._results, key=lambda one: (one.episode.point, one.episode.episode.index))
+        whole = io.StringIO()
+        csv.writer(whole, lineterminator="\n").writerows([self._head(), *(self._row(one) for one in ordered)])
+        write_atomic(self._path, whole.getvalue())
+
+    def _put(self, file: TextIO, rows: Sequence[Sequence[object]]) -> None:
+        try:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+            file.flush()
+        except OSError as error:
+            raise StorageError(f"{self._path}: cannot be written ({error.strerror})") from None
+
+    def _head(self) -> list[str]:
+        names = [axis.name for axis in self._axes]
+        return ["point", *names, "repeat", "episode_seed", "outcome", "reason", "steps", "margin"]
+
+    def _row(self, result: EpisodeResult) -> list[object]:
+        placed: PlacedEpisode = result.episode
+        told = (result.outcome, result.reason, result.steps, f"{result.margin:.6g}")
+        return [placed.point, *map(_number, placed.values), placed.episode.repeat, placed.episode_seed, *told]
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+def point_rows(axes: Sequence[Axis], points: Sequence[PointTally]) -> str:
+    """CSV with one row per placement."""
+    told = ("episodes", "successes", "falls", "errors", "success_rate", "mean_margin", "least_margin", "success_s")
+    whole = io.StringIO()
+    writer = csv.writer(whole, lineterminator="\n")
+    writer.writerow([*(axis.name for axis in axes), *told])
+    for one in points:
+        counts = (one.episodes, one.successes, one.falls, one.errors)
+        measured = (one.rate, one.mean_margin, one.least_margin, one.success_s)
+        writer.writerow([*map(_number, one.values), *counts, *map(_number, measured)])
+    return whole.getvalue()

@@ -1,0 +1,236 @@
+"""``eval matrix --ray``: one crew of a Ray cluster plays the cells of a suite, several at once.
+
+A cell is begun when a process has opened it, and is an ordinary results folder with a journal of its own, as `ray_run`
+writes it. Processes keep their environment from cell to cell where the next one asks for the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from ray.exceptions import RayError
+
+from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval.play.run import Factories, RunStopped
+from arena_newton.eval.play.whole_run import Group, begun, reported
+from arena_newton.eval.records.journal import Journal, StorageError
+from arena_newton.eval.reports.progress import Progress
+from arena_newton.eval.suites.suite_call import SuiteCall
+from arena_newton.eval.suites.suite_folder import SuiteFolder
+from arena_newton.eval.suites.suite_run import CellPlayer
+from arena_newton.eval.workers.ray_crew import Crew, Done, Job, Lease, Lost, Member, in_cluster
+from arena_newton.eval.workers.ray_run import DealtRun
+from arena_newton.eval.workers.slice_events import Event, Opened
+from arena_newton.files.text import counted, plain_text
+
+__all__ = ["run"]
+
+
+def run(call: SuiteCall, factories: Factories | None = None) -> int:
+    """Play the cells of a call by processes of a cluster.
+
+    Args:
+        call: Its flags name the cluster.
+        factories: What runs are built with, importable in the processes; the real parts by default.
+
+    Returns:
+        Exit code: 0 when all cells that this call was to play are done, 1 when cells failed under --keep-going or
+        episodes ended as errors, 130 when interrupted.
+
+    Raises:
+        InputError: A condition, a policy or the folder is wrong, here or on a node.
+        RunStopped: A cell could not be played, or no process of the cluster begins.
+        StorageError: The folder cannot be written.
+    """
+    folder = SuiteFolder(call.out, call.suite, *call.shard)
+    with folder.locked(call.cells):
+        return _RayPlayer(call.suite, folder, call.options, factories, again=call.again).play(call.chosen)
+
+
+@dataclass(eq=False)
+class _Cell:
+    """A cell of this call."""
+
+    name: str
+    number: int
+    """Its position among those to play."""
+    group: Group
+    episodes: int
+    """Not yet in its journal."""
+    job: Job
+    opening: bool = False
+    """Whether a process opens it that has not been opened before."""
+    dealt: DealtRun | None = None
+    """What is dealt out, once it has begun."""
+    held: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    """Journal and status, while it is played."""
+    error: ArenaError | None = None
+    """Why no more of it is dealt out."""
+    ended: bool = False
+
+    @property
+    def open(self) -> bool:
+        """Whether a process could be of use now."""
+        if self.ended or self.opening or self.error is not None:
+            return False
+        return self.dealt is None or self.dealt.waiting > 0
+
+
+class _RayPlayer(CellPlayer):
+    """Plays cells by a crew."""
+
+    def play_cells(self, todo: Sequence[str]) -> bool:
+        """Play cells that were checked; False when it was interrupted."""
+        if not todo:
+            return True
+        self.cells = [self._cell(name, number) for number, name in enumerate(todo)]
+        self.jobs = {cell.job: cell for cell in self.cells}
+        planned, ticks = sum(cell.episodes for cell in self.cells), sum(map(self._ticks_left, self.cells))
+        self.shown = Progress(ticks, planned=planned)
+        self.done = 0
+        self.played_ticks, self.began = 0.0, time.monotonic()
+        with in_cluster(self.options.ray or ()), contextlib.ExitStack() as ended:
+            self.crew = Crew(self.configs[todo[0]], planned, self.given)
+            self.crew.shown = self.shown
+            self.shown.group(counted(len(self.crew.members), "Ray actor"))
+            ended.callback(self.shown.close)
+            ended.callback(self.crew.dismiss)
+            try:
+                self._play()
+            except RayError as error:
+                self._leave(None)
+                raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
+            except KeyboardInterrupt as error:
+                self._leave(error)
+                return False
+            except BaseException:
+                self._leave(None)
+                raise
+        return True
+
+    def coming(self, ticks: int) -> float:
+        """Time that cells with step budgets of so many ticks take, at the speed so far of all processes [s]."""
+        return ticks * (time.monotonic() - self.began) / max(self.played_ticks, 1.0)
+
+    def _cell(self, name: str, number: int) -> _Cell:
+        cell, results = self.folder.plan.cell(name), self.results(name)
+        left = cell.episodes - self.folder.counts(name)["finished"]
+        return _Cell(name, number, (cell.task, cell.tracker, cell.mode), max(left, 1), Job(results))
+
+    def _ticks_left(self, cell: _Cell) -> int:
+        whole = self.folder.plan.cell(cell.name)
+        return round(whole.ticks * cell.episodes / whole.episodes)
+
+    def _play(self) -> None:
+        """Play until nothing is left."""
+        while not all(cell.ended for cell in self.cells):
+            for member in self.crew.idle():
+                self._give(member)
+            for job, lease, said in self.crew.heard():
+                self._hear(self.jobs[job], lease, said)
+            for cell in self.cells:
+                if not cell.ended and (cell.error is not None or cell.dealt is not None) and not self._is_played(cell):
+                    self._finish(cell)
+
+    def _give(self, member: Member) -> None:
+        """Give work to a process that waits: a slice of the run that it has open, or another run to open."""
+        busy = {one.lease.group for one in self.crew.members if one.lease is not None}
+
+        def wanted(cell: _Cell) -> bool:
+            if not cell.open or cell.dealt is None or cell.job is member.job:
+                return cell.open
+            coming = [one for one in self.crew.members if one.job is cell.job and one.lease is None]
+            return len(coming) < cell.dealt.slices  # no more open it than find something to play
+
+        def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int]:
+            fresh = cell.dealt is None
+            return cell.job is not member.job, cell.group != member.last, fresh, cell.group in busy, cell.number
+
+        found = min(filter(wanted, self.cells), key=order, default=None)
+        if found is None:
+            return
+        if found.job is not member.job:
+            found.opening = found.job.opened is None
+            self.crew.prepare(member, found.job)
+        elif found.dealt is not None and (lease := found.dealt.next(member)) is not None:
+            self.crew.lend(member, lease)
+
+    def _hear(self, cell: _Cell, lease: Lease | None, said: Opened | Event | Done | Lost | ArenaError) -> None:
+        """Take what a process tells of a cell."""
+        try:
+            if lease is not None and cell.dealt is not None and not isinstance(said, Opened):
+                cell.dealt.take(lease, said)
+                return
+            cell.opening = False
+            if isinstance(said, ArenaError):
+                raise said
+            if isinstance(said, Opened) and cell.dealt is None and cell.error is None:
+                self._begin(cell)
+        except StorageError:
+            raise
+        except ArenaError as error:
+            cell.error = cell.error or error
+
+    def _begin(self, cell: _Cell) -> None:
+        """Begin a cell that a process has opened."""
+        folder, config = cell.job.folder, cell.job.configured()
+        assert cell.job.opened is not None
+        self.begun(cell.name, cell.job.opened.device)
+        folder.make()
+        with self.silence():
+            journal = cell.held.enter_context(Journal(folder.journal))
+            folder.settle(config, journal.records)
+            folder.sweep()
+            cell.held.callback(folder.sweep)
+            done, waiting = begun(config, folder, journal)
+            if waiting:
+                cell.held.enter_context(folder.running())
+            cell.dealt = DealtRun(cell.job, journal, self.crew, done, waiting, self.shown, lambda: self._besides(cell))
+
+    def _besides(self, cell: _Cell) -> int:
+        """Episodes of other cells that nobody plays yet."""
+        others = [one for one in self.cells if one is not cell and one.open]
+        return sum(one.episodes if one.dealt is None else one.dealt.waiting for one in others)
+
+    def _is_played(self, cell: _Cell) -> bool:
+        """Whether a process plays something of a cell, or is to."""
+        if cell.dealt is None:
+            return False
+        return cell.dealt.leased or (cell.error is None and cell.dealt.waiting > 0)
+
+    def _finish(self, cell: _Cell) -> None:
+        """End a cell of which nothing is left to play, or no more can be played."""
+        cell.ended, code = True, 2
+        try:
+            self._close(cell, cell.error)
+            if cell.error is None:
+                with self.silence():
+                    code = reported(cell.job.folder, cell.job.seconds)
+        except StorageError:
+            raise
+        except ArenaError as error:
+            cell.error = cell.error or error
+        self.done += 1
+        if cell.error is None:
+            self.played_ticks += self._ticks_left(cell)
+        print(f"[{self.done}/{len(self.cells)}] {cell.name}", flush=True)
+        left = [one.name for one in self.cells if not one.ended]
+        self.ended(cell.name, code, cell.error, cell.job.seconds, left)
+
+    def _close(self, cell: _Cell, error: BaseException | None) -> None:
+        """Let go of the journal; the folder's status says how the run ended."""
+        cell.held.__exit__(None if error is None else type(error), error, None)
+
+    def _leave(self, interrupt: KeyboardInterrupt | None) -> None:
+        """End all cells that have begun, before they are whole."""
+        self.crew.dismiss()  # who writes files has ended
+        stop = interrupt or KeyboardInterrupt()
+        for cell in self.cells:
+            if cell.dealt is not None and not cell.ended:
+                cell.ended = True
+                with contextlib.suppress(InputError, StorageError):
+                    self._close(cell, stop)
+                    self.ended(cell.name, 130, None, cell.job.seconds, ())

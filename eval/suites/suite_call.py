@@ -1,0 +1,123 @@
+"""One call of `eval matrix`: its suite file and flags, checked, and the cells that it is about.
+
+No library of physics or pictures is loaded: a wrong file, a dry run and an absent checkpoint answer at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.plan.play_flags import RAY_FLAGS, check_ray
+from arena_newton.eval.plan.suite_options import MatrixOptions
+from arena_newton.eval.records.document import SUITE_FILE
+from arena_newton.eval.records.sharding import parse_shard
+from arena_newton.eval.suites.matrix_cells import (
+    check_policies,
+    dealt,
+    expand_cells,
+    matrix_table,
+    parse_only,
+    selected,
+)
+from arena_newton.eval.suites.suite_file import SuiteFile, read_suite_file, suite_path
+from arena_newton.eval.suites.suite_records import SuiteCell, read_suite
+from arena_newton.files.text import counted
+
+__all__ = ["SuiteCall", "plan_call"]
+
+MOST_PROCESSES = 9_999
+"""Processes of one estimate, as many as a plan has shards; each is a place in a queue."""
+
+
+@dataclass(frozen=True)
+class SuiteCall:
+    """What a call is to play."""
+
+    suite: SuiteFile
+    options: MatrixOptions
+    cells: tuple[SuiteCell, ...]
+    """All cells of the suite, in the order in which they are played."""
+    chosen: tuple[str, ...]
+    """Ids of those that the call is about."""
+    out: Path
+    shard: tuple[int, int]
+    """Number, from 1, and count."""
+    again: str
+    """The command that continues it."""
+    problem: InputError | None = None
+    """Why a dry run's cells could not be played."""
+
+    def table(self) -> str:
+        """The matrix of the chosen cells, with what is done of it."""
+        cells = [cell for cell in self.cells if cell.id in set(self.chosen)]
+        if (self.out / SUITE_FILE).exists():
+            played = {cell.id: cell.status for cell in read_suite(self.out).cells}
+            cells = [dataclasses.replace(cell, status=played.get(cell.id, "waiting")) for cell in cells]
+        return matrix_table(cells, each=self.options.verbose)
+
+
+def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
+    """Read and check a suite file and the flags of a call.
+
+    Raises:
+        InputError: One is wrong, or a checkpoint is absent.
+    """
+    suite = read_suite_file(suite_path(given))
+    only, shard = parse_only(options.only), parse_shard(options.shard)
+    options = dataclasses.replace(options, shard=str(shard))
+    if options.estimate and min(options.estimate) < 1:
+        raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
+    if options.estimate and max(options.estimate) > MOST_PROCESSES:
+        raise InputError(f"--estimate {max(options.estimate)}: expected at most {MOST_PROCESSES:,}")
+    check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
+    if options.limit is not None and options.limit < 1:
+        raise InputError(f"--limit {options.limit}: expected at least 1")
+    cells = expand_cells(suite)
+    if shard.count > max(len(cells), 1):
+        raise InputError(f"--shard {shard}: the suite has {counted(len(cells), 'cell')}, expected no more shards")
+    chosen = {cell.id for cell in dealt(cells, shard.number, shard.count)}
+    chosen &= {cell.id for cell in (selected(cells, only) if only else cells)}
+    checked, problem = {}, None
+    try:
+        checked = {c.id: c for c in check_policies(suite, [cell for cell in cells if cell.id in chosen])}
+    except InputError as error:
+        if not options.dry_run and options.estimate is None:  # which show the matrix first, or need no checkpoint
+            raise
+        problem = error
+    return SuiteCall(
+        suite=suite,
+        options=options,
+        cells=tuple(checked.get(cell.id, cell) for cell in cells),
+        chosen=tuple(cell.id for cell in cells if cell.id in chosen),
+        out=_out(options, suite),
+        shard=(shard.number, shard.count),
+        again=_again(given, options),
+        problem=problem,
+    )
+
+
+def _out(options: MatrixOptions, suite: SuiteFile) -> Path:
+    if options.out is None:
+        return Path("results") / suite.name
+    if not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
+    return Path(options.out).expanduser()
+
+
+def _again(given: str, options: MatrixOptions) -> str:
+    """The command that continues."""
+    parts = ["python", "-m", "arena_newton.eval", "matrix", given]
+    for name in ("out", "only", "shard", "device"):
+        value = getattr(options, name)
+        if value != getattr(MatrixOptions, name):
+            parts += [f"--{name}", value]
+    for name in ("ray", *RAY_FLAGS):
+        value = getattr(options, name)
+        if value != getattr(MatrixOptions, name):
+            parts += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return shlex.join([*parts, *(["--keep-going"] if options.keep_going else [])])

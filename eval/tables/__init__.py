@@ -1,0 +1,1 @@
+"""Tables, findings and comparisons of many runs, beside the numbers that the paper prints."""

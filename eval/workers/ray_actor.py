@@ -1,0 +1,102 @@
+"""A process of a Ray cluster that plays slices of runs: it is given numbers of episodes and gives journal lines back.
+
+Ray imports this module before the process knows its GPU, so torch, Warp and what needs them load inside the methods.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import socket
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.workers.slice_events import Broke, Event, Node, Opened, Slice, broke
+
+if TYPE_CHECKING:
+    from arena_newton.eval.plan.config import RunConfig
+    from arena_newton.eval.play.run import Factories
+    from arena_newton.policies.base import Policy
+
+__all__ = ["EpisodeActor"]
+
+
+class EpisodeActor:
+    """What Ray makes a process of. All is played in one thread, so that episodes are told of while others run."""
+
+    def __init__(self, gpu: bool):
+        """Hide the GPUs from a process that was given none: Warp would make a context on each."""
+        if not gpu:
+            os.environ["CUDA_VISIBLE_DEVICES"] = ""
+        self._thread = ThreadPoolExecutor(1, "episodes")
+        self._config: RunConfig
+        self._factories: Factories | None = None
+        self._policy: Policy | None = None
+        self._folder: Path
+
+    def node(self) -> Node:
+        """Where this process is."""
+        import ray
+
+        gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+        return Node(ray.get_runtime_context().get_node_id(), socket.gethostname(), os.getpid(), gpus)
+
+    def open(
+        self, options: RunOptions, folder: str, cores: tuple[int, int], factories: Factories | None
+    ) -> Broke | Opened:
+        """Build tracker and policy of a run, in place of those of the run before; an environment may last.
+
+        Args:
+            options: Its resolved flags.
+            folder: Results folder, absolute.
+            cores: First core of this process and their number, among those that the machine lets it use.
+            factories: What runs are built with, the same for all; the real parts by default.
+        """
+        usable, (first, number) = sorted(os.sched_getaffinity(0)), cores
+        if first + number <= len(usable):  # otherwise the cluster counts more cores than there are, or it has them
+            os.sched_setaffinity(0, usable[first : first + number])
+        self._folder = Path(folder)
+        return self._thread.submit(self._open, options, factories).result()
+
+    def play(self, part: Slice) -> Iterator[Event]:
+        """Play episodes; gives what happens when it happens."""
+        events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+        self._thread.submit(self._play, part, events)
+        while (event := events.get()) is not None:
+            yield event
+
+    def _open(self, options: RunOptions, factories: Factories | None) -> Broke | Opened:
+        try:
+            from arena_newton.doctor import versions
+            from arena_newton.eval.workers.slice_player import device_name, parts
+
+            policy, self._policy = self._policy, None
+            if policy is not None:
+                policy.close()
+            self._config, self._policy, self._factories = parts(options, self._factories or factories)
+            config = self._config
+            return Opened(
+                config.identity(),
+                config.labels,
+                config.worlds_matter,
+                config.tracker_facts,
+                config.policy_facts,
+                versions(),
+                device_name(config.device),
+            )
+        except (Exception, SystemExit) as error:
+            return broke(error)
+
+    def _play(self, part: Slice, events: queue.SimpleQueue[Event | None]) -> None:
+        try:
+            from arena_newton.eval.workers.slice_player import play
+
+            assert self._policy is not None and self._factories is not None, "plays before it has opened a run"
+            play(part, self._config, self._folder, self._factories, self._policy, events.put)
+        except (Exception, SystemExit) as error:
+            events.put(broke(error))
+        finally:
+            events.put(None)

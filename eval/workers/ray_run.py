@@ -1,0 +1,336 @@
+"""``run --ray``: processes of a Ray cluster play slices of the plan; this one deals them out and owns the journal.
+
+Numbers of episodes go out, journal lines come back; pictures and recordings are written by the processes themselves
+into the results folder. This process loads neither Warp nor torch for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shlex
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from math import ceil
+from typing import TYPE_CHECKING
+
+from ray.exceptions import RayError
+
+from arena_newton.errors import ArenaError
+from arena_newton.eval.folders.run_folder import BREAK_FILE, ResultsFolder, iso
+from arena_newton.eval.plan.episode_plan import Episode
+from arena_newton.eval.play.whole_run import (
+    Group,
+    RunStopped,
+    begun,
+    check_again,
+    command,
+    due,
+    kept,
+    progress_of,
+    run_and_report,
+    told_how_to_go_on,
+)
+from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
+from arena_newton.eval.reports.progress import Progress
+from arena_newton.eval.workers.ray_crew import Crew, Done, Job, Lease, Lost, Member, in_cluster
+from arena_newton.eval.workers.slice_events import Built, Ended, Event, Opened, Ticks
+from arena_newton.files.text import counted, plain_text
+from arena_newton.robot.g1 import TICK
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+
+__all__ = ["DealtRun", "execute", "round_seconds"]
+
+BATCHES = 2
+"""Most episodes of a slice, in batches of --worlds."""
+SMALLER = 4
+"""Episodes that were running when a process was lost are played again in slices so many times smaller, then alone."""
+ALONE = 2
+"""Losses after which an episode is played alone."""
+GIVEN_UP = 5
+"""So many episodes of a task, tracker and mode that end as errors before one ends otherwise stop the run."""
+
+
+def execute(folder: ResultsFolder, factories: Factories | None = None, beside: ResultsFolder | None = None) -> int:
+    """Run or continue the run of a folder that was checked, and that of a folder inside, by processes of a cluster.
+
+    Args:
+        folder: Of the run; its flags name the cluster.
+        factories: What the processes build the run with, importable there; the real parts by default.
+        beside: Of the run inside.
+
+    Returns:
+        Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
+
+    Raises:
+        InputError: A flag, file or folder is wrong, here or on a node; raised before the first episode.
+        StorageError: The results folder cannot be written; finished episodes are kept.
+        RunStopped: Simulator, tracker, policy or cluster broke down as a whole; finished episodes are kept.
+    """
+    with in_cluster(folder.config.flags.ray or ()):
+        return run_and_report(folder, beside, lambda one: _played(one, factories))
+
+
+def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
+    """Play what is missing in a folder; False when it was interrupted."""
+    crew = Crew(folder.config, len(folder.config.episodes), factories)
+    try:
+        return _played_by(crew, folder)
+    finally:
+        crew.dismiss()
+
+
+def round_seconds(folders: Sequence[ResultsFolder], number: int, factories: Factories | None) -> list[float] | None:
+    """Time of each of several runs that so many processes play one after the other, each run as a whole [s].
+
+    Returns:
+        None where the cluster has no room for as many processes.
+    """
+    config = folders[0].config
+    found = []
+    with in_cluster(config.flags.ray or ()):
+        crew = Crew(config, number, factories)
+        try:
+            if crew.room() < number:
+                return None
+            for folder in folders:
+                began = time.perf_counter()
+                if not _played_by(crew, folder):
+                    raise KeyboardInterrupt
+                found.append(time.perf_counter() - began)
+        finally:
+            crew.dismiss()
+    return found
+
+
+def _played_by(crew: Crew, folder: ResultsFolder) -> bool:
+    """Play what is missing in a folder by a crew; False when it was interrupted."""
+    job = Job(folder)
+    resume = f"{command(folder, 'resume')} {shlex.join(['--ray', *(folder.config.flags.ray or ())])}"
+    with contextlib.ExitStack() as ended:
+        config = crew.opened(job)
+        folder.make()
+        journal = ended.enter_context(Journal(folder.journal))
+        folder.settle(config, journal.records)
+        folder.sweep()
+        ended.callback(_swept, crew, folder)
+        try:
+            with told_how_to_go_on(resume, lambda: kept(config, journal.records)):
+                done, waiting = begun(config, folder, journal)
+                if waiting:
+                    _play(DealtRun(job, journal, crew, done, waiting, progress_of(config, done, waiting)))
+        except KeyboardInterrupt:
+            print(f"\ninterrupted: {kept(config, journal.records)}; continue with: {resume}")
+            return False
+    return True
+
+
+def _swept(crew: Crew, folder: ResultsFolder) -> None:
+    """Remove what unfinished recordings left, once who writes them has ended."""
+    if any(member.lease is not None for member in crew.members):
+        crew.dismiss()
+    folder.sweep()
+
+
+def _play(run: DealtRun) -> None:
+    """Play a run until nothing is left."""
+    crew = run.crew
+    try:
+        with run.folder.running():
+            run.shown.group(counted(len(crew.members), "Ray actor"))
+            while _dealt(run):
+                for _, lease, said in crew.heard():
+                    if lease is not None and not isinstance(said, Opened):
+                        run.take(lease, said)
+                    elif isinstance(said, ArenaError):
+                        raise said
+    except RayError as error:
+        raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
+    finally:
+        run.shown.close()
+
+
+def _dealt(run: DealtRun) -> bool:
+    """Give a slice to each process that waits for one; False when all is played."""
+    for member in run.crew.idle():
+        if member.job is not run.job:
+            run.crew.prepare(member, run.job)
+        elif (lease := run.next(member)) is not None:
+            run.crew.lend(member, lease)
+    return not run.finished
+
+
+class DealtRun:
+    """A run whose episodes are dealt out to a crew: its slices, and the journal of what comes back."""
+
+    def __init__(
+        self,
+        job: Job,
+        journal: Journal,
+        crew: Crew,
+        ended: dict[int, EpisodeRecord],
+        waiting: dict[Group, list[Episode]],
+        shown: Progress,
+        besides: Callable[[], int] = lambda: 0,
+    ):
+        """Take what is to be played of a run whose folder was settled.
+
+        Args:
+            job: The run.
+            journal: Its journal.
+            crew: Who plays.
+            ended: Finished episodes by number.
+            waiting: Those to play by task, tracker and mode.
+            shown: What shows how far all is.
+            besides: Episodes of other runs that nobody plays yet.
+        """
+        self.job, self.folder, self.config, self.journal, self.crew = job, job.folder, job.folder.config, journal, crew
+        self.ended, self._besides = ended, besides
+        self.shown = crew.shown = shown
+        self._queues: dict[tuple[Group, int], deque[Episode]] = {}
+        """Episodes to play, by group and by how often they were lost."""
+        for group, episodes in waiting.items():
+            self._queues[group, 0] = deque(episodes)
+        self._batch = max(1, min(self.config.flags.worlds, self._fair()))
+        """Worlds of environments."""
+        self._losses: Counter[int] = Counter()
+        """Losses of each episode while it was played alone."""
+        self._given_up: Counter[Group] = Counter()
+
+    @property
+    def waiting(self) -> int:
+        """Episodes that no process has."""
+        return sum(map(len, self._queues.values()))
+
+    @property
+    def slices(self) -> int:
+        """Slices that what nobody plays would make, at least."""
+        return ceil(self.waiting / self._batch)
+
+    @property
+    def leased(self) -> bool:
+        """Whether a process plays a slice."""
+        return any(one.lease is not None and one.lease.job is self.job for one in self.crew.members)
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to play."""
+        return not self.waiting and not self.leased
+
+    def _fair(self) -> int:
+        """Episodes for each process, if what nobody plays were divided now."""
+        return ceil((self.waiting + self._besides()) / len(self.crew.members))
+
+    def next(self, member: Member) -> Lease | None:
+        """The next slice for a process: of its environment if possible, else of the group that has the most to do."""
+        taken = Counter(one.lease.group for one in self.crew.members if one.lease is not None)
+        work = {
+            key: (key == (member.last, 0), sum(e.max_steps for e in queue) / (1 + taken[key[0]]))
+            for key, queue in self._queues.items()
+            if queue
+        }
+        if not work:
+            return None
+        group, level = key = max(work, key=lambda one: work[one])
+        queue, worlds = self._queues[key], self.config.flags.worlds
+        size = min(BATCHES * worlds, max(self._batch, self._fair())) if not level else max(1, worlds // SMALLER)
+        size = 1 if level == ALONE else min(size, len(queue))
+        episodes = [queue.popleft() for _ in range(size)]
+        return Lease(self.job, group, {e.index: e for e in episodes}, self._batch if not level else size, level)
+
+    def take(self, lease: Lease, said: Event | Done | Lost | ArenaError) -> None:
+        """Take what a process tells of its slice.
+
+        Raises:
+            ArenaError: The run cannot go on.
+        """
+        if isinstance(said, Built):
+            self.folder.register(" ".join(lease.group), said.facts)
+            lease.built = True
+        elif isinstance(said, Ticks):
+            self.shown.tick(said.count)
+        elif isinstance(said, Ended):
+            self._keep(lease, EpisodeRecord.from_json("a process of --ray", said.line))
+        elif isinstance(said, Lost):
+            self._again(lease, said)
+        elif isinstance(said, Done) and lease.left:  # told of as ended without a line: no process does that
+            self._again(lease, Lost("episodes were left out"))
+        elif isinstance(said, ArenaError):
+            raise said
+
+    def _keep(self, lease: Lease, record: EpisodeRecord) -> None:
+        """Append an episode to the journal, once."""
+        episode = lease.left.pop(record.index, None)
+        if episode is None:
+            return
+        check_again(self.config, self.folder.path, self.journal.records, record, episode, (record.media or {}).values())
+        self._append(episode, record)
+        self.shown.episode(episode.max_steps, round((record.durations or {}).get("sim_s", 0.0) / TICK))
+
+    def _append(self, episode: Episode, record: EpisodeRecord) -> None:
+        self.journal.append(record)
+        self.ended[record.index] = record
+        if self.config.flags.keep is not None or self.config.width_rule is not None:
+            self._next_round((episode.task, episode.tracker, episode.mode))
+
+    def _next_round(self, group: Group) -> None:
+        """More attempts where successes are missing, when all of a round have ended."""
+        mine = [one.lease for one in self.crew.members if one.lease is not None and one.lease.job is self.job]
+        if any(lease.left for lease in mine if lease.group == group):
+            return
+        if any(queue for (name, _), queue in self._queues.items() if name == group):
+            return
+        more = due(self.config, self.ended).get(group, [])
+        self._queues[group, 0] = deque(more)
+        self.shown.more([episode.max_steps for episode in more])
+
+    def _again(self, lease: Lease, lost: Lost) -> None:
+        """Deal out again what a lost process had not finished; who was running then comes into a smaller slice."""
+        if lost.trace:
+            with contextlib.suppress(ArenaError):
+                write_atomic(self.folder.path / BREAK_FILE, lost.trace)
+        left, suspects = list(lease.left.values()), set() if lost.with_node else {e.index for e in lease.running()}
+        lease.left.clear()
+        for episode in reversed(left):
+            suspected = episode.index in suspects
+            if suspected and lease.size == 1:
+                self._losses[episode.index] += 1
+                if self._losses[episode.index] >= self.config.flags.ray_attempts:
+                    self._give_up(lease, episode, lost.cause)
+                    continue
+            level = min(ALONE, lease.level + 1) if suspected else lease.level
+            self._queues.setdefault((lease.group, level), deque()).appendleft(episode)
+
+    def _give_up(self, lease: Lease, episode: Episode, cause: str) -> None:
+        """End an episode as an error: it takes its process with it."""
+        facts, now = self.folder.document["environments"][" ".join(lease.group)], iso(time.time())
+        attempts = f"played alone {self._losses[episode.index]} times, each time its process was lost"
+        planned = dataclasses.asdict(episode)
+        del planned["rank"]
+        record = EpisodeRecord(
+            schema=SCHEMA,
+            **planned,
+            hashes=self.folder.hashes(episode.tracker, facts),
+            outcome="error",
+            reason="environment",
+            steps=0,
+            error=plain_text(f"{attempts}: {cause}", 400),
+            durations={"wall_s": 0.0, "sim_s": 0.0},
+            started_at=now,
+            finished_at=now,
+            media={},
+            video="",
+            progress=0.0,
+        )
+        self.shown.say(f"  {episode.key} ends as an error: {record.error}")
+        self._append(episode, record)
+        self.shown.episode(episode.max_steps, 0)
+        self._given_up[lease.group] += 1
+        played = any(
+            (one.task, one.tracker, one.mode) == lease.group and one.outcome != "error" for one in self.ended.values()
+        )
+        if self._given_up[lease.group] >= GIVEN_UP and not played:
+            raise RunStopped(f"{' '.join(lease.group)}: {GIVEN_UP} episodes and no other: {cause}; see {BREAK_FILE}")

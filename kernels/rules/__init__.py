@@ -1,0 +1,1 @@
+"""Kernels of the judge: success, fall, predicates and the door's latch."""

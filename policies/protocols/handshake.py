@@ -1,0 +1,248 @@
+"""What a policy server declares of its policy, compared with what the robot takes before the first episode.
+
+The record is JSON: openpi's metadata frame holds it, vla-eval's HELLO under `arena`, and `GET /config` answers it in
+every protocol. What a server does not declare is None here: nobody can compare it, and the robot says so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from arena_newton.data.datasets.layouts import state_names
+from arena_newton.data.readers.label_protocols import LABELS, action_names
+from arena_newton.errors import InputError
+from arena_newton.files.text import plain_text
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, PICTURE_SIDES
+from arena_newton.policies.protocols.wire_error import WireError
+from arena_newton.robot import g1
+
+__all__ = ["HANDSHAKE_VERSION", "RATE", "ServedFacts", "ServedPicture", "compare_facts", "expected_facts", "read_facts"]
+
+HANDSHAKE_VERSION = 1
+"""Version of the record, its key `arena`."""
+RATE = round(1.0 / g1.TICK, 6)
+"""Actions per second [Hz]."""
+MOST_NAMES = 4096
+"""Most names of a list."""
+
+
+@dataclass(frozen=True)
+class ServedPicture:
+    """The picture that a policy wants."""
+
+    width: int
+    """[px]"""
+    height: int
+    """[px]"""
+    fit: str = "pad"
+    """`pad` or `native`, as in `CameraConfig`."""
+
+
+@dataclass(frozen=True)
+class ServedFacts:
+    """What a server declares; None: nothing."""
+
+    policy: str = ""
+    """What results are known by: the policy's name and a hash of its description."""
+    labels: str | None = None
+    """Protocol of its actions (`data.readers.label_protocols`)."""
+    realign: float | None = None
+    """Fraction of the gap between the commanded and the measured heading that whoever decodes actions of v4 closes each
+    tick; of v4 only."""
+    action_names: tuple[str, ...] | None = None
+    """Names of the numbers of an action, in their order."""
+    state_names: tuple[str, ...] | None = None
+    """Names of the numbers of a state, in their order."""
+    chunk_length: int | None = None
+    """Actions per chunk; 0: they differ."""
+    rate_hz: float | None = None
+    """Actions per second [Hz]."""
+    needs_picture: bool | None = None
+    """Whether the policy looks at pictures."""
+    picture: ServedPicture | None = None
+    """The picture that it looks at; pictures of other sizes are resized by the server."""
+    batched: bool = False
+    """Whether one request may hold several robots, along a leading axis."""
+    seeded: bool = False
+    """Whether an episode follows from its seed and what is seen, whoever else asks."""
+    facts: Mapping[str, object] = field(default_factory=dict)
+    """What the policy says of itself, `Policy.describe`."""
+
+    def to_json(self) -> dict[str, object]:
+        """The record as JSON; what is not declared is left out."""
+        picture = self.picture and {"width": self.picture.width, "height": self.picture.height, "fit": self.picture.fit}
+        content: dict[str, object] = {
+            "arena": HANDSHAKE_VERSION,
+            "policy": self.policy,
+            "labels": self.labels,
+            "realign": self.realign,
+            "action_names": self.action_names and list(self.action_names),
+            "state_names": self.state_names and list(self.state_names),
+            "chunk_length": self.chunk_length,
+            "rate_hz": self.rate_hz,
+            "needs_picture": self.needs_picture,
+            "picture": picture,
+            "batched": self.batched,
+            "seeded": self.seeded,
+            "facts": dict(self.facts),
+        }
+        return {key: value for key, value in content.items() if value is not None}
+
+    def undeclared(self) -> list[str]:
+        """Names of what the server does not declare, as a message lists them."""
+        said = {
+            "label protocol": self.labels,
+            "action names": self.action_names,
+            "state names": self.state_names,
+            "chunk length": self.chunk_length,
+            "rate": self.rate_hz,
+            "picture": self.needs_picture if self.needs_picture is not True else self.picture,
+        }
+        return [name for name, value in said.items() if value is None]
+
+
+def expected_facts(labels: str = "v3.1") -> ServedFacts:
+    """What this robot takes, with actions of a label protocol."""
+    return ServedFacts(
+        labels=labels, action_names=tuple(action_names(labels)), state_names=tuple(state_names()), rate_hz=RATE
+    )
+
+
+def read_facts(content: object, where: str) -> ServedFacts:
+    """The record of a server from its JSON; a server that knows nothing of it declares nothing.
+
+    Args:
+        content: What the server sent.
+        where: What errors name as the origin.
+
+    Raises:
+        WireError: The record is damaged or of a later version.
+    """
+    if not isinstance(content, Mapping):
+        raise WireError(f"{where}: the server's metadata is {type(content).__name__}, expected a map")
+    if "arena" not in content:
+        return ServedFacts()
+    if content["arena"] != HANDSHAKE_VERSION or isinstance(content["arena"], bool):
+        version = plain_text(content["arena"], 40)
+        raise WireError(f"{where}: the server's handshake has version {version}, expected {HANDSHAKE_VERSION}")
+    facts, policy, rate = content.get("facts", {}), content.get("policy", ""), content.get("rate_hz")
+    labels = content.get("labels")
+    if labels is not None and (not isinstance(labels, str) or labels not in LABELS):
+        raise _unfit(where, "labels", labels)
+    if not isinstance(policy, str):
+        raise _unfit(where, "policy", policy)
+    if not isinstance(facts, Mapping) or not all(isinstance(key, str) for key in facts):
+        raise _unfit(where, "facts", facts)
+    try:
+        json.dumps(facts, allow_nan=False)  # results hold them; MessagePack knows more than JSON
+    except (TypeError, ValueError, RecursionError):
+        raise _unfit(where, "facts", "something that is not JSON") from None
+    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < 1e6):
+        raise _unfit(where, "rate_hz", rate)
+    realign = content.get("realign")
+    if realign is not None and (
+        isinstance(realign, bool) or not isinstance(realign, int | float) or not 0 <= realign <= 1
+    ):
+        raise _unfit(where, "realign", realign)
+    return ServedFacts(
+        policy=plain_text(policy, 200),
+        labels=labels,
+        realign=None if realign is None else float(realign),
+        action_names=_names(content, "action_names", where),
+        state_names=_names(content, "state_names", where),
+        chunk_length=_whole(content, "chunk_length", where, 0, LONGEST_CHUNK),
+        rate_hz=None if rate is None else float(rate),
+        needs_picture=_flag(content, "needs_picture", where),
+        picture=_picture(content.get("picture"), where),
+        batched=_flag(content, "batched", where) or False,
+        seeded=_flag(content, "seeded", where) or False,
+        facts=dict(facts),
+    )
+
+
+def compare_facts(declared: ServedFacts, wanted: ServedFacts, where: str) -> None:
+    """Refuse a server whose actions or states are others; what one of both does not declare is not compared.
+
+    Args:
+        declared: Of the server.
+        wanted: Of the robot, `expected_facts`.
+        where: What the message names as the origin.
+
+    Raises:
+        InputError: They differ; the message names both values.
+    """
+    if None not in (declared.labels, wanted.labels) and declared.labels != wanted.labels:
+        raise InputError(
+            f"{where}: the server gives actions of label protocol {declared.labels}, the robot takes {wanted.labels}"
+        )
+    _compare_names(declared.action_names, wanted.action_names, where, "action")
+    _compare_names(declared.state_names, wanted.state_names, where, "state")
+    rates = (declared.rate_hz, wanted.rate_hz)
+    if rates[0] is not None and rates[1] is not None and abs(rates[0] - rates[1]) > 1e-3:
+        raise InputError(f"{where}: the server's actions are for {rates[0]:g} Hz, the robot executes {rates[1]:g} Hz")
+    lengths = (declared.chunk_length, wanted.chunk_length)
+    if lengths[0] and lengths[1] and lengths[0] != lengths[1]:
+        raise InputError(f"{where}: the server's chunks have {lengths[0]} actions, the robot expects {lengths[1]}")
+    if None not in (declared.picture, wanted.picture) and declared.picture != wanted.picture:
+        raise InputError(
+            f"{where}: the server wants {_shown(declared.picture)}, the robot sends {_shown(wanted.picture)}"
+        )
+
+
+def _shown(picture: ServedPicture | None) -> str:
+    return "no picture" if picture is None else f"pictures of {picture.width}x{picture.height}, {picture.fit}"
+
+
+def _compare_names(declared: Sequence[str] | None, wanted: Sequence[str] | None, where: str, noun: str) -> None:
+    if declared is None or wanted is None:
+        return
+    if len(declared) != len(wanted):
+        raise InputError(f"{where}: the server's {noun} has {len(declared)} numbers, the robot's {len(wanted)}")
+    for index, (theirs, ours) in enumerate(zip(declared, wanted, strict=True)):
+        if theirs != ours:
+            raise InputError(
+                f"{where}: number {index} of the server's {noun} is {plain_text(theirs, 80)}, of the robot's {ours}"
+            )
+
+
+def _unfit(where: str, name: str, value: object) -> WireError:
+    return WireError(f"{where}: the server declares {name} as {plain_text(value, 60)!r}, which it cannot be")
+
+
+def _names(content: Mapping[str, object], name: str, where: str) -> tuple[str, ...] | None:
+    value = content.get(name)
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) > MOST_NAMES or not all(isinstance(one, str) for one in value):
+        raise _unfit(where, name, value)
+    return tuple(value)
+
+
+def _whole(content: Mapping[str, object], name: str, where: str, least: int, most: int) -> int | None:
+    value = content.get(name)
+    if value is None:
+        return None
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise _unfit(where, name, value)
+    return value
+
+
+def _flag(content: Mapping[str, object], name: str, where: str) -> bool | None:
+    value = content.get(name)
+    if value is not None and not isinstance(value, bool):
+        raise _unfit(where, name, value)
+    return value
+
+
+def _picture(value: object, where: str) -> ServedPicture | None:
+    if value is None:
+        return None
+    if not isinstance(value, Mapping):
+        raise _unfit(where, "picture", value)
+    width, height = (_whole(value, side, where, *PICTURE_SIDES) for side in ("width", "height"))
+    fit = value.get("fit", "pad")
+    if width is None or height is None or fit not in ("pad", "native"):
+        raise _unfit(where, "picture", dict(value))
+    return ServedPicture(width, height, str(fit))

@@ -1,0 +1,1 @@
+"""Families of policies as the trainer needs them: losses, processors, saving."""

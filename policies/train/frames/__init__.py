@@ -1,0 +1,1 @@
+"""Rows and pictures of datasets on the device: decoded once, batched, transformed."""

@@ -1,0 +1,55 @@
+"""Pictures of a batch as a network sees them in training: shifted and tinted, each sample by itself, on the device.
+
+Only tensors of fixed shapes and the device's default generator are used, so that the work can be captured in a CUDA
+graph; whoever trains seeds that generator before each step.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from arena_newton.policies.train.frames.frame_store import FrameStore
+from arena_newton.policies.train.frames.image_transforms import drawn_transforms, transformed
+
+__all__ = ["gathered_pictures"]
+
+
+def gathered_pictures(
+    store: FrameStore, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0, transforms: bool = False
+) -> torch.Tensor:
+    """Pictures of rows, whole again and on the scale 0 to 1.
+
+    A shift repeats the edge of what the camera saw and leaves the black rows around it where they are: a policy always
+    sees them there.
+
+    Args:
+        store: All pictures.
+        rows: Rows of the samples, int64, shape [B].
+        shift: Most pixels by which a picture is shifted in each direction.
+        colour: Most relative change of the brightness, and of each colour on top.
+        transforms: Apply LeRobot's image transforms, to the whole picture as LeRobot does.
+
+    Returns:
+        float32, shape [B, 3, height, width].
+    """
+    batch, device = len(rows), store.device
+    height, width = int(store.pictures.shape[1]), int(store.pictures.shape[2])
+    if shift:
+        moved = torch.randint(-shift, shift + 1, (2, batch, 1), device=device)
+        down = (torch.arange(height, device=device) + moved[0]).clamp_(0, height - 1)
+        right = (torch.arange(width, device=device) + moved[1]).clamp_(0, width - 1)
+        seen = store.pictures[rows[:, None, None], down[:, :, None], right[:, None, :]]
+    else:
+        seen = store.pictures[rows]
+    pictures = seen.permute(0, 3, 1, 2).float().div_(255.0)
+    if colour:
+        change = torch.rand((batch, 4, 1, 1), device=device).mul_(2.0 * colour).add_(1.0 - colour)
+        pictures = pictures.mul_(change[:, :1] * change[:, 1:]).clamp_(0.0, 1.0)
+    if store.top or store.bottom:
+        # Channels last, as the pictures are stored and as a GPU's convolutions read them.
+        whole = pictures.new_zeros((batch, store.height, width, 3)).permute(0, 3, 1, 2)
+        whole[:, :, store.top : store.top + height] = pictures
+        pictures = whole
+    if transforms:
+        pictures = transformed(pictures, drawn_transforms(batch, store.height, width, device))
+    return pictures

@@ -1,0 +1,1 @@
+"""Terms of a tracker's training: what is measured, rewarded, ended, randomised and shown to the critic."""
