@@ -27,6 +27,7 @@ from arena_newton import tasks as task_registry
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
+from arena_newton.eval.plan.config import DEFAULT_TRACKER
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS, PROTOCOL_SEEDS
 from arena_newton.pictures.camera import Camera
 from arena_newton.pictures.settings import STRIP_SIZES, CameraConfig, Fit
@@ -44,8 +45,6 @@ __all__ = ["ArenaGymEnv", "ArenaVectorEnv", "env_id", "register"]
 
 NAMESPACE = "arena_newton"
 """What every id begins with."""
-DEFAULT_TRACKER = "twist2"
-"""Tracker when none is named, as on the command line."""
 IMAGE_SIZE = (224, 224)
 """Width and height of observed pictures [px], as policies of the original see them."""
 SETTLE = ("steps", "reset")

@@ -31,7 +31,7 @@ from arena_newton.eval.bench.suite_estimate import (
 )
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig, resolve
-from arena_newton.eval.plan.play_flags import RAY_FLAGS
+from arena_newton.eval.plan.flag_checks import RAY_FLAGS
 from arena_newton.eval.play.lasting_env import EnvironmentKeeper
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.reports.wording import markdown_table

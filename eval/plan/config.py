@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
-from arena_newton.cli.extras import require
 from arena_newton.data.recording.episode import CAMERAS
 from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
+from arena_newton.eval.plan.flag_checks import DRIVES, RAY_FLAGS, check_flags, flag_name
 from arena_newton.eval.plan.interaction import check_interactions
 from arena_newton.eval.plan.options import (
     QUICK_REPEATS,
@@ -29,7 +29,6 @@ from arena_newton.eval.plan.options import (
     RunOptions,
     is_quick,
 )
-from arena_newton.eval.plan.play_flags import RAY_FLAGS, check_ray, check_width
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.identity import (
     PACKAGE,
@@ -44,12 +43,11 @@ from arena_newton.eval.records.identity import (
 )
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
-from arena_newton.files.text import counted, plain_text, unprintable
+from arena_newton.files.text import counted, plain_text
 from arena_newton.physics.devices import cluster_engine, resolve_engine
-from arena_newton.pictures.settings import MOST_PORT, SIZE_LIMITS, VIEWERS, CameraConfig, Fit, robot_fit, video_sizes
+from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig, Fit, robot_fit, video_sizes
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
-from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
@@ -71,20 +69,12 @@ DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
 POLICY_PATH_SCHEMES = ("learned", "lerobot", "replay")
 """Policies whose text after the colon is a path."""
-DRIVES: Mapping[str, DriveGains | None] = {
-    "auto": None,
-    "twist2": TWIST2_DRIVE,
-    "humanoidarena": TWIST2_HUMANOIDARENA_DRIVE,
-}
-"""Drive gains of --drive; `auto` is what rule set and tracker ask for."""
 CHUNK_FLAGS = ("replan", "ensemble", "latency_ticks")
 """Flags that say how a policy's chunks are executed."""
 MOST_EPISODES = 200
 """Episodes of a task, tracker and mode under --until-width; the widest interval is then 14 points wide."""
 MOST_DISTURBANCE = 10.0
 """Largest factor of the noise; no robot stands far less."""
-LABELS = ("v3.1", "v4")
-"""Label protocols, `data.readers.label_protocols.LABELS`, which loads torch."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
 ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
 ONE_CALL |= {"ray", *RAY_FLAGS}
@@ -288,7 +278,7 @@ def resolve(options: RunOptions) -> RunConfig:
     Raises:
         InputError: A flag names something unknown or absent; the message says what is known.
     """
-    _check_flags(options)
+    check_flags(options)
     quick = is_quick(options)
     tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
     if quick and options.policy == "expert":  # a task that was added may have none
@@ -407,90 +397,6 @@ def _card(target: str) -> PolicyCard:
     return card
 
 
-def _check_flags(options: RunOptions) -> None:
-    """Refuse flags that are wrong by themselves, without a look at any file."""
-    for field in dataclasses.fields(options):
-        given = getattr(options, field.name)
-        for text in given if isinstance(given, tuple) else (given,):
-            if isinstance(text, str) and (reason := unprintable(text)) is not None:
-                raise InputError(f"{_flag(field.name)} {plain_text(text)}: {reason}")
-    if options.drive not in DRIVES:
-        raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
-    if options.labels not in (None, *LABELS):
-        raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
-    _check_chunks(options)
-    _check_shard(options)
-    if options.video_episodes is not None and options.video_episodes < 1:
-        raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
-    for name in ("video_episodes", "video_size", "follow"):
-        if getattr(options, name) and not (options.video or options.strip or is_quick(options)):
-            raise InputError(f"{_flag(name)}: belongs to --video or --strip, neither is given")
-    for name in ("record_cameras", "record_size", "record_depth"):
-        if getattr(options, name) != getattr(RunOptions, name) and not options.record:
-            raise InputError(f"{_flag(name)}: belongs to --record, which is not given")
-    _check_viewer(options)
-    check_ray(options)
-    check_width(options)
-    if "all" in options.task and len(options.task) > 1:
-        raise InputError("--task all: must be alone, name either all or single tasks")
-    if options.seeds and min(options.seeds) < 0:
-        raise InputError(f"--seeds {min(options.seeds)}: expected numbers of at least 0")
-    if options.worlds < 1:
-        raise InputError(f"--worlds {options.worlds}: expected at least 1")
-
-
-def _check_shard(options: RunOptions) -> None:
-    """Refuse a shard that is none, and one of a run that has no plan to split."""
-    if options.shard is None:
-        return
-    parse_shard(options.shard)
-    if is_quick(options) or options.seeing:
-        raise InputError(
-            "--shard: splits a plan, which --task, --seeds or --repeats name; --task all is the benchmark's"
-        )
-    if options.keep is not None:
-        raise InputError("--shard: does not go with --only-success, whose attempts follow from the earlier ones")
-
-
-def _check_chunks(options: RunOptions) -> None:
-    """Refuse ways to execute chunks that contradict each other; chunks that are too short show at the first look."""
-    replan, late = options.replan, options.latency_ticks
-    if replan is not None and replan < 1:
-        raise InputError(f"--replan {replan}: expected at least 1")
-    if late < 0:
-        raise InputError(f"--latency-ticks {late}: expected at least 0")
-    if replan is not None and 0 < replan <= late:
-        raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
-    if options.ensemble and replan is None and late:
-        raise InputError(
-            f"--latency-ticks {late}: --ensemble looks every tick; name more than {late} ticks by --replan"
-        )
-
-
-def _check_viewer(options: RunOptions) -> None:
-    """Refuse a viewer that cannot be started, before anything is."""
-    if options.viewer is None:
-        for name in ("viewer_follow", "viewer_port", "viewer_real_time"):
-            if getattr(options, name) != getattr(RunOptions(), name):
-                raise InputError(f"{_flag(name)}: belongs to --viewer, which is not given")
-    elif options.viewer not in VIEWERS:
-        raise InputError(f"--viewer {options.viewer}: unknown, choose from {', '.join(VIEWERS)}")
-    if options.viewer_follow and options.viewer != "viser":
-        raise InputError(f"--viewer-follow: belongs to --viewer viser, not {options.viewer}")
-    if not 1 <= options.viewer_port <= MOST_PORT:
-        raise InputError(f"--viewer-port {options.viewer_port}: expected 1 to {MOST_PORT}")
-    if options.viewer == "viser":
-        require("teleop", "--viewer viser", ("viser",))
-    if options.viewer == "rerun":
-        require("rerun", "--viewer rerun")
-    if options.viewer_failures:
-        require("teleop", "--viewer-failures", ("viser",))
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 def _size(given: str | None) -> tuple[int, int] | None:
     """Width and height of --video-size."""
     if given is None:
@@ -557,7 +463,7 @@ def _policy_options(options: RunOptions) -> JsonObject:
     scheme = options.policy.partition(":")[0]
     for name in ("replan", "ensemble"):
         if getattr(options, name) and scheme != "lerobot":
-            raise InputError(f"{_flag(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
+            raise InputError(f"{flag_name(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
     if scheme == "remote":
         return {
             "timeout": options.remote_timeout,
@@ -568,7 +474,7 @@ def _policy_options(options: RunOptions) -> JsonObject:
         }
     for field in dataclasses.fields(options):
         if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
-            raise InputError(f"{_flag(field.name)}: belongs to --policy remote:<url>, not {options.policy}")
+            raise InputError(f"{flag_name(field.name)}: belongs to --policy remote:<url>, not {options.policy}")
     return {"replan": options.replan, "ensemble": options.ensemble} if scheme == "lerobot" else {}
 
 

@@ -33,9 +33,9 @@ from arena_newton.data.recording.episode import (
 from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import EPISODES, SUBFOLDERS, setting
-from arena_newton.eval.plan.config import DRIVES, RunConfig, plain_facts, recorded_cameras, resolve
+from arena_newton.eval.plan.config import RunConfig, plain_facts, recorded_cameras, resolve
+from arena_newton.eval.plan.flag_checks import DRIVES, RAY_FLAGS
 from arena_newton.eval.plan.options import RecordOptions, RunOptions
-from arena_newton.eval.plan.play_flags import RAY_FLAGS
 from arena_newton.eval.play import recording
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.records.identity import differing_key

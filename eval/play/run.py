@@ -23,8 +23,9 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.recordings import ActionRecorder
 from arena_newton.eval.folders.run_folder import PROCESSOR, ResultsFolder, iso
-from arena_newton.eval.plan.config import DRIVES, RunConfig
+from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
+from arena_newton.eval.plan.flag_checks import DRIVES
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import recording
 from arena_newton.eval.play.signal_recorder import SignalRecorder

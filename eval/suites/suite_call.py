@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton.errors import InputError
+from arena_newton.eval.plan.flag_checks import RAY_FLAGS, check_ray
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.plan.play_flags import RAY_FLAGS, check_ray
 from arena_newton.eval.plan.suite_options import MatrixOptions
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.sharding import parse_shard

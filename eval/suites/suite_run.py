@@ -16,7 +16,7 @@ from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder, iso, setting
 from arena_newton.eval.plan.config import RunConfig, resolve
-from arena_newton.eval.plan.play_flags import RAY_FLAGS
+from arena_newton.eval.plan.flag_checks import RAY_FLAGS
 from arena_newton.eval.plan.suite_options import MatrixOptions
 from arena_newton.eval.play.lasting_env import EnvironmentKeeper
 from arena_newton.eval.play.run import Factories, RunStopped, execute

@@ -17,8 +17,7 @@ from arena_newton.cli.flags import parse_flags
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification.checks.failures import HELD_OUT, LEAST, TUNED, confusion
-from arena_newton.eval.certification.checks.failures import failures as check
+from arena_newton.eval.certification.checks.failures import HELD_OUT, LEAST, TUNED, confusion, failures
 from arena_newton.eval.certification.checks.labelled_failures import (
     LABELLED,
     LabelledFailure,
@@ -285,12 +284,12 @@ def test_readers_and_rules_agree_as_often_as_is_counted(tmp_path):
             journal.append(line)
     answers = "number,reader 1,reader 2\n1,perception,perception\n2,approach,posture\n3,contact,tracker\n"
     (tmp_path / "readers.csv").write_text(answers)
-    failures = labelled_failures(tmp_path)
-    assert failures[2].said == ("recovery", "contact", "tracking (legs)")
-    rates = {(one.judges, one.part): (one.same, one.failures) for one in agreements(failures)}
+    judged = labelled_failures(tmp_path)
+    assert judged[2].said == ("recovery", "contact", "tracking (legs)")
+    rates = {(one.judges, one.part): (one.same, one.failures) for one in agreements(judged)}
     assert rates[("rules", "reader 1"), "all"] == (2, 3) and rates[("rules", "reader 1"), "even"] == (1, 1)
     assert rates[("rules", "reader 2"), "odd"] == (1, 2) and rates[("reader 1", "reader 2"), "all"] == (1, 3)
-    sheets = labelled_sheets(failures)
+    sheets = labelled_sheets(judged)
     assert sheets[1].rows[0] == ("perception", "1", "0", "0", "0", "0", "0") and len(sheets) == 4
     assert sheets[3].title == "real failures: reader 2 (rows) and what reader 1 says (columns)"
     assert sheets[3].rows[2] == ("posture", "0", "1", "0", "0", "0", "0")  # number 2
@@ -355,17 +354,17 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
     monkeypatch.delitem(INTERACTIONS, "football")
     assert set(OF) == set(SABOTAGES)
     assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
-    good = check(played(lambda body: OF[body] * 5))
+    good = failures(played(lambda body: OF[body] * 5))
     assert good.verdict == "pass" and good.summary.startswith("30 of 30")
     assert "| perception      |               5 |" in capsys.readouterr().out
     assert good.sheets[0].rows[0] == ("perception", "5", "0", "0", "0", "0", "0", "1.00", "1.00")
     assert any("football" in note for note in good.notes)
-    one = check(played(lambda body: OF[body] * 5 + OF["clumsy"] * (body == "misaimed")))
+    one = failures(played(lambda body: OF[body] * 5 + OF["clumsy"] * (body == "misaimed")))
     assert one.verdict == "pass" and one.summary.startswith("30 of 31")
-    bad = check(played(lambda body: OF["misaimed" if body == "blinded" else body] * 5))
+    bad = failures(played(lambda body: OF["misaimed" if body == "blinded" else body] * 5))
     assert bad.verdict == "fail" and f"expected at least {LEAST:g}" in bad.notes[0]
     for times, verdict in ((1, "note"), (5, "fail")):  # 3 of 4 may well be 4 of 5, 15 of 20 are counted
-        few = check(played(lambda body, n=times: n * (OF[body] * 3 + OF["clumsy" if body == "misaimed" else body])))
+        few = failures(played(lambda body, n=times: n * (OF[body] * 3 + OF["clumsy" if body == "misaimed" else body])))
         assert few.verdict == verdict and f"recall of approach is {3 * times} of {4 * times}" in few.notes[0]
         assert ("too few episodes" in few.notes[0]) is (verdict == "note")
     assert any("recall of perception" in note for note in bad.notes)
@@ -373,7 +372,7 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
         LabelledFailure(number, (FailureStage.CONTACT, FailureStage.POSTURE, FailureStage.CONTACT))
         for number in (1, 3, 5)
     ]
-    unlike = check(played(lambda body: OF[body] * 5))
+    unlike = failures(played(lambda body: OF[body] * 5))
     assert unlike.verdict == "fail" and "rules and reader 1 agree on 7 of 10 (all numbers)" in " ".join(unlike.notes)
     assert "1.00 rules with reader 2" in unlike.summary
 
@@ -388,7 +387,7 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
 
     monkeypatch.setitem(INTERACTIONS, "push_bin", INTERACTIONS["boxing"])  # an entry, and nothing else
     context = vars(played(None)) | {"tasks": tuple(INTERACTIONS), "evaluate": evaluate}
-    found = check(SimpleNamespace(**context))
+    found = failures(SimpleNamespace(**context))
     scripted = [(task, name) for task in INTERACTIONS for name, one in SABOTAGES.items() if task not in one.without]
     assert [(cell.task, cell.body) for cell in cells] == scripted
     assert f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none" in " ".join(
