@@ -22,7 +22,6 @@ from arena_newton.eval.commands.pack_options import PackOptions
 from arena_newton.eval.plan.options import (
     BenchOptions,
     CertifyOptions,
-    EngineOptions,
     FilmOptions,
     LoopOptions,
     RecordOptions,
@@ -59,7 +58,6 @@ OVERVIEW = f"""commands:
   {PROG} adversary [flags]       search the placement at which a policy does worst
   {PROG} bench [--what ...]      measure this machine against the figures to reach
   {PROG} doors [flags]           one checkpoint through lerobot-eval and each served protocol, compared
-  {PROG} engines [flags]         compare the rates of the two physics engines
   {PROG} certify [--quick]       prove the benchmark: checks, a certificate, an exit code
 """
 
@@ -325,13 +323,6 @@ def _bench(arguments: list[str], factories: Factories | None) -> int:
     return bench.run(options)
 
 
-def _engines(arguments: list[str], factories: Factories | None) -> int:
-    options = parse_flags(EngineOptions, arguments, f"{PROG} engines")
-    from arena_newton.eval.studies import engines
-
-    return engines.run(options)
-
-
 def _doors(arguments: list[str], factories: Factories | None) -> int:
     options = parse_flags(DoorOptions, arguments, f"{PROG} doors")
     from arena_newton.eval.adapters import door_comparison
@@ -414,7 +405,6 @@ _COMMANDS = {
     "adversary": _adversary,
     "bench": _bench,
     "doors": _doors,
-    "engines": _engines,
     "certify": _certify,
     "list": _list,
 }

@@ -24,6 +24,23 @@ PACKAGE = "arena_newton"
 ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4}
 """Folder → level; a module imports from its own level and from those below. Scenes stand next to the world: the world
 reads their files with their checks, their authors load a scene to look at it."""
+INNER = {
+    f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
+        | certification studies loop | commands | bench | __main__""",
+    f"{PACKAGE}.eval.certification": "stand_ins | context | finding | claims | checks | certificate jobs",
+    PACKAGE: """errors | files | cli | robot | interfaces rules | kernel_cache tasks | physics | rule_sets | pictures
+        | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
+    f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
+    f"{PACKAGE}.policies": """recipes | base | label_reader open_loop stand serve_example | protocols | replay_dataset
+        | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
+}
+"""Folder → its rooms and single modules from the bottom to the top: each imports from those before it. Imports for type
+checkers count here."""
+NAMES_ABOVE = {
+    f"{PACKAGE}.interfaces": "protocols name the types that they connect",
+    f"{PACKAGE}.tasks": "a judge is handed the scene and the physics that it reads",
+}
+"""Rooms whose imports for type checkers may name what stands above them, and why."""
 FRONT_DOOR = f"{PACKAGE}.__main__"
 """The command line imports every other module by name when it is asked for; it is above all rooms."""
 
@@ -37,6 +54,8 @@ class Import:
     line: int
     late: bool
     """Inside a function."""
+    checking: bool = False
+    """For type checkers alone."""
 
 
 @dataclass(frozen=True)
@@ -75,21 +94,22 @@ def modules(root: Path) -> dict[str, Module]:
     return found
 
 
-def statements(tree: ast.AST) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Import statements that run, and whether each stands inside a function."""
+def statements(tree: ast.AST, *, checking: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Import statements that run, or those for type checkers, and whether each stands inside a function."""
 
-    def walk(node: ast.AST, late: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    def walk(node: ast.AST, late: bool, runs: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.Import | ast.ImportFrom):
-                yield child, late
+                if runs != checking:
+                    yield child, late
             elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-                for other in child.orelse:
-                    yield from walk(other, late)
+                for part, others in ((child.body, False), (child.orelse, True)):
+                    yield from walk(ast.Module(part, []), late, others)
             else:
                 function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-                yield from walk(child, late or function)
+                yield from walk(child, late or function, runs)
 
-    yield from walk(tree, False)
+    yield from walk(tree, False, True)
 
 
 def imported(statement: ast.Import | ast.ImportFrom, module: Module, known: dict[str, Module]) -> Iterator[str]:
@@ -110,12 +130,12 @@ def imported(statement: ast.Import | ast.ImportFrom, module: Module, known: dict
             yield base
 
 
-def imports(known: dict[str, Module]) -> list[Import]:
-    """Every import of one product module by another."""
+def imports(known: dict[str, Module], *, checking: bool = False) -> list[Import]:
+    """Every import of one product module by another that runs, or that is for type checkers."""
     return [
-        Import(module.name, target, statement.lineno, late)
+        Import(module.name, target, statement.lineno, late, checking)
         for module in known.values()
-        for statement, late in statements(module.tree)
+        for statement, late in statements(module.tree, checking=checking)
         for target in imported(statement, module, known)
         if target != module.name
     ]
@@ -155,6 +175,26 @@ def circles(edges: list[Import]) -> list[list[str]]:
 def upward(edges: list[Import], known: dict[str, Module]) -> list[Import]:
     """Imports of a room above."""
     return [e for e in edges if known[e.target].level > known[e.source].level and e.target != FRONT_DOOR]
+
+
+def part_of(name: str, folder: str) -> str:
+    """Room or single module of a folder that a module belongs to; empty for the folder itself and strangers."""
+    inside = name.removeprefix(f"{folder}.") if name.startswith(f"{folder}.") else ""
+    part = inside.partition(".")[0]
+    return "" if folder == PACKAGE and part in ROOMS else part
+
+
+def upward_rooms(edges: list[Import]) -> list[Import]:
+    """Imports of a room by another one of its folder that does not stand above it."""
+    found = []
+    for folder, text in INNER.items():
+        level = {part: number for number, parts in enumerate(text.split("|")) for part in parts.split()}
+        for edge in edges:
+            source, target = part_of(edge.source, folder), part_of(edge.target, folder)
+            named = edge.checking and f"{folder}.{source}" in NAMES_ABOVE
+            if source and target and source != target and level[target] >= level[source] and not named:
+                found.append(edge)
+    return found
 
 
 def draw(root: Path, out: Path, title: str) -> None:

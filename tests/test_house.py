@@ -11,7 +11,18 @@ from pathlib import Path
 import pytest
 
 from arena_newton import tasks
-from tests.import_graph import PACKAGE, Module, circles, imports, modules, statements, upward
+from tests.import_graph import (
+    INNER,
+    PACKAGE,
+    Module,
+    circles,
+    imports,
+    modules,
+    part_of,
+    statements,
+    upward,
+    upward_rooms,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 KNOWN = modules(ROOT)
@@ -55,6 +66,7 @@ ANY = {
 }
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
 MOST_LINES = 600
+MOST_FILES = 20
 STEMS = {
     "base": "the base class of a room's kind of thing",
     "build": "every scene has its builder",
@@ -92,6 +104,21 @@ def test_imports_have_no_circle():
 def test_imports_run_one_way():
     """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval."""
     report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in upward(EDGES, KNOWN)])
+
+
+def test_rooms_stand_in_order():
+    """No room of a folder imports one that does not stand below it, for type checkers neither; each room has its place."""
+    found = upward_rooms([*EDGES, *imports(KNOWN, checking=True)])
+    report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in found])
+    for folder, order in INNER.items():
+        assert {part_of(name, folder) for name in KNOWN} - {""} == set(order.replace("|", " ").split()), folder
+
+
+def test_rooms_are_small():
+    """No folder holds more than 20 modules; the front doors of the world and of the evaluation hold few."""
+    count = collections.Counter(module.path.parent for module in KNOWN.values() if module.path.name != "__init__.py")
+    report([f"{folder.relative_to(ROOT)}: {number} modules" for folder, number in count.items() if number > MOST_FILES])
+    assert count[ROOT / "eval"] <= 2 and count[ROOT / PACKAGE] <= 9
 
 
 def private(name: str) -> bool:

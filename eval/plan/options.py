@@ -15,7 +15,6 @@ __all__ = [
     "QUICK_TRACKERS",
     "BenchOptions",
     "CertifyOptions",
-    "EngineOptions",
     "FilmOptions",
     "LoopOptions",
     "RecordOptions",
@@ -400,38 +399,6 @@ class BenchOptions:
     """File to which each pair that was measured is appended as a JSON line."""
     json: bool = False
     """Print one JSON array instead of the table."""
-
-
-@dataclass(frozen=True)
-class EngineOptions:
-    """Fall and success rates of one task on each engine, over rollouts with slightly moved spawn positions."""
-
-    policy: str = "stand"
-    """Policy, such as `replay:walk.pkl`."""
-    task: str = "double_desk"
-    """Task."""
-    tracker: str = "twist2"
-    """Tracker."""
-    checkpoint: str | None = None
-    """Its weights."""
-    engines: tuple[str, ...] = ("mujoco",)
-    """Engines: `mujoco` (CPU), `warp` (CUDA where there is one)."""
-    rollouts: int = 200
-    """Rollouts per engine."""
-    noise: float = 1e-3
-    """Standard deviation of the spawn position, x and y [m]."""
-    worlds: int = 20
-    """Worlds in a batch."""
-    max_steps: int | None = None
-    """Step budget instead of the rule set's [ticks]."""
-    fast_physics: bool = False
-    """Physics at 5 ms x 4."""
-    seed: int = 0
-    """Seed of the moved spawn positions; another range of it gives independent rollouts."""
-    against: str | None = None
-    """JSON file of an earlier call, possibly on another machine, to compare with."""
-    out: str | None = None
-    """Write the rates to this JSON file."""
 
 
 @dataclass(frozen=True)

@@ -155,8 +155,6 @@ def test_files_of_several_trackers_have_names_of_their_own(tmp_path):
         (["--drive", "stiff"], "--drive stiff: .*humanoidarena"),
         (["--strip", "--video-size", "big"], "--video-size big"),
         (["bench", "--what", "all", "nosuch"], "--what nosuch: known are help"),
-        (["engines", "--engines", "mujoco", "bullet"], "--engine bullet"),
-        (["engines", "--seed", "-1"], "--seed -1"),
         (["--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--seeds", "-1"], "seeds"),
         (["--task", "football", "--seeds", "99999999999999999999999"], "--seeds 99999999999999999999999: expected at"),
