@@ -107,7 +107,7 @@ def test_imports_run_one_way():
 
 
 def test_rooms_stand_in_order():
-    """No room of a folder imports one that does not stand below it, for type checkers neither; each room has its place."""
+    """No room imports one of its folder that does not stand below it, for type checkers neither; each has its place."""
     found = upward_rooms([*EDGES, *imports(KNOWN, checking=True)])
     report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in found])
     for folder, order in INNER.items():
