@@ -8,7 +8,7 @@ import sys
 import unicodedata
 from collections.abc import Collection
 
-__all__ = ["counted", "is_printable", "plain_text", "unprintable"]
+__all__ = ["counted", "is_printable", "plain", "plain_text", "unprintable"]
 
 _ESCAPES = re.compile(
     r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[PX^_][^\x1b]*(?:\x1b\\)?|[@-Z\\-_])?"
@@ -35,6 +35,11 @@ def plain_text(value: object, limit: int | None = 2000, *, mark: str | None = No
     else:
         text = _clean(value if isinstance(value, str) else _dumped(value), mark, _INVISIBLE)
     return text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
+
+
+def plain(value: object) -> str:
+    """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
+    return plain_text(value, None, mark="\ufffd")
 
 
 def _dumped(value: object) -> str:

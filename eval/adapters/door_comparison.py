@@ -32,6 +32,7 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.files.own_processes import environment
+from arena_newton.files.text_tables import Table
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
 from arena_newton.robot.canonical import ACTION_WIDTH
@@ -193,20 +194,15 @@ def compare_doors(plays: Sequence[DoorPlay], first: int, promised: Sequence[str]
 
 def door_table(rows: Sequence[DoorRow], first: int) -> str:
     """The comparison as a table in Markdown."""
-    lines = [
-        f"| door | successes | steps | first {first} actions | largest difference | all actions, margins | first "
-        "difference at tick |",
-        "|---|--:|---|---|--:|---|--:|",
-    ]
+    head = ("door", "successes", "steps", f"first {first} actions", "largest difference", "all actions, margins")
+    lines = []
     for row in rows:
         actions, all_of_it = ("same bits" if same else "differ" for same in (row.same_actions, row.same_everything))
         steps = " ".join(str(number) for number in row.steps)
         parts = "–" if row.parts_at is None else str(row.parts_at)
-        lines.append(
-            f"| `{row.door}` | {row.successes} of {row.episodes} | {steps} | {actions} | {row.largest:.1e} | "
-            f"{all_of_it} | {parts} |"
-        )
-    return "\n".join(lines) + "\n"
+        won = f"{row.successes} of {row.episodes}"
+        lines.append((f"`{row.door}`", won, steps, actions, f"{row.largest:.1e}", all_of_it, parts))
+    return "\n".join(Table((*head, "first difference at tick"), lines, "lrllrlr").compact()) + "\n"
 
 
 def _parts_at(ours: np.ndarray, theirs: np.ndarray) -> int | None:

@@ -34,12 +34,12 @@ from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.flag_checks import RAY_FLAGS
 from arena_newton.eval.play.lasting_env import EnvironmentKeeper
 from arena_newton.eval.play.run import Factories, execute
-from arena_newton.eval.reports.wording import markdown_table
 from arena_newton.eval.suites.matrix_cells import check_policies, run_options
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.eval.workers.slice_player import device_name
 from arena_newton.files.text import counted, plain_text
+from arena_newton.files.text_tables import Table
 
 __all__ = ["run"]
 
@@ -239,7 +239,7 @@ class _Timing:
             each = _time(rate * sum(size.ticks for size in mine) / len(mine))
             rows.append([*kind, str(len(mine)), str(sample), f"{1 / rate:.1f}" if rate else "–", each])
         head = ["policy", "mode", "cells", "measured", "ticks/s", "a cell"]
-        lines = ["", markdown_table(head, sorted(rows), 2).rstrip()]
+        lines = ["", Table(head, sorted(rows), "llr").markdown().rstrip()]
         lines.append(
             f"measured on {device}: {counted(len(measured), 'cell')} with {batch}, {ticks[0]} and {ticks[1]} ticks; "
             "extrapolated to the step budgets: episodes that succeed or fall take less"
@@ -258,7 +258,7 @@ class _Timing:
             [str(one.devices), _basis(one, slowdown), _time(one.seconds), f"{_time(one.low)} to {_time(one.high)}"]
             for one in found.on
         ]
-        lines += ["", markdown_table(["processes", "how it is known", "time", "95 %"], times, 2).rstrip()]
+        lines += ["", Table(["processes", "how it is known", "time", "95 %"], times, "llr").markdown().rstrip()]
         for name, cause in self.left_out.items():
             number = sum(size.kind[0] == name and size not in known for size in sizes)
             if number:

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TypedDict
 
 from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed, verdict_of
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.html_report import FOLDER, page_template
-from arena_newton.eval.reports.wording import escaped
 from arena_newton.files.text import counted
+from arena_newton.files.text_tables import Table, escaped
 
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 
@@ -103,8 +103,8 @@ def document(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding])
     }
 
 
-def _sheet(sheet: Sheet) -> JsonObject:
-    return {"title": sheet.title, "head": list(sheet.head), "rows": [list(row) for row in sheet.rows]}
+def _sheet(sheet: Table) -> JsonObject:
+    return {"title": sheet.title, "head": list(sheet.head), "rows": [list(map(str, row)) for row in sheet.rows]}
 
 
 def _said(facts: Facts) -> list[tuple[str, str]]:
@@ -155,21 +155,19 @@ def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as Markdown, without pictures."""
     lines = ["# Certificate", "", f"**{escaped(verdict_of(findings, len(facts['planned'])))}**", ""]
     lines += [line for text in _warnings(facts) for line in (f"> {escaped(text)}", "")]
-    lines += ["| claim | verdict | measured |", "|---|---|---|"]
-    claims = claimed(findings)
+    claims, rows = claimed(findings), []
     for one in claims:
         verdicts = {check.name: finding.verdict for check, finding in one.findings}
         told = [f"[{name}](#{name}-{verdicts[name]}): {escaped(text)}" for name, text in _measured(one)]
-        lines.append(f"| {escaped(one.text)} | {one.verdict} | {'<br>'.join(told)} |")
+        rows.append((escaped(one.text), one.verdict, "<br>".join(told)))
+    lines += Table(("claim", "verdict", "measured"), rows).compact()
     lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
     lines += ["## What was certified", ""]
     lines += [f"- {name}: {escaped(text)}" for name, text in _said(facts)]
     for check, finding in (part for one in claims for part in one.findings):
         lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", escaped(finding.summary), ""]
         for sheet in finding.sheets:
-            lines += [f"{escaped(sheet.title)}:", "", "| " + " | ".join(map(escaped, sheet.head)) + " |"]
-            lines.append("|" + "---|" * len(sheet.head))
-            lines += ["| " + " | ".join(map(escaped, row)) + " |" for row in sheet.rows] + [""]
+            lines += [f"{escaped(sheet.title)}:", "", *sheet.compact(escaped), ""]
         lines += [f"- {escaped(note)}" for note in finding.notes]
     return "\n".join(lines).rstrip() + "\n"
 

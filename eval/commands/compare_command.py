@@ -11,11 +11,11 @@ from arena_newton.errors import InputError
 from arena_newton.eval.commands.table_options import CompareOptions
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import StorageError, write_atomic
-from arena_newton.eval.reports.wording import plain
 from arena_newton.eval.statistics.comparison import Comparison, compare
 from arena_newton.eval.tables.comparison_page import comparison_page
 from arena_newton.eval.tables.comparison_text import as_csv, as_json, as_markdown, p_text, rate_text, remarks, verdict
 from arena_newton.eval.tables.contenders import read_contenders
+from arena_newton.files.text import plain
 
 __all__ = ["run"]
 

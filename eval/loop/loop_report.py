@@ -21,9 +21,10 @@ from arena_newton.eval.folders.results import RunRecord, load_run
 from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
 from arena_newton.eval.reports.html_report import FOLDER, page_template
 from arena_newton.eval.reports.progress import duration
-from arena_newton.eval.reports.wording import escaped, markdown_table, media_of, plain
+from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.statistics.stats import wilson
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
+from arena_newton.files.text_tables import Table, between, escaped
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 
 __all__ = [
@@ -189,11 +190,9 @@ def _rate_rows(run: RunRecord) -> list[list[str]]:
     for cell in dict.fromkeys((r.task, r.tracker, r.mode) for r in run.records):
         own = [r for r in run.records if (r.task, r.tracker, r.mode) == cell]
         ends = Counter(r.outcome for r in own)
-        interval = wilson(ends["success"], len(own))
-        between = "-" if interval is None else f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f}"
-        rate = f"{100 * ends['success'] / len(own):.1f}"
+        rates = [f"{100 * ends['success'] / len(own):.1f}", between(wilson(ends["success"], len(own)))]
         rows.append(
-            [*map(plain, cell), f"{ends['success']}/{len(own)}", rate, between]
+            [*map(plain, cell), f"{ends['success']}/{len(own)}", *rates]
             + [str(ends[outcome]) for outcome in ("fall", "timeout", "error")]
         )
     return rows
@@ -245,12 +244,12 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
     rates, stages = _rate_rows(run), _stage_rows(loop)
     notes = ["A small loop, which tries the machinery: no result."] if loop.options.get("small") is True else []
     text = [f"# The loop of {escaped(' '.join(map(str, _listed(loop.options.get('task')))))}", ""]
-    text += [f"`{plain(command).replace('`', '')}`", "", "## Result", "", markdown_table(RATE_HEAD, rates, 3)]
+    text += [f"`{plain(command).replace('`', '')}`", "", "## Result", "", Table(RATE_HEAD, rates, "lllr").markdown()]
     text += [f"> {note}" for note in notes] + [
         "",
         "## Time",
         "",
-        markdown_table(["stage", "seconds", ""], stages, 1),
+        Table(["stage", "seconds", ""], stages, "lr").markdown(),
         "## What was made",
         "",
     ]

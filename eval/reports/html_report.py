@@ -28,12 +28,13 @@ from arena_newton.eval.reports.wording import (
     MEDIA,
     environment_facts,
     media_of,
-    plain,
     replay_command,
     rules_that_ran,
     tasks_of,
 )
 from arena_newton.eval.statistics.stats import ErrorReason, ResultCell
+from arena_newton.files.text import plain
+from arena_newton.files.text_tables import percent
 from arena_newton.robot.g1 import TICK
 
 __all__ = ["FOLDER", "page", "page_template"]
@@ -196,10 +197,6 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], cells: int) -> di
     }
 
 
-def _per_cent(fraction: float | None) -> str:
-    return f"{100 * (fraction or 0.0):.2f}%"
-
-
 def _bars(cells: Sequence[ResultCell]) -> list[dict[str, object]]:
     """A bar of outcomes per cell; under it the success rate with its interval and the rates of the group seeds."""
 
@@ -216,7 +213,7 @@ def _bar(title: str, cell: ResultCell) -> dict[str, object]:
     parts, done = [], 0
     for outcome, count in counts.items():
         if count:
-            x, width = _per_cent(done / cell["episodes"]), _per_cent(count / cell["episodes"])
+            x, width = (percent(number / cell["episodes"], 2) + "%" for number in (done, count))
             parts.append({"outcome": outcome, "count": count, "x": x, "width": width})
             done += count
     same: dict[float, int] = {}
@@ -225,15 +222,15 @@ def _bar(title: str, cell: ResultCell) -> dict[str, object]:
         # Seeds of one rate are drawn next to each other.
         same[rate] = same.get(rate, -1) + 1
         towards = -SEED_SPACING if rate > 0.5 else SEED_SPACING
-        seeds.append({"name": seed, "rate": _per_cent(rate), "cx": towards * same[rate]})
+        seeds.append({"name": seed, "rate": percent(rate, 2) + "%", "cx": towards * same[rate]})
     return {
         "title": title,
         "episodes": cell["episodes"],
         "all": ", ".join(f"{count} {outcome}" for outcome, count in counts.items()),
         "counts": ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count),
         "parts": parts,
-        "interval": [_per_cent(bound) for bound in cell["ci95"]] if cell["ci95"] is not None else None,
-        "rate": _per_cent(cell["sr"]),
+        "interval": [percent(bound, 2) + "%" for bound in cell["ci95"]] if cell["ci95"] is not None else None,
+        "rate": percent(cell["sr"] or 0.0, 2) + "%",
         "seeds": seeds,
     }
 

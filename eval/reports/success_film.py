@@ -17,9 +17,9 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord
 from arena_newton.eval.plan.options import FilmOptions
 from arena_newton.eval.records.journal import EpisodeRecord, StorageError
-from arena_newton.eval.reports.wording import media_of, plain
+from arena_newton.eval.reports.wording import media_of
 from arena_newton.files.own_files import replace_atomically
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
 from arena_newton.pictures.settings import STRIP_SIZES
 from arena_newton.pictures.video import VideoWriter, caption
 from arena_newton.robot.g1 import TICK

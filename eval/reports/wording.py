@@ -16,15 +16,12 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.records.schema import Json
-from arena_newton.files.text import plain_text
+from arena_newton.files.text import plain
 
 __all__ = [
     "MEDIA",
     "environment_facts",
-    "escaped",
-    "markdown_table",
     "media_of",
-    "plain",
     "replay_command",
     "rules_that_ran",
     "safe_media",
@@ -40,30 +37,6 @@ REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) 
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"
 _PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
-
-
-def plain(value: object) -> str:
-    """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
-    return plain_text(value, None, mark="\ufffd")
-
-
-def escaped(text: object) -> str:
-    """Text of a results folder as Markdown that stays text, also where a backslash does not keep a tag shut."""
-    shown = re.sub(r"([\\`*\[\]>|])", r"\\\1", re.sub(r"&(?=#?\w+;)", "&amp;", plain(text)))
-    return re.sub(r"<(?=[A-Za-z/!?]|$)", "&lt;", shown)
-
-
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A Markdown table with aligned columns, the first `left` of them flush left; cells are texts and stay so."""
-    lines = [list(head), *([escaped(text) for text in row] for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-
-    def row(cells: Sequence[str]) -> str:
-        padded = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
-        return f"| {' | '.join(padded)} |"
-
-    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([row(head), rule, *map(row, lines[1:])]) + "\n"
 
 
 def safe_media(path: object) -> str | None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton.eval.reports.html_report import FOLDER, page_template
-from arena_newton.eval.reports.wording import MEDIA, media_of, plain, replay_command
+from arena_newton.eval.reports.wording import MEDIA, media_of, replay_command
 from arena_newton.eval.statistics.comparison import Comparison, PairComparison, Standing
 from arena_newton.eval.statistics.rate_tests import PairedCounts
 from arena_newton.eval.tables.comparison_text import (
@@ -29,6 +29,8 @@ from arena_newton.eval.tables.comparison_text import (
     verdict,
 )
 from arena_newton.eval.tables.contenders import ContenderSet, PlayedEpisode
+from arena_newton.files.text import plain
+from arena_newton.files.text_tables import percent
 
 __all__ = ["beta_density", "comparison_page"]
 
@@ -120,16 +122,12 @@ def _rows(comparison: Comparison, standings: Sequence[Standing]) -> list[dict[st
                 "interval": interval,
                 "letters": standing.letters,
                 "path": _outline(standing),
-                "ends": [_per_cent(bound) for bound in (standing.low, standing.high)],
-                "dot": _per_cent(standing.rate),
-                "mean": _per_cent((standing.successes + 1) / (standing.episodes + 2)),
+                "ends": [percent(bound, 2) + "%" for bound in (standing.low, standing.high)],
+                "dot": percent(standing.rate, 2) + "%",
+                "mean": percent((standing.successes + 1) / (standing.episodes + 2), 2) + "%",
             }
         )
     return rows
-
-
-def _per_cent(fraction: float) -> str:
-    return f"{100 * fraction:.2f}%"
 
 
 def _outline(standing: Standing) -> str:

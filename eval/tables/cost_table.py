@@ -52,4 +52,4 @@ def cost_table(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
         "suite measured, start and compilation included."
     )
     whole = (*head, "evaluation min", "min per cell")
-    return SuiteTable("cost", "Time", caption, whole, 4, tuple(rows), (0,), ())
+    return SuiteTable(whole, rows, "llllr", "Time", caption, "cost")

@@ -10,10 +10,10 @@ from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, changed_conditions, due_episodes, is_complete
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.reports.wording import markdown_table, plain
 from arena_newton.eval.statistics.stats import wilson
 from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
+from arena_newton.files.text_tables import Table, between
 from arena_newton.rules.rule_types import MODES
 
 __all__ = ["joint_table"]
@@ -51,7 +51,7 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
         if any(figures):
             rows.append([task, tracker, *([policy] if len(policies) > 1 else []), *(text or "–" for text in figures)])
     head = ["task", "tracker", *(["policy"] if len(policies) > 1 else []), *modes]
-    table = markdown_table(head, [[plain(text) for text in row] for row in rows], len(head) - len(modes))
+    table = Table(head, rows, "l" * (len(head) - len(modes)) + "r").markdown()
     return f"{table}\n{_conditions(runs, policies, weights)}\n" + "".join(f"{note}\n" for note in _notes(runs, records))
 
 
@@ -106,7 +106,7 @@ def _cell(records: Sequence[EpisodeRecord]) -> str:
     """Such as `58/60 (89 to 99)`; empty without episodes."""
     won = sum(record.outcome == "success" for record in records)
     interval = wilson(won, len(records))
-    return "" if interval is None else f"{won}/{len(records)} ({100 * interval[0]:.0f} to {100 * interval[1]:.0f})"
+    return "" if interval is None else f"{won}/{len(records)} ({between(interval)})"
 
 
 def _conditions(runs: Sequence[RunRecord], policies: Sequence[str], weights: Mapping[str, str]) -> str:

@@ -11,6 +11,7 @@ from arena_newton import tasks
 from arena_newton.eval.statistics.stats import Contrast, contrast, population_std, seed_rates, suites, wilson
 from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import PaperRate, PublishedRow
+from arena_newton.files.text_tables import Table, percent
 
 __all__ = [
     "PAPER_NAMES",
@@ -23,8 +24,6 @@ __all__ = [
     "ours",
     "ours_average",
     "paper_entry",
-    "percent",
-    "points",
     "published_entry",
     "probability",
     "rate_text",
@@ -99,20 +98,10 @@ class TableEntry:
 
 
 @dataclass(frozen=True)
-class SuiteTable:
-    """A table as it is shown."""
+class SuiteTable(Table):
+    """A table as it is shown, and its numbers."""
 
-    name: str
-    """Name of its files."""
-    title: str
-    caption: str
-    head: tuple[str, ...]
-    left: int
-    """Columns flush left."""
-    rows: tuple[tuple[str, ...], ...]
-    groups: tuple[int, ...]
-    """Numbers of the rows that begin a group; a rule is drawn above them."""
-    entries: tuple[TableEntry, ...]
+    entries: Sequence[TableEntry] = ()
 
 
 def task_title(task: str) -> str:
@@ -130,17 +119,6 @@ def semantic_text() -> str:
         f"Semantic mode changes looks, and nothing that moves or collides in base mode: {'; '.join(parts)}. (Under "
         "rules released what counts in VisNavi becomes a disc, too, and Football has a second ball.)"
     )
-
-
-def percent(value: float, digits: int = 1) -> str:
-    """A fraction as a percentage without sign of percent, such as `45.0`."""
-    return f"{100 * value:.{digits}f}"
-
-
-def points(value: float) -> str:
-    """A difference of fractions in percentage points, such as `−4.2`."""
-    text = f"{100 * value:+.1f}"
-    return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
 
 
 def interval_text(low: float, high: float) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
 from arena_newton.files.foreign import read_bytes
+from arena_newton.files.text_tables import Table, between, percent
 
 __all__ = ["CARD_FILE", "CARD_PAGE", "NOT_SHIPPED", "SHIPPED", "CellResult", "PolicyCard", "read_card", "shipped_card"]
 
@@ -122,11 +123,11 @@ class PolicyCard:
             "size": f"{self.bytes / 1e6:.1f} MB, matrices in {self.precision}, computed in float32",
             "weights": self.weights,
         }
-        lines = ["# The learned policy", "", *([self.note, ""] if self.note else []), "| | |", "|---|---|"]
-        lines += [f"| {name} | {_cell(text)} |" for name, text in rows.items() if text]
+        about = Table(("", ""), [(name, _cell(text)) for name, text in rows.items() if text])
+        lines = ["# The learned policy", "", *([self.note, ""] if self.note else []), *about.compact()]
         if self.results:
-            lines += ["", "## Results", "", "| task | tracker | mode | successes | SR % | 95 % CI | falls |"]
-            lines += ["|---|---|---|--:|--:|--:|--:|", *map(_result, self.results)]
+            head = ("task", "tracker", "mode", "successes", "SR %", "95 % CI", "falls")
+            lines += ["", "## Results", "", *Table(head, [_result(one) for one in self.results], "lllr").compact()]
         return "\n".join(lines) + "\n"
 
 
@@ -139,10 +140,9 @@ def _dataset(facts: Mapping[str, object]) -> str:
     return f"{facts.get('name', '?')} ({', '.join(filter(None, (counts, str(facts.get('hash', '')))))})"
 
 
-def _result(one: CellResult) -> str:
-    low, high = wilson(one.successes, one.episodes)
-    shown = f"{one.successes}/{one.episodes} | {100 * one.rate:.0f} | {100 * low:.0f}–{100 * high:.0f} | {one.falls}"
-    return f"| {one.task} | {one.tracker} | {one.mode} | {shown} |"
+def _result(one: CellResult) -> tuple[object, ...]:
+    rates = (percent(one.rate, 0), between(wilson(one.successes, one.episodes)).replace(" to ", "–"))
+    return (one.task, one.tracker, one.mode, f"{one.successes}/{one.episodes}", *rates, one.falls)
 
 
 def read_card(folder: Path) -> PolicyCard:

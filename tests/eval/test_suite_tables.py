@@ -24,10 +24,10 @@ from arena_newton.eval.tables.table_entries import (
     SEMANTIC_STRENGTH,
     SuiteTable,
     interval_text,
-    points,
     probability,
     semantic_text,
 )
+from arena_newton.files.text_tables import points
 
 
 @pytest.fixture(scope="module")
@@ -360,7 +360,7 @@ def test_wrong_calls_are_one_error(suite, tmp_path, capsys, arguments, message):
 
 def hostile(text):
     """A table whose policy and notes say this."""
-    return SuiteTable("x", "Title", f"caption {text}", ("policy", "rate"), 1, ((text, "1"),), (0,), ())
+    return SuiteTable(("policy", "rate"), ((text, "1"),), "lr", "Title", f"caption {text}", "x")
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.files.foreign import numbers, read_arrays, read_bytes
 from arena_newton.files.new_folder import link, new_folder
 from arena_newton.files.text import counted
+from arena_newton.files.text_tables import Table
 from arena_newton.pictures.video import VideoWriter
 from arena_newton.rules import seeding
 
@@ -311,10 +312,6 @@ def _add(lines: dict[str, dict[str, int]], file: Path, found: Mapping[str, np.nd
 def table(lines: Mapping[str, Mapping[str, int]]) -> str:
     """Counts per folder as Markdown; a row that breaks several rules counts in each, and once as dropped."""
     names = ("episodes", "rows", *RULES, "dropped", "spoiled")
-    heads = [*names[:-1], "episodes with dropped rows"]
-    out = [f"| folder | {' | '.join(heads)} |", "|---|" + "--:|" * len(names)]
-    out += [f"| {folder} | {' | '.join(str(line[name]) for name in names)} |" for folder, line in lines.items()]
-    if len(lines) > 1:
-        total = [sum(line[name] for line in lines.values()) for name in names]
-        out.append(f"| all | {' | '.join(map(str, total))} |")
-    return "\n".join(out)
+    rows = [[folder, *(line[name] for name in names)] for folder, line in lines.items()]
+    rows += [["all", *(sum(line[name] for line in lines.values()) for name in names)]] if len(lines) > 1 else []
+    return "\n".join(Table(("folder", *names[:-1], "episodes with dropped rows"), rows, "lr").compact())

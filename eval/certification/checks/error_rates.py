@@ -14,10 +14,11 @@ import numpy as np
 from scipy.stats import binom
 
 from arena_newton.cli.intervals import wilson
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding
 from arena_newton.eval.statistics.comparison import LEVEL, Contender, compare
 from arena_newton.eval.statistics.detectable import paired_power
 from arena_newton.eval.statistics.trainings import MATCHED_SPREAD, RateTerm, trained_contrast
+from arena_newton.files.text_tables import Table, between, percent
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
@@ -226,9 +227,8 @@ def _statistics(context: Context) -> CheckFinding:
     found = tallies(number)
     rows = []
     for tally in found:
-        low, high = wilson(tally.happened, tally.times)
-        expected = "" if tally.expected is None else f"{100 * tally.expected:.1f}"
-        figures = (f"{100 * tally.rate:.1f}", f"{100 * low:.1f} to {100 * high:.1f}", expected)
+        expected = "" if tally.expected is None else percent(tally.expected)
+        figures = (percent(tally.rate), between(wilson(tally.happened, tally.times), 1), expected)
         rows.append((tally.case, tally.what, tally.kind, *figures, "" if tally.holds else "fails"))
     errors = [tally.rate for tally in found if tally.kind == "error"]
     failed = [f"{tally.what} ({tally.case})" for tally in found if not tally.holds]
@@ -243,7 +243,7 @@ def _statistics(context: Context) -> CheckFinding:
     return CheckFinding(
         "fail" if failed else "pass",
         summary + (f"; {', '.join(failed)}" if failed else ""),
-        (Sheet(f"{EPISODES} episodes of each policy in {len(RATES)} tasks, level 5 %", head, tuple(rows)),),
+        (Table(head, rows, title=f"{EPISODES} episodes of each policy in {len(RATES)} tasks, level 5 %"),),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,13 +10,13 @@ from dataclasses import dataclass
 from arena_newton.cli.intervals import wilson
 from arena_newton.eval.certification.checks.labelled_failures import agreements, labelled_failures, labelled_sheets
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Verdict, skipped
 from arena_newton.eval.certification.stand_ins.bodies import Body
 from arena_newton.eval.certification.stand_ins.sabotage import SABOTAGES
 from arena_newton.eval.folders.failure_rules import stage_of
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.plan.interaction import INTERACTIONS
-from arena_newton.eval.reports.wording import markdown_table
+from arena_newton.files.text_tables import Table
 
 __all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 
@@ -119,7 +120,7 @@ def failures(context: Context) -> CheckFinding:
     )
     sheets = (*(_sheet(task, matrix) for task, matrix in matrices.items()), *labelled_sheets(real))
     for sheet in sheets:
-        print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
+        print(f"{sheet.title}\n\n{dataclasses.replace(sheet, align='lr').markdown()}")
     return CheckFinding(verdict, summary, sheets, (*(text for text, _ in below), *notes))
 
 
@@ -141,7 +142,7 @@ def _below(matrix: Confusion) -> list[tuple[str, bool]]:
     return found
 
 
-def _sheet(task: str, matrix: Confusion) -> Sheet:
+def _sheet(task: str, matrix: Confusion) -> Table:
     """The matrix: a row for each stage that was scripted."""
 
     def part(value: float | None) -> str:
@@ -157,7 +158,7 @@ def _sheet(task: str, matrix: Confusion) -> Sheet:
         for scripted in FailureStage
     ]
     head = ("scripted", *(f"said {stage}" for stage in FailureStage), "recall", "precision")
-    return Sheet(f"{task}: scripted failures (rows) and what the rules say (columns)", head, tuple(rows))
+    return Table(head, rows, title=f"{task}: scripted failures (rows) and what the rules say (columns)")
 
 
 BODIES: dict[str, Body] = {name: sabotage.body for name, sabotage in SABOTAGES.items()}

@@ -19,7 +19,8 @@ from arena_newton.differentiable import ReferenceState, RollingBall, ball_flight
 from arena_newton.differentiable.kernel_gradients import recorded
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, percent
+from arena_newton.eval.certification.finding import Check, CheckFinding
+from arena_newton.files.text_tables import Table, percent
 from arena_newton.interfaces import Recorder, World
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
@@ -136,9 +137,9 @@ def gradients(context: Context) -> CheckFinding:
         f"The tolerance is {100 * TOLERANCE:g} % of the estimate, or of the root mean square of all of the same kind. "
         "Estimates are central differences; those of the conversion are played through the closed loop.",
         "Where slopes within the step differ by more than that there is a kink, or too little slope for float32: "
-        f"nothing is compared there, and {percent(1.0 - COMPARABLE)} of the slopes at most may be left out so.",
+        f"nothing is compared there, and {percent(1.0 - COMPARABLE, 0)} % of the slopes at most may be left out so.",
     )
-    sheet = Sheet("Exact slopes and central differences", head, tuple(rows))
+    sheet = Table(head, rows, title="Exact slopes and central differences")
     return CheckFinding("fail" if wrong else "pass", summary, (sheet,), (*wrong, *notes))
 
 

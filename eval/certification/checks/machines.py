@@ -17,7 +17,7 @@ from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.checks.same_files import contents, digest
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Verdict, skipped
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
@@ -27,6 +27,7 @@ from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
 from arena_newton.files.own_processes import environment
 from arena_newton.files.text import counted, plain_text
+from arena_newton.files.text_tables import Table
 
 __all__ = ["CHECKS", "RayRun", "compared", "play_by_ray", "plan_of"]
 
@@ -188,7 +189,7 @@ def _judged(found: JsonObject, who: str) -> tuple[Verdict, str, tuple[str, ...]]
     return "fail" if wrong else "pass", said, wrong
 
 
-def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Sheet:
+def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Table:
     """The files that a reader knows, and the others together."""
     files = cast("list[list[str]]", found["files"])
     shown = [tuple(row) for row in files if row[0] in SHOWN]
@@ -198,7 +199,7 @@ def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Sheet:
         shown.append((f"{len(rest)} more, together", *sums))
     cells = f"{counted(cast('int', found['episodes']), 'episode')} of {' '.join(plan.task)} through"
     title = f"SHA-256 of the files of {cells} {' '.join(plan.tracker)}, without the times at which they were played"
-    return Sheet(title, ("file", "one process", other), tuple(shown))
+    return Table(("file", "one process", other), shown, title=title)
 
 
 def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:

@@ -12,8 +12,9 @@ from PIL import Image
 from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.text_tables import Table
 from arena_newton.interfaces import World
 from arena_newton.kernels.tick import RUNNING
 from arena_newton.pictures.settings import CameraConfig
@@ -79,8 +80,8 @@ def visible(context: Context) -> CheckFinding:
         "latest",
         "never",
     )
-    sheet = Sheet(
-        f"The head camera's picture of the expert's episodes, looked at every {EVERY} ticks", head, tuple(rows)
+    sheet = Table(
+        head, rows, title=f"The head camera's picture of the expert's episodes, looked at every {EVERY} ticks"
     )
     summary = f"the target is in the first picture of {shown} of {total} episodes"
     summary += "" if missing else ", and is seen in all of them"
