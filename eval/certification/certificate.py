@@ -6,7 +6,6 @@ A page begins with the verdict and the claims, in the order of a reader's questi
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +15,8 @@ from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import JsonObject
-from arena_newton.eval.reports.html_report import FOLDER, page_template
+from arena_newton.eval.reports.html_report import FOLDER
+from arena_newton.files.pages import EMBEDDED, render
 from arena_newton.files.text import counted
 from arena_newton.files.text_tables import Table, escaped
 
@@ -174,12 +174,11 @@ def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
 
 def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as one page that needs no other file."""
-    style = (FOLDER / "report.css").read_text(encoding="utf-8") + (FOLDER / "certify.css").read_text(encoding="utf-8")
-    known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     claims = claimed(findings)
-    return page_template("certify.html").render(
-        policy=f"default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
-        style=style,
+    return render(
+        FOLDER / "certify.html",
+        styles=["report.css", "certify.css"],
+        sources=EMBEDDED,
         verdict=verdict_of(findings, len(facts["planned"])),
         claims=[{"text": one.text, "verdict": one.verdict, "measured": _measured(one)} for one in claims],
         facts=_said(facts),

@@ -5,9 +5,7 @@ Markdown and one HTML page; what comes from the folder is text to both, pictures
 
 from __future__ import annotations
 
-import base64
 import csv
-import hashlib
 import json
 import math
 from collections import Counter
@@ -19,10 +17,11 @@ from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run
 from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
-from arena_newton.eval.reports.html_report import FOLDER, page_template
+from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.reports.progress import duration
 from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.statistics.stats import wilson
+from arena_newton.files.pages import FILES, render
 from arena_newton.files.text import counted, plain
 from arena_newton.files.text_tables import Table, between, escaped
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
@@ -49,8 +48,6 @@ MOST_POINTS = 400
 """Points of a curve; of more, every second, third ... is drawn."""
 MAX_BYTES = 1 << 20
 """Largest loop.json that is read."""
-SOURCES = "default-src 'none'; img-src 'self' file:; base-uri 'none'; form-action 'none'"
-"""Content-Security-Policy of the page, without its style."""
 STAGES = {
     "record": "record demonstrations",
     "build": "build the dataset",
@@ -265,11 +262,10 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
         text += [f"{escaped(title)}: {escaped(record.outcome)} after {record.steps} ticks", ""]
         text += [f"![{escaped(title)}]({path})" for path in strips] + [""]
     write_atomic(out / "loop.md", "\n".join(text).rstrip() + "\n")
-    style = (FOLDER / "report.css").read_text(encoding="utf-8")
-    named = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    page = page_template("loop.html").render(
-        policy=f"{SOURCES}; style-src 'sha256-{named}'",
-        style=style,
+    page = render(
+        FOLDER / "loop.html",
+        styles=["report.css"],
+        sources=FILES,
         title=" ".join(map(str, _listed(loop.options.get("task")))),
         command=command,
         head=RATE_HEAD,

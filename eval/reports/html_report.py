@@ -7,15 +7,12 @@ so nothing in a journal can become an element or an attribute; media are linked 
 
 from __future__ import annotations
 
-import base64
 import functools
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
 from markupsafe import Markup
 
 from arena_newton.eval.folders.failure_rules import near_bars, stage_of, waits_in_view
@@ -33,11 +30,12 @@ from arena_newton.eval.reports.wording import (
     tasks_of,
 )
 from arena_newton.eval.statistics.stats import ErrorReason, ResultCell
+from arena_newton.files.pages import FILES, render
 from arena_newton.files.text import plain
 from arena_newton.files.text_tables import percent
 from arena_newton.robot.g1 import TICK
 
-__all__ = ["FOLDER", "page", "page_template"]
+__all__ = ["FOLDER", "page"]
 
 FOLDER = Path(__file__).resolve().parent / "page"
 """Templates and style sheets of pages."""
@@ -74,41 +72,6 @@ COLUMNS = (
 )
 
 
-@functools.cache
-def page_template(name: str) -> jinja2.Template:
-    """A page of the folder `page` by its file name; what it shows is escaped, undefined names are errors."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(FOLDER),
-        autoescape=True,
-        finalize=lambda value: value if hasattr(value, "__html__") else plain(value),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template(name)
-
-
-@functools.cache
-def _source(name: str) -> str:
-    """Style or script of the page: the only texts that are not escaped, and the only ones that are ours alone."""
-    return (FOLDER / name).read_text(encoding="utf-8")
-
-
-@functools.cache
-def _policy() -> str:
-    """Content-Security-Policy of the page."""
-
-    def named(text: str) -> str:
-        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-    # A page opened from a disk has no origin that 'self' could mean in every browser, hence `file:`.
-    return (
-        "default-src 'none'; img-src 'self' file:; media-src 'self' file:; base-uri 'none'; form-action 'none'; "
-        f"style-src {named(_source('report.css'))}; script-src {named(_source('report.js'))}"
-    )
-
-
 def _linked(note: str) -> str:
     """A note whose last word is the folder of the learned policy's row, with a link to the report in it."""
     before, name, after = note.rpartition(f"{ROW_FOLDER}/.")
@@ -135,10 +98,11 @@ def page(
     opening = _opening(records)
     # The policy's number of worlds is in the configuration only where its answers depend on it.
     command = functools.partial(replay_command, document["options"], worlds=document["config"].get("worlds"))
-    return page_template("report.html").render(
-        policy=_policy(),
-        style=_source("report.css"),
-        script=_source("report.js"),
+    return render(
+        FOLDER / "report.html",
+        styles=["report.css"],
+        script="report.js",
+        sources=FILES | {"media-src": FILES["img-src"]},
         results=results,
         facts=_facts(document, results),
         notes=[_linked(note) for note in notes],

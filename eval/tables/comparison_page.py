@@ -6,8 +6,6 @@ that two policies ended differently are linked with their recordings, by paths f
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
 import os
 import urllib.parse
@@ -15,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from arena_newton.eval.reports.html_report import FOLDER, page_template
+from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.reports.wording import MEDIA, media_of, replay_command
 from arena_newton.eval.statistics.comparison import Comparison, PairComparison, Standing
 from arena_newton.eval.statistics.rate_tests import PairedCounts
@@ -29,6 +27,7 @@ from arena_newton.eval.tables.comparison_text import (
     verdict,
 )
 from arena_newton.eval.tables.contenders import ContenderSet, PlayedEpisode
+from arena_newton.files.pages import render
 from arena_newton.files.text import plain
 from arena_newton.files.text_tables import percent
 
@@ -67,12 +66,10 @@ def beta_density(successes: int, episodes: int, rate: float) -> float:
 
 def comparison_page(out: Path, comparison: Comparison, contenders: ContenderSet) -> str:
     """The page as text, the same for the same content and folders byte for byte; `out` is the folder it will be in."""
-    style = (FOLDER / "report.css").read_text(encoding="utf-8") + (FOLDER / "compare.css").read_text(encoding="utf-8")
-    known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     several = len(comparison.strata) > 1
-    return page_template("compare.html").render(
-        policy=f"default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
-        style=style,
+    return render(
+        FOLDER / "compare.html",
+        styles=["report.css", "compare.css"],
         facts=[("policies", len(comparison.names)), ("tasks", _task_count(comparison)), *contenders.alike],
         notes=remarks(comparison, contenders),
         ticks=TICKS,
