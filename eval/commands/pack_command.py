@@ -11,7 +11,8 @@ from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.commands.pack_options import ENOUGH, PackOptions
 from arena_newton.eval.folders.results import RunRecord, is_complete, load_run
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell, read_cells
+from arena_newton.eval.tables.episode_table import EvaluatedCell
+from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.files.text import counted
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, CellResult, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint

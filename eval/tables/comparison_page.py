@@ -74,8 +74,8 @@ def comparison_page(out: Path, comparison: Comparison, contenders: ContenderSet)
         notes=remarks(comparison, contenders),
         ticks=TICKS,
         size=VIOLIN,
-        policies=[(name, dict(facts)) for name, facts in zip(comparison.names, contenders.facts, strict=True)],
-        reports=[_report(out, folder) for folder in contenders.folders],
+        policies=[(one.name, dict(one.facts)) for one in contenders.compared],
+        reports=[_report(out, one.folder) for one in contenders.compared],
         overall=_rows(comparison, comparison.overall),
         verdicts=[verdict(comparison, pair) for pair in comparison.pairs],
         pairs=[_pair(comparison, pair) for pair in comparison.pairs],
@@ -159,7 +159,7 @@ def _within(
     out: Path, comparison: Comparison, contenders: ContenderSet, pair: PairComparison, position: int
 ) -> dict[str, object]:
     part = pair.strata[position]
-    first, second = contenders.played[pair.first], contenders.played[pair.second]
+    first, second = (contenders.compared[n].episodes for n in (pair.first, pair.second))
     outcomes = [contenders.contenders[n].outcomes[part.stratum] for n in (pair.first, pair.second)]
     differing = [key for key in outcomes[0] if key in outcomes[1] and outcomes[0][key] != outcomes[1][key]]
     # Those of the first alone come first.

@@ -123,8 +123,8 @@ def _standings(comparison: Comparison, standings: Sequence[Standing], title: str
 def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
     """Rates and letters, pairs, counts per task, notes and methods."""
     lines = ["# Comparison", ""]
-    for name, facts in zip(comparison.names, contenders.facts, strict=True):
-        lines.append(f"- {escaped(name)}: " + ", ".join(f"{key} {escaped(value)}" for key, value in facts))
+    for one in contenders.compared:
+        lines.append(f"- {escaped(one.name)}: " + ", ".join(f"{key} {escaped(value)}" for key, value in one.facts))
     if contenders.alike:
         lines.append("- alike: " + ", ".join(f"{key} {escaped(value)}" for key, value in contenders.alike))
     notes = remarks(comparison, contenders)
@@ -175,7 +175,7 @@ def as_json(comparison: Comparison, contenders: ContenderSet) -> JsonObject:
         within = {
             stratum_title(stratum): _standing(comparison.within[stratum][number]) for stratum in comparison.strata
         }
-        facts: JsonObject = dict(contenders.facts[number])
+        facts: JsonObject = dict(contenders.compared[number].facts)
         policies.append({"name": name} | facts | {"all": _standing(comparison.overall[number]), "tasks": within})
     pairs = []
     for pair in comparison.pairs:

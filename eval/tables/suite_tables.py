@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from arena_newton import tasks
 from arena_newton.eval.statistics.stats import contrast, paired_rates, suites
 from arena_newton.eval.tables.cost_table import cost_table
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paired_rows import PAIRED, RowPair, paired_rows
 from arena_newton.eval.tables.paper_numbers import (
     FAMILIES,

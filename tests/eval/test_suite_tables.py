@@ -319,7 +319,7 @@ def test_cells_that_one_table_must_not_mix(tmp_path):
     with pytest.raises(InputError, match="max_steps is 1300, in"):
         read_cells([tmp_path / "a", tmp_path / "c"])
     write_cell(tmp_path / "d", cell, [], seed_range="demonstration")
-    with pytest.raises(InputError, match="d: holds recordings for training; tables are of evaluations"):
+    with pytest.raises(InputError, match="d: holds recordings for training; results are of evaluations"):
         read_cells([tmp_path / "d"])
 
 
