@@ -9,7 +9,7 @@ import functools
 import sys
 
 from arena_newton import tasks
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 from arena_newton.rules.rule_types import (
     ByRules,

@@ -28,8 +28,8 @@ INNER = {
     f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
         | certification studies loop | commands | bench | __main__""",
     f"{PACKAGE}.eval.certification": "stand_ins | context | finding | claims | checks | certificate jobs",
-    PACKAGE: """errors | files | cli | robot | interfaces rules | kernel_cache tasks | physics | rule_sets | pictures
-        | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
+    PACKAGE: """errors | files | cli pages | robot | interfaces rules | kernel_cache tasks | physics | rule_sets
+        | pictures | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
     f"{PACKAGE}.policies": """recipes | base | label_reader open_loop stand serve_example | protocols | replay_dataset
         | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",

@@ -32,7 +32,7 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.files.own_processes import environment
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
 from arena_newton.robot.canonical import ACTION_WIDTH

@@ -39,7 +39,7 @@ from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.eval.workers.slice_player import device_name
 from arena_newton.files.text import counted, plain_text
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 
 __all__ = ["run"]
 

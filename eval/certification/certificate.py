@@ -16,9 +16,9 @@ from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.html_report import FOLDER
-from arena_newton.files.pages import EMBEDDED, render
 from arena_newton.files.text import counted
-from arena_newton.files.text_tables import Table, escaped
+from arena_newton.pages.html import EMBEDDED, render
+from arena_newton.pages.tables import Table, escaped
 
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 

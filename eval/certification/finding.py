@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.eval.statistics.stats import paired_rates
-from arena_newton.files.text_tables import Table, percent
+from arena_newton.pages.tables import Table, percent
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context

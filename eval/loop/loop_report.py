@@ -21,9 +21,9 @@ from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.reports.progress import duration
 from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.statistics.stats import wilson
-from arena_newton.files.pages import FILES, render
 from arena_newton.files.text import counted, plain
-from arena_newton.files.text_tables import Table, between, escaped
+from arena_newton.pages.html import FILES, render
+from arena_newton.pages.tables import Table, between, escaped
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 
 __all__ = [

@@ -54,6 +54,7 @@ UNHASHED = (
     "eval/suites",
     "eval/tables",
     "eval/workers",
+    "pages",
     "policies/recipes",
     "policies/train",
     "trackers/evaluation",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from arena_newton.eval.folders.failure_counts import FailureCell, SeenRate
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.files.text import plain
-from arena_newton.files.text_tables import Table, between
+from arena_newton.pages.tables import Table, between
 
 __all__ = ["SENTENCES", "WAITS", "StageBar", "failures_markdown", "stage_bars"]
 

@@ -30,9 +30,9 @@ from arena_newton.eval.reports.wording import (
     tasks_of,
 )
 from arena_newton.eval.statistics.stats import ErrorReason, ResultCell
-from arena_newton.files.pages import FILES, render
 from arena_newton.files.text import plain
-from arena_newton.files.text_tables import percent
+from arena_newton.pages.html import FILES, render
+from arena_newton.pages.tables import percent
 from arena_newton.robot.g1 import TICK
 
 __all__ = ["FOLDER", "page"]

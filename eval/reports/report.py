@@ -14,7 +14,7 @@ from arena_newton.eval.reports.learned_row import ROW_FOLDER, row_results
 from arena_newton.eval.reports.wording import environment_facts, media_of, rules_that_ran, tasks_of
 from arena_newton.eval.statistics.stats import ResultCell, Suite, error_reasons, outside_suites
 from arena_newton.files.text import counted, plain
-from arena_newton.files.text_tables import Table, between, escaped, percent
+from arena_newton.pages.tables import Table, between, escaped, percent
 from arena_newton.robot.g1 import TICK
 
 __all__ = ["notes", "table", "write_reports"]

@@ -20,7 +20,7 @@ from arena_newton.eval.reports.progress import simulated
 from arena_newton.eval.suites.suite_file import SELECTORS, PolicyEntry, Selector, SuiteFile
 from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.files.text import counted, plain_text
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, CheckpointFacts, checkpoint_folder
 
 __all__ = [

@@ -27,9 +27,9 @@ from arena_newton.eval.tables.comparison_text import (
     verdict,
 )
 from arena_newton.eval.tables.contenders import ContenderSet, PlayedEpisode
-from arena_newton.files.pages import render
 from arena_newton.files.text import plain
-from arena_newton.files.text_tables import percent
+from arena_newton.pages.html import render
+from arena_newton.pages.tables import percent
 
 __all__ = ["beta_density", "comparison_page"]
 

@@ -11,7 +11,7 @@ from arena_newton.eval.statistics.rate_tests import LARGEST_BOSCHLOO, PairedCoun
 from arena_newton.eval.statistics.stats import Contrast
 from arena_newton.eval.tables.contenders import ContenderSet
 from arena_newton.files.text import counted, plain
-from arena_newton.files.text_tables import Table, between, escaped, percent
+from arena_newton.pages.tables import Table, between, escaped, percent
 
 __all__ = [
     "METHOD",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from arena_newton.eval.statistics.trainings import DROP_SPREAD, ENOUGH, MATCHED_SPREAD, SWAPPED_SPREAD
 from arena_newton.eval.tables.paper_claims import NEGLIGIBLE, SIGNIFICANT, ClaimResult
 from arena_newton.eval.tables.table_entries import probability
-from arena_newton.files.text_tables import Table, escaped
+from arena_newton.pages.tables import Table, escaped
 
 __all__ = ["findings_table", "findings_text"]
 

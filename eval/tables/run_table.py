@@ -20,7 +20,7 @@ from arena_newton.eval.tables.episode_table import (
 )
 from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
 from arena_newton.files.text import counted, plain
-from arena_newton.files.text_tables import Table, between
+from arena_newton.pages.tables import Table, between
 from arena_newton.rules.rule_types import MODES
 
 __all__ = ["joint_table"]

@@ -39,7 +39,7 @@ from arena_newton.eval.tables.table_entries import (
     task_title,
 )
 from arena_newton.eval.tables.trainings_table import trainings_table
-from arena_newton.files.text_tables import percent, points
+from arena_newton.pages.tables import percent, points
 
 __all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 

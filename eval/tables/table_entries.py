@@ -11,7 +11,7 @@ from arena_newton import tasks
 from arena_newton.eval.statistics.stats import Contrast, contrast, population_std, seed_rates, suites, wilson
 from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import PaperRate, PublishedRow
-from arena_newton.files.text_tables import Table, percent
+from arena_newton.pages.tables import Table, percent
 
 __all__ = [
     "PAPER_NAMES",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from arena_newton.eval.tables.table_entries import SuiteTable, TableEntry
 from arena_newton.files.text import plain
-from arena_newton.files.text_tables import Table, escaped, latex_text
+from arena_newton.pages.tables import Table, escaped, latex_text
 
 __all__ = ["as_csv", "as_latex", "as_markdown"]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.table_entries import SuiteTable, task_title
-from arena_newton.files.text_tables import percent
+from arena_newton.pages.tables import percent
 
 __all__ = ["trainings_table"]
 

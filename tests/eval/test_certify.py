@@ -21,9 +21,9 @@ from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.play import run as runs
 from arena_newton.eval.records.journal import ContradictionError
 from arena_newton.eval.statistics.stats import mcnemar
-from arena_newton.files.text_tables import Table
 from arena_newton.interfaces import Verdict
 from arena_newton.kernels import tick as codes
+from arena_newton.pages.tables import Table
 
 
 class SolvedEnv(FakeEnv):

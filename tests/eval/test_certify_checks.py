@@ -17,7 +17,7 @@ from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGH
 from arena_newton.eval.commands import certify
 from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.play.run import Factories
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK

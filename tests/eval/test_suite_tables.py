@@ -27,7 +27,7 @@ from arena_newton.eval.tables.table_entries import (
     probability,
     semantic_text,
 )
-from arena_newton.files.text_tables import points
+from arena_newton.pages.tables import points
 
 
 @pytest.fixture(scope="module")

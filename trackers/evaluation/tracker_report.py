@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.cli.intervals import wilson
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.trackers.evaluation.figures import Figure, Result, figures
 
 __all__ = ["COLUMNS", "cell_rows", "document", "figure_table", "markdown", "write"]

@@ -8,7 +8,7 @@ from typing import Any
 
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import replace_atomically
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
 from arena_newton.trackers.train.checkpoint import Checkpoint

@@ -16,7 +16,7 @@ import numpy as np
 
 from arena_newton.data.datasets.motion_source import Motion, motions
 from arena_newton.files.text import counted
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, STATE
 

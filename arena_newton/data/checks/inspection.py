@@ -23,8 +23,8 @@ from arena_newton.data.datasets.motion_source import Motion, motions
 from arena_newton.data.readers.frame_reader import OpenVideo
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import replace_atomically
-from arena_newton.files.pages import EMBEDDED, render
 from arena_newton.files.text import counted
+from arena_newton.pages.html import EMBEDDED, render
 from arena_newton.pictures.video import evenly
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, HAND_CLOSED, STATE

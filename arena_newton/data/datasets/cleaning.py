@@ -25,7 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.files.foreign import numbers, read_arrays, read_bytes
 from arena_newton.files.new_folder import link, new_folder
 from arena_newton.files.text import counted
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.video import VideoWriter
 from arena_newton.rules import seeding
 

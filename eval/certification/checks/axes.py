@@ -16,8 +16,8 @@ from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, score, skipped
 from arena_newton.eval.records.schema import JsonObject
-from arena_newton.files.text_tables import Table
 from arena_newton.interfaces import World
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.rules.rule_types import CylinderRange, ObjectRule, PoseRange
 

@@ -16,7 +16,7 @@ import numpy as np
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding
-from arena_newton.files.text_tables import Table, percent
+from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.ball import BALL
 from arena_newton.physics.devices import resolve_engine
 from arena_newton.physics.engines import make_physics

@@ -18,7 +18,7 @@ from arena_newton.eval.certification.finding import Check, CheckFinding
 from arena_newton.eval.statistics.comparison import LEVEL, Contender, compare
 from arena_newton.eval.statistics.detectable import paired_power
 from arena_newton.eval.statistics.trainings import MATCHED_SPREAD, RateTerm, trained_contrast
-from arena_newton.files.text_tables import Table, between, percent
+from arena_newton.pages.tables import Table, between, percent
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context

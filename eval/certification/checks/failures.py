@@ -16,7 +16,7 @@ from arena_newton.eval.certification.stand_ins.sabotage import SABOTAGES
 from arena_newton.eval.folders.failure_rules import stage_of
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.plan.interaction import INTERACTIONS
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 

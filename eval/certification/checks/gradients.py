@@ -20,8 +20,8 @@ from arena_newton.differentiable.kernel_gradients import recorded
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding
-from arena_newton.files.text_tables import Table, percent
 from arena_newton.interfaces import Recorder, World
+from arena_newton.pages.tables import Table, percent
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.judge import Judge

@@ -20,8 +20,8 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import check_parts
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.text import counted
-from arena_newton.files.text_tables import Table
 from arena_newton.interfaces import Chunk, Observation, Tracker
+from arena_newton.pages.tables import Table
 from arena_newton.policies.base import Mask, Policy
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout

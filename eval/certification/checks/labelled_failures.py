@@ -13,7 +13,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.failure_rules import stage_of
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.records.journal import EpisodeRecord, read_journal
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 
 __all__ = ["LABELLED", "JudgeAgreement", "LabelledFailure", "agreements", "labelled_failures", "labelled_sheets"]
 

@@ -9,7 +9,7 @@ from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Verdict, pooled_score, score
 from arena_newton.files.text import counted
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "GLIDES"]
 

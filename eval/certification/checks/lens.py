@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding
-from arena_newton.files.text_tables import Table, percent
+from arena_newton.pages.tables import Table, percent
 from arena_newton.pictures.camera import CAMERA_PRIMS
 from arena_newton.pictures.settings import CameraConfig
 

@@ -27,7 +27,7 @@ from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
 from arena_newton.files.own_processes import environment
 from arena_newton.files.text import counted, plain_text
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "RayRun", "compared", "play_by_ray", "plan_of"]
 

@@ -25,7 +25,7 @@ from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.foreign import read_arrays
 from arena_newton.files.own_files import file_label
 from arena_newton.files.text import counted, plain_text
-from arena_newton.files.text_tables import Table
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "SOLVED", "own_replay", "recorded"]
 

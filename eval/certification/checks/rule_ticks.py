@@ -17,8 +17,8 @@ from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
-from arena_newton.files.text_tables import Table
 from arena_newton.interfaces import EpisodeResult, Recorder, World
+from arena_newton.pages.tables import Table
 from arena_newton.rollout import Rollout
 from arena_newton.tasks import boxing, double_desk, football, open_door, pp_box, vis_navi
 

@@ -11,8 +11,8 @@ import numpy as np
 from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
-from arena_newton.files.text_tables import Table, percent
 from arena_newton.interfaces import Recorder, World
+from arena_newton.pages.tables import Table, percent
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.double_desk import SILL
 

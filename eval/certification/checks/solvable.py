@@ -5,7 +5,7 @@ from __future__ import annotations
 from arena_newton.eval.certification.checks.replays import SOLVED, own_replay, recorded
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, pooled_score, score
-from arena_newton.files.text_tables import Table, percent
+from arena_newton.pages.tables import Table, percent
 from arena_newton.rule_sets import names as rule_sets
 
 __all__ = ["CHECKS"]

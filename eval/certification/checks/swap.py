@@ -17,7 +17,7 @@ from arena_newton.eval.certification.finding import (
     skipped,
 )
 from arena_newton.eval.statistics.stats import mcnemar
-from arena_newton.files.text_tables import Table, percent
+from arena_newton.pages.tables import Table, percent
 
 __all__ = ["CHECKS", "retention"]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from arena_newton.files.text_tables import Table, between, percent, points
+from arena_newton.pages.tables import Table, between, percent, points
 
 TABLE = Table(("task", "rate", "why"), (("a|b", 45.0, ""), ("_c", "-", "<b>")), "lrl", groups=(1,), name="A b")
 
