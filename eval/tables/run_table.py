@@ -18,7 +18,7 @@ from arena_newton.eval.tables.episode_table import (
     error_note,
     incomplete_note,
 )
-from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
+from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, ordered, semantic_text
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between
 from arena_newton.rules.rule_types import MODES
@@ -42,12 +42,12 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
     _check_unique(found)
     policies = list(dict.fromkeys(policy for policy, _ in found))
     used = dict.fromkeys(cell.tracker for _, cell in found)
-    modes = _ordered({cell.mode for _, cell in found}, MODES)
+    modes = ordered({cell.mode for _, cell in found}, MODES)
     cells: dict[tuple[str, ...], list[bool]] = {}
     for policy, cell in found:
         for task in (cell.task, ALL):
             cells.setdefault((task, cell.tracker, policy, cell.mode), []).extend(cell.held().values())
-    shown = _ordered({cell.task for _, cell in found}, tasks.names())
+    shown = ordered({cell.task for _, cell in found}, tasks.names())
     shown += [ALL] if len(shown) > 1 else []
     rows = []
     for task, tracker, policy in itertools.product(shown, used, policies):
@@ -78,11 +78,6 @@ def _check_unique(found: Sequence[tuple[str, EvaluatedCell]]) -> None:
                 name = " ".join(map(plain, (cell.task, cell.tracker, policy, cell.mode)))
                 name += f" seed {r.group_seed} repeat {r.repeat}"
                 raise InputError(f"{cell.folder}: episode {name} is in {other.folder} too; leave one of them out")
-
-
-def _ordered(names: set[str], known: Sequence[str]) -> list[str]:
-    """Names in the order of those that are known, others after them."""
-    return [name for name in known if name in names] + sorted(names - set(known))
 
 
 def _cell(held: Sequence[bool]) -> str:

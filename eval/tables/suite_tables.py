@@ -29,6 +29,7 @@ from arena_newton.eval.tables.table_entries import (
     SuiteTable,
     TableEntry,
     interval_text,
+    ordered,
     ours,
     ours_average,
     paper_entry,
@@ -68,7 +69,7 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers, changed: S
         paper = PaperNumbers({}, {}, {})
     cells = [cell for cell in cells if cell.records]
     prompt = [cell for cell in cells if cell.latency == 0]
-    modes = _ordered({c.mode for c in prompt}, MODE_ORDER)
+    modes = ordered({c.mode for c in prompt}, MODE_ORDER)
     found: list[SuiteTable | None] = [_in_gmt(prompt, paper, mode) for mode in modes]
     found += [_untrained(prompt, mode) for mode in modes]
     found += [
@@ -93,11 +94,7 @@ def _with_rules(table: SuiteTable, changed: Sequence[str]) -> SuiteTable:
 
 def tracker_order(names: set[str]) -> list[str]:
     """Trackers, the paper's first."""
-    return _ordered(names, ("twist2", "sonic"))
-
-
-def _ordered(names: set[str], known: Sequence[str]) -> list[str]:
-    return [name for name in known if name in names] + sorted(names - set(known))
+    return ordered(names, ("twist2", "sonic"))
 
 
 def _policies(cells: Sequence[EvaluatedCell]) -> list[tuple[str, str]]:
@@ -108,7 +105,7 @@ def _policies(cells: Sequence[EvaluatedCell]) -> list[tuple[str, str]]:
 
 
 def _tasks(cells: Sequence[EvaluatedCell]) -> list[str]:
-    return _ordered({cell.task for cell in cells}, suites()["ALL_AVG"])
+    return ordered({cell.task for cell in cells}, suites()["ALL_AVG"])
 
 
 def _in_gmt_cells(cells: Sequence[EvaluatedCell], mode: str = "base") -> list[EvaluatedCell]:
@@ -374,7 +371,7 @@ def _paper_transfers(pairs: Sequence[RowPair], paper: PaperNumbers) -> list[Tabl
 def _perturbation(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:
     """Average rates per mode over the tasks that were played in every mode shown, and drops from base."""
     mine = [c for mode in MODE_ORDER for c in _in_gmt_cells(cells, mode)]
-    modes = _ordered({c.mode for c in mine}, MODE_ORDER)
+    modes = ordered({c.mode for c in mine}, MODE_ORDER)
     if len(modes) < 2 or "base" not in modes:
         return None
     rows: list[tuple[str, ...]] = []

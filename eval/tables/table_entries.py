@@ -21,6 +21,7 @@ __all__ = [
     "SuiteTable",
     "TableEntry",
     "interval_text",
+    "ordered",
     "ours",
     "ours_average",
     "paper_entry",
@@ -102,6 +103,11 @@ class SuiteTable(Table):
     """A table as it is shown, and its numbers."""
 
     entries: Sequence[TableEntry] = ()
+
+
+def ordered(names: set[str], known: Sequence[str]) -> list[str]:
+    """Names in the order of those that are known, others after them."""
+    return [name for name in known if name in names] + sorted(names - set(known))
 
 
 def task_title(task: str) -> str:
