@@ -1,4 +1,4 @@
-"""Distances of an `interaction.Interaction`, measured in running worlds: from robot and hands to the things to touch."""
+"""Distances of an `interaction.Interaction`, measured in running worlds: of robot and hands to the things to touch."""
 
 from __future__ import annotations
 

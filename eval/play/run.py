@@ -394,7 +394,7 @@ class RunPlayer:
 
 
 def _recorder(config: RunConfig, folder: Path, tracker: str) -> EpisodeRecorder | None:
-    """Recorder of the pictures; None when none are wanted. Of several trackers each has its name in its files' names."""
+    """Recorder of the pictures; None when none are wanted. File names name the tracker where there are several."""
     flags = config.flags
     if not (flags.video or flags.strip):
         return None
