@@ -20,7 +20,7 @@ NOISE_RULE = "sha256(policy seed|look)"
 
 @dataclass(frozen=True)
 class Draw:
-    """Whose noise it is."""
+    """Seed and query of one world, from which its noise is drawn."""
 
     seed: int
     """Seed that the policy was given of the episode."""
