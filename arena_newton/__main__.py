@@ -30,7 +30,7 @@ class Command:
     """One command, with flags and subcommands of its own."""
 
     words: str
-    """What is typed, such as `trackers evaluate`."""
+    """Words as typed, such as `trackers evaluate`."""
     module: str
     """Module whose `main` takes the arguments and returns the exit code."""
     purpose: str

@@ -121,8 +121,21 @@ def test_rooms_are_small():
     assert count[ROOT / "eval"] <= 2 and count[ROOT / PACKAGE] <= 9
 
 
+def test_the_page_of_rooms_names_each():
+    """`docs/design/rooms.md` lists the rooms of each folder from the bottom to the top, and the names at its places."""
+    page = (ROOT / "docs" / "design" / "rooms.md").read_text()
+    packages = {module.name for module in KNOWN.values() if module.path.name == "__init__.py"}
+    for folder in (PACKAGE, f"{PACKAGE}.data", f"{PACKAGE}.policies", f"{PACKAGE}.eval"):
+        title = folder.replace(".", "/") if folder.endswith("data") else f"{folder.split('.')[-1]}/"
+        listed = re.findall(r"^\| `(\w+)` \|", page.split(f"### `{title}`")[1].split("\n#")[0], flags=re.MULTILINE)
+        groups = [[p for p in part.split() if f"{folder}.{p}" in packages] for part in INNER[folder].split("|")]
+        assert listed == [name for group in groups for name in sorted(group, key=[*listed, *group].index)], folder
+    for file, name in re.findall(r"\]\(../../(\S+)\): `(\w+)`", page):
+        assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), f"{file}: no {name}"
+
+
 def private(name: str) -> bool:
-    """Whether a name is one module's own."""
+    """True if a name is one module's own."""
     return name.startswith("_") and not name.startswith("__")
 
 

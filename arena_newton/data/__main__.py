@@ -32,7 +32,7 @@ class DataCommand:
     """One command: what it is given after its folders, and who does it."""
 
     words: str
-    """How it is called, such as `build <recordings> [<recordings> ...]`."""
+    """Usage, such as `build <recordings> [<recordings> ...]`."""
     purpose: str
     options: type
     """Dataclass of its flags."""

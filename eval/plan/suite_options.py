@@ -33,7 +33,7 @@ class MatrixOptions:
     """Measure a few cells of each kind for seconds, and print how long all of them take on so many devices (1 2 8 when
     no number follows); nothing else is played. With --ray also what a second process costs the first."""
     keep_going: bool = False
-    """When a cell cannot be played, go on with the others and list it at the end."""
+    """Skip a cell that cannot be played, go on with the others and list it at the end."""
     accept_changes: bool = False
     """Cells that were played under other conditions are played again; what they hold is moved to <out>/.replaced."""
     accept_code: bool = False

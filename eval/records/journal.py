@@ -119,9 +119,9 @@ class EpisodeRecord:
     progress: Fraction | None = None
     """Fraction of the task's predicates that have held; None in a line of schema 1."""
     events: Annotated[tuple[EpisodeEvent, ...], Fit("objects with kind, tick and detail")] = ()
-    """What happened once in the episode, in the order of its ticks."""
+    """Single events of the episode, in the order of its ticks."""
     signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
-    """What tells why it failed; None, and absent in the line, without `eval run --failures`."""
+    """Signals that tell why it failed; None, and absent in the line, without `eval run --failures`."""
 
     @property
     def shown_policy(self) -> str:

@@ -36,7 +36,7 @@ MOST_PROCESSES = 9_999
 
 @dataclass(frozen=True)
 class SuiteCall:
-    """What a call is to play."""
+    """Cells and options of a call."""
 
     suite: SuiteFile
     options: MatrixOptions

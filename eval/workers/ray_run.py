@@ -212,12 +212,12 @@ class DealtRun:
 
     @property
     def leased(self) -> bool:
-        """Whether a process plays a slice."""
+        """True if a process plays a slice."""
         return any(one.lease is not None and one.lease.job is self.job for one in self.crew.members)
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to play."""
+        """True if nothing is left to play."""
         return not self.waiting and not self.leased
 
     def _fair(self) -> int:

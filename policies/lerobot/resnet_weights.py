@@ -73,7 +73,7 @@ def check_resnet(recipe: TrainingRecipe, weights: str | Path | None) -> None:
 
 
 def find_resnet(kind: str, wanted: object) -> Path | torchvision.models.WeightsEnum:
-    """Where pretrained weights are; nothing is loaded.
+    """Location of pretrained weights; nothing is loaded.
 
     Args:
         kind: As of `load_resnet`.

@@ -37,7 +37,7 @@ from arena_newton.policies.serve.websocket_listener import WebsocketListener, di
 __all__ = ["WebsocketDoor", "WebsocketProtocol"]
 
 type WebsocketProtocol = Literal["openpi", "roboarena", "vla-eval"]
-"""What is spoken; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
+"""Protocol on the connection; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
 
 PONG_SECONDS = 300.0
 """Time that a client has to answer a ping: compiling kernels holds up a robot [s]."""

@@ -40,13 +40,13 @@ SYNCHRONISED = 10
 
 @dataclass(frozen=True)
 class SpeedFigure:
-    """What one training of a measurement did."""
+    """Figures of one training of a measurement."""
 
     steps_per_s: float
     memory: float
     """Most memory of the device that torch held [GB]; 0 on the CPU."""
     graphed: bool
-    """Whether a step was a CUDA graph."""
+    """True if a step was a CUDA graph."""
 
 
 def bench_recipe(options: TrainingBenchOptions) -> TrainingRecipe:

@@ -33,7 +33,7 @@ PROGRAM = "arena_newton.policies.train.measured_training"
 BAR = 70.0
 """Steps/s of one ACT training of batch 64 on one H200 that the product must reach."""
 LOOP_BAR = 31.0
-"""What LeRobot's own loop reached there, for comparison."""
+"""Speed of LeRobot's own loop there, for comparison."""
 START_LIMIT = 900.0
 """Longest time that the processes may take to begin [s]."""
 
@@ -80,7 +80,7 @@ def bench(options: TrainingBenchOptions) -> list[tuple[int, list[SpeedFigure]]]:
 
 
 def _verdict(device: str, settings: TrainingRecipe, speed: float) -> str:
-    """Whether the bar is reached, where it is about this measurement."""
+    """Sentence on whether the bar is reached, where it is about this measurement."""
     if "H200" not in device or settings.family != "act" or settings.batch_size != 64 or settings.name == "small":
         return ""
     return f"  >= {BAR:.0f} {'pass' if speed >= BAR else 'MISS'} (LeRobot's loop: {LOOP_BAR:.0f})"
@@ -114,7 +114,7 @@ def _at_once(options: TrainingBenchOptions, count: int) -> list[SpeedFigure]:
 
 
 def _command(flags: str) -> list[str]:
-    """How a measured training is started."""
+    """Command of a measured training."""
     return [sys.executable, "-P", "-m", PROGRAM, flags]
 
 

@@ -68,7 +68,7 @@ class DataFigure:
 
     @property
     def met(self) -> bool:
-        """Whether it reaches its bar."""
+        """True if it reaches its bar."""
         return self.bar is None or (self.value <= self.bar if self.at_most else self.value >= self.bar)
 
     @property

@@ -26,7 +26,7 @@ class BuildOptions:
     out: Path = Path("dataset")
     """Folder of the dataset, which must not exist yet."""
     labels: str = "v3.1"
-    """What the actions mean: v3.1 (reference pose, the original's) or v4 (root velocities)."""
+    """Meaning of the actions: v3.1 (reference pose, the original's) or v4 (root velocities)."""
     layout: str = "arena"
     """Names of the features: arena (the original's), sonic (GR00T-WholeBodyControl) or lerobot (Unitree G1)."""
     cameras: Several[str] = ()

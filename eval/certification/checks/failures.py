@@ -50,11 +50,11 @@ class Confusion:
     """(scripted, said) → episodes."""
 
     def scripted(self, stage: FailureStage) -> int:
-        """How many failures of a stage were scripted."""
+        """Number of scripted failures of a stage."""
         return sum(self.counts.get((stage, said), 0) for said in FailureStage)
 
     def said(self, stage: FailureStage) -> int:
-        """How many failures are said to be of a stage."""
+        """Number of failures that the rules assign to a stage."""
         return sum(self.counts.get((scripted, stage), 0) for scripted in FailureStage)
 
     def recall(self, stage: FailureStage) -> float | None:

@@ -171,7 +171,7 @@ class Pi05Model(TrainableModel):
 
 
 def prompts(tasks: Sequence[str], state: torch.Tensor) -> list[str]:
-    """What pi0.5 reads, from instructions and normalised states [B, 64] (`Pi05PrepareStateTokenizerProcessorStep`)."""
+    """Prompts of pi0.5 from instructions and normalised states [B, 64] (`Pi05PrepareStateTokenizerProcessorStep`)."""
     edges = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
     bins = np.digitize(state.reshape(len(tasks), -1).float().cpu().numpy(), bins=edges) - 1
     texts = [task.strip().replace("_", " ").replace("\n", " ") for task in tasks]
