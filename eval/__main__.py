@@ -286,11 +286,6 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
         return 0
     if options.ray is not None:
         _before_ray()
-    if options.estimate is not None:
-        from arena_newton.eval.bench import suite_timing
-
-        return suite_timing.run(call, factories)
-    if options.ray is not None:
         from arena_newton.eval.suites import ray_suite
 
         return ray_suite.run(call, factories)
