@@ -12,6 +12,10 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import benchmarks  # noqa: E402, F401  before the package takes the root of a checkout off the path
+
+sys.path.remove(str(ROOT))
 SHARED = Path(os.environ.get("ARENA_REFERENCE", ROOT.parent / "shared"))
 
 if sys.dont_write_bytecode:
