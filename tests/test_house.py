@@ -263,3 +263,14 @@ def test_a_class_name_names_one_thing():
     described = {"Judge", "Physics", "Policy", "Tracker"}
     doubled = {name: found for name, found in homes.items() if len(found) > 1 + (name in described)}
     report([f"{where}: {name}" for name, found in doubled.items() for where in found])
+
+
+def test_few_tests_are_long():
+    """At most twenty tests wait for `pytest -m release`."""
+    marks = [
+        f"{path.relative_to(ROOT)}: {line}"
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        for line in path.read_text().splitlines()
+        if re.search(r"\bmark\.release$|marks=.*\bmark\.release\b", line)
+    ]
+    assert len(marks) <= 20, marks
