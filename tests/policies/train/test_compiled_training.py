@@ -26,12 +26,8 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(autouse=True)
 def narrow(monkeypatch):
-    """A vision encoder that trains in milliseconds, in one thread."""
+    """A vision encoder that trains in milliseconds."""
     narrow_network.install(monkeypatch.setattr)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture

@@ -45,20 +45,10 @@ from tests.policies.train.small_dataset import info, make_dataset, padded
 STEPS = 8
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Work this small is slower in two threads, on a busy machine by far."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(autouse=True)
 def narrow(monkeypatch):
     """A vision encoder that trains in milliseconds."""
     narrow_network.install(monkeypatch.setattr)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
 def options(data, out, **changes):
