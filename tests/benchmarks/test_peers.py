@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.policies.lerobot.resnet_weights import find_resnet
+from arena_newton.policies.train.families.resnet_weights import find_resnet
 from benchmarks import __main__ as benches
 from benchmarks import peers
 from benchmarks.__main__ import BENCHES, main

@@ -8,10 +8,9 @@ from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot import pretrained_weights
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import training
-from arena_newton.policies.train.families import families
+from arena_newton.policies.train.families import families, pretrained_weights
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from tests.policies.train.small_dataset import info
 
