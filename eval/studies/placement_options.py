@@ -11,7 +11,7 @@ __all__ = ["AdversaryOptions", "PlacementOptions", "SensitivityOptions"]
 
 @dataclass(frozen=True)
 class PlacementOptions:
-    """What is played at every placement."""
+    """Options of the episodes at every placement."""
 
     task: str = ""
     """Task whose placements are moved."""

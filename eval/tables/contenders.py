@@ -1,4 +1,4 @@
-"""What is compared, read from results folders and suites: policies with their episodes, alike in what must be alike."""
+"""Policies of a comparison with their episodes, alike in what must be alike."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from arena_newton.files.text import counted, plain_text
 __all__ = ["CONDITIONS", "MOST_CONTENDERS", "ContenderSet", "PlayedEpisode", "read_contenders"]
 
 CONDITIONS = ("rules", "engine", "max_steps", "variant", "fast_physics")
-"""What must be alike in everything that is compared, unless it is what is compared (`--differ`)."""
+"""Conditions that must be alike in everything that is compared, unless they are compared (`--differ`)."""
 NOTED = ("device", "drive", "labels", "replan", "ensemble", "latency_ticks")
-"""What may differ; every value is named."""
+"""Conditions that may differ; every value is named."""
 HASHED = {"rules_hash": "The rules", "scenes": "The scenes"}
-"""What is known by its content, of the tasks of a run; that it differs is named."""
+"""Contents that belong to the tasks of a run, known by their hashes; a difference is named."""
 NOT_GIVEN = "not given"
-"""How a condition is shown that a run leaves open."""
+"""Text for a condition that a run leaves open."""
 USUAL = {"labels": "v3.1"}
-"""What a run had that does not say it."""
+"""Values of a run that does not say them."""
 MOST_CONTENDERS = 12
 """Policies of one comparison: 66 pairs, whose page is of some megabytes."""
 
@@ -108,7 +108,7 @@ class ContenderSet:
     alike: tuple[tuple[str, str], ...]
     """Conditions that all share, by name."""
     notes: tuple[str, ...]
-    """What a reader must know besides the figures."""
+    """Sentences for a reader besides the figures."""
 
 
 def read_contenders(
@@ -204,7 +204,7 @@ def _check_sample(run: RunRecord, notes: list[str]) -> None:
 
 
 def _conditions(cell: SuiteCell) -> tuple[str, ...]:
-    """What tells cells of one policy of a suite apart, besides task, tracker and mode.
+    """Conditions that tell cells of one policy of a suite apart, besides task, tracker and mode.
 
     Checkpoints of one policy, each executed by the tracker of its training, are one contender.
     """

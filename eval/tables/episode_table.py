@@ -88,16 +88,16 @@ class EvaluatedCell:
 
     @property
     def merged(self) -> bool:
-        """Whether the policy was trained on several tasks or through several trackers at once."""
+        """True if the policy was trained on several tasks or through several trackers at once."""
         return len(self.trained_tasks) > 1 or len(self.trained_on) > 1
 
     @property
     def matched(self) -> bool:
-        """Whether it was executed by the tracker of its training, or needs none."""
+        """True if the tracker of its training executed it, or it needs none."""
         return self.trained_on in ((), (self.tracker,))
 
     def held(self, outcome: str = "success") -> dict[Hashable, bool]:
-        """Whether each episode ended so, by group seed and repeat; a task and these two decide an episode's start."""
+        """True for each episode that ended so, by group seed and repeat; a task and these two decide its start."""
         if self.tallied is not None:
             return dict(self.tallied[outcome])
         return {(record.group_seed, record.repeat): record.outcome == outcome for record in self.records}
@@ -211,7 +211,7 @@ def _tracker_order(name: str) -> tuple[bool, str]:
 
 
 def _facts(given: Json) -> Mapping[str, Json]:
-    """What a checkpoint says of itself, in what its policy said: on top of it, or as its `facts`."""
+    """Facts of a checkpoint in those of its policy: on top of them, or as its `facts`."""
     if not isinstance(given, dict):
         return {}
     inner = given.get("facts")
@@ -267,7 +267,7 @@ def code_notes(runs: Iterable[RunRecord]) -> list[str]:
 
 
 def error_note(cells: Iterable[EvaluatedCell]) -> str:
-    """How many episodes ended with an error, and how they count; empty without one."""
+    """Number of episodes that ended with an error, in a sentence; empty without one."""
     outcomes = [record.outcome for cell in cells for record in cell.records]
     errors = outcomes.count("error")
     said = f"{counted(errors, 'episode')} of {len(outcomes)} ended with an error; they count as no success."

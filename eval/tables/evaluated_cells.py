@@ -36,7 +36,7 @@ class CellSet:
     cells: tuple[EvaluatedCell, ...]
     rules: str
     notes: tuple[str, ...]
-    """What a reader of the tables must know besides them."""
+    """Sentences for a reader of the tables."""
     changed: tuple[str, ...] = ()
     """Reasons for which these episodes are no results of the benchmark: cut step budgets, a variant of the scene."""
 
@@ -162,7 +162,7 @@ def _of_row(
 
 
 def _conditions(cells: Sequence[PlayedCell]) -> list[str]:
-    """What ran, and what went wrong, in sentences."""
+    """Conditions of the runs, and errors, in sentences."""
     runs, found = runs_of(cells), []
     for name in NAMED:
         values = sorted({shown(run.config.get(name)) for run in runs if name in run.config})
