@@ -57,7 +57,7 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 MOST_ANY = 35
 ANY = {
     "arena_newton/differentiable/kernel_gradients.py": "a context of autograd keeps whatever it is given",
-    "arena_newton/files/foreign.py": "NumPy's dtypes",
+    "arena_newton/files/untrusted_files.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/physics/policy_view.py": "a view has the attributes of what it shows",
     "arena_newton/cli/registry.py": "what a maker takes is its own business",
