@@ -48,7 +48,7 @@ PLANNING = ("eval.plan.config", "eval.folders.run_folder", *(f"tasks.{name}" for
 imported by name."""
 LATE = {
     "arena_newton.doctor": "it reports libraries that do not import",
-    "arena_newton.files.probe": "its other process imports only the library that it tries",
+    "arena_newton.files.sandboxed_load": "its other process imports only the library that it tries",
     "arena_newton.cli.quiet": "light modules call it before they import Warp",
 }
 """Other modules that import heavy libraries inside functions, and why."""
