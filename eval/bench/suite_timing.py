@@ -32,7 +32,7 @@ from arena_newton.eval.bench.suite_estimate import (
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.flag_checks import RAY_FLAGS
-from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.reports.wording import markdown_table
 from arena_newton.eval.suites.matrix_cells import check_policies, run_options
@@ -77,8 +77,8 @@ class _Timing:
     def __init__(self, call: SuiteCall, factories: Factories | None, folder: Path):
         self.call, self.suite, self.options = call, call.suite, call.options
         self.given, self.folder = factories, folder
-        self.keeper = EnvironmentKeeper()
-        self.factories = factories or Factories(env=self.keeper)
+        self.env_cache = EnvCache()
+        self.factories = factories or Factories(env=self.env_cache)
         self.installed = doctor.versions()
         self.cells = {cell.id: cell for cell in call.cells if cell.id in set(call.chosen)}
         self.specs: dict[str, str] = {}
@@ -170,7 +170,7 @@ class _Timing:
                 found.append(one)
                 print(f"[{number}/{len(sample)}] {size.name}: about {_time(one.seconds)}", flush=True)
         finally:
-            self.keeper.drop()
+            self.env_cache.drop()
         return found
 
     def _measure(
@@ -179,7 +179,7 @@ class _Timing:
         spec = self._spec(cell)
         if not warm:  # kernels are compiled, libraries loaded
             self._seconds(cell, spec, worlds, ticks[0])
-            self.keeper.drop()
+            self.env_cache.drop()
         cold, short, long = (self._seconds(cell, spec, worlds, n) for n in (ticks[0], ticks[0], ticks[1]))
         per_tick = max(0.0, long - short) / (ticks[1] - ticks[0])
         startup = rule_sets.get(cell.rules).startup.ticks
