@@ -15,7 +15,7 @@ from ray.exceptions import RayError
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.play.run import Factories, RunStopped
-from arena_newton.eval.play.whole_run import Group, begun, reported
+from arena_newton.eval.play.run_flow import Group, begun, reported
 from arena_newton.eval.records.journal import Journal, StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.suites.suite_call import SuiteCall

@@ -29,7 +29,7 @@ from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import RAY_FLAGS
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.play.whole_run import Group, RunStopped
+from arena_newton.eval.play.run_flow import Group, RunStopped
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress

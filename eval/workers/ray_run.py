@@ -20,7 +20,7 @@ from ray.exceptions import RayError
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.run_folder import BREAK_FILE, ResultsFolder, iso
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.play.whole_run import (
+from arena_newton.eval.play.run_flow import (
     Group,
     RunStopped,
     begun,

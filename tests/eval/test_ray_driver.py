@@ -10,7 +10,7 @@ from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import RunStopped, check_parts
-from arena_newton.eval.play.whole_run import begun, progress_of
+from arena_newton.eval.play.run_flow import begun, progress_of
 from arena_newton.eval.records.journal import Journal, read_journal
 from arena_newton.eval.workers.slice_events import Ended, Slice
 from arena_newton.eval.workers.slice_player import play
