@@ -44,9 +44,7 @@ COMMANDS = (
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
     Command("policies serve", "arena_newton.policies.serve.__main__", "serve a policy: openpi, vla-eval, HTTP"),
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
-    Command(
-        "policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; bench, teachable"
-    ),
+    Command("policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; teachable"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),

@@ -18,9 +18,9 @@ from arena_newton.cli.command_line import exit_code, program
 from arena_newton.cli.flags import folders_named, parse_flags, user_path
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.door_options import DoorOptions
+from arena_newton.eval.commands import bench
 from arena_newton.eval.commands.pack_options import PackOptions
 from arena_newton.eval.plan.options import (
-    BenchOptions,
     CertifyOptions,
     FilmOptions,
     LoopOptions,
@@ -286,11 +286,6 @@ def _matrix(arguments: list[str], factories: Factories | None) -> int:
         return 0
     if options.ray is not None:
         _before_ray()
-    if options.estimate is not None:
-        from arena_newton.eval.bench import suite_timing
-
-        return suite_timing.run(call, factories)
-    if options.ray is not None:
         from arena_newton.eval.suites import ray_suite
 
         return ray_suite.run(call, factories)
@@ -317,10 +312,7 @@ def _adversary(arguments: list[str], factories: Factories | None) -> int:
 
 
 def _bench(arguments: list[str], factories: Factories | None) -> int:
-    options = parse_flags(BenchOptions, arguments, f"{PROG} bench")
-    from arena_newton.eval.bench import bench
-
-    return bench.run(options)
+    return bench.run(parse_flags(bench.BenchOptions, arguments, f"{PROG} bench"))
 
 
 def _doors(arguments: list[str], factories: Factories | None) -> int:

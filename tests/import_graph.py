@@ -23,12 +23,14 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 PACKAGE = "arena_newton"
-ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4}
-"""Folder → level; a module imports from its own level and from those below. Scenes stand next to the world: the world
+BENCHMARKS = "benchmarks"
+"""Measurements outside of the package: they import everything, and nothing imports them."""
+ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4, BENCHMARKS: 6}
+"""Folder → level; a module imports from its own level and from those below. Scenes are next to the world: the world
 reads their files with their checks, their authors load a scene to look at it."""
 INNER = {
     f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
-        | certification studies loop | commands | bench | __main__""",
+        | certification studies loop bench | commands | __main__""",
     f"{PACKAGE}.eval.certification": "stand_ins | context | finding | claims | checks | certificate jobs",
     PACKAGE: """errors | files | cli | robot | interfaces rules | kernel_cache tasks | physics | rule_sets | pictures
         | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
@@ -71,13 +73,13 @@ class Module:
     @property
     def room(self) -> str:
         """Top-level folder."""
-        second = self.name.split(".")[1] if "." in self.name else ""
-        return second if second in ROOMS else PACKAGE
+        parts = self.name.split(".")
+        return next((part for part in (parts[0], *parts[1:2]) if part in ROOMS and part != PACKAGE), PACKAGE)
 
     @property
     def level(self) -> int:
-        """Level of the room; the front door is above all."""
-        return max(ROOMS.values()) + 1 if self.name == FRONT_DOOR else ROOMS[self.room]
+        """Level of the room; the front door is above all rooms of the package."""
+        return ROOMS["eval"] + 1 if self.name == FRONT_DOOR else ROOMS[self.room]
 
 
 def modules(root: Path) -> dict[str, Module]:
@@ -88,7 +90,7 @@ def modules(root: Path) -> dict[str, Module]:
             parts = path.relative_to(root).with_suffix("").parts
             if room == PACKAGE and len(parts) > 1 and parts[1] in ROOMS:
                 continue  # the link to another room
-            parts = parts if parts[0] == PACKAGE else (PACKAGE, *parts)
+            parts = parts if parts[0] in (PACKAGE, BENCHMARKS) else (PACKAGE, *parts)
             name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
             text = path.read_text(encoding="utf-8")
             found[name] = Module(name, path, ast.parse(text))

@@ -13,7 +13,6 @@ from arena_newton.cli.flags import folders_named, parse_flags
 from arena_newton.data.datasets.data_options import (
     BuildOptions,
     CleanOptions,
-    DatasetBenchOptions,
     InspectOptions,
     MergeOptions,
     SplitOptions,
@@ -87,13 +86,6 @@ COMMANDS: dict[str, DataCommand] = {
         purpose="show episodes as one page: figures, phases, curves, film strips",
         options=InspectOptions,
         work="checks.inspection:inspect",
-    ),
-    "bench": DataCommand(
-        words="bench <dataset> [--recordings <recordings> ...] | <recordings> --made 100",
-        purpose="measure random reads, and the time that building and verifying take",
-        options=DatasetBenchOptions,
-        work="checks.dataset_bench:bench",
-        extra="data",
     ),
 }
 """By name, in the order of a dataset's life."""

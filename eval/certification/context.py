@@ -27,7 +27,7 @@ from arena_newton.rules import seeding
 
 __all__ = ["CertifyCell", "Context", "with_expert"]
 
-QUICK_EPISODES = 4
+QUICK_EPISODES = 2
 """Episodes of each cell under --quick."""
 FULL_EPISODES = 60
 """Episodes of each cell otherwise: the protocol's."""

@@ -170,6 +170,8 @@ def contradiction(record: EpisodeRecord) -> str | None:
     if record.outcome == "success":
         if record.margin is not None and record.margin < 0.0:
             return f"a success with a margin of {record.margin:g}"
+        if record.progress is not None and record.progress < 1.0:
+            return f"a success with a progress of {record.progress:g}"
         if last != record.steps:
             return f"a success at step {record.steps}, whose last predicate held first at {last}"
     elif record.outcome == "timeout" and record.reason == "timeout" and record.steps != record.max_steps:

@@ -30,9 +30,6 @@ from arena_newton.files.text import counted
 
 __all__ = ["SuiteCall", "plan_call"]
 
-MOST_PROCESSES = 9_999
-"""Processes of one estimate, as many as a plan has shards; each is a place in a queue."""
-
 
 @dataclass(frozen=True)
 class SuiteCall:
@@ -70,10 +67,6 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
-    if options.estimate and min(options.estimate) < 1:
-        raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
-    if options.estimate and max(options.estimate) > MOST_PROCESSES:
-        raise InputError(f"--estimate {max(options.estimate)}: expected at most {MOST_PROCESSES:,}")
     check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit {options.limit}: expected at least 1")
@@ -86,7 +79,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     try:
         checked = {c.id: c for c in check_policies(suite, [cell for cell in cells if cell.id in chosen])}
     except InputError as error:
-        if not options.dry_run and options.estimate is None:  # which show the matrix first, or need no checkpoint
+        if not options.dry_run:  # which shows the matrix first
             raise
         problem = error
     return SuiteCall(

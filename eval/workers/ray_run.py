@@ -11,7 +11,7 @@ import dataclasses
 import shlex
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -42,7 +42,7 @@ from arena_newton.robot.g1 import TICK
 if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
 
-__all__ = ["DealtRun", "execute", "round_seconds"]
+__all__ = ["DealtRun", "execute"]
 
 BATCHES = 2
 """Most episodes of a slice, in batches of --worlds."""
@@ -81,29 +81,6 @@ def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
         return _played_by(pool, folder)
     finally:
         pool.dismiss()
-
-
-def round_seconds(folders: Sequence[ResultsFolder], number: int, factories: Factories | None) -> list[float] | None:
-    """Time of each of several runs that so many processes play one after the other, each run as a whole [s].
-
-    Returns:
-        None where the cluster has no room for as many processes.
-    """
-    config = folders[0].config
-    found = []
-    with in_cluster(config.flags.ray or ()):
-        pool = WorkerPool(config, number, factories)
-        try:
-            if pool.room() < number:
-                return None
-            for folder in folders:
-                began = time.perf_counter()
-                if not _played_by(pool, folder):
-                    raise KeyboardInterrupt
-                found.append(time.perf_counter() - began)
-        finally:
-            pool.dismiss()
-    return found
 
 
 def _played_by(pool: WorkerPool, folder: ResultsFolder) -> bool:

@@ -364,10 +364,6 @@ class WorkerPool:
             self._end(worker)
             worker.again_at = math.inf
 
-    def room(self) -> int:
-        """Processes that the cluster holds now."""
-        return sum(map(self._room, _resources()))
-
     def _grow(self, nodes: list[dict[str, float]]) -> None:
         """Ask for as many processes as there is room for now, or as --ray-actors says."""
         wanted = self._flags.ray_actors or max(1, sum(map(self._room, nodes)))

@@ -32,12 +32,6 @@ from arena_newton.policies.lerobot.encoder_sources import (
     read_tokenizer,
     tokenizer_from,
 )
-from arena_newton.policies.lerobot.pretrained_weights import (
-    check_safetensors,
-    checksum,
-    read_safetensors,
-    weights_folder,
-)
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
@@ -47,6 +41,12 @@ from arena_newton.policies.train.families.policy_model import (
     finished,
     new_policy,
     prepared,
+)
+from arena_newton.policies.train.families.pretrained_weights import (
+    check_safetensors,
+    checksum,
+    read_safetensors,
+    weights_folder,
 )
 from arena_newton.policies.train.families.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 from arena_newton.policies.train.frames.feature_scaling import Stats

@@ -12,13 +12,13 @@ import torchvision
 from torch import nn
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot.pretrained_weights import (
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
+from arena_newton.policies.train.families.pretrained_weights import (
     PATIENCE,
     check_safetensors,
     read_safetensors,
     weights_folder,
 )
-from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 
 __all__ = ["check_resnet", "find_resnet", "load_resnet"]
 
