@@ -55,7 +55,7 @@ class SpeedFigure:
     memory: float
     """Most memory of the device that torch held [GB]; 0 on the CPU."""
     graphed: bool
-    """Whether a step was a CUDA graph."""
+    """True if a step was a CUDA graph."""
 
 
 def bench_recipe(options: TrainingBenchOptions) -> TrainingRecipe:

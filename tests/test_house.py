@@ -49,7 +49,7 @@ PLANNING = ("eval.plan.config", "eval.folders.run_folder", *(f"tasks.{name}" for
 imported by name."""
 LATE = {
     "arena_newton.doctor": "it reports libraries that do not import",
-    "arena_newton.files.probe": "its other process imports only the library that it tries",
+    "arena_newton.files.sandboxed_load": "its other process imports only the library that it tries",
     "arena_newton.cli.quiet": "light modules call it before they import Warp",
 }
 """Other modules that import heavy libraries inside functions, and why."""
@@ -58,7 +58,7 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 MOST_ANY = 35
 ANY = {
     "arena_newton/differentiable/kernel_gradients.py": "a context of autograd keeps whatever it is given",
-    "arena_newton/files/foreign.py": "NumPy's dtypes",
+    "arena_newton/files/untrusted_files.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/physics/policy_view.py": "a view has the attributes of what it shows",
     "arena_newton/cli/registry.py": "what a maker takes is its own business",

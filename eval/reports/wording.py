@@ -113,7 +113,7 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
 
 
 def environment_facts(facts: Mapping[str, Json]) -> list[tuple[str, str]]:
-    """What an environment said of itself, in words: engine, physics rate, drive, start-up and the rest."""
+    """Environment's own description, in words: engine, physics rate, drive, start-up and the rest."""
     left = dict(facts)
     found: list[tuple[str, str]] = [(name, plain(left.pop(name))) for name in ("engine", "device") if name in left]
     dt, substeps = left.pop("physics_dt", None), left.pop("substeps", None)

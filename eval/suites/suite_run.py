@@ -18,7 +18,7 @@ from arena_newton.eval.folders.run_folder import ResultsFolder, iso, setting
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.flag_checks import RAY_FLAGS
 from arena_newton.eval.plan.suite_options import MatrixOptions
-from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunStopped, execute
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.journal import StorageError
@@ -67,9 +67,9 @@ class CellPlayer:
         self, suite: SuiteFile, folder: SuiteFolder, options: MatrixOptions, factories: Factories | None, *, again: str
     ):
         self.suite, self.folder, self.options, self.again = suite, folder, options, again
-        self.keeper = EnvironmentKeeper()
+        self.env_cache = EnvCache()
         self.given = factories
-        self.factories = factories or Factories(env=self.keeper)
+        self.factories = factories or Factories(env=self.env_cache)
         self.installed = doctor.versions()
         self.configs: dict[str, RunConfig] = {}
         self.devices: dict[str, str] = {}
@@ -99,7 +99,7 @@ class CellPlayer:
         try:
             return all(self._play_cell(name, number, todo) for number, name in enumerate(todo))
         finally:
-            self.keeper.drop()
+            self.env_cache.drop()
 
     def _kept(self, chosen: Sequence[str]) -> str:
         done = sum(self.folder.plan.cell(name).status == "done" for name in chosen)
@@ -239,7 +239,7 @@ class CellPlayer:
             code, error = 2, caught
         wall = time.perf_counter() - began
         if code:
-            self.keeper.drop()  # what broke off in it may have left it in any state
+            self.env_cache.drop()  # what broke off in it may have left it in any state
         return self.ended(name, code, error, wall, todo[number + 1 :])
 
     def silence(self) -> contextlib.AbstractContextManager[object]:

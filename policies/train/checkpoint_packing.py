@@ -19,8 +19,8 @@ import torch
 from safetensors.torch import save
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import create
 from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.untrusted_files import create
 from arena_newton.policies.learned.card_check import training_entries
 from arena_newton.policies.learned.learned_card import CARD_FILE, CARD_PAGE, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import (

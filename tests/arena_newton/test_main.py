@@ -21,7 +21,7 @@ def test_every_program_of_the_package_has_a_command():
     """What `python -m` runs has a command; builders, examples, processes of commands and front doors aside."""
     doors = {
         "arena_newton/__main__.py",
-        "arena_newton/files/probe.py",
+        "arena_newton/files/sandboxed_load.py",
         "arena_newton/data/recording/film_process.py",
         "policies/train/frames/decoder_process.py",
         "trackers/__main__.py",
