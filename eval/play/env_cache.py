@@ -47,11 +47,7 @@ class EnvCache:
         key = (task, type(tracker), description, tuple(sorted(options.items(), key=lambda item: item[0])))
         if self._env is None or self._key != key:
             self.drop()
-<<<<<<< HEAD:eval/play/env_cache.py
-            self._env = CachedEnv(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
-=======
             self._env = self._kind(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
->>>>>>> 630e0015d6cd4bd97748e24d86d826b39871a2fd:eval/play/lasting_env.py
             self._key, self.built = key, self.built + 1
         return self._env
 

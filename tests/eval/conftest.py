@@ -50,9 +50,9 @@ class Keepers(defaultdict):
 @pytest.fixture(scope="session")
 def kept_worlds():
     """Environments that all files share."""
-    from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+    from arena_newton.eval.play.env_cache import EnvCache
 
-    keepers = Keepers(EnvironmentKeeper)
+    keepers = Keepers(EnvCache)
     yield keepers
     keepers.drop()
 
@@ -62,10 +62,10 @@ def watched_worlds():
     """Environments that all files share and that keep a hash of every tick."""
     from watched import LastingWatchedEnv
 
-    from arena_newton.eval.play import lasting_env
+    from arena_newton.eval.play import env_cache
 
     def keeper():
-        return lasting_env.EnvironmentKeeper(LastingWatchedEnv)
+        return env_cache.EnvCache(LastingWatchedEnv)
 
     keepers = Keepers(keeper)
     yield keepers

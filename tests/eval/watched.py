@@ -7,7 +7,7 @@ import numpy as np
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.plan import episode_plan
-from arena_newton.eval.play.lasting_env import LastingEnv
+from arena_newton.eval.play.env_cache import CachedEnv
 from arena_newton.interfaces import Recorder
 from arena_newton.rollout import Rollout
 
@@ -36,7 +36,7 @@ class WatchedEnv(ArenaEnv):
         return status
 
 
-class LastingWatchedEnv(LastingEnv, WatchedEnv):
+class LastingWatchedEnv(CachedEnv, WatchedEnv):
     """A watched environment that is handed out again."""
 
 
