@@ -25,13 +25,13 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.bench.bench_figure import BenchFigure
 from arena_newton.eval.bench.bench_learned import learned_figures
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.bench_peers import peer_items
 from arena_newton.eval.bench.bench_policy import policy_figures
 from arena_newton.eval.bench.bench_recording import recording_figures
 from arena_newton.eval.bench.bench_start import start_figures
 from arena_newton.eval.bench.bench_tick import RATES, tick_times
 from arena_newton.eval.plan import episode_plan
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.rollout import Rollout

@@ -14,12 +14,12 @@ import warp as wp
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.bench_tick import RATES, network_seconds, tick_times
 from arena_newton.eval.bench.peer_camera import camera_figures
 from arena_newton.eval.bench.peer_lerobot_eval import lerobot_eval_figures
 from arena_newton.eval.bench.peer_pairs import add_to_history, device_name, processor_name, versions
 from arena_newton.eval.bench.peer_tracker_training import tracker_training_figures
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.files.own_processes import environment
 
 __all__ = ["new_vision_weights", "peer_items", "training_speeds"]

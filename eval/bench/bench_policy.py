@@ -16,8 +16,8 @@ from arena_newton.cli.extras import require
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.plan import episode_plan
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.interfaces import Policy
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.recipes.training_recipe import FAMILIES

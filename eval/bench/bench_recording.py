@@ -13,9 +13,10 @@ from arena_newton.data.recording.demonstration import DemonstrationRecorder
 from arena_newton.data.recording.disturbed_execution import ActionNoise
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.plan import episode_plan
 from arena_newton.eval.plan.config import recorded_cameras
-from arena_newton.eval.plan.options import BenchOptions, RunOptions
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import recording
 from arena_newton.interfaces import Recorder
 from arena_newton.pictures.settings import CameraConfig

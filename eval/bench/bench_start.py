@@ -22,7 +22,7 @@ from arena_newton.cli.quiet import quiet_warp
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError
 from arena_newton.eval.bench.bench_figure import BenchFigure
-from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.kernel_cache import kernel_loading
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import STAND_ACTION

@@ -14,8 +14,8 @@ from pxr import Usd, UsdGeom
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.pictures.camera import CAMERA_PRIMS, Camera
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.tasks.base import LightDraw

@@ -19,11 +19,11 @@ from arena_newton.cli.extras import require
 from arena_newton.cli.flags import user_path
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.files.own_processes import environment
 from arena_newton.policies.learned.learned_card import SHIPPED, shipped_card
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder

@@ -16,7 +16,7 @@ import warp as wp
 
 import arena_newton
 from arena_newton.eval.bench.bench_figure import BenchFigure
-from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.eval.bench.bench_options import BenchOptions
 
 __all__ = ["NEEDS_CUDA", "PEERS", "add_to_history", "device_name", "median_speeds", "processor_name", "versions"]
 

@@ -20,8 +20,8 @@ import torch
 from arena_newton.cli.extras import require
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench.bench_figure import BenchFigure
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.trackers.motions.library import MotionLibrary
 from arena_newton.trackers.motions.programs import random_clips
 

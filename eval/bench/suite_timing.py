@@ -31,7 +31,7 @@ from arena_newton.eval.bench.suite_estimate import (
 )
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig, resolve
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS
+from arena_newton.eval.plan.options import Ray, flags_of
 from arena_newton.eval.play.lasting_env import EnvironmentKeeper
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.reports.wording import markdown_table
@@ -201,7 +201,7 @@ class _Timing:
         from arena_newton.eval.workers.ray_run import round_seconds
 
         cell = self.cells[one.size.name]
-        spec, flags = self._spec(cell), {name: getattr(self.options, name) for name in ("ray", *RAY_FLAGS)}
+        spec, flags = self._spec(cell), {name: getattr(self.options, name) for name in flags_of(Ray)}
         rounds: dict[int, tuple[float, ...]] = {}
         for number in (2, 1):  # first two: there may be no room for them
             count = worlds[cell.id] * number

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
@@ -172,7 +172,7 @@ def _check_ranges(options: PolicyTrainOptions | TrainingBenchOptions | Teachable
             low, high = one.metadata["range"]
             value = getattr(options, one.name)
             if value is not None and not (low <= value <= high and math.isfinite(value)):
-                flag = "--" + one.name.replace("_", "-")
+                flag = flag_name(one.name)
                 until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise InputError(f"{flag} {value}: expected a number {until}")
 

@@ -7,8 +7,8 @@ import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.bench_tick import network_seconds
-from arena_newton.eval.plan.options import BenchOptions
 from arena_newton.policies.lerobot.resnet_weights import find_resnet
 
 

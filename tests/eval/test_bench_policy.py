@@ -9,7 +9,7 @@ import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench import bench_learned, bench_policy, bench_start
-from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe

@@ -17,6 +17,7 @@ from arena_newton.cli.flags import parse_flags
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.failures import HELD_OUT, LEAST, TUNED, confusion, failures
 from arena_newton.eval.certification.checks.labelled_failures import (
     LABELLED,
@@ -40,7 +41,7 @@ from arena_newton.eval.folders.failure_rules import BARS, near_bars, sees_at_sta
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.folders.results import OWN_FOLDER, load_run
 from arena_newton.eval.plan.interaction import INTERACTIONS
-from arena_newton.eval.plan.options import CertifyOptions, RunOptions
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.interaction_view import InteractionView
 from arena_newton.eval.play.own_tracker import own_options
 from arena_newton.eval.play.run import Factories

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from arena_newton.eval.bench import peer_camera
-from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.eval.bench.bench_options import BenchOptions
 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="draws 1024 worlds there")

@@ -8,8 +8,8 @@ import pytest
 
 from arena_newton.errors import ArenaError
 from arena_newton.eval.bench import peer_lerobot_eval
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.peer_lerobot_eval import lerobot_eval_figures
-from arena_newton.eval.plan.options import BenchOptions
 
 
 class _Programs:

@@ -9,8 +9,8 @@ import pytest
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench import peer_tracker_training
+from arena_newton.eval.bench.bench_options import BenchOptions
 from arena_newton.eval.bench.peer_tracker_training import MjlabTraining, tracker_training_figures
-from arena_newton.eval.plan.options import BenchOptions
 
 FAKE = """#!{python}
 import json, os, sys
