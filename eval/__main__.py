@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from arena_newton.cli.command_line import exit_code
-from arena_newton.cli.commands import HELP, Command, call, overview
+from arena_newton.cli.command_table import HELP, CommandRow, call, overview
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,38 +20,40 @@ if TYPE_CHECKING:
 
 __all__ = ["COMMANDS", "main"]
 
-RUNS = {"takes": "<out> [<out> ...]", "noun": "the results folder"}
+RUNS = ("<out> [<out> ...]", "the results folder")
 COMMANDS = {
-    "run": Command("evaluate (flags below); `run` may be left out"),
-    "resume": Command(
-        "continue a run: finished episodes are kept, flags that change the results refused", "<out>", RUNS["noun"]
+    "run": CommandRow("evaluate (flags below); `run` may be left out"),
+    "resume": CommandRow(
+        "continue a run: finished episodes are kept, flags that change the results refused", "<out>", RUNS[1]
     ),
-    "merge": Command(
+    "merge": CommandRow(
         "join the folders of run --shard 1/16 ... 16/16", "<out> [<out> ...]", "the folders of the shards"
     ),
-    "record": Command("record demonstrations for datasets, or more cameras with --from <out>"),
-    "report": Command("write tables and report again from the journal; one table of several runs", **RUNS),
-    "film": Command("one success per task as a film or a picture", **RUNS),
-    "tables": Command("the paper's tables from suites and runs, next to the paper's numbers", **RUNS),
-    "compare": Command("compare policies by their episodes: tests, intervals, who won which", **RUNS),
-    "tsne": Command(
+    "record": CommandRow("record demonstrations for datasets, or more cameras with --from <out>"),
+    "report": CommandRow("write tables and report again from the journal; one table of several runs", *RUNS),
+    "film": CommandRow("one success per task as a film or a picture", *RUNS),
+    "tables": CommandRow("the paper's tables from suites and runs, next to the paper's numbers", *RUNS),
+    "compare": CommandRow("compare policies by their episodes: tests, intervals, who won which", *RUNS),
+    "tsne": CommandRow(
         "map what one policy answers to the observations of two datasets", extras={"plots": (), "data": ("pyarrow",)}
     ),
-    "pack": Command(
+    "pack": CommandRow(
         "make a trained policy the one that ships: half precision, a card, 32 MB",
         "<checkpoint>",
         "the checkpoint, or the folder of a training",
     ),
-    "list": Command("show the plan of a run, run nothing"),
-    "loop": Command("record, build, train, evaluate, report: the whole loop"),
-    "matrix": Command(
+    "list": CommandRow("show the plan of a run, run nothing"),
+    "loop": CommandRow("record, build, train, evaluate, report: the whole loop"),
+    "matrix": CommandRow(
         "play policies x trackers x tasks x modes as one plan that can be continued", "<suite>", "the suite file"
     ),
-    "sensitivity": Command("map success and margin over the placements of a task", extras={"plots": ("matplotlib",)}),
-    "adversary": Command("search the placement at which a policy does worst"),
-    "bench": Command("measure this machine against the figures to reach"),
-    "doors": Command("one checkpoint through lerobot-eval and each served protocol, compared"),
-    "certify": Command("prove the benchmark: checks, a certificate, an exit code"),
+    "sensitivity": CommandRow(
+        "map success and margin over the placements of a task", extras={"plots": ("matplotlib",)}
+    ),
+    "adversary": CommandRow("search the placement at which a policy does worst"),
+    "bench": CommandRow("measure this machine against the figures to reach"),
+    "doors": CommandRow("one checkpoint through lerobot-eval and each served protocol, compared"),
+    "certify": CommandRow("prove the benchmark: checks, a certificate, an exit code"),
 }
 """By name, as the overview lists them."""
 

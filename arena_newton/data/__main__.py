@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from arena_newton.cli.command_line import exit_code
-from arena_newton.cli.commands import HELP, Command, call, overview
+from arena_newton.cli.command_table import HELP, CommandRow, call, overview
 from arena_newton.data.datasets.data_options import (
     BuildOptions,
     CleanOptions,
@@ -23,52 +23,52 @@ __all__ = ["COMMANDS", "main"]
 
 
 COMMANDS = {
-    "clean": Command(
+    "clean": CommandRow(
         takes="<recordings> [<recordings> ...] --out <folder>",
         purpose="drop rows that a stalled or jumping source spoiled",
         options=CleanOptions,
         work="datasets.cleaning:clean",
     ),
-    "build": Command(
+    "build": CommandRow(
         takes="<recordings> [<recordings> ...] --out <dataset>",
         purpose="make a LeRobot v3.0 dataset of recorded episodes",
         options=BuildOptions,
         work="datasets.lerobot_dataset:build",
         extras={"data": ()},
     ),
-    "verify": Command(
+    "verify": CommandRow(
         takes="<dataset> [--recordings <recordings> ...]",
         purpose="check a dataset number by number and frame by frame, and against its recordings",
         options=VerifyOptions,
         work="checks.verification:verify",
         extras={"data": ()},
     ),
-    "merge": Command(
+    "merge": CommandRow(
         takes="<dataset> <dataset> [<dataset> ...] --out <dataset>",
         purpose="make one dataset of several; pictures are copied as they are",
         options=MergeOptions,
         work="datasets.sets:merge",
         extras={"data": ()},
     ),
-    "split": Command(
+    "split": CommandRow(
         takes="<datasets or recordings ...> --out-train <folder> --out-held-out <folder>",
         purpose="hold out episodes by their seeds",
         options=SplitOptions,
         work="datasets.sets:split",
     ),
-    "stats": Command(
+    "stats": CommandRow(
         takes="<datasets or recordings ...>",
         purpose="print figures of episodes, and those unlike the others",
         options=StatsOptions,
         work="checks.episode_figures:stats",
     ),
-    "inspect": Command(
+    "inspect": CommandRow(
         takes="<datasets or recordings ...> --out <page.html>",
         purpose="show episodes as one page: figures, phases, curves, film strips",
         options=InspectOptions,
         work="checks.inspection:inspect",
     ),
-    "bench": Command(
+    "bench": CommandRow(
         takes="<dataset> [--recordings <recordings> ...] | <recordings> --made 100",
         purpose="measure random reads, and the time that building and verifying take",
         options=DatasetBenchOptions,

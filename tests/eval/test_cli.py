@@ -14,7 +14,7 @@ from eval_fakes import factories
 
 from arena_newton import rule_sets, tasks
 from arena_newton.cli.command_line import exit_code
-from arena_newton.cli.commands import Command
+from arena_newton.cli.command_table import CommandRow
 from arena_newton.cli.flags import parse_flags, words
 from arena_newton.errors import InputError
 from arena_newton.eval import commands
@@ -283,7 +283,7 @@ def test_a_new_command_is_its_file_and_its_row(tmp_path, monkeypatch, capsys):
         "    return 7\n"
     )
     monkeypatch.setattr(commands, "__path__", [*commands.__path__, str(tmp_path)])
-    monkeypatch.setitem(COMMANDS, "greet", Command("say hello", "<out> [<out> ...]", "the results folder"))
+    monkeypatch.setitem(COMMANDS, "greet", CommandRow("say hello", "<out> [<out> ...]", "the results folder"))
     assert main(["greet", "a", "b", "--times", "2"]) == 7
     assert capsys.readouterr().out == "['a', 'b', 'a', 'b']\n"
     assert main(["greet", "--times", "2"]) == main(["greet", "a", "a"]) == main(["greet", "a", "--time", "x"]) == 2
@@ -292,7 +292,7 @@ def test_a_new_command_is_its_file_and_its_row(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit):
             main(typed)
         assert shown in capsys.readouterr().out
-    monkeypatch.setitem(COMMANDS, "greet", Command("say hello", "<out>", extras={"data": ("nosuch",)}))
+    monkeypatch.setitem(COMMANDS, "greet", CommandRow("say hello", "<out>", extras={"data": ("nosuch",)}))
     assert main(["greet", "a"]) == 2
     assert "eval greet: needs the extra [data] (nosuch" in capsys.readouterr().err
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 from arena_newton.cli.command_line import program
 
-__all__ = ["HELP", "Command", "call", "overview"]
+__all__ = ["HELP", "CommandRow", "call", "overview"]
 
 HELP = ("-h", "--help")
 
 
 @dataclass(frozen=True)
-class Command:
+class CommandRow:
     """One command: a line of the overview, what it is given, and the module that does it."""
 
     purpose: str
@@ -31,7 +31,7 @@ class Command:
     """Extras that it needs, with the modules that it needs of them; none named: all."""
 
 
-def overview(area: str, commands: Mapping[str, Command]) -> str:
+def overview(area: str, commands: Mapping[str, CommandRow]) -> str:
     """A line per command."""
     rows = {f"{name} {one.takes or '[flags]'}": one.purpose for name, one in commands.items()}
     width = max(map(len, rows))
@@ -39,7 +39,7 @@ def overview(area: str, commands: Mapping[str, Command]) -> str:
     return "\n".join(["commands:", *(f"  {prog} {words:<{width}}  {purpose}" for words, purpose in rows.items())])
 
 
-def call(area: str, name: str, command: Command, arguments: list[str], **more: object) -> int:
+def call(area: str, name: str, command: CommandRow, arguments: list[str], **more: object) -> int:
     """Parse what was typed after a command's name, and do its work.
 
     A module with a function `defaults` says by the folders which values flags have that are not given.
