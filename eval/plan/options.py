@@ -21,7 +21,7 @@ __all__ = [
     "Batch",
     "Chunks",
     "Conditions",
-    "Simulation",
+    "Stepping",
     "Ray",
     "RecordOptions",
     "Recording",
@@ -105,7 +105,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Simulation:
+class Stepping:
     """Rate and length of the simulation."""
 
     fast_physics: bool = False
@@ -220,9 +220,7 @@ class _Plan:
 
 
 @dataclass(frozen=True)
-class RunOptions(
-    Remote, Output, Ray, Viewer, Recording, Pictures, Simulation, Batch, _Plan, Conditions, Chunks, Tested
-):
+class RunOptions(Remote, Output, Ray, Viewer, Recording, Pictures, Stepping, Batch, _Plan, Conditions, Chunks, Tested):
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
     Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
@@ -286,7 +284,7 @@ class _Demonstrations:
 
 
 @dataclass(frozen=True)
-class RecordOptions(Output, Ray, Simulation, Batch, _Demonstrations, Conditions, Tested):
+class RecordOptions(Output, Ray, Stepping, Batch, _Demonstrations, Conditions, Tested):
     """Record demonstrations: episodes as files, of which `python -m arena_newton.data build` makes a dataset.
 
     Seeds are of a range of their own, which no evaluation plays. `python -m arena_newton.eval resume <out>` continues.

@@ -7,7 +7,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import OWN_FOLDER
 from arena_newton.eval.folders.run_folder import stored_options
-from arena_newton.eval.plan.options import Batch, Conditions, RunOptions, Simulation, flags_of
+from arena_newton.eval.plan.options import Batch, Conditions, RunOptions, Stepping, flags_of
 
 __all__ = ["own_options"]
 
@@ -31,6 +31,6 @@ def own_options(folder: Path, tracker: str) -> RunOptions:
         raise InputError(f"{where}: {folder} was played through it; name the tracker that the policy was trained with")
     if (folder / OWN_FOLDER).is_symlink():
         raise InputError(f"{where}: {folder / OWN_FOLDER} is a link; a run writes inside its own folder only")
-    groups = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Simulation))
+    groups = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping))
     same = {name: getattr(stored, name) for name in ("task", "seeds", "repeats", *groups)}
     return RunOptions(**same | {"tracker": (tracker,), "policy": f"replay:{actions}", "out": str(folder / OWN_FOLDER)})

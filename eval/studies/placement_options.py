@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from arena_newton.cli.flags import Several
-from arena_newton.eval.plan.options import Batch, Chunks, Simulation
+from arena_newton.eval.plan.options import Batch, Chunks, Stepping
 
 __all__ = ["PlacementOptions"]
 
@@ -35,5 +35,5 @@ class _Placements:
 
 
 @dataclass(frozen=True)
-class PlacementOptions(Chunks, Simulation, Batch, _Placements):
+class PlacementOptions(Chunks, Stepping, Batch, _Placements):
     """Run behind a study of placements."""
