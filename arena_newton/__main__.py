@@ -26,7 +26,7 @@ class Command:
     """One command, with flags and subcommands of its own."""
 
     words: str
-    """What is typed, such as `trackers evaluate`."""
+    """Words as typed, such as `trackers evaluate`."""
     module: str
     """Module whose `main` takes the arguments and returns the exit code."""
     purpose: str
@@ -40,9 +40,7 @@ COMMANDS = (
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
     Command("policies serve", "arena_newton.policies.serve.__main__", "serve a policy: openpi, vla-eval, HTTP"),
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
-    Command(
-        "policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; bench, teachable"
-    ),
+    Command("policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; teachable"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),

@@ -57,7 +57,7 @@ class ReplayDataset(RecordedEpisodes):
         self._tracker, self._read = "", dict[int, np.ndarray]()
 
     def _all(self) -> None:
-        """Which of our episodes are recorded."""
+        """Find the recorded ones among our episodes."""
         for number, seed in enumerate(self.dataset.seeds()):
             if seed.task not in task_registry.names():
                 raise InputError(f"{self.dataset.where}: arena: episode {number}: no task {seed.task[:80]!r}")

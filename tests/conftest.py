@@ -8,10 +8,16 @@ import tomllib
 from pathlib import Path
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+# Two threads that wait for each other on a busy machine make small networks a hundred times slower, in children too.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import benchmarks  # noqa: E402, F401  before the package takes the root of a checkout off the path
+
+sys.path.remove(str(ROOT))
 SHARED = Path(os.environ.get("ARENA_REFERENCE", ROOT.parent / "shared"))
 
 if sys.dont_write_bytecode:

@@ -43,17 +43,6 @@ SAYS = {
 """Example → what its output holds."""
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Two threads that wait for each other on a busy machine make small networks a hundred times slower."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def test_every_example_is_run():
     """No example is without a test, and no test without its example."""
     assert {path.stem for path in EXAMPLES} == set(SHORT) == set(SAYS)

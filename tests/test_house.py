@@ -13,6 +13,7 @@ import pytest
 from arena_newton import tasks
 from arena_newton.eval.__main__ import COMMANDS
 from tests.import_graph import (
+    BENCHMARKS,
     INNER,
     PACKAGE,
     Module,
@@ -104,7 +105,7 @@ def test_imports_have_no_circle():
 
 
 def test_imports_run_one_way():
-    """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval."""
+    """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval, benchmarks."""
     report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in upward(EDGES, KNOWN)])
 
 
@@ -123,8 +124,21 @@ def test_rooms_are_small():
     assert count[ROOT / "eval"] <= 2 and count[ROOT / PACKAGE] <= 9
 
 
+def test_the_page_of_rooms_names_each():
+    """`docs/design/rooms.md` lists the rooms of each folder from the bottom to the top, and the names at its places."""
+    page = (ROOT / "docs" / "design" / "rooms.md").read_text()
+    packages = {module.name for module in KNOWN.values() if module.path.name == "__init__.py"}
+    for folder in (PACKAGE, f"{PACKAGE}.data", f"{PACKAGE}.policies", f"{PACKAGE}.eval"):
+        title = folder.replace(".", "/") if folder.endswith("data") else f"{folder.split('.')[-1]}/"
+        listed = re.findall(r"^\| `(\w+)` \|", page.split(f"### `{title}`")[1].split("\n#")[0], flags=re.MULTILINE)
+        groups = [[p for p in part.split() if f"{folder}.{p}" in packages] for part in INNER[folder].split("|")]
+        assert listed == [name for group in groups for name in sorted(group, key=[*listed, *group].index)], folder
+    for file, name in re.findall(r"\]\(../../(\S+)\): `(\w+)`", page):
+        assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), f"{file}: no {name}"
+
+
 def private(name: str) -> bool:
-    """Whether a name is one module's own."""
+    """True if a name is one module's own."""
     return name.startswith("_") and not name.startswith("__")
 
 
@@ -133,7 +147,7 @@ def test_private_names_stay_at_home():
     found = []
     for module in KNOWN.values():
         for statement, _ in statements(module.tree):
-            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(PACKAGE):
+            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, BENCHMARKS)):
                 names = [a.name for a in statement.names if private(a.name)]
                 found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
         nodes = list(ast.walk(module.tree))
@@ -145,7 +159,7 @@ def test_private_names_stay_at_home():
         for statement, _ in statements(module.tree):
             source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
             for alias in statement.names:
-                if not (source or alias.name).startswith(PACKAGE):
+                if not (source or alias.name).startswith((PACKAGE, BENCHMARKS)):
                     strangers.add((alias.asname or alias.name).split(".")[0])
         inherited = {"_replace", "_asdict"}
         for node in nodes:
@@ -190,7 +204,7 @@ def light() -> set[str]:
         if not edge.late:
             following[edge.source].add(edge.target)
     found: set[str] = set()
-    todo = [f"{PACKAGE}.{start}" for start in STARTS + PLANNING]
+    todo = [f"{BENCHMARKS}.__main__", *(f"{PACKAGE}.{start}" for start in STARTS + PLANNING)]
     while todo:
         name = todo.pop()
         if name not in found:
@@ -252,3 +266,14 @@ def test_a_class_name_names_one_thing():
     described = {"Judge", "Physics", "Policy", "Tracker"}
     doubled = {name: found for name, found in homes.items() if len(found) > 1 + (name in described)}
     report([f"{where}: {name}" for name, found in doubled.items() for where in found])
+
+
+def test_few_tests_are_long():
+    """At most twenty tests wait for `pytest -m release`."""
+    marks = [
+        f"{path.relative_to(ROOT)}: {line}"
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        for line in path.read_text().splitlines()
+        if re.search(r"\bmark\.release$|marks=.*\bmark\.release\b", line)
+    ]
+    assert len(marks) <= 20, marks

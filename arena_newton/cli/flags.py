@@ -109,7 +109,7 @@ def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | 
 
 
 def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
-    """What is wrong with arguments that tyro refuses: each flag with its values is given to it alone.
+    """Fault of arguments that tyro refuses: each flag with its values is given to it alone.
 
     tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
     """

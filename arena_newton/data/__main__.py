@@ -10,7 +10,6 @@ from arena_newton.cli.command_table import HELP, CommandRow, call, overview
 from arena_newton.data.datasets.data_options import (
     BuildOptions,
     CleanOptions,
-    DatasetBenchOptions,
     InspectOptions,
     MergeOptions,
     SplitOptions,
@@ -67,13 +66,6 @@ COMMANDS = {
         purpose="show episodes as one page: figures, phases, curves, film strips",
         options=InspectOptions,
         work="checks.inspection:inspect",
-    ),
-    "bench": CommandRow(
-        takes="<dataset> [--recordings <recordings> ...] | <recordings> --made 100",
-        purpose="measure random reads, and the time that building and verifying take",
-        options=DatasetBenchOptions,
-        work="checks.dataset_bench:bench",
-        extras={"data": ()},
     ),
 }
 """By name, in the order of a dataset's life."""

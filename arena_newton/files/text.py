@@ -50,7 +50,7 @@ def _clean(text: str, mark: str, marks: Collection[str]) -> str:
 
 
 def is_printable(text: str) -> bool:
-    """Whether a text has no control characters, unpaired surrogates or marks that turn its direction."""
+    """True if a text has no control characters, unpaired surrogates or marks that turn its direction."""
     return text.isprintable() or _clean(text, "", _TURNING) == text
 
 

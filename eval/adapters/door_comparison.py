@@ -26,7 +26,6 @@ from arena_newton.cli.extras import require
 from arena_newton.cli.flags import user_path
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
-from arena_newton.eval.adapters.picture_differences import picture_rows, picture_table
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
@@ -127,10 +126,6 @@ def run(options: DoorOptions) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
-    pictures = ""
-    if options.pictures:
-        pictures = picture_table(picture_rows(options, checkpoint))
-        print(pictures, flush=True)
     plays = []
     for door in doors:
         plays.append(_play(door, options, checkpoint, out / door))
@@ -142,7 +137,7 @@ def run(options: DoorOptions) -> int:
     said = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
     text = door_table(rows, options.first)
     commands = "\n".join(f"- {row.door}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
-    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n" + (f"\n{pictures}" if pictures else ""))
+    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n")
     facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": [asdict(row) for row in rows]}
     write_atomic(out / "doors.json", json.dumps(facts, indent=2) + "\n")
     print(f"\n{said}\n\n{text}")

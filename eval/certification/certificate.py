@@ -35,7 +35,7 @@ MEANING = {
 
 
 class Facts(TypedDict):
-    """What was certified."""
+    """Facts about the certified benchmark."""
 
     tasks: list[str]
     without_expert: list[str]
@@ -124,7 +124,7 @@ def _said(facts: Facts) -> list[tuple[str, str]]:
 
 
 def _warnings(facts: Facts) -> list[str]:
-    """What limits the certificate as a whole."""
+    """Limits of the certificate as a whole."""
     found = []
     if facts["quick"]:
         found.append(f"--quick: {facts['episodes']} episodes of each cell, so the intervals are wide.")

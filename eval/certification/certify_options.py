@@ -30,7 +30,7 @@ class CertifyOptions:
     semantic execution physics camera rules engines batches official shards ray swap visible sill failures statistics
     gradients; all when none is named."""
     episodes: int | None = None
-    """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
+    """Episodes of each cell: 60, the protocol's, or 2 under --quick."""
     worlds: int = 20
     """Episodes simulated at once."""
     engine: str = "mujoco"

@@ -1,4 +1,4 @@
-"""What the checks of one certification share: what to measure, and evaluations that are resumed instead of repeated."""
+"""Context that the checks of one certification share: what to measure, and evaluations to resume instead of repeat."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from arena_newton.rules import seeding
 
 __all__ = ["CertifyCell", "Context", "with_expert"]
 
-QUICK_EPISODES = 4
+QUICK_EPISODES = 2
 """Episodes of each cell under --quick."""
 FULL_EPISODES = 60
 """Episodes of each cell otherwise: the protocol's."""
@@ -75,7 +75,7 @@ class CertifyCell:
 
 @dataclass
 class Context:
-    """What the checks measure with."""
+    """Context of the checks."""
 
     options: CertifyOptions
     folder: Path
@@ -192,7 +192,7 @@ class Context:
         settings: Mapping[str, Json],
         measure: Callable[[], Json],
     ) -> Json:
-        """What a measurement gave that is no evaluation; taken from the folder where the same was measured before.
+        """Value of a measurement that is no evaluation; read from the folder where the same was measured before.
 
         Args:
             name: Name of the measurement, unique for a task and tracker; it becomes a file's.

@@ -1,4 +1,4 @@
-"""What a check is and what it finds: records that the page, the JSON and the console say in their own ways."""
+"""Checks and their findings: records that the page, the JSON and the console show in their own ways."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class CheckFinding:
-    """What a check measured and what follows from it."""
+    """Measurement of a check and its conclusion."""
 
     verdict: Verdict
     summary: str
-    """What it measured, in one line."""
+    """Measurement in one line."""
     sheets: tuple[Sheet, ...] = ()
     notes: tuple[str, ...] = ()
-    """What a reader must know besides the numbers: causes, exceptions, limits."""
+    """Notes for a reader besides the numbers: causes, exceptions, limits."""
     pictures: tuple[Picture, ...] = ()
     claim: str = ""
     """Words for the line of the claim itself."""

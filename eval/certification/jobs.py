@@ -25,13 +25,13 @@ __all__ = ["Piece", "command_line", "flags", "play_ahead"]
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """What one process plays."""
+    """Part that one process plays."""
 
     checks: tuple[str, ...]
     tasks: tuple[str, ...]
     trackers: tuple[str, ...]
     cores: bool = True
-    """Whether it keeps to cores of its own."""
+    """True if it keeps to cores of its own."""
 
     def __str__(self) -> str:
         """Names of checks, tasks and trackers."""

@@ -148,7 +148,7 @@ class _Study:
 
 @dataclasses.dataclass(frozen=True)
 class _Found:
-    """What the search came to."""
+    """Result of the search."""
 
     axes: tuple[Axis, ...]
     mean: tuple[int, int]

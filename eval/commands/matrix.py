@@ -27,11 +27,6 @@ def run(files: Sequence[Path], options: MatrixOptions, factories: Factories | No
         return 0
     if options.ray is not None:
         before_ray()
-    if options.estimate is not None:
-        from arena_newton.eval.bench import suite_timing
-
-        return suite_timing.run(call, factories)
-    if options.ray is not None:
         from arena_newton.eval.suites import ray_suite
 
         return ray_suite.run(call, factories)

@@ -46,7 +46,7 @@ SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f
 RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
 """Flags that all episodes of a folder share, though they change none of them."""
 BREAK_FILE = "break.txt"
-"""Where the trace of a break is kept for who looks into it."""
+"""File with the trace of a break, for a later look."""
 
 
 def results_folder(out: str | None, shard: Shard | None = None) -> Path:
@@ -267,7 +267,7 @@ class ResultsFolder:
         return plain
 
     def hashes(self, tracker: str, environment: JsonObject) -> dict[str, str | None]:
-        """What a journal line names its run by, given the tracker and what the episode's environment said of itself."""
+        """Names of a journal line's run, from the tracker and the environment's own description."""
         config = self.config
         return {
             "config": self.document["config_hash"],

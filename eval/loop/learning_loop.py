@@ -44,7 +44,7 @@ from arena_newton.policies.train.policy_options import PolicyTrainOptions, check
 __all__ = ["LOOP_FILE", "LoopParts", "held", "resolved", "run"]
 
 LOOP_FILE = "loop.json"
-"""What was asked, and which stages are finished."""
+"""Options of the loop, and its finished stages."""
 LOCK_FILE = "loop.lock"
 """Locked while a process works in the folder."""
 FORMAT = 1
@@ -52,12 +52,12 @@ FORMAT = 1
 RECORD_WORLDS = {True: 100, False: 20}
 """Episodes simulated at once, with CUDA and without."""
 FULL = {"episodes": 100, "repeats": 20, "recipe": "fast", "size": "224x224"}
-"""What is left open in a loop."""
+"""Options that a loop leaves open."""
 SMALL_STEPS = 20
 """Optimizer steps of a small loop."""
 SMALL = {"episodes": 3, "repeats": 1, "recipe": "small", "size": "64x64", "max_steps": 60, "worlds": 3}
 SMALL |= {"steps": SMALL_STEPS}
-"""What is left open in one that only tries the machinery."""
+"""Options that a loop leaves open which only tries the machinery."""
 UNRESOLVED = ("out",)
 """Flags that may differ when a loop goes on."""
 
@@ -78,7 +78,7 @@ def _check_training(options: PolicyTrainOptions) -> int:
 
 @dataclass(frozen=True)
 class LoopParts:
-    """What the stages call; tests put their own in."""
+    """Calls of the stages; tests put their own in."""
 
     check: Callable[[PolicyTrainOptions], int] = _check_training
     """Refuses a training that cannot begin, and gives the bytes of its checkpoints."""

@@ -203,7 +203,7 @@ RATE_HEAD = ["task", "tracker", "mode", "successes", "SR %", "95 % Wilson", "fal
 
 
 def _facts(out: Path, loop: LoopRecord) -> list[tuple[str, str]]:
-    """What was recorded and trained, in words."""
+    """Recording and training in words."""
     found = []
     if (out / RECORDINGS / "config.json").is_file():
         recorded = load_run(out / RECORDINGS).records
@@ -226,7 +226,7 @@ def _facts(out: Path, loop: LoopRecord) -> list[tuple[str, str]]:
 
 
 def lines(out: Path, loop: LoopRecord) -> list[str]:
-    """What the command prints at its end: times and rates."""
+    """Last lines of the command: times and rates."""
     times = ", ".join(f"{name} {duration(stage.seconds)}" for name, stage in loop.stages.items())
     found = [f"time: {times}; together {duration(sum(stage.seconds for stage in loop.stages.values()))}"]
     for row in _rate_rows(load_run(out / EVALUATION)):

@@ -89,7 +89,7 @@ class RunConfig:
     flags: RunOptions
     """The flags with every default filled in and every path absolute."""
     episodes: tuple[episode_plan.Episode, ...]
-    """What is to be played: the plan, or its part that the shard has."""
+    """Episodes to play: the plan, or its part that the shard has."""
     planned: int
     """Episodes of the whole plan."""
     repeats: int
@@ -105,7 +105,7 @@ class RunConfig:
     video_size: tuple[int, int] | None
     """Size of the world camera's pictures [px]; None: the usual one."""
     policy_options: JsonObject
-    """What the policy is made with besides its spec."""
+    """Arguments of the policy besides its spec."""
     checkpoint_hashes: Mapping[str, str | None]
     """Weights by tracker."""
     policy_hash: str | None
@@ -126,14 +126,14 @@ class RunConfig:
     camera: CameraConfig | None = None
     """Camera that the policy asks for; None for one that does not see."""
     worlds_matter: bool = False
-    """Whether the policy depends on how many worlds ask at once; known when it was made and checked."""
+    """True if the policy depends on how many worlds ask at once; known when it was made and checked."""
     tracker_facts: JsonObject | None = None
     """`Tracker.describe()` by tracker, once the trackers are made."""
     policy_facts: JsonObject | None = None
     """`Policy.describe()` and, of one that takes the world itself, `privileged`, once the policy is made."""
 
     def identity(self) -> Identity:
-        """What the results depend on, by flag name; two runs with equal identity may share a results folder.
+        """Identity of the results, by flag name; two runs with equal identity may share a results folder.
 
         Videos, viewers, the folder and shards are absent: they do not change an episode. So is the number of worlds,
         except for a policy that depends on it. Files count by content. What each environment was built with and the
@@ -171,13 +171,13 @@ class RunConfig:
         }
 
     def _chunks(self) -> Identity:
-        """How chunks are executed, as far as it is not the usual: whole, at once, one after the other."""
+        """Execution of chunks, where it is not the usual: whole, at once, one after the other."""
         given = {name: getattr(self.flags, name) for name in flags_of(Chunks) if name != "labels"}
         return {name: value for name, value in given.items() if value}  # type: ignore[return-value]  # a part of one
 
     @property
     def width_rule(self) -> rounds.WidthRule | None:
-        """When a task, tracker and mode has enough episodes; None: when all are played."""
+        """Rule by which a task, tracker and mode has enough episodes; None: all are played."""
         flags = self.flags
         if flags.until_width is None:
             return None
@@ -189,7 +189,7 @@ class RunConfig:
         return {} if rule is None else {"until_width": rule.width, "max": rule.most}  # type: ignore[typeddict-item]
 
     def _demonstrations(self) -> Identity:
-        """What tells a run of `eval record` from an evaluation; nothing for one."""
+        """Identity of a run of `eval record` as against an evaluation; nothing for one."""
         if self.flags.series is None:
             return {}  # type: ignore[typeddict-item]  # a part of one
         scales = {task: self.noise_scale(task) for task in self.flags.task}
@@ -211,7 +211,7 @@ class RunConfig:
         return config_hash(self.identity())
 
     def stored_flags(self) -> JsonObject:
-        """What `resume` starts from: all flags but those of one call."""
+        """Flags that `resume` starts from: all flags but those of one call."""
         once = {field.name: field.default for field in dataclasses.fields(self.flags) if field.name in ONE_CALL}
         flags: JsonObject = json.loads(json.dumps(dataclasses.asdict(self.flags) | once))
         return flags
@@ -229,7 +229,7 @@ class RunConfig:
 
 
 def _facts(part: Tracker | Policy) -> JsonObject:
-    """What a tracker or policy says of itself as JSON, and the hash of its code where that is another package's."""
+    """Own description of a tracker or policy, and the hash of its code if it is of another package, as JSON."""
     code = own_code(part)
     return plain_facts(part.describe() | ({} if code is None else {"code": code}))
 
@@ -458,7 +458,7 @@ def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, 
 
 
 def _policy_options(options: RunOptions) -> JsonObject:
-    """What a policy is made with besides its spec."""
+    """Arguments of a policy besides its spec."""
     scheme = options.policy.partition(":")[0]
     if scheme == "remote":
         return {
@@ -480,7 +480,7 @@ def _shown(path: Path) -> str:
 
 
 def _decisive(scheme: str, path: Path) -> Path:
-    """What of a policy's path counts by content: of a training the checkpoint, of a dataset its description.
+    """Part of a policy's path that counts by content: of a training the checkpoint, of a dataset its description.
 
     The policy itself says the hash of the actions that it plays.
     """

@@ -142,7 +142,7 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
 
 
 def _done(out: Path, source: EpisodeFile, config: RunConfig) -> bool:
-    """Whether an earlier call wrote the episode with these cameras."""
+    """True if an earlier call wrote the episode with these cameras."""
     path = out / EPISODES / source.path.name
     try:
         if not path.is_file() or path.is_symlink():
@@ -161,7 +161,7 @@ def _done(out: Path, source: EpisodeFile, config: RunConfig) -> bool:
 
 
 def _checked(options: RecordOptions, key: tuple[str, ...], group: Sequence[EpisodeFile], made: Factories) -> RunConfig:
-    """How the episodes of a group are played: as they were recorded.
+    """Configuration with which the episodes of a group are played: as they were recorded.
 
     Raises:
         InputError: It was recorded with something else than what is installed here.
@@ -370,7 +370,7 @@ def _planned(number: int, file: EpisodeFile) -> RecordedEpisode:
 
 
 def _result(number: int, file: EpisodeFile) -> EpisodeResult:
-    """How the recorded episode ended."""
+    """Ending of the recorded episode."""
     return EpisodeResult(
         number, file.text("arena_outcome"), file.text("arena_reason"), file.rows, float(file.array("arena_margin"))
     )

@@ -1,4 +1,4 @@
-"""What a run is whoever plays its episodes: what is due, when it may count, the reports and the exit code of its end.
+"""Flow of a run, whoever plays its episodes: the pending episodes, when one counts, the reports and the exit code.
 
 No library of physics is loaded: a process that leaves the episodes to others needs none.
 """
@@ -126,7 +126,7 @@ def begun(
 def progress_of(
     config: RunConfig, ended: Mapping[int, EpisodeRecord], waiting: Mapping[Group, Sequence[Episode]]
 ) -> Progress:
-    """What shows how far the run is."""
+    """Progress of the run."""
     finished = sum(episode.max_steps for episode in config.episodes if episode.index in ended)
     coming = [episode.max_steps for group in waiting.values() for episode in group]
     return Progress(finished + sum(coming), planned=len(ended) + len(coming), finished=len(ended), done=finished)
@@ -159,7 +159,7 @@ def due(config: RunConfig, ended: Mapping[int, EpisodeRecord]) -> dict[Group, li
 
 
 def kept(config: RunConfig, records: Sequence[EpisodeRecord]) -> str:
-    """How many of the planned episodes are in the journal, in words."""
+    """Number of planned episodes in the journal, in words."""
     number = len({record.index for record in records})
     return f"{number} of {counted(len(config.episodes), 'episode')} kept"
 
@@ -205,7 +205,7 @@ def _ending(result: EpisodeRecord | EpisodeResult) -> tuple[str, str | None, int
 
 
 def _recorded(folder: ResultsFolder, records: Sequence[EpisodeRecord]) -> list[str]:
-    """What is said of the recorded episodes."""
+    """Lines on the recorded episodes."""
     if folder.config.recording is None:
         return []
     from arena_newton.eval.play import recording

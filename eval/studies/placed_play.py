@@ -40,7 +40,7 @@ class PlacedEpisode:
     point: int
     """Number of the placement."""
     episode: Episode
-    """What else is played there: seed, mode, budget."""
+    """Other parameters of the episode: seed, mode, budget."""
 
     @property
     def episode_seed(self) -> int:

@@ -145,7 +145,7 @@ def _ruled(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCell]:
 
 
 def _fields(cell: SuiteCell) -> dict[str, tuple[str, ...]]:
-    """What a selector compares, by its key."""
+    """Fields that a selector compares, by its key."""
     matched = "none" if cell.matched is None else str(cell.matched).lower()
     plain = {key: (str(getattr(cell, key)),) for key in SELECTORS if key not in ("trained_on", "matched")}
     return plain | {"trained_on": cell.trained_on or ("none",), "matched": (matched,)}
@@ -261,7 +261,7 @@ def _check_chunk(where: str, cell: SuiteCell, executed: int | None, predicted: i
 
 
 def _said(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, tuple[int | None, int | None]]:
-    """What the checkpoint of a spec says of itself, and of how many actions it executes and predicts at most.
+    """Facts of the checkpoint of a spec, and the largest numbers of actions that it executes and predicts.
 
     None for what it does not say, such as one that is somebody else's.
     """

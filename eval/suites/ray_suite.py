@@ -62,9 +62,9 @@ class _Cell:
     """Not yet in its journal."""
     job: Job
     opening: bool = False
-    """Whether a process opens it that has not been opened before."""
+    """True if a process opens it that has not been opened before."""
     dealt: DealtRun | None = None
-    """What is dealt out, once it has begun."""
+    """Run whose episodes are assigned, once it has begun."""
     held: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """Journal and status, while it is played."""
     error: ArenaError | None = None
@@ -73,7 +73,7 @@ class _Cell:
 
     @property
     def open(self) -> bool:
-        """Whether a process could be of use now."""
+        """True if a process could be of use now."""
         if self.ended or self.opening or self.error is not None:
             return False
         return self.dealt is None or self.dealt.waiting > 0
@@ -196,7 +196,7 @@ class _RayPlayer(CellPlayer):
         return sum(one.episodes if one.dealt is None else one.dealt.waiting for one in others)
 
     def _is_played(self, cell: _Cell) -> bool:
-        """Whether a process plays something of a cell, or is to."""
+        """True if a process plays something of a cell, or is to."""
         if cell.dealt is None:
             return False
         return cell.dealt.leased or (cell.error is None and cell.dealt.waiting > 0)

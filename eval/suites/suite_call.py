@@ -29,13 +29,10 @@ from arena_newton.files.text import counted
 
 __all__ = ["SuiteCall", "plan_call"]
 
-MOST_PROCESSES = 9_999
-"""Processes of one estimate, as many as a plan has shards; each is a place in a queue."""
-
 
 @dataclass(frozen=True)
 class SuiteCall:
-    """What a call is to play."""
+    """Cells and options of a call."""
 
     suite: SuiteFile
     options: MatrixOptions
@@ -69,10 +66,6 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
-    if options.estimate and min(options.estimate) < 1:
-        raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
-    if options.estimate and max(options.estimate) > MOST_PROCESSES:
-        raise InputError(f"--estimate {max(options.estimate)}: expected at most {MOST_PROCESSES:,}")
     check_ray(options)
     check_least(options, 1, "limit")
     cells = expand_cells(suite)
@@ -84,7 +77,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     try:
         checked = {c.id: c for c in check_policies(suite, [cell for cell in cells if cell.id in chosen])}
     except InputError as error:
-        if not options.dry_run and options.estimate is None:  # which show the matrix first, or need no checkpoint
+        if not options.dry_run:  # which shows the matrix first
             raise
         problem = error
     return SuiteCall(
@@ -109,6 +102,6 @@ def _out(options: MatrixOptions, suite: SuiteFile) -> Path:
 
 def _again(given: str, options: MatrixOptions) -> str:
     """The command that continues."""
-    once = ("limit", "dry_run", "estimate", "accept_changes", "accept_code", "retry_errors", "verbose")
+    once = ("limit", "dry_run", "accept_changes", "accept_code", "retry_errors", "verbose")
     again = dataclasses.replace(options, **{name: getattr(MatrixOptions, name) for name in once})
     return shell_command("arena_newton.eval", "matrix", given, *words(again))

@@ -27,11 +27,8 @@ class _Cells:
     this task of a Slurm array; slurm/4 where the array has not all 4."""
     dry_run: bool = False
     """Print the matrix and its size, and play nothing."""
-    estimate: tuple[int, ...] | None = None
-    """Measure a few cells of each kind for seconds, and print how long all of them take on so many devices (1 2 8 when
-    no number follows); nothing else is played. With --ray also what a second process costs the first."""
     keep_going: bool = False
-    """When a cell cannot be played, go on with the others and list it at the end."""
+    """Skip a cell that cannot be played, go on with the others and list it at the end."""
     accept_changes: bool = False
     """Cells that were played under other conditions are played again; what they hold is moved to <out>/.replaced."""
     accept_code: bool = False

@@ -73,7 +73,7 @@ class CellPlayer:
         self.installed = doctor.versions()
         self.configs: dict[str, RunConfig] = {}
         self.devices: dict[str, str] = {}
-        """Where the cells of this call are played."""
+        """Devices on which the cells of this call are played."""
         self.failed: list[tuple[str, str]] = []
         self.spent = self.done_ticks = 0.0
 
@@ -203,7 +203,7 @@ class CellPlayer:
         return names
 
     def _is_done(self, name: str) -> bool:
-        """Whether a cell is done; one whose results are gone is not."""
+        """True if a cell is done; one whose results are gone is not."""
         cell = self.folder.plan.cell(name)
         if cell.status != "done":
             return False
@@ -243,7 +243,7 @@ class CellPlayer:
         return self.ended(name, code, error, wall, todo[number + 1 :])
 
     def silence(self) -> contextlib.AbstractContextManager[object]:
-        """What a run prints is shown on --verbose only."""
+        """Context that hides the output of a run unless --verbose shows it."""
         return contextlib.nullcontext() if self.options.verbose else contextlib.redirect_stdout(io.StringIO())
 
     def begun(self, name: str, device: str) -> None:
@@ -307,7 +307,7 @@ class CellPlayer:
         return self.folder.plan.cell(name)
 
     def _line(self, cell: SuiteCell, wall: float, left: Sequence[str]) -> str:
-        """What is said of a cell that is done, and how long the others take."""
+        """Line about a cell that is done, with the time that the others take."""
         parts = [f"{cell.successes}/{cell.episodes} successes"]
         parts += [f"{counted(cell.errors, 'error')}"] if cell.errors else []
         parts.append(duration(wall))

@@ -73,7 +73,7 @@ class Job:
 
     folder: ResultsFolder
     opened: Opened | None = None
-    """What the first process says that has opened it."""
+    """Message of the first process that has opened it."""
     seconds: float = 0.0
     """Time that processes were busy with it, each with its part of a GPU where they are on one [s]."""
 
@@ -99,18 +99,18 @@ class Lease:
     """Episodes that have not ended, by number, in their order."""
     worlds: int
     level: int
-    """How often its episodes were running when a process was lost, up to a limit of who deals them out."""
+    """Number of times that its episodes were running when a process was lost, up to a limit that the caller sets."""
     size: int = 0
     """Episodes at its beginning."""
     built: bool = False
-    """Whether its environment was built, so that a loss says something of its episodes."""
+    """True once its environment was built: a loss is then evidence about its episodes."""
 
     def __post_init__(self) -> None:
         """Count the episodes."""
         self.size = len(self.left)
 
     def running(self) -> list[Episode]:
-        """What is running: the next episode starts as soon as a world is free."""
+        """Running episodes: the next episode starts as soon as a world is free."""
         return list(self.left.values())[: self.worlds] if self.built else []
 
 
@@ -121,7 +121,7 @@ class Lost:
     cause: str
     trace: str = ""
     with_node: bool = False
-    """Whether its machine left the cluster, for which no episode is to blame."""
+    """True if its machine left the cluster, for which no episode is to blame."""
 
 
 @dataclass(frozen=True)
@@ -138,14 +138,14 @@ class Member:
     rank: int = 0
     """Its number among the processes of its node."""
     pending: ObjectRef[object] | ObjectRefGenerator[Event] | None = None
-    """What it is to answer; None while it waits for work."""
+    """Pending answer; None while it waits for work."""
     since: float = 0.0
     """Monotonic time at which it was asked [s]."""
     job: Job | None = None
     """The run that it has opened, or is opening."""
     lease: Lease | None = None
     last: Group | None = None
-    """What its environment is of."""
+    """Group that its environment is made for."""
     until: float = math.inf
     """Monotonic time at which it is stopped if it has not answered [s]."""
     starts: int = 0
@@ -210,7 +210,7 @@ def _knock(address: str) -> None:
 
 @contextlib.contextmanager
 def _native_silence() -> Iterator[None]:
-    """What native code complains of goes nowhere: each attempt to reach a cluster that is not there is a line."""
+    """Discard messages of native code: each attempt to reach a cluster that is not there is a line."""
     sys.stderr.flush()
     kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -247,7 +247,7 @@ class Crew:
             raise InputError(f"{flag}: a process asks for {self._asked()}, {_shown(nodes)}")
         self.members: list[Member] = []
         self.shown: Progress | None = None
-        """Where losses are told of."""
+        """Progress that shows losses."""
         self._said = self._grown = time.monotonic()
         self._grow(nodes)
 
@@ -292,7 +292,7 @@ class Crew:
         member.pending = member.actor.play.options(num_returns="streaming").remote(part)
 
     def heard(self) -> Iterator[tuple[Job, Lease | None, Opened | Event | Done | Lost | ArenaError]]:
-        """What processes tell; waits a little for it. Those that are lost are replaced.
+        """Messages of the processes; waits a little for them. Lost processes are replaced.
 
         Yields:
             The run, the slice of it where one is played, and what is told: an error where another process could not
@@ -357,10 +357,6 @@ class Crew:
         for member in self.members:
             self._end(member)
             member.again_at = math.inf
-
-    def room(self) -> int:
-        """Processes that the cluster holds now."""
-        return sum(map(self._room, _resources()))
 
     def _grow(self, nodes: list[dict[str, float]]) -> None:
         """Ask for as many processes as there is room for now, or as --ray-actors says."""
@@ -443,7 +439,7 @@ class Crew:
             _print(f"  no process has begun: each asks for {self._asked()}, {_shown(_resources())}")
 
     def _late(self) -> float:
-        """When a process that begins something now is stopped [s]."""
+        """Deadline of a process that begins something now [s]."""
         return time.monotonic() + 60.0 * self._flags.ray_minutes
 
     def _room(self, node: dict[str, float]) -> int:
@@ -460,13 +456,13 @@ DIED = "it died"
 
 
 def _error(said: Broke) -> ArenaError | None:
-    """What playing again would not mend; None where it may."""
+    """Error that playing again would not mend; None where it may."""
     kinds = {"input": InputError, "storage": StorageError, "stop": RunStopped}
     return kinds[said.kind](said.message) if said.kind in kinds else None
 
 
 def _resources() -> list[dict[str, float]]:
-    """What each machine of the cluster has."""
+    """Resources of each machine of the cluster."""
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
@@ -476,7 +472,7 @@ def _shown(nodes: list[dict[str, float]]) -> str:
 
 
 def _lives(node: Node) -> bool:
-    """Whether a machine is in the cluster."""
+    """True if a machine is in the cluster."""
     return any(one["NodeID"] == node.name and one["Alive"] for one in ray.nodes())
 
 

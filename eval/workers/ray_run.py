@@ -11,7 +11,7 @@ import dataclasses
 import shlex
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -42,7 +42,7 @@ from arena_newton.robot.g1 import TICK
 if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
 
-__all__ = ["DealtRun", "execute", "round_seconds"]
+__all__ = ["DealtRun", "execute"]
 
 BATCHES = 2
 """Most episodes of a slice, in batches of --worlds."""
@@ -81,29 +81,6 @@ def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
         return _played_by(crew, folder)
     finally:
         crew.dismiss()
-
-
-def round_seconds(folders: Sequence[ResultsFolder], number: int, factories: Factories | None) -> list[float] | None:
-    """Time of each of several runs that so many processes play one after the other, each run as a whole [s].
-
-    Returns:
-        None where the cluster has no room for as many processes.
-    """
-    config = folders[0].config
-    found = []
-    with in_cluster(config.flags.ray or ()):
-        crew = Crew(config, number, factories)
-        try:
-            if crew.room() < number:
-                return None
-            for folder in folders:
-                began = time.perf_counter()
-                if not _played_by(crew, folder):
-                    raise KeyboardInterrupt
-                found.append(time.perf_counter() - began)
-        finally:
-            crew.dismiss()
-    return found
 
 
 def _played_by(crew: Crew, folder: ResultsFolder) -> bool:
@@ -212,12 +189,12 @@ class DealtRun:
 
     @property
     def leased(self) -> bool:
-        """Whether a process plays a slice."""
+        """True if a process plays a slice."""
         return any(one.lease is not None and one.lease.job is self.job for one in self.crew.members)
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to play."""
+        """True if nothing is left to play."""
         return not self.waiting and not self.leased
 
     def _fair(self) -> int:

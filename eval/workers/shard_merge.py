@@ -42,12 +42,12 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class MergedRun:
-    """What a merge wrote."""
+    """Result of a merge."""
 
     run: RunRecord
     results: Results
     notes: tuple[str, ...]
-    """What a reader must know besides the table."""
+    """Notes for a reader besides the table."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class _Kept:
 
     record: EpisodeRecord
     folder: Path
-    """Where it is from."""
+    """Folder that it is from."""
     others: tuple[Path, ...] = ()
     """Folders where the same came of it."""
 
@@ -222,7 +222,7 @@ def _joined(runs: Sequence[RunRecord]) -> tuple[list[_Kept], list[str]]:
 
 
 def _whole(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> bool:
-    """Whether the plan is played: every episode, or as many successes as were to be kept."""
+    """True if the plan is played: every episode, or as many successes as were to be kept."""
     document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
     document.pop("shard", None)
     return is_complete(RunRecord(runs[0].folder, document, [part.record for part in kept]))
@@ -242,7 +242,7 @@ def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
 
 
 def _outcome(record: EpisodeRecord) -> JsonObject:
-    """What came of an episode, without times of day, recordings and the libraries' versions."""
+    """Outcome of an episode, without times of day, recordings and the libraries' versions."""
     line = record.to_json()
     for key in (*TIMES, *PICTURES):
         del line[key]
@@ -252,7 +252,7 @@ def _outcome(record: EpisodeRecord) -> JsonObject:
 
 
 def _missing(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> str:
-    """Which shards are unfinished, and which are missing, in words."""
+    """Unfinished and missing shards, in words."""
     known = {part.record.index for part in kept}
     count = max((shard.count for shard in map(_shard, runs) if shard), default=0)
     keys = list(plan_numbers(runs[0].folder / CONFIG_FILE, runs[0].config)) if count else []

@@ -111,7 +111,7 @@ def _check_shared(path: Path) -> None:
 
 @contextlib.contextmanager
 def _alone_while_compiling(engine: str, device: str) -> Iterator[None]:
-    """Where kernels must be compiled, one process of a machine does it, and the others wait for its cache."""
+    """Let one process of a machine compile missing kernels while the others wait for its cache."""
     cache = Path(wp.config.kernel_cache_dir or ".")  # named once Warp has begun
     if not wp.config.kernel_cache_dir or not kernels_to_compile(cache, engine, device):
         yield

@@ -23,7 +23,7 @@ NOT_SHIPPED = (
     "--policy learned: no policy comes with this build; learned:<folder> takes one that `python -m arena_newton.eval "
     "pack` made, lerobot:<checkpoint> a checkpoint"
 )
-"""What is said where there is none."""
+"""Error where no policy is shipped."""
 FORMAT = 1
 """Version of the card."""
 MOST_CARD = 1 << 20
@@ -34,7 +34,7 @@ MOST_EPISODES = 10_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class CellResult:
-    """What a policy reached on one task, through one tracker, in one mode."""
+    """Result of a policy on one task, through one tracker, in one mode."""
 
     task: str
     tracker: str
@@ -62,7 +62,7 @@ class CellResult:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyCard:
-    """What a packed policy says of itself."""
+    """Card of a packed policy, which describes it."""
 
     tasks: tuple[str, ...]
     """Tasks that it is offered for; the default run shows the first."""
@@ -76,7 +76,7 @@ class PolicyCard:
     gpu_minutes: float = 0.0
     """Time of the training [min]."""
     device: str = ""
-    """Where it was trained."""
+    """Device of the training."""
     datasets: tuple[Mapping[str, object], ...] = ()
     """Of each dataset of its training: name, hash, episodes, frames."""
     command: str = ""

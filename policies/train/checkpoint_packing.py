@@ -41,7 +41,7 @@ MOST_BYTES = 32_000_000
 MIN_HALF_DIMS = 2
 """Tensors with fewer dimensions stay in float32: all together they are less than a hundredth of a network."""
 LATENT = "model.vae_encoder"
-"""How names begin of weights that only training uses."""
+"""Name prefix of weights that only training uses."""
 PRIVATE = {"device": "cpu", "repo_id": None, "pretrained_path": None, "use_vae": False}
 """Fields of `config.json` that say where it was trained, and of what is left out of the file."""
 UNTOLD = ("out", "resume", "device", "log_every", "save_every", "num_workers")

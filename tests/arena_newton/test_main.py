@@ -24,9 +24,7 @@ def test_every_program_of_the_package_has_a_command():
         "arena_newton/__main__.py",
         "arena_newton/files/probe.py",
         "arena_newton/data/recording/film_process.py",
-        "eval/bench/mjlab_training.py",
         "policies/train/frames/decoder_process.py",
-        "policies/train/measured_training.py",
         "trackers/__main__.py",
         "usd_scenes/g1/build.py",
     }

@@ -9,7 +9,6 @@ import json
 import re
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
 from test_matrix import SUITE, journals
@@ -211,14 +210,6 @@ def test_a_failing_cell_stops_or_is_passed(inline, suite, alone, tmp_path, capsy
     assert call(suite, out) == 0
 
 
-class Plodding(FakeEnv):
-    """A world in which nothing happens."""
-
-    def step(self, action, worlds=None):
-        self.tick[self.active] += 1
-        return np.zeros(self.worlds, np.int32)
-
-
 class Hasty(FakeEnv):
     """A world that breaks in every process."""
 
@@ -238,18 +229,6 @@ def test_a_cell_that_ends_every_process_is_passed(inline, suite, tmp_path, capsy
     assert {name.split("/")[2] for name in failed} == {"boxing"} and len(failed) == 3
     assert all("5 processes on host ended one after the other: RuntimeError: no room" in e for e in failed.values())
     assert {c.status for c in read_suite(out).cells if c.task == "football"} == {"done"}
-
-
-def test_an_estimate_measures_two_processes(inline, suite, tmp_path, capsys):
-    """With --ray one process and then two play rounds of the same work; without room for two something is assumed."""
-    suite.write_text(SUITE.replace('["boxing", "football"]', '"boxing"'))
-    for cores, said in ((2.0, "measured cells, two at once measured"), (1.0, "assumes that processes do not slow")):
-        fake = inline(cores=cores)
-        assert call(suite, tmp_path / "out", "--only", "policy=still", "--estimate", "2", env=Plodding) == 0
-        output = capsys.readouterr().out
-        assert said in output and ("two processes at once take" in output) == (cores == 2.0)
-        assert len({folder for _, folder in fake.opened}) == (8 if cores == 2.0 else 0)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

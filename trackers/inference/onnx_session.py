@@ -69,7 +69,7 @@ class OnnxSession(torch.nn.Module):
 
     @property
     def on_host(self) -> bool:
-        """Whether it computes on the CPU whatever the device of its rows: no CUDA graph can hold it then."""
+        """True if it computes on the CPU whatever the device of its rows: no CUDA graph can hold it then."""
         return self.twin is None
 
     def convert(self, device: torch.device) -> None:

@@ -68,7 +68,7 @@ class EpisodeFigures:
 
     @property
     def is_outlier(self) -> bool:
-        """Whether it is unlike the others of its task and tracker."""
+        """True if it is unlike the others of its task and tracker."""
         return self.score >= OUTLIER
 
 

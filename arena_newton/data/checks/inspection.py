@@ -68,7 +68,7 @@ class Curve:
     """As `polyline` takes them."""
     colour: int
     faint: bool = False
-    """Whether it is what was measured, drawn behind what was asked for."""
+    """True for the measured values, drawn behind the commanded ones."""
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class _Subject:
         return self.kind.columns(self.labels)
 
     def origin(self, index: int) -> Mapping[str, object]:
-        """What the block says about an episode."""
+        """Entry of an episode in the block `arena`."""
         episodes = self.arena.get("episodes") if self.arena else None
         found = episodes[index] if isinstance(episodes, list) and index < len(episodes) else {}
         return found if isinstance(found, dict) else {}
@@ -140,7 +140,7 @@ def _verified(files: DatasetFiles, recorded: Sequence[EpisodeFile], jobs: int) -
 
 
 def _subject(files: DatasetFiles) -> _Subject:
-    """Which layout and which labels a dataset has."""
+    """Layout and labels of a dataset."""
     info = files.root / "meta" / "info.json"
     given, arena = files.info.get("robot_type"), files.info.get("arena")
     if arena is not None and not isinstance(arena, dict):

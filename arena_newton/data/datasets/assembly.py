@@ -52,7 +52,7 @@ class Selection:
 
 
 def described(files: DatasetFiles) -> list[dict[str, object]] | None:
-    """What the block `arena` says of each episode; None in a dataset of others.
+    """Entry of each episode in the block `arena`; None in a dataset of others.
 
     Raises:
         InputError: It has another number of episodes, or one is no object.

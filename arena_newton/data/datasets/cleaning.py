@@ -64,7 +64,7 @@ the larger number, as the recorder has it."""
 
 @dataclass(frozen=True)
 class Rows:
-    """What the rules look at, row by row; None where a recording has no such field."""
+    """Fields that the rules read, row by row; None where a recording has no such field."""
 
     frame: np.ndarray | None
     """Frame index of the source, shape [T]."""
@@ -76,7 +76,7 @@ class Rows:
     step: float
     """Control step [s]."""
     fields: Mapping[str, str]
-    """Which field each was read from."""
+    """Name of the field that each was read from."""
 
 
 def broken_rules(rows: Rows, *, max_gap: int = 1, max_step: float = 2.5) -> dict[str, np.ndarray]:
@@ -236,7 +236,7 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
 
 
 def _is_rows(name: str, array: np.ndarray, count: int) -> bool:
-    """Whether an array has one entry per row."""
+    """True if an array has one entry per row."""
     once = name in ONCE or name.startswith(("episode_", "meta_"))
     if once or name.startswith("arena_vision_") and name.endswith(("_histogram", "_size")):
         return False

@@ -1,4 +1,4 @@
-"""What a LeRobot dataset of our episodes holds: features by name, from the arrays of an episode.
+"""Layout of a LeRobot dataset of our episodes: features by name, from the arrays of an episode.
 
 Three layouts. `arena` is that of the original's released data (protocol v3.1, or its authors' draft v4) and what our
 policies are trained on. `sonic` has the names of GR00T-WholeBodyControl's SONIC exporter
@@ -281,7 +281,7 @@ _MEANING: Mapping[str, Mapping[str, str]] = {
         "root_velocity_frame": "current_reference_base_frame",
     },
 }
-"""What the original's converter says of v3.1 (`write_v31_protocol_metadata`), and as much of v4."""
+"""Metadata that the original's converter writes for v3.1 (`write_v31_protocol_metadata`), and as much of it for v4."""
 
 
 def described_protocol(labels: str, trackers: list[str]) -> dict[str, object]:
@@ -310,7 +310,7 @@ def described_protocol(labels: str, trackers: list[str]) -> dict[str, object]:
 
 
 def described_slots(labels: str) -> dict[str, object]:
-    """Where state and action hold what, for the block `arena` of `meta/info.json`: [first, end] of each part."""
+    """Slots of state and action for the block `arena` of `meta/info.json`: [first, end] of each part."""
     slots = protocol(labels).slots
     return {
         "state": {name: [part.start, part.stop] for name, part in STATE.items()},

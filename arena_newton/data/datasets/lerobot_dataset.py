@@ -374,7 +374,7 @@ class _Closing:
 
 
 def _encoder(video: SourceVideo) -> RGBEncoderConfig:
-    """What LeRobot writes into `info.json` about the codec; nothing is encoded."""
+    """Encoder settings that LeRobot writes into `info.json`; nothing is encoded."""
     codec = dict(video.codec)
     known = {name: codec.pop(name) for name in ("vcodec", "g", "crf", "preset") if name in codec}
     return RGBEncoderConfig(**known, extra_options=codec)

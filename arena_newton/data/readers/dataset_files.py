@@ -52,7 +52,7 @@ def read_json(path: Path) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class VideoPart:
-    """Where the frames of an episode are."""
+    """Video file and time range with the frames of an episode."""
 
     path: Path
     first: int
@@ -195,7 +195,7 @@ class DatasetFiles:
         return found
 
     def video(self, row: EpisodeRow, key: str) -> VideoPart:
-        """Where the frames of an episode are.
+        """Video file and time range with the frames of an episode.
 
         Raises:
             InputError: The table does not say, or the file is absent.

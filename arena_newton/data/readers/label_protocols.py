@@ -47,7 +47,7 @@ MAX_RATE = 1e6
 
 @dataclass(frozen=True)
 class LabelProtocol:
-    """What the 40 numbers of an action mean."""
+    """Meaning of an action's 40 numbers."""
 
     name: str
     robot_type: str

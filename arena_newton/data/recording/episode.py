@@ -228,7 +228,7 @@ class EpisodeFile:
             raise InputError(f"{self.path}: num_frames is {self.rows}, expected 1 to {MAX_ROWS}")
 
     def __contains__(self, name: str) -> bool:
-        """Whether the file has that array."""
+        """True if the file has that array."""
         return name in self.names
 
     def load(self, names: Iterable[str]) -> None:

@@ -33,7 +33,7 @@ def key_frames(height: int) -> int:
 
 @dataclass(frozen=True)
 class FilmFacts:
-    """What a finished film holds."""
+    """Facts about a finished film."""
 
     width: int
     """[px]."""

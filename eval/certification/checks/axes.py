@@ -212,13 +212,13 @@ def _range(bounds: tuple[float, float] | None) -> str:
 
 
 def _fills(low: float, high: float, bounds: tuple[float, float]) -> bool:
-    """Whether draws lie in a range and span it."""
+    """True if draws lie in a range and span it."""
     least, most = min(bounds), max(bounds)
     return least <= low and high <= most and high - low >= FILLED * (most - least)
 
 
 def _light_faults(task: str, rules: str, seeds: list[int]) -> list[str]:
-    """What is wrong with the lights: visual mode draws one for each episode, the other modes share one."""
+    """Faults of the lights: visual mode draws one for each episode, the other modes share one."""
     spec, rule_set = tasks.get(task), rule_sets.get(rules)
     lights = {
         mode: [spec.draw(seed, mode, rule_set).light for seed in seeds] for mode in ("base", "execution", "semantic")

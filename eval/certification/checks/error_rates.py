@@ -51,14 +51,14 @@ SEED = 20260611
 
 @dataclass
 class EventTally:
-    """How often something happened."""
+    """Frequency of an event."""
 
     case: str
     what: str
     kind: str
     """`error`: at most the level; `power`: as high as it gets; `coverage`: about 95 % or more; `shown`: as it is."""
     expected: float | None = None
-    """What it must be, computed in closed form, where there is one."""
+    """Expected frequency in closed form, where there is one."""
     happened: int = 0
     times: int = 0
 
@@ -74,7 +74,7 @@ class EventTally:
 
     @property
     def holds(self) -> bool:
-        """Whether the count agrees with what it must be, up to chance."""
+        """True if the count agrees with the expected one, up to chance."""
         if self.kind == "error":
             return bool(self.happened <= binom.isf(SLACK, self.times, LEVEL))
         if self.kind == "coverage":

@@ -22,7 +22,7 @@ __all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 LEAST = 0.8
 """Least precision and recall of each stage."""
 QUICK_FAILURES = 2
-"""Episodes of each kind, task and tracker under --quick."""
+"""Episodes of each kind of failure and tracker under --quick, all in one task."""
 ENOUGH = 20
 """From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
@@ -50,11 +50,11 @@ class Confusion:
     """(scripted, said) → episodes."""
 
     def scripted(self, stage: FailureStage) -> int:
-        """How many failures of a stage were scripted."""
+        """Number of scripted failures of a stage."""
         return sum(self.counts.get((stage, said), 0) for said in FailureStage)
 
     def said(self, stage: FailureStage) -> int:
-        """How many failures are said to be of a stage."""
+        """Number of failures that the rules assign to a stage."""
         return sum(self.counts.get((scripted, stage), 0) for scripted in FailureStage)
 
     def recall(self, stage: FailureStage) -> float | None:
@@ -85,7 +85,7 @@ def failures(context: Context) -> CheckFinding:
     for task in tasks:
         for tracker in context.sample:
             for name, sabotage in SABOTAGES.items():
-                if task in sabotage.without:
+                if task in sabotage.without or context.options.quick and task != _quick_task(name):
                     continue
                 episodes = min(QUICK_FAILURES, context.episodes) if context.options.quick else None
                 cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT, episodes=episodes)
@@ -121,6 +121,12 @@ def failures(context: Context) -> CheckFinding:
     for sheet in sheets:
         print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
     return CheckFinding(verdict, summary, sheets, (*(text for text, _ in below), *notes))
+
+
+def _quick_task(name: str) -> str | None:
+    """The task in which a kind of failure is played under --quick: the kinds go round the tasks."""
+    fit = [task for task in INTERACTIONS if task not in SABOTAGES[name].without]
+    return fit[list(SABOTAGES).index(name) % len(fit)] if fit else None
 
 
 def _below(matrix: Confusion) -> list[tuple[str, bool]]:

@@ -35,8 +35,8 @@ __all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "agreement_of", "flight
 TOLERANCE = 0.0025
 """An exact slope may differ from its estimate by so much of it, or of the root mean square of all if that is larger."""
 KINK = TOLERANCE
-"""Where slopes within the step differ from the estimate by more, the function has a kink there, or is smaller than what
-float32 resolves: there is no one slope to compare with."""
+"""Largest difference between slopes within the step and the estimate. Beyond it the function has a kink there, or is
+smaller than float32 resolves: there is no one slope to compare with."""
 COMPARABLE = 0.1
 """Of the slopes at least so many must be comparable. Feet abreast are a kink of VisNavi's margin, for a start."""
 MOVED = (0, 1, 2, 3, 4, 5, 6, 7, 8)
@@ -74,11 +74,11 @@ class Slopes(NamedTuple):
     exact: torch.Tensor
     estimated: torch.Tensor
     spread: torch.Tensor
-    """How far slopes within the step are from the estimate."""
+    """Distance of slopes within the step from the estimate."""
 
 
 class Agreement(NamedTuple):
-    """How far exact slopes are from estimated ones."""
+    """Distance of exact slopes from estimated ones."""
 
     compared: int
     total: int
@@ -87,7 +87,7 @@ class Agreement(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether enough could be compared and all agree."""
+        """True if enough could be compared and all agree."""
         return self.compared >= COMPARABLE * self.total and self.error <= TOLERANCE
 
 
@@ -161,7 +161,7 @@ def _measured(context: Context, task: str, tracker: str) -> JsonObject:
 
 
 def _conversion(env: ArenaEnv, seed: int) -> Slopes:
-    """Where the reference is after some ticks of the closed loop, against the same by `reference_step`."""
+    """Slopes of the reference after some ticks of the closed loop, against the same by `reference_step`."""
     draws = torch.Generator().manual_seed(SEED)
     weights = [torch.randn(width, generator=draws).to(env.torch_device) for width in (3, 4)]
     stand = torch.tensor(STAND_ACTION, device=env.torch_device)

@@ -47,11 +47,11 @@ POLL = 0.2
 ENDING = 60.0
 """Time for the cluster to end when it is told to [s]."""
 COMMAND = (sys.executable, "-P", "-m", "arena_newton.eval")
-"""What plays by a cluster."""
+"""Command that plays on a cluster."""
 ACTOR = b"ray::EpisodeActor.play"
-"""How the title of a process begins while it plays for a cluster."""
+"""Title prefix of a process while it plays for a cluster."""
 REPLACED = "left: a process"
-"""What a run says of a process that it lost with the episodes that it played."""
+"""Message of a run about a process that it lost with the episodes that it played."""
 SHOWN = (CONFIG_FILE, JOURNAL_FILE, "results.json", "table.md", "table.csv", "report.md", "report.html")
 """Files that a page names; the others are counted."""
 NAMED = 20
@@ -61,7 +61,7 @@ BITS = "bits are promised on engine mujoco alone"
 
 @dataclass(frozen=True)
 class RayRun:
-    """How a run by a cluster went."""
+    """Outcome of a run on a cluster."""
 
     code: int | None
     """Its exit code; None where it had to be stopped."""
@@ -177,7 +177,7 @@ def compared(alone: Path, other: Path) -> JsonObject:
 
 
 def _judged(found: JsonObject, who: str) -> tuple[Verdict, str, tuple[str, ...]]:
-    """What compared digests say: the verdict, a sentence about those who played, and what is wrong."""
+    """Judgement of compared digests: the verdict, a sentence about those who played, and what is wrong."""
     files, episodes = cast("list[list[str]]", found["files"]), cast("int", found["episodes"])
     different = [name for name, one, two in files if one != two]
     wrong = tuple(f"{name} differs" for name in different[:NAMED])

@@ -1,4 +1,4 @@
-"""What a swapped tracker costs: an expert's actions, recorded through one tracker, replayed through the other."""
+"""Cost of a swapped tracker: an expert's actions, recorded through one tracker, replayed through the other."""
 
 from __future__ import annotations
 

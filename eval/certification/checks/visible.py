@@ -144,7 +144,7 @@ def first_sights(env: World, seeds: list[int], prim: str) -> tuple[list[int | No
 
 
 def _shapes_of(env: World, prim: str) -> torch.Tensor:
-    """Which shapes of the model belong to a prim, bool, shape [shapes]."""
+    """Shapes of the model that belong to a prim, bool, shape [shapes]."""
     labels = env.scene.model.shape_label
     return torch.tensor([f"{label}/".startswith(f"{prim}/") for label in labels], device=env.torch_device)
 

@@ -1,4 +1,4 @@
-"""bench --peers lerobot_eval: both programs are called for the same episodes, and are judged whole."""
+"""The pair `lerobot_eval`: both programs are called for the same episodes, and are judged whole."""
 
 import json
 from pathlib import Path
@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from arena_newton.errors import ArenaError
-from arena_newton.eval.bench import peer_lerobot_eval
-from arena_newton.eval.bench.bench_options import BenchOptions
-from arena_newton.eval.bench.peer_lerobot_eval import lerobot_eval_figures
+from benchmarks import peer_lerobot_eval, peer_pairs
+from benchmarks.bench_options import PeerOptions
+from benchmarks.peer_lerobot_eval import lerobot_eval_figures
 
 
 class _Programs:
@@ -46,7 +46,7 @@ def test_whole_commands_are_compared(tmp_path, monkeypatch):
     programs = _Programs(monkeypatch, [2.0, 8.0, 2.0, 12.0, 4.0, 12.0], [3.0, 4.0, 9.0])
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: False)
     history = tmp_path / "history.jsonl"
-    (figure,) = lerobot_eval_figures(BenchOptions(peers_steps=30, peers_history=str(history)))
+    (figure,) = lerobot_eval_figures(PeerOptions(steps=30, history=str(history)))
     assert figure.value is None and "4.00 x, 1.000 / 0.167 episodes/s" in figure.note and "30 steps" in figure.name
     assert "without start and end 4.00 x; 1.0 s of 2.0 s, 2 solved / 3.0 s of 8.0 s, 0 solved" in figure.note
     assert json.loads(history.read_text())["ratio"] == 4.0
@@ -55,17 +55,17 @@ def test_whole_commands_are_compared(tmp_path, monkeypatch):
     assert "--eval.batch_size=2" in peer and "--seed=0" in peer
 
 
-@pytest.mark.parametrize(("flags", "value"), [({}, 6.0), ({"peers_episodes": 20}, None), ({"peers_steps": 9}, None)])
+@pytest.mark.parametrize(("flags", "value"), [({}, 6.0), ({"episodes": 20}, None), ({"steps": 9}, None)])
 def test_the_bar_is_for_the_whole_protocol(monkeypatch, flags, value):
     """With CUDA only the protocol's 60 whole episodes, three group seeds of 20, are judged."""
     programs = _Programs(monkeypatch, [10.0, 60.0], [7.0])
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: True)
-    monkeypatch.setattr(peer_lerobot_eval, "device_name", lambda: "a GPU")
-    (figure,) = lerobot_eval_figures(BenchOptions(peers_rounds=1, **flags))
+    monkeypatch.setattr(peer_pairs, "device_name", lambda: "a GPU")
+    (figure,) = lerobot_eval_figures(PeerOptions(long_rounds=1, **flags))
     assert figure.value == value and figure.verdict == ("-" if value is None else "pass")
     ours = programs.commands[0]
     seeds = ours[ours.index("--seeds") + 1 : ours.index("--repeats")]
-    assert len(seeds) * 20 == flags.get("peers_episodes", 60) and ours[ours.index("--repeats") + 1] == "20"
+    assert len(seeds) * 20 == flags.get("episodes", 60) and ours[ours.index("--repeats") + 1] == "20"
 
 
 def test_missing_episodes_are_an_error(monkeypatch):
@@ -73,7 +73,7 @@ def test_missing_episodes_are_an_error(monkeypatch):
     _Programs(monkeypatch, [1.0, 1.0], [1.0], played=1)
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: False)
     with pytest.raises(ArenaError, match="1 episodes instead of 2"):
-        list(lerobot_eval_figures(BenchOptions()))
+        list(lerobot_eval_figures(PeerOptions()))
 
 
 def test_a_program_that_fails_says_its_last_line():

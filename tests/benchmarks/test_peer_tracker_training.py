@@ -1,4 +1,4 @@
-"""bench --peers tracker_training: mjlab in an interpreter of its own, by turns with our training."""
+"""The pair `tracker_training`: mjlab in an interpreter of its own, by turns with our training."""
 
 import json
 import sys
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.bench import peer_tracker_training
-from arena_newton.eval.bench.bench_options import BenchOptions
-from arena_newton.eval.bench.peer_tracker_training import MjlabTraining, tracker_training_figures
+from benchmarks import peer_tracker_training
+from benchmarks.bench_options import PeerOptions
+from benchmarks.peer_tracker_training import MjlabTraining, tracker_training_figures
 
 FAKE = """#!{python}
 import json, os, sys
@@ -65,7 +65,7 @@ def test_rounds_are_taken_by_turns(fake, tmp_path, monkeypatch):
     monkeypatch.setattr(peer_tracker_training, "OwnTraining", _Ours)
     monkeypatch.setattr(peer_tracker_training.torch.cuda, "is_available", lambda: False)
     history = tmp_path / "history.jsonl"
-    flags = BenchOptions(mjlab_python=fake(), peers_worlds=(4,), peers_iterations=2, peers_history=str(history))
+    flags = PeerOptions(mjlab_python=fake(), training_worlds=(4,), iterations=2, history=str(history))
     (figure,) = tracker_training_figures(flags)
     assert figure.value is None and figure.verdict == "-" and figure.bar == 1.2
     assert "1.00 x, 384 / 384 samples/s" in figure.note and "mjlab 1.6.0, 5 ms x 4" in figure.note
@@ -76,7 +76,7 @@ def test_rounds_are_taken_by_turns(fake, tmp_path, monkeypatch):
 
 def test_without_an_interpreter_nothing_is_measured():
     """No figure has a value, and each says which flag is missing."""
-    figures = list(tracker_training_figures(BenchOptions(peers_worlds=(4096, 8192))))
+    figures = list(tracker_training_figures(PeerOptions(training_worlds=(4096, 8192))))
     assert [figure.value for figure in figures] == [None, None]
     assert all("--mjlab-python" in figure.note for figure in figures)
 

@@ -1,9 +1,8 @@
-"""``bench --peers camera``: the head camera's colour pictures beside those of Newton's own `SensorCamera`."""
+"""``peers --what camera``: the head camera's colour pictures beside those of Newton's own `SensorCamera`."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import newton
@@ -13,17 +12,16 @@ from pxr import Usd, UsdGeom
 
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
-from arena_newton.eval.bench.bench_figure import BenchFigure
-from arena_newton.eval.bench.bench_options import BenchOptions
-from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
+from arena_newton.eval.bench.timing import BenchFigure, seconds_of
 from arena_newton.pictures.camera import CAMERA_PRIMS, Camera
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.tasks.base import LightDraw
+from benchmarks.bench_options import PeerOptions
+from benchmarks.peer_pairs import Pair, on_cpu
 
 __all__ = ["NewtonPictures", "camera_figures"]
 
-BAR = 1.0
-"""Least ratio of pictures per second."""
+PAIR = Pair("camera", 1.0, "pictures/s", ("newton", "warp-lang"))
 CPU_WORLDS = 2
 """Worlds without CUDA, where the bar is not judged."""
 SCENE = "football"
@@ -76,10 +74,10 @@ class NewtonPictures:
         self.sensor.update(state, self.camera.poses, self.rays, color_image=self.image)
 
 
-def camera_figures(options: BenchOptions) -> Iterator[BenchFigure]:
+def camera_figures(options: PeerOptions) -> Iterator[BenchFigure]:
     """Pictures per second, without shadows and with those of one distant light."""
     cuda = bool(wp.is_cuda_available())
-    worlds, size = options.camera_worlds if cuda else CPU_WORLDS, options.peers_size
+    worlds, size = options.camera_worlds if cuda else CPU_WORLDS, options.size
     env = ArenaEnv(
         SCENE,
         worlds=worlds,
@@ -101,39 +99,15 @@ def camera_figures(options: BenchOptions) -> Iterator[BenchFigure]:
                 camera.lights.set(world, LIGHT if shadows else None)
             camera.render(state)  # the poses
             theirs = NewtonPictures(env.scene.model, camera, lens, shadows)
-            rounds = _rounds(partial(camera.render, state), partial(theirs.render, state), worlds, options)
-            yield _figure(options, worlds, shadows, rounds, cuda)
+            sides = partial(camera.render, state), partial(theirs.render, state)
+            for draw in sides:  # kernels are compiled
+                draw()
+            rounds = [tuple(worlds / seconds_of(draw) for draw in sides) for _ in range(options.rounds)]
+            light = "one light's shadows" if shadows else "no shadows"
+            label = f"head-camera pictures/s / Newton's SensorCamera, {worlds} worlds, {size}x{size}, {light}"
+            yield PAIR.judge(options, label, rounds, unjudged=on_cpu(cuda))
     finally:
         env.close()
-
-
-def _rounds(
-    ours: Callable[[], object], peer: Callable[[], object], worlds: int, options: BenchOptions
-) -> list[tuple[float, float]]:
-    """Pictures per second of both, by turns; each was drawn once before, so kernels are compiled."""
-
-    def speed(draw: Callable[[], object]) -> float:
-        wp.synchronize()
-        began = time.perf_counter()
-        draw()
-        wp.synchronize()
-        return worlds / (time.perf_counter() - began)
-
-    speed(ours), speed(peer)
-    return [(speed(ours), speed(peer)) for _ in range(options.rounds)]
-
-
-def _figure(
-    options: BenchOptions, worlds: int, shadows: bool, rounds: list[tuple[float, float]], cuda: bool
-) -> BenchFigure:
-    ours, peer, ratio = median_speeds(rounds)
-    size, light = options.peers_size, "one light's shadows" if shadows else "no shadows"
-    note = f"{ours:,.0f} / {peer:,.0f} pictures/s, median of {len(rounds)} ratios; {versions('camera')}"
-    if not cuda:
-        note = f"{NEEDS_CUDA}{ratio:.2f} x, {note}"
-    name = f"head-camera pictures/s / Newton's SensorCamera, {worlds} worlds, {size}x{size}, {light}"
-    figure = BenchFigure(name, BAR, "x", False, ratio if cuda else None, note)
-    return add_to_history(options, "camera", figure, (ours, peer, ratio), "pictures/s", device_name())
 
 
 def _lens(stage: Usd.Stage) -> UsdGeom.Camera:

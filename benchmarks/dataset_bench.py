@@ -1,4 +1,4 @@
-"""``data bench``: how fast a dataset is read in random order, and how long it takes to build and to verify.
+"""``python -m benchmarks dataset``: random reads of a dataset, and the time that building and verifying take.
 
 Both readers take turns, block by block, so that other work on the machine slows both alike.
 """
@@ -11,9 +11,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import datasets
 import numpy as np
@@ -21,7 +19,6 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.import_utils import get_safe_default_video_backend
 
-from arena_newton.data.checks.episode_copies import copy_episodes
 from arena_newton.data.checks.verification import verify
 from arena_newton.data.datasets.data_options import VerifyOptions
 from arena_newton.data.datasets.layouts import layout
@@ -30,13 +27,13 @@ from arena_newton.data.readers.dataset_files import DatasetFiles
 from arena_newton.data.readers.frame_reader import Frames
 from arena_newton.data.recording.episode import episode_files, opened
 from arena_newton.errors import InputError
+from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.new_folder import scratch_folder
 from arena_newton.files.text import counted
+from benchmarks.bench_options import DatasetBenchOptions
+from benchmarks.episode_copies import copy_episodes
 
-if TYPE_CHECKING:
-    from arena_newton.data.datasets.data_options import DatasetBenchOptions
-
-__all__ = ["DataFigure", "bench", "measured"]
+__all__ = ["dataset_figures"]
 
 WARM_READS = 100
 """Reads before the clock starts: files are opened, decoders made."""
@@ -53,58 +50,8 @@ BUILD_BAR = 40.0
 BUILD_ROWS = 80_000
 
 
-@dataclass(frozen=True)
-class DataFigure:
-    """One line of the bench."""
-
-    name: str
-    value: float
-    bar: float | None
-    """None where nothing is asked of it."""
-    unit: str
-    at_most: bool = False
-    cpu: float | None = None
-    """The same figure by time of the CPU instead of the clock: what other work on the machine hardly changes."""
-
-    @property
-    def met(self) -> bool:
-        """Whether it reaches its bar."""
-        return self.bar is None or (self.value <= self.bar if self.at_most else self.value >= self.bar)
-
-    @property
-    def verdict(self) -> str:
-        """The bar, and whether it is reached."""
-        if self.bar is None:
-            return ""
-        return f"{'<=' if self.at_most else '>='} {self.bar:6.0f}  {'pass' if self.met else 'MISS'}"
-
-
-def bench(folders: Sequence[Path], options: DatasetBenchOptions) -> int:
-    """Measure and print.
-
-    Returns:
-        Exit code: 0 when no figure misses its bar, otherwise 1.
-
-    Raises:
-        InputError: It is no dataset with pictures, or a flag is unfit.
-    """
-    if len(folders) != 1:
-        raise InputError(f"bench: name one folder, not {len(folders)}")
-    figures = measured(folders[0], options)
-    for figure in figures:
-        cpu = "" if figure.cpu is None else f"{figure.cpu:9.1f} by CPU time"
-        print(f"{figure.name:<75} {figure.value:9.1f} {figure.unit:<9} {cpu:<21} {figure.verdict}".rstrip())
-    cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
-    print(f"{cores} CPU cores, load {load:.1f}; bars are for 224x224 pictures and an idle machine of 2 cores")
-    return 0 if all(figure.met for figure in figures) else 1
-
-
-def measured(folder: Path, options: DatasetBenchOptions) -> list[DataFigure]:
+def dataset_figures(options: DatasetBenchOptions) -> Iterator[BenchFigure]:
     """Figures of a dataset, and of building its recordings where they are named.
-
-    Args:
-        folder: The dataset; with `options.made` recordings, of which one is made.
-        options: What to measure.
 
     Raises:
         InputError: It is no dataset with pictures, or a flag is unfit.
@@ -113,21 +60,25 @@ def measured(folder: Path, options: DatasetBenchOptions) -> list[DataFigure]:
         raise InputError(f"--reads {options.reads}: expected at least 1")
     if not 0 <= options.made <= MOST_MADE:
         raise InputError(f"--made {options.made}: expected 0 to {MOST_MADE} episodes")
-    if options.made and options.recordings:
-        raise InputError("--made: the folder holds the recordings, so --recordings names no others")
-    if not options.made and not options.recordings:
-        return _reads(folder, options)
-    with scratch_folder(folder.resolve().with_name(f"{folder.resolve().name}_bench"), "bench") as own:
-        recordings = options.recordings
+    if options.made and (options.dataset or not options.recordings):
+        raise InputError("--made: makes a dataset of copies of --recordings; name those, and no --dataset")
+    if not options.made and options.dataset is None:
+        raise InputError("--dataset: name a folder, or --recordings with --made")
+    if options.dataset is not None and not options.recordings:
+        yield from _reads(options.dataset, options)
+        return
+    source = (options.dataset or options.recordings[0]).resolve()
+    with scratch_folder(source.with_name(f"{source.name}_bench"), "bench") as own:
+        recordings, built = options.recordings, own / "dataset"
         if options.made:
-            copy_episodes(list(opened(episode_files([folder]))), own / "recordings", options.made)
+            copy_episodes(list(opened(episode_files(recordings))), own / "recordings", options.made)
             recordings = (own / "recordings",)
-        built = own / "dataset"
-        figures = _building(recordings, built)
-        return [*_reads(built if options.made else folder, options, scratch=own), *figures]
+        building = _building(recordings, built)
+        yield from _reads(options.dataset or built, options, own)
+        yield from building
 
 
-def _building(recordings: Sequence[Path], out: Path) -> list[DataFigure]:
+def _building(recordings: Sequence[Path], out: Path) -> list[BenchFigure]:
     """Build recordings, and verify the dataset against them."""
     with contextlib.redirect_stderr(io.StringIO()):
         begin = _now()
@@ -143,12 +94,12 @@ def _building(recordings: Sequence[Path], out: Path) -> list[DataFigure]:
     about = ", ".join([*dict.fromkeys(sizes), counted(len(chosen.episodes), "episode"), f"{chosen.rows} rows"])
     bar = max(1.0, BUILD_BAR * chosen.rows / BUILD_ROWS) if judged else None
     return [
-        DataFigure(f"building, {about}", built[0], bar, "s", at_most=True, cpu=built[1]),
-        DataFigure(f"verifying, {about}", verified[0], None, "s", at_most=True, cpu=verified[1]),
+        BenchFigure(f"building, {about}", bar, "s", True, built[0], _note(built[1])),
+        BenchFigure(f"verifying, {about}", None, "s", True, verified[0], _note(verified[1])),
     ]
 
 
-def _reads(root: Path, options: DatasetBenchOptions, scratch: Path | None = None) -> list[DataFigure]:
+def _reads(root: Path, options: DatasetBenchOptions, scratch: Path | None = None) -> list[BenchFigure]:
     """Random reads of a dataset."""
     files = DatasetFiles(root)
     frames = Frames(root)
@@ -171,8 +122,8 @@ def _reads(root: Path, options: DatasetBenchOptions, scratch: Path | None = None
     read *= cameras  # a row of LeRobot's holds a picture of each
     name = f"random reads, LeRobotDataset with {backend}, {about}"
     return [
-        DataFigure(name, read[0], bars[0], "frames/s", cpu=read[1]),
-        DataFigure(f"random reads, data.Frames, {about}", own[0], bars[1], "frames/s", cpu=own[1]),
+        BenchFigure(name, bars[0], "frames/s", False, read[0], _note(read[1])),
+        BenchFigure(f"random reads, data.Frames, {about}", bars[1], "frames/s", False, own[0], _note(own[1])),
     ]
 
 
@@ -186,6 +137,11 @@ def _cache_in(folder: Path | None) -> Iterator[None]:
         yield
     finally:
         datasets.config.HF_DATASETS_CACHE = before
+
+
+def _note(cpu: float) -> str:
+    """The same figure by time of the CPU, which other work on the machine hardly changes, and how busy that is."""
+    return f"{cpu:.1f} by CPU time; {len(os.sched_getaffinity(0))} CPU cores, load {os.getloadavg()[0]:.1f}"
 
 
 def _now() -> np.ndarray:

@@ -1,4 +1,4 @@
-"""``bench --peers tracker_training``: our training of a tracker beside mjlab's G1 tracking task, same walk."""
+"""``peers --what tracker_training``: our training of a tracker beside mjlab's G1 tracking task, same walk."""
 
 from __future__ import annotations
 
@@ -10,25 +10,22 @@ import shutil
 import subprocess
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from arena_newton.cli.extras import require
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.bench.bench_figure import BenchFigure
-from arena_newton.eval.bench.bench_options import BenchOptions
-from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
+from arena_newton.eval.bench.timing import BenchFigure, seconds_of
 from arena_newton.trackers.motions.library import MotionLibrary
 from arena_newton.trackers.motions.programs import random_clips
+from benchmarks.bench_options import PeerOptions
+from benchmarks.peer_pairs import Pair, on_cpu
 
 __all__ = ["MjlabTraining", "OwnTraining", "tracker_training_figures"]
 
-BAR = 1.2
-"""Least ratio of samples per second."""
+PAIR = Pair("tracker_training", 1.2, "samples/s", ("mujoco-warp", "newton", "rsl-rl-lib", "torch", "warp-lang"))
 CUDA_WORLDS, CPU_WORLDS = (4096, 8192), (4,)
 """Worlds with CUDA and without, where the bar is not judged."""
 WARM_UP = 3
@@ -150,47 +147,29 @@ class OwnTraining:
         self.options = TrainOptions(tracker="twist2", worlds=worlds, device=device, library=library, bench=True)
         with contextlib.redirect_stdout(io.StringIO()):
             self._runner = build(self.options)
-        self._cuda = device != "cpu"
 
     def speed(self, iterations: int) -> float:
         """Train on for so many iterations; samples per second."""
-        began = time.perf_counter()
-        with contextlib.redirect_stdout(io.StringIO()):  # its lines would stand among the figures
-            self._runner.learn(iterations)
-        if self._cuda:
-            torch.cuda.synchronize()
-        return iterations * self.options.worlds * self.options.steps / (time.perf_counter() - began)
+        with contextlib.redirect_stdout(io.StringIO()):  # its lines would be among the figures
+            seconds = seconds_of(lambda: self._runner.learn(iterations))
+        return iterations * self.options.worlds * self.options.steps / seconds
 
 
-def tracker_training_figures(options: BenchOptions) -> Iterator[BenchFigure]:
+def tracker_training_figures(options: PeerOptions) -> Iterator[BenchFigure]:
     """Samples per second, rollout and update together, for each number of worlds."""
     cuda = torch.cuda.is_available()
-    for worlds in options.peers_worlds or (CUDA_WORLDS if cuda else CPU_WORLDS):
-        name = f"tracker training, samples/s / mjlab's G1 tracking task, {worlds} worlds"
+    for worlds in options.training_worlds or (CUDA_WORLDS if cuda else CPU_WORLDS):
+        label = f"tracker training, samples/s / mjlab's G1 tracking task, {worlds} worlds"
         if not options.mjlab_python:
-            reason = "not measured: name an interpreter that has mjlab by --mjlab-python"
-            yield BenchFigure(name, BAR, "x", False, None, reason)
-            continue
-        try:
-            require("train", "eval bench --peers tracker_training")
-        except InputError as error:  # the other pairs of `all` need no such library
-            yield BenchFigure(name, BAR, "x", False, None, f"not measured: {error}")
+            yield PAIR.missing(label, "not measured: name an interpreter that has mjlab by --mjlab-python")
             continue
         rounds, mjlab = _rounds(options, worlds, "cuda:0" if cuda else "cpu")
-        ours, peer, ratio = median_speeds(rounds)
         said = ", ".join(f"{one} {version}" for one, version in mjlab.versions.items())
-        note = (
-            f"{ours:,.0f} / {peer:,.0f} samples/s, median of {len(rounds)} ratios; ours {versions('tracker_training')}"
-        )
-        note += f"; peer {said}, {mjlab.physics}"
-        if not cuda:
-            note = f"{NEEDS_CUDA}{ratio:.2f} x, {note}"
-        figure = BenchFigure(name, BAR, "x", False, ratio if cuda else None, note)
-        speeds = (ours, peer, ratio)
-        yield add_to_history(options, "tracker_training", figure, speeds, "samples/s", device_name(), mjlab.versions)
+        notes = [f"peer: {said}, {mjlab.physics}"]
+        yield PAIR.judge(options, label, rounds, unjudged=on_cpu(cuda), notes=notes, peer_versions=mjlab.versions)
 
 
-def _rounds(options: BenchOptions, worlds: int, device: str) -> tuple[list[tuple[float, float]], MjlabTraining]:
+def _rounds(options: PeerOptions, worlds: int, device: str) -> tuple[list[tuple[float, float]], MjlabTraining]:
     """Speeds of both, by turns."""
     assert options.mjlab_python is not None
     with tempfile.TemporaryDirectory() as made:
@@ -205,8 +184,8 @@ def _rounds(options: BenchOptions, worlds: int, device: str) -> tuple[list[tuple
             ours = OwnTraining(library, worlds, device)
             for side in (ours, mjlab):
                 side.speed(1 if device == "cpu" else WARM_UP)
-            iterations = options.peers_iterations
-            rounds = [(ours.speed(iterations), mjlab.speed(iterations)) for _ in range(options.peers_rounds)]
+            iterations = options.iterations
+            rounds = [(ours.speed(iterations), mjlab.speed(iterations)) for _ in range(options.long_rounds)]
         finally:
             mjlab.close()
     return rounds, mjlab

@@ -1,8 +1,8 @@
 """mjlab's G1 tracking task, trained for as many iterations as asked: run by the interpreter that has mjlab, as a file.
 
-Nothing of this product is imported: mjlab needs other versions of MuJoCo and mujoco_warp. `bench --peers
-tracker_training` hands over the motion and talks through stdin and stdout: a number of iterations in, one JSON line
-out. Nothing is logged or written.
+Nothing of this product is imported: mjlab needs other versions of MuJoCo and mujoco_warp. The pair `tracker_training`
+of `python -m benchmarks peers` gives it the motion and talks through stdin and stdout: a number of iterations in, one
+JSON line out. Nothing is logged or written.
 """
 
 from __future__ import annotations

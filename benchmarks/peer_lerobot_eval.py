@@ -1,4 +1,4 @@
-"""``bench --peers lerobot_eval``: a learned policy's episodes by our runner and by stock `lerobot-eval`."""
+"""``peers --what lerobot_eval``: a learned policy's episodes by our runner and by stock `lerobot-eval`."""
 
 from __future__ import annotations
 
@@ -15,23 +15,21 @@ from pathlib import Path
 
 import warp as wp
 
-from arena_newton.cli.extras import require
 from arena_newton.cli.flags import user_path
-from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.bench.bench_figure import BenchFigure
-from arena_newton.eval.bench.bench_options import BenchOptions
-from arena_newton.eval.bench.peer_pairs import NEEDS_CUDA, add_to_history, device_name, median_speeds, versions
+from arena_newton.errors import ArenaError
+from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
 from arena_newton.files.own_processes import environment
 from arena_newton.policies.learned.learned_card import SHIPPED, shipped_card
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
+from benchmarks.bench_options import PeerOptions
+from benchmarks.peer_pairs import Pair, on_cpu
 
 __all__ = ["lerobot_eval_figures"]
 
-BAR = 5.0
-"""Least ratio of episodes per second."""
+PAIR = Pair("lerobot_eval", 5.0, "episodes/s", ("lerobot", "newton", "torch", "warp-lang"), digits=3)
 CUDA_EPISODES, CPU_EPISODES = 60, 2
 """Episodes with CUDA and without, where the bar is not judged."""
 TASK = "vis_navi"
@@ -42,7 +40,7 @@ CLOCK = ("started_at", "finished_at")
 
 @dataclass(frozen=True)
 class _Played:
-    """What a command did."""
+    """Episodes that a command played."""
 
     seconds: float
     """From the first episode's start to the last one's end [s]."""
@@ -56,56 +54,44 @@ class _Played:
         return f"{self.seconds:.1f} s of {self.command_seconds:.1f} s, {self.solved} solved"
 
 
-def lerobot_eval_figures(options: BenchOptions) -> Iterator[BenchFigure]:
+def lerobot_eval_figures(options: PeerOptions) -> Iterator[BenchFigure]:
     """Episodes per second of the whole commands: what one of them loads or compiles beforehand counts too."""
     cuda = bool(wp.is_cuda_available())
-    episodes = options.peers_episodes or (CUDA_EPISODES if cuda else CPU_EPISODES)
-    name = f"{episodes} VisNavi episodes, learned policy / lerobot-eval, episodes/s"
-    if options.policy_checkpoint is None and shipped_card() is None:
-        reason = "not measured: no policy comes with this package; name a checkpoint by --policy-checkpoint"
-        yield BenchFigure(name, BAR, "x", False, None, reason)
+    episodes = options.episodes or (CUDA_EPISODES if cuda else CPU_EPISODES)
+    label = f"{episodes} VisNavi episodes, learned policy / lerobot-eval, episodes/s"
+    if options.checkpoint is None and shipped_card() is None:
+        reason = "not measured: no policy comes with this package; name a checkpoint by --checkpoint"
+        yield PAIR.missing(label, reason)
         return
-    try:
-        require("data", "eval bench --peers lerobot_eval")
-    except InputError as error:  # the other pairs of `all` need no such library
-        yield BenchFigure(name, BAR, "x", False, None, f"not measured: {error}")
-        return
-    checkpoint = SHIPPED if options.policy_checkpoint is None else user_path(options.policy_checkpoint)
-    checkpoint = checkpoint_folder(checkpoint, "--policy-checkpoint")
+    checkpoint = SHIPPED if options.checkpoint is None else user_path(options.checkpoint)
+    checkpoint = checkpoint_folder(checkpoint, "--checkpoint")
     rounds, plays, notes = [], [], []
-    for _ in range(options.peers_rounds):
+    for _ in range(options.long_rounds):
         with tempfile.TemporaryDirectory() as made:
             folder = Path(made)
-            ours_play = _ours(options, checkpoint, episodes, cuda, folder / "ours")
-            peer_play = _peer(options, checkpoint, episodes, cuda, folder / "peer")
-        rounds.append((episodes / ours_play.command_seconds, episodes / peer_play.command_seconds))
-        plays.append(peer_play.seconds / ours_play.seconds)
-        notes.append(f"{ours_play.text} / {peer_play.text}")
-    ours, peer, ratio = median_speeds(rounds)
-    cap = f", {options.peers_steps} steps at most" if options.peers_steps else ""
-    note = f"{ours:.3f} / {peer:.3f} episodes/s, median of {len(rounds)} ratios; "
-    note += f"without start and end {statistics.median(plays):.2f} x; {'; '.join(notes)}"
-    note += f"; {versions('lerobot_eval')}"
-    if not cuda:
-        note = f"{NEEDS_CUDA}{ratio:.2f} x, {note}"
-    # The bar is for whole episodes, as many as the protocol's.
-    judged = cuda and episodes == CUDA_EPISODES and not options.peers_steps
-    if cuda and not judged:
-        note = f"not judged (the bar is for {CUDA_EPISODES} whole episodes): {ratio:.2f} x, {note}"
-    figure = BenchFigure(name + cap, BAR, "x", False, ratio if judged else None, note)
-    yield add_to_history(options, "lerobot_eval", figure, (ours, peer, ratio), "episodes/s", device_name())
+            ours = _ours(options, checkpoint, episodes, cuda, folder / "ours")
+            peer = _peer(options, checkpoint, episodes, cuda, folder / "peer")
+        rounds.append((episodes / ours.command_seconds, episodes / peer.command_seconds))
+        plays.append(peer.seconds / ours.seconds)
+        notes.append(f"{ours.text} / {peer.text}")
+    notes.insert(0, f"without start and end {statistics.median(plays):.2f} x")
+    unjudged = on_cpu(cuda)
+    if cuda and (episodes != CUDA_EPISODES or options.steps):
+        unjudged = f"not judged (the bar is for {CUDA_EPISODES} whole episodes)"
+    label += f", {options.steps} steps at most" if options.steps else ""
+    yield PAIR.judge(options, label, rounds, unjudged=unjudged, notes=notes)
 
 
-def _ours(options: BenchOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
+def _ours(options: PeerOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
     """Play them by `eval run`."""
-    spec = "learned" if options.policy_checkpoint is None else f"lerobot:{checkpoint}"
+    spec = "learned" if options.checkpoint is None else f"lerobot:{checkpoint}"
     groups, rest = divmod(episodes, PROTOCOL_REPEATS)
     seeds, repeats = (list(range(groups)), PROTOCOL_REPEATS) if groups and not rest else ([0], episodes)
     line = [sys.executable, "-P", "-m", "arena_newton.eval", "run", "--task", TASK, "--tracker", "twist2"]
     line += ["--policy", spec, "--seeds", *map(str, seeds), "--repeats", str(repeats), "--worlds", str(episodes)]
     line += ["--engine", "warp" if cuda else "mujoco", "--device", "cuda" if cuda else "cpu", "--out", str(folder)]
-    if options.peers_steps:
-        line += ["--max-steps", str(options.peers_steps)]
+    if options.steps:
+        line += ["--max-steps", str(options.steps)]
     seconds = _timed("eval run", line, (0, 1))
     records = load_run(folder).records
     if len(records) != episodes:
@@ -116,7 +102,7 @@ def _ours(options: BenchOptions, checkpoint: Path, episodes: int, cuda: bool, fo
     return _Played(played, seconds, sum(one.outcome == "success" for one in records))
 
 
-def _peer(options: BenchOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
+def _peer(options: PeerOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
     """Play them by `lerobot-eval`, which counts the seconds itself once its environment is built."""
     engine, device = ("warp", "cuda") if cuda else ("mujoco", "cpu")
     line = [sys.executable, "-P", "-m", "lerobot.scripts.lerobot_eval"]
@@ -125,8 +111,8 @@ def _peer(options: BenchOptions, checkpoint: Path, episodes: int, cuda: bool, fo
     line += [f"--env.episodes={folder}", f"--policy.path={checkpoint}", f"--policy.device={device}", "--seed=0"]
     # One batch, as many worlds as on our side.
     line += [f"--eval.n_episodes={episodes}", f"--eval.batch_size={episodes}", f"--output_dir={folder / 'lerobot'}"]
-    if options.peers_steps:
-        line += [f"--env.episode_length={options.peers_steps}"]
+    if options.steps:
+        line += [f"--env.episode_length={options.steps}"]
     seconds = _timed("lerobot-eval", line, (0,))
     played = (folder / OUTCOMES_FILE).read_text().splitlines()
     if len(played) != episodes:

@@ -12,13 +12,13 @@ import torchvision
 from torch import nn
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot.pretrained_weights import (
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
+from arena_newton.policies.train.families.pretrained_weights import (
     PATIENCE,
     check_safetensors,
     read_safetensors,
     weights_folder,
 )
-from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 
 __all__ = ["check_resnet", "find_resnet", "load_resnet"]
 
@@ -73,7 +73,7 @@ def check_resnet(recipe: TrainingRecipe, weights: str | Path | None) -> None:
 
 
 def find_resnet(kind: str, wanted: object) -> Path | torchvision.models.WeightsEnum:
-    """Where pretrained weights are; nothing is loaded.
+    """Location of pretrained weights; nothing is loaded.
 
     Args:
         kind: As of `load_resnet`.

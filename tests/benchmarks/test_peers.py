@@ -1,4 +1,4 @@
-"""bench --peers: ratios are medians of rounds, what was not measured says so, history names device and versions."""
+"""Pairs with other programs: ratios are medians of rounds, what was not measured says so, history names versions."""
 
 import json
 
@@ -6,24 +6,25 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.bench import bench, bench_peers, peer_lerobot_eval, peer_tracker_training
-from arena_newton.eval.bench.bench_options import BenchOptions
-from arena_newton.eval.bench.bench_tick import network_seconds
-from arena_newton.policies.lerobot.resnet_weights import find_resnet
+from arena_newton.policies.train.families.resnet_weights import find_resnet
+from benchmarks import __main__ as benches
+from benchmarks import peers
+from benchmarks.__main__ import BENCHES, main
+from benchmarks.bench_options import PeerOptions
 
 
 def figures_of(options):
     """All figures of the pairs that are named."""
-    return [figure for _, found in bench_peers.peer_items(options) for figure in found]
+    return [figure for measure in peers.pairs(options).values() for figure in measure()]
 
 
 def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
     """The ratio is formed within each round; every measured pair leaves one line with what it was measured on."""
     rounds = [(0.003, 0.002), (0.008, 0.004), (0.009, 0.003)]
-    monkeypatch.setattr(bench_peers, "tick_times", lambda *given: rounds)
-    monkeypatch.setattr(bench_peers, "network_seconds", lambda *given: 0.0006)
+    monkeypatch.setattr(peers, "tick_times", lambda *given: rounds)
+    monkeypatch.setattr(peers, "network_seconds", lambda *given: 0.0006)
     history = tmp_path / "history.jsonl"
-    figures = figures_of(BenchOptions(peers=("tick",), peers_history=str(history)))
+    figures = figures_of(PeerOptions(what=("tick",), history=str(history)))
     assert [figure.value for figure in figures] == [2.0, 2.0]
     assert [figure.verdict for figure in figures] == ["MISS", "MISS"]
     assert all("0.600 ms, so no tick can have less than 1.20 x" in figure.note for figure in figures)
@@ -36,36 +37,35 @@ def test_tick_is_the_median_of_the_rounds_ratios(tmp_path, monkeypatch):
 
 def test_the_network_alone_is_timed():
     """One row of TWIST2's network takes more than a microsecond and less than a whole tick of 20 ms."""
-    assert 1e-6 < network_seconds(rounds=3, count=5) < 0.02
+    assert 1e-6 < peers.network_seconds(rounds=3, count=5) < 0.02
 
 
 def test_on_the_cpu_world_ticks_are_information(monkeypatch):
     """Without CUDA no bar is judged, whatever the ratio is."""
-    monkeypatch.setattr(bench_peers.wp, "is_cuda_available", lambda: False)
-    monkeypatch.setattr(bench_peers, "tick_times", lambda *given: [(0.5, 0.4)])
-    (figure,) = figures_of(BenchOptions(peers=("world_ticks",)))
+    monkeypatch.setattr(peers.wp, "is_cuda_available", lambda: False)
+    monkeypatch.setattr(peers, "tick_times", lambda *given: [(0.5, 0.4)])
+    (figure,) = figures_of(PeerOptions(what=("world_ticks",)))
     assert figure.value is None and figure.verdict == "-" and "0.80 x" in figure.note
 
 
 @pytest.mark.parametrize("pair", ["tracker_training", "act_training"])
 def test_what_is_not_measured_is_not_reached(pair):
     """A pair without its dataset or its peer's interpreter says so and has no value."""
-    (figure,) = figures_of(BenchOptions(peers=(pair,), peers_worlds=(4,)))
+    (figure,) = figures_of(PeerOptions(what=(pair,), training_worlds=(4,)))
     assert figure.value is None and figure.note.startswith("not measured:")
 
 
-@pytest.mark.parametrize("module", [peer_tracker_training, peer_lerobot_eval])
-def test_a_missing_extra_is_one_line(module, monkeypatch):
-    """A pair whose libraries are not installed says so and has no value: it is not reached."""
+def test_a_missing_extra_is_one_line(monkeypatch, capsys):
+    """A bench whose libraries are not installed is refused in one line."""
 
     def missing(extra, what):
         raise InputError(f"{what} needs the extra {extra}")
 
-    monkeypatch.setattr(module, "require", missing)
-    pair = module.__name__.rsplit(".peer_")[-1]
-    (figure,) = figures_of(BenchOptions(peers=(pair,), mjlab_python="python", peers_worlds=(4,)))
-    assert figure.value is None and figure.verdict == "-"
-    assert figure.note.startswith(f"not measured: eval bench --peers {pair} needs the extra")
+    monkeypatch.setattr(benches, "require", missing)
+    for name, bench in BENCHES.items():
+        if bench.extras:
+            assert main([name]) == 2
+            assert capsys.readouterr().err == f"error: benchmarks {name} needs the extra {bench.extras[0]}\n"
 
 
 def test_a_pair_that_breaks_does_not_stop_the_others(monkeypatch, capsys):
@@ -75,8 +75,8 @@ def test_a_pair_that_breaks_does_not_stop_the_others(monkeypatch, capsys):
         raise ArenaError("mjlab ended with code 1: out of memory")
         yield
 
-    monkeypatch.setattr(bench_peers, "tracker_training_figures", broken)
-    assert bench.run(BenchOptions(peers=("tracker_training", "act_training"))) == 1
+    monkeypatch.setattr(peers, "tracker_training_figures", broken)
+    assert main(["peers", "--what", "tracker_training", "act_training"]) == 1
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("MISS") and "tracker_training" in first and "out of memory" in first
     assert "ACT training" in second
@@ -84,21 +84,13 @@ def test_a_pair_that_breaks_does_not_stop_the_others(monkeypatch, capsys):
 
 def test_unknown_pair():
     """An unknown pair is an error that names the flag."""
-    with pytest.raises(InputError, match="--peers nonsense"):
-        bench.run(BenchOptions(peers=("nonsense",)))
-
-
-def test_training_speeds_are_read():
-    """Both speeds of the training's bench are found; where one is missing that is an error."""
-    text = "act/paper\nalone: 71.5 steps/s (one graph a step)\nLeRobot's loop, 4 workers: 31.0 steps/s; ours\n"
-    assert bench_peers.training_speeds(text) == (71.5, 31.0)
-    with pytest.raises(ArenaError, match="no two speeds"):
-        bench_peers.training_speeds("alone: 71.5 steps/s\n")
+    with pytest.raises(InputError, match="--what nonsense: known are tick"):
+        peers.pairs(PeerOptions(what=("nonsense",)))
 
 
 def test_training_needs_no_download(tmp_path):
     """The paper's recipe takes vision weights that are made on the spot."""
-    path = bench_peers.new_vision_weights(tmp_path)
+    path = peers.new_vision_weights(tmp_path)
     assert find_resnet("resnet18", path) == path
     assert torch.load(path, weights_only=True)["conv1.weight"].shape == (64, 3, 7, 7)
 
@@ -106,4 +98,4 @@ def test_training_needs_no_download(tmp_path):
 def test_vision_weights_that_cannot_be_made(tmp_path):
     """A folder that is not there is one error."""
     with pytest.raises(ArenaError, match="vision encoder's weights"):
-        bench_peers.new_vision_weights(tmp_path / "missing")
+        peers.new_vision_weights(tmp_path / "missing")

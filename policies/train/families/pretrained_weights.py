@@ -20,7 +20,7 @@ from arena_newton.errors import InputError
 __all__ = ["PATIENCE", "check_safetensors", "checksum", "read_safetensors", "weights_folder"]
 
 PATIENCE = 10.0
-"""How long the hub is waited for [s]."""
+"""Longest wait for the hub [s]."""
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 
 
