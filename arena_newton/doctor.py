@@ -15,7 +15,7 @@ from pathlib import Path
 
 from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.extras import EXTRAS
-from arena_newton.files.probe import faults
+from arena_newton.files.sandboxed_load import faults
 
 __all__ = ["Finding", "examine", "examine_extras", "main", "versions"]
 

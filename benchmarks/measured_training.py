@@ -55,7 +55,7 @@ class SpeedFigure:
     memory: float
     """Most memory of the device that torch held [GB]; 0 on the CPU."""
     graphed: bool
-    """Whether a step was a CUDA graph."""
+    """True if a step was a CUDA graph."""
 
 
 def bench_recipe(options: TrainingBenchOptions) -> TrainingRecipe:
@@ -84,7 +84,7 @@ def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch
         return made_frames(options.frames, settings.picture, device, network=network), made_statistics()
     datasets, stats = _read(options, settings)
     ones = torch.ones(len({episode.task for dataset in datasets for episode in dataset.episodes}))
-    stats[VECTOR_KEY] = {"mean": 0 * ones, "std": ones}
+    stats = {**stats, VECTOR_KEY: {"mean": 0 * ones, "std": ones}}
     return load_frames(datasets, device, network=network), stats
 
 

@@ -35,7 +35,7 @@ CUDA_EPISODES, CPU_EPISODES = 60, 2
 TASK = "vis_navi"
 """Task of the episodes."""
 CLOCK = ("started_at", "finished_at")
-"""When an episode of our journal began and ended."""
+"""Fields of our journal with the beginning and the end of an episode."""
 
 
 @dataclass(frozen=True)

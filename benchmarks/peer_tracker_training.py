@@ -35,9 +35,9 @@ WALK_SECONDS = 10.0
 FPS = 50.0
 """Frames per second of our motions."""
 SCRIPT = Path(__file__).with_name("mjlab_training.py")
-"""What mjlab's interpreter is handed."""
+"""Program that mjlab's interpreter runs."""
 ANSWER_S = 900.0
-"""How long mjlab may take for an answer [s]."""
+"""Longest wait for an answer of mjlab [s]."""
 
 
 class MjlabTraining:

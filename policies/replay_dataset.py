@@ -13,7 +13,7 @@ from arena_newton import tasks as task_registry
 from arena_newton.data.readers.dataset_files import PARQUET_BYTES
 from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
 from arena_newton.policies.base import Json, Mask
 from arena_newton.policies.open_loop import RecordedEpisodes
 from arena_newton.rules import seeding

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from arena_newton import tasks
+from arena_newton.eval.__main__ import COMMANDS
 from tests.import_graph import (
     BENCHMARKS,
     INNER,
@@ -43,13 +44,14 @@ STARTS = (
 STARTS += ("trackers.train.__main__", "trackers.motions.__main__", "usd_scenes.__main__")
 STARTS += ("policies.train.__main__",)
 STARTS += ("trackers.tracker_check", "policies.policy_check", "policies.teleop.__main__", "policies.serve.__main__")
+STARTS += tuple(f"eval.commands.{name}" for name in COMMANDS)
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
 PLANNING = ("eval.plan.config", "eval.folders.run_folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are
 imported by name."""
 LATE = {
     "arena_newton.doctor": "it reports libraries that do not import",
-    "arena_newton.files.probe": "its other process imports only the library that it tries",
+    "arena_newton.files.sandboxed_load": "its other process imports only the library that it tries",
     "arena_newton.cli.quiet": "light modules call it before they import Warp",
 }
 """Other modules that import heavy libraries inside functions, and why."""
@@ -58,7 +60,7 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 MOST_ANY = 35
 ANY = {
     "arena_newton/differentiable/kernel_gradients.py": "a context of autograd keeps whatever it is given",
-    "arena_newton/files/foreign.py": "NumPy's dtypes",
+    "arena_newton/files/untrusted_files.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/physics/policy_view.py": "a view has the attributes of what it shows",
     "arena_newton/cli/registry.py": "what a maker takes is its own business",
@@ -245,7 +247,8 @@ def test_a_stem_names_one_thing():
     """Two modules have one name only where a table says why."""
     homes = collections.defaultdict(list)
     for module in KNOWN.values():
-        if not module.path.stem.startswith("__"):
+        named = f"{PACKAGE}.eval.commands.{module.path.stem}"  # a command's file has the name of what it calls
+        if not module.path.stem.startswith("__") and module.name != named:
             homes[module.path.stem].append(module)
     doubled = {stem: found for stem, found in homes.items() if len(found) > 1}
     report([place(m, 1) for stem, found in doubled.items() if stem not in STEMS for m in found])

@@ -21,7 +21,7 @@ from pxr import Ar, Gf, Sdf, Tf
 
 import arena_newton
 from arena_newton.errors import InputError
-from arena_newton.files import limits, probe
+from arena_newton.files import limits, sandboxed_load
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
 __all__ = ["LAYERS", "PACKAGE", "Dependencies", "Problem", "check_files", "collect", "layers", "probe_layers", "reason"]
@@ -241,7 +241,7 @@ def _crate_fault(location: Location) -> str | None:
 
 def _probe(locations: list[Location]) -> None:
     names = [str(location) for location in locations]
-    faults = probe.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
+    faults = sandboxed_load.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
     _CRATE_FAULTS.update({_known_as(location): fault for location, fault in zip(locations, faults, strict=True)})
 
 

@@ -43,16 +43,16 @@ SERVED = ("openpi", "roboarena", "vla-eval", "arena")
 SAME_BITS = tuple(name for name in DOOR_NAMES if name != "learned")
 """Doors that promise the bits of `lerobot` on engine mujoco and the CPU."""
 START_S = 300.0
-"""How long a server may take until it listens [s]."""
+"""Longest wait until a server listens [s]."""
 END_S = 30.0
-"""How long it may take to end [s]."""
+"""Longest wait until it ends [s]."""
 ADDRESS = "eval asks it by --policy "
 """Beginning of the line in which a server says how it is asked."""
 
 
 @dataclass(frozen=True)
 class DoorEpisode:
-    """What became of an episode."""
+    """Result of an episode."""
 
     key: str
     """`s<group seed>/r<repeat>`."""
@@ -67,7 +67,7 @@ class DoorEpisode:
 
 @dataclass(frozen=True)
 class DoorPlay:
-    """What a door's program did."""
+    """Result of a protocol's program."""
 
     door: str
     episodes: tuple[DoorEpisode, ...]
@@ -97,13 +97,13 @@ class DoorRow:
     parts_at: int | None
     """First tick at which an action differs, over all episodes; None where none does."""
     promised: bool
-    """Whether it must be the same."""
+    """True if it must be the same."""
     seconds: float
     commands: tuple[str, ...] = field(default=())
 
     @property
     def kept(self) -> bool:
-        """Whether what is promised holds."""
+        """True if the promise holds."""
         return not self.promised or (self.same_endings and self.same_everything)
 
 
@@ -352,7 +352,7 @@ type Ending = tuple[str, str | None, int, float | None]
 
 
 def _run_endings(folder: Path) -> Mapping[str, Ending]:
-    """How the episodes of a results folder ended."""
+    """Endings of the episodes of a results folder."""
     return {
         f"s{one.group_seed}/r{one.repeat}": (one.outcome, one.reason, one.steps, one.margin)
         for one in load_run(folder).records
@@ -360,7 +360,7 @@ def _run_endings(folder: Path) -> Mapping[str, Ending]:
 
 
 def _stock_endings(door: str, folder: Path, options: DoorOptions) -> Mapping[str, Ending]:
-    """How the episodes ended that the environment of `lerobot-eval` wrote, checked against LeRobot's own file."""
+    """Endings of the episodes that the environment of `lerobot-eval` wrote, checked against LeRobot's own file."""
     lines = [json.loads(line) for line in (folder / OUTCOMES_FILE).read_text().splitlines()]
     info = json.loads((folder / "lerobot" / "eval_info.json").read_text())
     successes = info["per_task"][0]["metrics"]["successes"]

@@ -28,8 +28,7 @@ from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import DRIVES
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import recording
-from arena_newton.eval.play.signal_recorder import SignalRecorder
-from arena_newton.eval.play.whole_run import (
+from arena_newton.eval.play.run_flow import (
     Group,
     RunStopped,
     begun,
@@ -42,6 +41,7 @@ from arena_newton.eval.play.whole_run import (
     run_and_report,
     told_how_to_go_on,
 )
+from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.episode_signals import EpisodeSignals
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, StorageError
 from arena_newton.eval.reports import console

@@ -125,7 +125,7 @@ def page(
 
 
 def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
-    """What the page opens with, by name."""
+    """Facts at the top of the page, by name."""
     config = document["config"]
     found = [("episodes", f"{results['finished']} of {results['planned']}")]
     found += [(name, plain(config.get(name))) for name in ("policy", "rules") if name in config]

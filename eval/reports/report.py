@@ -92,7 +92,7 @@ _STATES = {
 
 
 def notes(run: RunRecord, results: Results) -> list[str]:
-    """What a reader of the table must know besides it."""
+    """Notes for a reader of the table."""
     found = []
     if run.status is not None and run.status["state"] != "success":
         found.append(_STATES[run.status["state"]] + (f": {run.status['error']}" if run.status["error"] else ""))

@@ -20,7 +20,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig, plain_facts, resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_parts
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
@@ -47,7 +47,7 @@ def parts(options: RunOptions, factories: Factories | None) -> tuple[RunConfig, 
         factories: The real parts by default, with environments that last from one slice to the next.
     """
     quiet_warp()
-    made_of = factories or Factories(env=EnvironmentKeeper())
+    made_of = factories or Factories(env=EnvCache())
     return *check_parts(resolve(options), made_of), made_of
 
 

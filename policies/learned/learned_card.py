@@ -9,7 +9,7 @@ from pathlib import Path
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
 from arena_newton.pages.tables import Table, between, percent
 
 __all__ = ["CARD_FILE", "CARD_PAGE", "NOT_SHIPPED", "SHIPPED", "CellResult", "PolicyCard", "read_card", "shipped_card"]

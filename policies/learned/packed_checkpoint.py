@@ -15,7 +15,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import check_size, file_digest, read_bytes
+from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
 from arena_newton.policies.lerobot.checkpoint_tensors import check_spread

@@ -21,7 +21,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import check_size, file_digest, read_bytes
+from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,

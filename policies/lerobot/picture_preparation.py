@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
 
 __all__ = ["MOST_JSON", "TRAIN_CONFIG", "PicturePreparation"]
 

@@ -67,7 +67,7 @@ def test_wheel_holds_one_top_level_package(tmp_path):
     assert "arena_newton/usd_scenes/football/scene.usda" in names
     assert "arena_newton/py.typed" in names
     assert {f"arena_newton/eval/suites/{name}.toml" for name in ("paper", "tiny")} <= set(names)
-    assert {f"arena_newton/eval/page/report.{ending}" for ending in ("html", "css", "js")} <= set(names)
+    assert {f"arena_newton/eval/reports/page/report.{ending}" for ending in ("html", "css", "js")} <= set(names)
 
 
 def test_dependencies_have_both_ends_and_a_tested_version():

@@ -1,4 +1,4 @@
-"""`eval matrix --ray`: one crew plays the cells of a suite, several at once; what is lost is played again.
+"""`eval matrix --ray`: one pool plays the cells of a suite, several at once; what is lost is played again.
 
 Processes are objects of this process, which answer in turn; a test says when one dies.
 """
@@ -23,7 +23,7 @@ ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
 from arena_newton.eval.suites import ray_suite  # noqa: E402
-from arena_newton.eval.workers import ray_crew, ray_run  # noqa: E402
+from arena_newton.eval.workers import ray_run, worker_pool  # noqa: E402
 from arena_newton.eval.workers.ray_actor import EpisodeActor  # noqa: E402
 from arena_newton.eval.workers.slice_events import Node  # noqa: E402
 
@@ -36,7 +36,7 @@ class Answer:
 
 
 class InlineRay:
-    """What the crew uses of Ray; `dies` is asked before each answer."""
+    """What the pool uses of Ray; `dies` is asked before each answer."""
 
     def __init__(self, dies=lambda: False, cores=2.0):
         self.dies, self.opened, self.actors, self.killed = dies, [], 0, 0
@@ -81,8 +81,8 @@ def inline(monkeypatch):
 
     def make(dies=lambda: False, cores=2.0):
         found = InlineRay(dies, cores)
-        monkeypatch.setattr(ray_crew, "ray", found)
-        monkeypatch.setattr(ray_crew, "FIRST_PAUSE", 0.0)
+        monkeypatch.setattr(worker_pool, "ray", found)
+        monkeypatch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
         for module in (ray_run, ray_suite):
             monkeypatch.setattr(module, "in_cluster", lambda address: contextlib.nullcontext())
         return found
@@ -221,7 +221,7 @@ class Hasty(FakeEnv):
 
 def test_a_cell_that_ends_every_process_is_passed(inline, suite, tmp_path, capsys, monkeypatch):
     """Five processes one after the other that break on a cell fail this cell alone."""
-    monkeypatch.setattr(ray_crew, "LONGEST_PAUSE", 0.0)
+    monkeypatch.setattr(worker_pool, "LONGEST_PAUSE", 0.0)
     inline(cores=1.0)
     out = tmp_path / "out"
     assert call(suite, out, "--keep-going", env=Hasty) == 1

@@ -22,8 +22,8 @@ from safetensors.torch import save as encode
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import read_bytes
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import read_bytes
 from arena_newton.robot.g1 import TICK, DriveGains, PhysicsRate
 from arena_newton.trackers import base, interface
 from arena_newton.trackers.inference.networks import TrackerNetwork

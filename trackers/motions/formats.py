@@ -21,8 +21,8 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import numbers, read_arrays, read_bytes
 from arena_newton.files.text import counted
+from arena_newton.files.untrusted_files import numbers, read_arrays, read_bytes
 from arena_newton.robot.g1 import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions.frames import actions_to_motion
 from arena_newton.trackers.motions.kinematics import forward

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import numbers, read_arrays
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import numbers, read_arrays
 from arena_newton.robot.g1 import MUJOCO_JOINTS, TICK
 from arena_newton.robot.rotations import quat_conjugate, quat_multiply, rotation_vector
 from arena_newton.trackers.motions.frames import frame_mimic

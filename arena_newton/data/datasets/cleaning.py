@@ -22,9 +22,9 @@ from tqdm import tqdm
 from arena_newton.data.recording.episode import CAMERAS, VIDEO_FOLDER, episode_files, vision, write_episode
 from arena_newton.data.recording.image_statistics import VALUES, add_picture
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import numbers, read_arrays, read_bytes
 from arena_newton.files.new_folder import link, new_folder
 from arena_newton.files.text import counted
+from arena_newton.files.untrusted_files import numbers, read_arrays, read_bytes
 from arena_newton.pages.tables import Table
 from arena_newton.pictures.video import VideoWriter
 from arena_newton.rules import seeding

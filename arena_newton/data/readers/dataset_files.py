@@ -15,7 +15,7 @@ import pyarrow.parquet
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import check_size, read_bytes
+from arena_newton.files.untrusted_files import check_size, read_bytes
 
 __all__ = ["CODEBASE_VERSION", "DatasetFiles", "EpisodeRow", "VideoPart", "read_json"]
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import numbers
+from arena_newton.files.untrusted_files import numbers
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, validate_action
 from arena_newton.robot.rotations import matrix_from_quat, quat_from_euler

@@ -23,8 +23,8 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import check_size, numbers, read_arrays
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import check_size, numbers, read_arrays
 from arena_newton.pages.tables import Table
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 

@@ -6,7 +6,7 @@ import pytest
 
 from arena_newton import trackers
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.suites.suite_records import read_suite
 
@@ -33,13 +33,13 @@ spec = "expert"
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """Folder of a suite of three cells that were played in one environment, and that environment's keeper."""
+    """Folder of a suite of three cells that were played in one environment, and that environment's cache."""
     folder = tmp_path_factory.mktemp("suite")
     (folder / "three.toml").write_text(SUITE)
-    keeper = EnvironmentKeeper()
-    assert main(["matrix", str(folder / "three.toml"), "--out", str(folder / "out")], Factories(env=keeper)) == 0
-    keeper.drop()
-    return folder / "out", keeper
+    cache = EnvCache()
+    assert main(["matrix", str(folder / "three.toml"), "--out", str(folder / "out")], Factories(env=cache)) == 0
+    cache.drop()
+    return folder / "out", cache
 
 
 def ends(path):
@@ -61,8 +61,8 @@ def ends(path):
 
 def test_episodes_do_not_know_what_ran_before(played, tmp_path):
     """Cells in a used environment equal runs in one of their own, bit for bit, and one environment was built."""
-    out, keeper = played
-    assert keeper.built == 1
+    out, cache = played
+    assert cache.built == 1
     assert [cell.status for cell in read_suite(out).cells] == ["done"] * 3
     flags = "--task boxing --seeds 0 --repeats 3 --worlds 2 --max-steps 25 --engine mujoco --policy".split()
     for name, policy in (("still", "stand"), ("again", "expert")):
@@ -77,13 +77,13 @@ def test_episodes_do_not_know_what_ran_before(played, tmp_path):
 
 def test_another_environment_is_built():
     """Another number of worlds, another mode or what was dropped is built again; the same is handed out again."""
-    keeper = EnvironmentKeeper()
+    cache = EnvCache()
     made = {"engine": "mujoco", "device": "cpu", "rules": "paper", "mode": "base"}
-    first = keeper("boxing", tracker=trackers.get("twist2", None), worlds=1, **made)
+    first = cache("boxing", tracker=trackers.get("twist2", None), worlds=1, **made)
     first.close()
-    assert keeper("boxing", tracker=trackers.get("twist2", None), worlds=1, **made) is first
-    second = keeper("boxing", tracker=trackers.get("twist2", None), worlds=2, **made)
-    assert second is not first and keeper.built == 2
-    keeper.drop()
-    assert keeper("boxing", tracker=trackers.get("twist2", None), worlds=2, **made) is not second
-    keeper.drop()
+    assert cache("boxing", tracker=trackers.get("twist2", None), worlds=1, **made) is first
+    second = cache("boxing", tracker=trackers.get("twist2", None), worlds=2, **made)
+    assert second is not first and cache.built == 2
+    cache.drop()
+    assert cache("boxing", tracker=trackers.get("twist2", None), worlds=2, **made) is not second
+    cache.drop()

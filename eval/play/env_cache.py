@@ -1,4 +1,4 @@
-"""Environments for runs that follow each other: one that is asked for again is handed out again, not built again.
+"""Cache of environments for runs that follow each other: the same one again is not built again.
 
 Building an environment takes seconds, for runs of a minute. An episode begins from its seed alone, so what ran before
 in the same environment does not change it; a test compares them bit for bit.
@@ -12,10 +12,10 @@ import json
 from arena_newton.env import ArenaEnv
 from arena_newton.trackers.base import Tracker
 
-__all__ = ["EnvironmentKeeper", "LastingEnv"]
+__all__ = ["EnvCache", "CachedEnv"]
 
 
-class LastingEnv(ArenaEnv):
+class CachedEnv(ArenaEnv):
     """An environment that its run does not release."""
 
     def close(self) -> None:
@@ -27,26 +27,27 @@ class LastingEnv(ArenaEnv):
         super().close()
 
 
-class EnvironmentKeeper:
+class EnvCache:
     """Makes environments (`Factories.env`) and keeps the last one."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: type[CachedEnv] = CachedEnv) -> None:
         """Begin without any."""
+        self._kind = kind
         self._key: object = None
-        self._env: LastingEnv | None = None
+        self._env: CachedEnv | None = None
         self.built = 0
         """Environments built so far."""
 
-    def __call__(self, task: str, *, tracker: Tracker, **options: object) -> LastingEnv:
-        """The environment of a run, whose arguments are those of `ArenaEnv`.
+    def __call__(self, task: str, *, tracker: Tracker, **options: object) -> CachedEnv:
+        """Environment of a run, whose arguments are those of `ArenaEnv`.
 
-        A tracker that says the same of itself as the last one's is taken to be the same.
+        A tracker whose description equals the last one's is taken to be the same.
         """
-        said = json.dumps(tracker.describe(), sort_keys=True, default=str)
-        key = (task, type(tracker), said, tuple(sorted(options.items(), key=lambda item: item[0])))
+        description = json.dumps(tracker.describe(), sort_keys=True, default=str)
+        key = (task, type(tracker), description, tuple(sorted(options.items(), key=lambda item: item[0])))
         if self._env is None or self._key != key:
             self.drop()
-            self._env = LastingEnv(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
+            self._env = self._kind(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
             self._key, self.built = key, self.built + 1
         return self._env
 

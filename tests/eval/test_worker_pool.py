@@ -20,8 +20,8 @@ from arena_newton.eval.workers.slice_events import Broke, Built, Node, Opened, T
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval.workers import ray_crew  # noqa: E402
-from arena_newton.eval.workers.ray_crew import Crew, Done, Job, Lease, Lost  # noqa: E402
+from arena_newton.eval.workers import worker_pool  # noqa: E402
+from arena_newton.eval.workers.worker_pool import Assignment, Done, Job, Lost, WorkerPool  # noqa: E402
 
 
 class Ref:
@@ -59,7 +59,7 @@ class Method:
 
 
 class FakeRay:
-    """What the crew uses of Ray; a test says what actors answer."""
+    """What the pool uses of Ray; a test says what actors answer."""
 
     def __init__(self, opened, nodes):
         self.node_list, self.opened, self.asked, self.killed = nodes, opened, [], []
@@ -105,8 +105,8 @@ def node(name="n0", **resources):
 
 
 @pytest.fixture
-def crew_of(tmp_path, monkeypatch):
-    """Makes a crew for a plan of eight episodes, and the Ray that it asks."""
+def pool_of(tmp_path, monkeypatch):
+    """Makes a pool for a plan of eight episodes, and the Ray that it asks."""
 
     def make(nodes=None, opened=None, **changes):
         options = RunOptions(
@@ -124,119 +124,119 @@ def crew_of(tmp_path, monkeypatch):
             "cpu",
         )
         fake = FakeRay(dataclasses.replace(said, **(opened or {})), nodes or [node()])
-        monkeypatch.setattr(ray_crew, "ray", fake)
+        monkeypatch.setattr(worker_pool, "ray", fake)
         folder = ResultsFolder(tmp_path / "r", planned, doctor.versions())
         folder.document = {"config_hash": config.hash}
-        crew = Crew(planned, len(planned.episodes), None)
-        crew.job = Job(folder)
-        return crew, fake, config
+        pool = WorkerPool(planned, len(planned.episodes), None)
+        pool.job = Job(folder)
+        return pool, fake, config
 
     return make
 
 
-def lease(crew, config):
+def assignment(pool, config):
     """The first two episodes."""
     episodes = config.episodes[:2]
-    return Lease(crew.job, ("boxing", "twist2", "base"), {episode.index: episode for episode in episodes}, 2, 0)
+    return Assignment(pool.job, ("boxing", "twist2", "base"), {episode.index: episode for episode in episodes}, 2, 0)
 
 
-def told(crew, rounds=6):
+def messages(pool, rounds=6):
     """What comes in so many rounds."""
-    return [said for _ in range(rounds) for _, _, said in crew.heard()]
+    return [message for _ in range(rounds) for _, _, message in pool.messages()]
 
 
-def all_idle(crew):
+def all_idle(pool):
     """Hear until all have opened the run."""
-    while not (crew.members and all(member.job is crew.job and member.pending is None for member in crew.members)):
-        for member in crew.idle():
-            if member.job is not crew.job:
-                crew.prepare(member, crew.job)
-        told(crew, 1)
+    while not (pool.workers and all(worker.job is pool.job and worker.pending is None for worker in pool.workers)):
+        for worker in pool.idle():
+            if worker.job is not pool.job:
+                pool.prepare(worker, pool.job)
+        messages(pool, 1)
 
 
-def test_as_many_as_there_is_room_for(crew_of):
+def test_as_many_as_there_is_room_for(pool_of):
     """Cores and fractions of GPUs are asked for per actor; cores of one machine are taken once."""
-    crew, fake, config = crew_of()
+    pool, fake, config = pool_of()
     assert fake.asked == [{"num_cpus": 4, "num_gpus": 0.0, "max_restarts": 0}] * 2
-    assert crew.opened(crew.job).hash == config.hash
-    all_idle(crew)
-    assert sorted(member.rank for member in crew.members) == [0, 1] and fake.cores in ((0, 4), (4, 4))
+    assert pool.opened(pool.job).hash == config.hash
+    all_idle(pool)
+    assert sorted(worker.rank for worker in pool.workers) == [0, 1] and fake.cores in ((0, 4), (4, 4))
     gpus = [node(GPU=2.0, CPU=32.0), node("n1", CPU=2.0)]
-    crew, fake, _ = crew_of(gpus, engine="warp", ray_gpus=0.5)
+    pool, fake, _ = pool_of(gpus, engine="warp", ray_gpus=0.5)
     assert len(fake.asked) == 4 and fake.asked[0]["num_gpus"] == 0.5 and fake.asked[0]["num_cpus"] == 4
-    assert len(crew_of(ray_actors=3)[0].members) == 3
-    assert len(crew_of([node(CPU=256.0)])[0].members) == 8, "no more than episodes"
+    assert len(pool_of(ray_actors=3)[0].workers) == 3
+    assert len(pool_of([node(CPU=256.0)])[0].workers) == 8, "no more than episodes"
 
 
-def test_machines_that_join_are_used(crew_of, monkeypatch):
+def test_machines_that_join_are_used(pool_of, monkeypatch):
     """Actors are added when the cluster grows."""
-    crew, fake, _ = crew_of()
-    all_idle(crew)
+    pool, fake, _ = pool_of()
+    all_idle(pool)
     fake.node_list.append(node("n1"))
-    monkeypatch.setattr(ray_crew, "GROWTH", 0.0)
-    told(crew, 1)
-    assert len(crew.members) == 4
+    monkeypatch.setattr(worker_pool, "GROWTH", 0.0)
+    messages(pool, 1)
+    assert len(pool.workers) == 4
 
 
-def test_a_slice_is_told_of(crew_of):
+def test_a_slice_is_told_of(pool_of):
     """Events come in their order, then the end; then the process waits."""
-    crew, fake, config = crew_of(ray_actors=1)
-    all_idle(crew)
+    pool, fake, config = pool_of(ray_actors=1)
+    all_idle(pool)
     fake.events = [Built({}), Ticks(3)]
-    crew.lend(crew.idle()[0], lease(crew, config))
-    assert told(crew) == [Built({}), Ticks(3), Done()] and crew.idle()
+    pool.assign(pool.idle()[0], assignment(pool, config))
+    assert messages(pool) == [Built({}), Ticks(3), Done()] and pool.idle()
 
 
-def test_a_slice_past_its_deadline_is_stopped(crew_of):
+def test_a_slice_past_its_deadline_is_stopped(pool_of):
     """Its process is killed, the slice is told of as lost, and another process is asked for."""
-    crew, fake, config = crew_of(ray_actors=1, ray_minutes=0.001)
-    all_idle(crew)
+    pool, fake, config = pool_of(ray_actors=1, ray_minutes=0.001)
+    all_idle(pool)
     fake.hangs = True
-    crew.lend(crew.idle()[0], lease(crew, config))
-    crew.members[0].until -= 1.0
-    assert told(crew, 1) == [Lost("took longer than 0.001 min (--ray-minutes)")]
+    pool.assign(pool.idle()[0], assignment(pool, config))
+    pool.workers[0].until -= 1.0
+    assert messages(pool, 1) == [Lost("took longer than 0.001 min (--ray-minutes)")]
     assert fake.killed == [0]
-    crew.members[0].again_at = 0.0
-    all_idle(crew)
+    pool.workers[0].again_at = 0.0
+    all_idle(pool)
     assert len(fake.asked) == 2
 
 
-def test_death_is_told_with_its_machine(crew_of):
+def test_death_is_told_with_its_machine(pool_of):
     """A machine that left the cluster is told apart from a process that died."""
     for alive in (True, False):
-        crew, fake, config = crew_of(ray_actors=1)
-        all_idle(crew)
+        pool, fake, config = pool_of(ray_actors=1)
+        all_idle(pool)
         fake.events = [ActorDiedError()]
-        crew.lend(crew.idle()[0], lease(crew, config))
+        pool.assign(pool.idle()[0], assignment(pool, config))
         fake.node_list[0]["Alive"] = alive
-        (lost,) = told(crew, 1)
+        (lost,) = messages(pool, 1)
         assert lost.with_node != alive
 
 
-def test_processes_that_never_begin_stop_the_run(crew_of, monkeypatch):
+def test_processes_that_never_begin_stop_the_run(pool_of, monkeypatch):
     """Five in a row that break before an environment is built: the cause is told."""
-    monkeypatch.setattr(ray_crew, "LONGEST_PAUSE", 0.0)
-    crew, fake, _ = crew_of(ray_actors=1)
+    monkeypatch.setattr(worker_pool, "LONGEST_PAUSE", 0.0)
+    pool, fake, _ = pool_of(ray_actors=1)
     fake.opened = Broke("broken", "ImportError: no newton", "a trace")
     with pytest.raises(RunStopped, match="--ray: 5 processes on host ended one after the other: ImportError"):
-        crew.opened(crew.job)
+        pool.opened(pool.job)
     assert len(fake.asked) == 5
 
 
-def test_other_code_or_versions_are_refused(crew_of):
+def test_other_code_or_versions_are_refused(pool_of):
     """A node that would play something else is named, with what differs."""
     versions = doctor.versions() | {"mujoco": "3.0"}
     with pytest.raises(InputError, match=r"--ray: on node host mujoco is 3\.0, here .*; all nodes need the same code"):
-        crew, _, _ = crew_of(opened={"versions": versions})
-        crew.opened(crew.job)
-    crew, fake, config = crew_of()
+        pool, _, _ = pool_of(opened={"versions": versions})
+        pool.opened(pool.job)
+    pool, fake, config = pool_of()
     fake.opened = dataclasses.replace(fake.opened, identity=config.identity() | {"code": "0123"})
     with pytest.raises(InputError, match="on node host code is 0123"):
-        crew.opened(crew.job)
-    crew, fake, _ = crew_of()
+        pool.opened(pool.job)
+    pool, fake, _ = pool_of()
     fake.opened = Broke("input", "--policy x: no such file", "")
     with pytest.raises(InputError, match="^--policy x: no such file$"):
-        crew.opened(crew.job)
+        pool.opened(pool.job)
 
 
 def test_the_driver_loads_no_physics():

@@ -11,7 +11,7 @@ import pytest
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import file_digest, read_arrays, read_bytes
+from arena_newton.files.untrusted_files import file_digest, read_arrays, read_bytes
 
 
 def member(shape, dtype="<f8", data=b"") -> bytes:

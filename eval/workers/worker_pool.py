@@ -1,6 +1,6 @@
-"""Processes of a Ray cluster: asked for, given runs to open, held to a deadline, and replaced when they are lost.
+"""Worker pool: processes of a Ray cluster that open runs, have a deadline, and are replaced when they are lost.
 
-Ray restarts none by itself (`max_restarts=0`), so that who deals out knows of every loss and what was running.
+Ray restarts none by itself (`max_restarts=0`), so that the run knows of every loss and of the episodes behind it.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS
-from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.play.whole_run import Group, RunStopped
+from arena_newton.eval.plan.options import Ray, RunOptions, flags_of
+from arena_newton.eval.play.run_flow import Group, RunStopped
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
 
 
-__all__ = ["Crew", "Done", "Job", "Lease", "Lost", "Member", "in_cluster"]
+__all__ = ["WorkerPool", "Done", "Job", "Assignment", "Lost", "Worker", "in_cluster"]
 
 OWN = "local"
 """Address that makes Ray start a cluster of its own."""
@@ -81,17 +80,17 @@ class Job:
     def configured(self) -> RunConfig:
         """The configuration, with what tracker and policy of the first process say of themselves."""
         assert self.opened is not None
-        told = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
-        return dataclasses.replace(self.folder.config, **{name: getattr(self.opened, name) for name in told})
+        described = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
+        return dataclasses.replace(self.folder.config, **{name: getattr(self.opened, name) for name in described})
 
     def options(self) -> RunOptions:
         """The flags that a process opens it with."""
-        alone = {name: getattr(RunOptions, name) for name in ("ray", *RAY_FLAGS, "shard", "out")}
+        alone = {name: getattr(RunOptions, name) for name in (*flags_of(Ray), "shard", "out")}
         return dataclasses.replace(self.folder.config.flags, **alone)
 
 
 @dataclass
-class Lease:
+class Assignment:
     """A slice of a run that a process plays."""
 
     job: Job
@@ -127,12 +126,12 @@ class Lost:
 
 @dataclass(frozen=True)
 class Done:
-    """The process of a slice has told of all that it played, and waits."""
+    """The process of a slice has reported all that it played, and waits."""
 
 
 @dataclass
-class Member:
-    """A process of the crew, or the gap where one was."""
+class Worker:
+    """Process of the pool, or the gap where one was."""
 
     actor: ActorHandle[EpisodeActor] | None = None
     node: Node | None = None
@@ -144,7 +143,7 @@ class Member:
     """Monotonic time at which it was asked [s]."""
     job: Job | None = None
     """The run that it has opened, or is opening."""
-    lease: Lease | None = None
+    assignment: Assignment | None = None
     last: Group | None = None
     """Group that its environment is made for."""
     until: float = math.inf
@@ -223,7 +222,7 @@ def _native_silence() -> Iterator[None]:
         os.close(sink)
 
 
-class Crew:
+class WorkerPool:
     """Processes that play one run, or several with the same flags of --ray on the same kind of device."""
 
     def __init__(self, config: RunConfig, most: int, factories: Factories | None):
@@ -246,10 +245,10 @@ class Crew:
         if not flags.ray and not any(map(self._room, nodes)):
             flag = "--ray-cpus" if flags.ray_cpus else "--ray"
             raise InputError(f"{flag}: a process asks for {self._asked()}, {_shown(nodes)}")
-        self.members: list[Member] = []
+        self.workers: list[Worker] = []
         self.shown: Progress | None = None
         """Progress that shows losses."""
-        self._said = self._grown = time.monotonic()
+        self._reported = self._grown = time.monotonic()
         self._grow(nodes)
 
     def opened(self, job: Job) -> RunConfig:
@@ -263,40 +262,45 @@ class Crew:
             RunStopped: No process begins.
         """
         while job.opened is None:
-            for member in self.idle():
-                if member.job is not job:
-                    self.prepare(member, job)
-            for _, _, said in self.heard():
-                if isinstance(said, ArenaError):
-                    raise said
+            for worker in self.idle():
+                if worker.job is not job:
+                    self.prepare(worker, job)
+            for _, _, message in self.messages():
+                if isinstance(message, ArenaError):
+                    raise message
         return job.configured()
 
-    def idle(self) -> list[Member]:
+    def idle(self) -> list[Worker]:
         """Those that wait for work."""
-        return [member for member in self.members if member.node is not None and member.pending is None]
+        return [worker for worker in self.workers if worker.node is not None and worker.pending is None]
 
-    def prepare(self, member: Member, job: Job) -> None:
+    def prepare(self, worker: Worker, job: Job) -> None:
         """Let a process that waits build tracker and policy of a run, in place of those that it has."""
-        assert member.actor is not None
-        member.job, member.since = job, time.monotonic()
-        member.until = max(self._late(), member.since + BEGINNING)
+        assert worker.actor is not None
+        worker.job, worker.since = job, time.monotonic()
+        worker.until = max(self._late(), worker.since + BEGINNING)
         path = os.path.abspath(job.folder.path)
-        cores = (member.rank * self._cpus, self._cpus)
-        member.pending = member.actor.open.remote(job.options(), path, cores, self._factories)
+        cores = (worker.rank * self._cpus, self._cpus)
+        worker.pending = worker.actor.open.remote(job.options(), path, cores, self._factories)
 
-    def lend(self, member: Member, lease: Lease) -> None:
+    def assign(self, worker: Worker, assignment: Assignment) -> None:
         """Let a process that waits play a slice of the run that it has opened."""
-        assert member.actor is not None and member.job is lease.job
-        config_hash = lease.job.folder.document["config_hash"]
-        part = Slice(" ".join(lease.group), tuple(lease.left), lease.worlds, config_hash)
-        member.lease, member.last, member.since, member.until = lease, lease.group, time.monotonic(), self._late()
-        member.pending = member.actor.play.options(num_returns="streaming").remote(part)
+        assert worker.actor is not None and worker.job is assignment.job
+        config_hash = assignment.job.folder.document["config_hash"]
+        part = Slice(" ".join(assignment.group), tuple(assignment.left), assignment.worlds, config_hash)
+        worker.assignment, worker.last, worker.since, worker.until = (
+            assignment,
+            assignment.group,
+            time.monotonic(),
+            self._late(),
+        )
+        worker.pending = worker.actor.play.options(num_returns="streaming").remote(part)
 
-    def heard(self) -> Iterator[tuple[Job, Lease | None, Opened | Event | Done | Lost | ArenaError]]:
+    def messages(self) -> Iterator[tuple[Job, Assignment | None, Opened | Event | Done | Lost | ArenaError]]:
         """Messages of the processes; waits a little for them. Lost processes are replaced.
 
         Yields:
-            The run, the slice of it where one is played, and what is told: an error where another process could not
+            The run, the slice of it where one is played, and its message: an error where another process could not
             go on with the run either.
 
         Raises:
@@ -307,87 +311,87 @@ class Crew:
         if now - self._grown >= GROWTH:
             self._grown = now
             self._grow(_resources())
-        for member in self.members:
-            if member.actor is None and now >= member.again_at:
-                self._hire(member)
-            elif member.actor is not None and now >= member.until:
+        for worker in self.workers:
+            if worker.actor is None and now >= worker.again_at:
+                self._start(worker)
+            elif worker.actor is not None and now >= worker.until:
                 minutes = self._flags.ray_minutes
-                yield from self._lose(member, Lost(f"took longer than {minutes:g} min (--ray-minutes)"))
+                yield from self._lose(worker, Lost(f"took longer than {minutes:g} min (--ray-minutes)"))
         self._say_if_none_begins(now)
-        asked = {member.pending: member for member in self.members if member.pending is not None}
+        asked = {worker.pending: worker for worker in self.workers if worker.pending is not None}
         if not asked:
             time.sleep(FIRST_PAUSE)
             return
         answered, _ = ray.wait(list(asked), timeout=POLL)
         for pending in answered:
-            member = asked[pending]
+            worker = asked[pending]
             try:
-                said = ray.get(
-                    next(cast("ObjectRefGenerator[Event]", pending)) if member.lease is not None else pending
+                message = ray.get(
+                    next(cast("ObjectRefGenerator[Event]", pending)) if worker.assignment is not None else pending
                 )
             except StopIteration:
-                job, lease, member.lease = member.job, member.lease, None
-                self._rest(member)
+                job, assignment, worker.assignment = worker.job, worker.assignment, None
+                self._rest(worker)
                 assert job is not None
-                yield job, lease, Done()
+                yield job, assignment, Done()
                 continue
             except RayError:
-                gone = member.node is not None and not _lives(member.node)
-                yield from self._lose(member, Lost("its machine left the cluster" if gone else DIED, with_node=gone))
+                gone = worker.node is not None and not _lives(worker.node)
+                yield from self._lose(worker, Lost("its machine left the cluster" if gone else DIED, with_node=gone))
                 continue
-            job = member.job
+            job = worker.job
             if job is None:
-                self._begin(member, cast("Node", said))
-            elif isinstance(said, Broke) and (error := _error(said)) is not None:
-                lease = member.lease
-                self._replace(member)
-                yield job, lease, error
-            elif isinstance(said, Broke):
-                yield from self._lose(member, Lost(said.message, said.trace))
-            elif member.lease is not None:
-                yield job, member.lease, said
+                self._begin(worker, cast("Node", message))
+            elif isinstance(message, Broke) and (error := _error(message)) is not None:
+                assignment = worker.assignment
+                self._replace(worker)
+                yield job, assignment, error
+            elif isinstance(message, Broke):
+                yield from self._lose(worker, Lost(message.message, message.trace))
+            elif worker.assignment is not None:
+                yield job, worker.assignment, message
             else:
-                assert isinstance(said, Opened)
-                self._check(member, job, said)
-                job.opened = job.opened or said
-                self._rest(member)
-                yield job, None, said
+                assert isinstance(message, Opened)
+                self._check(worker, job, message)
+                job.opened = job.opened or message
+                self._rest(worker)
+                yield job, None, message
 
     def dismiss(self) -> None:
         """End all processes."""
-        for member in self.members:
-            self._end(member)
-            member.again_at = math.inf
+        for worker in self.workers:
+            self._end(worker)
+            worker.again_at = math.inf
 
     def _grow(self, nodes: list[dict[str, float]]) -> None:
         """Ask for as many processes as there is room for now, or as --ray-actors says."""
         wanted = self._flags.ray_actors or max(1, sum(map(self._room, nodes)))
-        for _ in range(min(wanted, self._most) - len(self.members)):
-            self.members.append(Member())
-            self._hire(self.members[-1])
+        for _ in range(min(wanted, self._most) - len(self.workers)):
+            self.workers.append(Worker())
+            self._start(self.workers[-1])
 
-    def _hire(self, member: Member) -> None:
+    def _start(self, worker: Worker) -> None:
         """Ask for a process; where there is no room the cluster answers when there is."""
         resources = {"num_cpus": self._cpus, "num_gpus": self._gpus}
         made = ray.remote(EpisodeActor).options(**resources, max_restarts=0).remote(self._gpus > 0)
-        member.actor = cast("ActorHandle[EpisodeActor]", made)
-        member.pending = member.actor.node.remote()
+        worker.actor = cast("ActorHandle[EpisodeActor]", made)
+        worker.pending = worker.actor.node.remote()
 
-    def _begin(self, member: Member, node: Node) -> None:
+    def _begin(self, worker: Worker, node: Node) -> None:
         """A process has begun, and waits."""
-        taken = {one.rank for one in self.members if one.node is not None and one.node.name == node.name}
-        member.node, member.rank = node, min(set(range(len(self.members))) - taken)
-        member.pending = None
+        taken = {one.rank for one in self.workers if one.node is not None and one.node.name == node.name}
+        worker.node, worker.rank = node, min(set(range(len(self.workers))) - taken)
+        worker.pending = None
 
-    def _rest(self, member: Member) -> None:
+    def _rest(self, worker: Worker) -> None:
         """A process has done what it was asked, and waits; its time counts for the run."""
-        if member.job is not None and member.pending is not None:
-            member.job.seconds += (time.monotonic() - member.since) * (self._gpus or 1.0)
-        member.pending, member.until = None, math.inf
+        if worker.job is not None and worker.pending is not None:
+            worker.job.seconds += (time.monotonic() - worker.since) * (self._gpus or 1.0)
+        worker.pending, worker.until = None, math.inf
 
-    def _check(self, member: Member, job: Job, opened: Opened) -> None:
+    def _check(self, worker: Worker, job: Job, opened: Opened) -> None:
         """Hold what a process built to what is planned, and to what the first one built."""
-        assert member.node is not None
+        assert worker.node is not None
         unknown = () if job.opened is not None else ("tracker_facts", "policy_facts", "worlds", "labels")
         planned = job.folder.config.identity() if job.opened is None else job.opened.identity
         difference = differing_key(planned, opened.identity, unknown)
@@ -395,48 +399,54 @@ class Crew:
         if difference is not None:
             key, here, there = (plain_text(str(part), 80) for part in difference)
             raise InputError(
-                f"--ray: on node {member.node.host} {key} is {there}, here {here}; all nodes need the same code, files "
+                f"--ray: on node {worker.node.host} {key} is {there}, here {here}; all nodes need the same code, files "
                 "and libraries"
             )
 
-    def _lose(self, member: Member, lost: Lost) -> Iterator[tuple[Job, Lease | None, Lost | ArenaError]]:
+    def _lose(self, worker: Worker, lost: Lost) -> Iterator[tuple[Job, Assignment | None, Lost | ArenaError]]:
         """End a process, if it has not ended, to be replaced after a pause; tells of what it did."""
-        job, lease, where = member.job, member.lease, f" on {member.node.host}" if member.node is not None else ""
-        member.starts = 0 if lease is not None and lease.built else member.starts + 1
-        starts = member.starts
-        self._replace(member)
+        job, assignment, where = (
+            worker.job,
+            worker.assignment,
+            f" on {worker.node.host}" if worker.node is not None else "",
+        )
+        worker.starts = 0 if assignment is not None and assignment.built else worker.starts + 1
+        starts = worker.starts
+        self._replace(worker)
         say = self.shown.say if self.shown is not None else _print
         doing = (
-            f"  {' '.join(lease.group)}, {counted(len(lease.left), 'episode')} left" if lease else "  it had not begun"
+            f"  {' '.join(assignment.group)}, {counted(len(assignment.left), 'episode')} left"
+            if assignment
+            else "  it had not begun"
         )
         if starts >= STARTS:
             error = RunStopped(f"--ray: {STARTS} processes{where} ended one after the other: {lost.cause}")
             if job is None:
                 raise error
-            member.starts = 0
-            yield job, lease, error
+            worker.starts = 0
+            yield job, assignment, error
             return
         say(f"{doing}: a process{where} is replaced: {lost.cause}")
         if job is not None:
-            yield job, lease, lost
+            yield job, assignment, lost
 
-    def _replace(self, member: Member) -> None:
+    def _replace(self, worker: Worker) -> None:
         """End a process, to be replaced after a pause."""
-        self._end(member)
-        member.again_at = time.monotonic() + min(LONGEST_PAUSE, FIRST_PAUSE * 2.0**member.starts)
+        self._end(worker)
+        worker.again_at = time.monotonic() + min(LONGEST_PAUSE, FIRST_PAUSE * 2.0**worker.starts)
 
-    def _end(self, member: Member) -> None:
-        self._rest(member)
-        if member.actor is not None:
+    def _end(self, worker: Worker) -> None:
+        self._rest(worker)
+        if worker.actor is not None:
             with contextlib.suppress(RayError, ValueError):
-                ray.kill(member.actor)
-        member.actor = member.lease = member.node = member.last = member.job = None
+                ray.kill(worker.actor)
+        worker.actor = worker.assignment = worker.node = worker.last = worker.job = None
 
     def _say_if_none_begins(self, now: float) -> None:
-        if any(member.node is not None for member in self.members):
-            self._said = now
-        elif now - self._said >= PATIENCE:
-            self._said = now
+        if any(worker.node is not None for worker in self.workers):
+            self._reported = now
+        elif now - self._reported >= PATIENCE:
+            self._reported = now
             _print(f"  no process has begun: each asks for {self._asked()}, {_shown(_resources())}")
 
     def _late(self) -> float:
@@ -456,10 +466,10 @@ DIED = "it died"
 """Cause of a loss of which no more is known: killed, out of memory, or native code crashed."""
 
 
-def _error(said: Broke) -> ArenaError | None:
+def _error(message: Broke) -> ArenaError | None:
     """Error that playing again would not mend; None where it may."""
     kinds = {"input": InputError, "storage": StorageError, "stop": RunStopped}
-    return kinds[said.kind](said.message) if said.kind in kinds else None
+    return kinds[message.kind](message.message) if message.kind in kinds else None
 
 
 def _resources() -> list[dict[str, float]]:
