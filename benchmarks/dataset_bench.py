@@ -21,11 +21,11 @@ from lerobot.utils.import_utils import get_safe_default_video_backend
 
 from arena_newton.data.checks.verification import verify
 from arena_newton.data.datasets.data_options import VerifyOptions
-from arena_newton.data.datasets.layouts import layout
 from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset
 from arena_newton.data.readers.dataset_files import DatasetFiles
 from arena_newton.data.readers.frame_reader import Frames
 from arena_newton.data.recording.episode import episode_files, opened
+from arena_newton.data.recording.layouts import layout
 from arena_newton.errors import InputError
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.new_folder import scratch_folder

@@ -10,8 +10,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from arena_newton.data.datasets.layouts import state_names
 from arena_newton.data.readers.label_protocols import LABELS, action_names
+from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import InputError
 from arena_newton.files.text import plain_text
 from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, PICTURE_SIDES

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 
 from arena_newton import tasks
-from arena_newton.data.datasets.layouts import state_names
 from arena_newton.data.readers.label_protocols import action_names, protocol
+from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.text import plain_text
 from arena_newton.interfaces import Observation

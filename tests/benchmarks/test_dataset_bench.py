@@ -4,9 +4,9 @@ import datasets
 import numpy as np
 import pytest
 
-from arena_newton.data.datasets.layouts import LAYOUTS
 from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset
 from arena_newton.data.recording.episode import EpisodeFile, episode_files
+from arena_newton.data.recording.layouts import LAYOUTS
 from benchmarks.__main__ import main
 from benchmarks.episode_copies import copy_episodes
 from tests.arena_newton.data.consistent import ROWS, consistent_episode

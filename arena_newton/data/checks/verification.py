@@ -19,7 +19,12 @@ from tqdm import tqdm
 
 from arena_newton import tasks
 from arena_newton.data.checks.video_checks import CameraVideos, DatasetMismatch, check_videos
-from arena_newton.data.datasets.layouts import (
+from arena_newton.data.datasets.row_statistics import aggregated, quantile_name, row_statistics
+from arena_newton.data.readers.dataset_files import DatasetFiles, EpisodeRow, read_json
+from arena_newton.data.readers.label_protocols import encode_v4
+from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened, vision
+from arena_newton.data.recording.image_statistics import QUANTILES, VALUES, statistics
+from arena_newton.data.recording.layouts import (
     FPS,
     LAYOUTS,
     Column,
@@ -28,11 +33,6 @@ from arena_newton.data.datasets.layouts import (
     described_slots,
     modality,
 )
-from arena_newton.data.datasets.row_statistics import aggregated, quantile_name, row_statistics
-from arena_newton.data.readers.dataset_files import DatasetFiles, EpisodeRow, read_json
-from arena_newton.data.readers.label_protocols import encode_v4
-from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened, vision
-from arena_newton.data.recording.image_statistics import QUANTILES, VALUES, statistics
 from arena_newton.errors import InputError
 from arena_newton.files.text import counted
 from arena_newton.robot import g1

@@ -18,7 +18,6 @@ import pyarrow.compute
 import pyarrow.parquet
 from tqdm import tqdm
 
-from arena_newton.data.datasets.layouts import REFERENCE_SOURCES
 from arena_newton.data.datasets.row_statistics import HAND_NAME, aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import (
     DATA_PATH,
@@ -28,6 +27,7 @@ from arena_newton.data.readers.dataset_files import (
     VideoPart,
     read_json,
 )
+from arena_newton.data.recording.layouts import REFERENCE_SOURCES
 from arena_newton.errors import InputError
 from arena_newton.files.limits import MIB
 from arena_newton.files.own_files import replace_atomically

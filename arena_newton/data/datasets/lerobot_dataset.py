@@ -29,11 +29,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from arena_newton import __version__
-from arena_newton.data.datasets.layouts import Layout, described_protocol, described_slots, layout, modality
 from arena_newton.data.datasets.row_statistics import row_statistics
 from arena_newton.data.readers.dataset_files import read_json
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.recording.image_statistics import statistics
+from arena_newton.data.recording.layouts import Layout, described_protocol, described_slots, layout, modality
 from arena_newton.data.recording.source_videos import SourceVideo, source_video
 from arena_newton.errors import InputError
 from arena_newton.files.new_folder import new_folder

@@ -14,9 +14,9 @@ import pytest
 pytest.importorskip("pyarrow")
 
 from arena_newton.data import Frames  # noqa: E402
-from arena_newton.data.datasets.layouts import LAYOUTS  # noqa: E402
 from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset  # noqa: E402
 from arena_newton.data.recording.episode import EpisodeFile, episode_files  # noqa: E402
+from arena_newton.data.recording.layouts import LAYOUTS  # noqa: E402
 from arena_newton.errors import InputError  # noqa: E402
 from tests.arena_newton.data import made_episodes  # noqa: E402
 from tests.arena_newton.data.consistent import ROWS, consistent_episode  # noqa: E402
