@@ -192,7 +192,7 @@ def _say(text: str) -> None:
 
 
 def _facts(context: Context, left_out: Sequence[str], planned: Sequence[str]) -> certificate.Facts:
-    """What was certified."""
+    """Facts about the certified benchmark."""
     options = context.options
     engine, device = resolve_engine(options.engine, options.device)
     return {

@@ -12,7 +12,7 @@ class BenchOptions:
     """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
 
     what: tuple[str, ...] = ("all",)
-    """What to measure: tick throughput learned start, or `all`."""
+    """Figures to measure: tick throughput learned start, or `all`."""
     checkpoint: str | None = None
     """Weights of TWIST2; those that come with the package when none are named."""
     worlds: int = 20

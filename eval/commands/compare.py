@@ -30,7 +30,7 @@ class CompareOptions:
     only: Several[str] = ()
     """Names of those to compare, as the command prints them; all when none is named."""
     differ: Several[str] = ()
-    """What may differ between them, because it is what is compared: rules engine max_steps variant fast_physics."""
+    """Conditions that may differ between them, as they are compared: rules engine max_steps variant fast_physics."""
     per_tracker: bool = False
     """Each tracker of a folder is compared as one of its own, and against the others."""
 

@@ -103,7 +103,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
 
 
 def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResult, ...]:
-    """What a checkpoint reached: its cells, chunks executed as it says itself, without latency.
+    """Results of a checkpoint: its cells, with chunks executed as its own facts say, without latency.
 
     Raises:
         InputError: A folder is unfit or unfinished, was played under conditions of its own, or holds no cell of this

@@ -64,7 +64,7 @@ class Tested:
 
 @dataclass(frozen=True)
 class Chunks:
-    """How a policy's actions are understood, and how many of a chunk are executed."""
+    """Protocol of a policy's actions, and how many of a chunk are executed."""
 
     labels: str | None = None
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
@@ -239,7 +239,7 @@ class RunOptions(Remote, Output, Ray, Viewer, Recording, Pictures, Stepping, Bat
     accept_versions: bool = False
     """Continue a folder that was begun with other versions of the libraries; the journal then names both."""
     skip_broken: bool = False
-    """When simulator or tracker break down as a whole, end the episodes that were running as errors and go on.
+    """End the running episodes as errors and go on when simulator or tracker break down as a whole.
     Without it such a break stops the run and leaves them unplayed."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
@@ -256,7 +256,7 @@ class RunOptions(Remote, Output, Ray, Viewer, Recording, Pictures, Stepping, Bat
 
 
 def is_quick(options: RunOptions) -> bool:
-    """Whether the flags leave the plan open: the default run over all tasks."""
+    """True if the flags leave the plan open: the default run over all tasks."""
     named = options.task or options.mode or options.seeds or options.series is not None
     return not named and (options.repeats, options.max_steps, options.until_width) == (None, None, None)
 

@@ -45,7 +45,7 @@ SHOWN_EPISODES = 400
 
 @dataclass(frozen=True)
 class _Side:
-    """How one of two policies ended an episode."""
+    """Ending of an episode by one of two policies."""
 
     outcome: str
     why: str

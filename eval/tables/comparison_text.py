@@ -30,7 +30,7 @@ __all__ = [
 OVER_ALL = "all"
 """Name of the rows over all tasks."""
 CELLS = ("both", "only_first", "only_second", "neither")
-"""How a pair of episodes can end."""
+"""Endings of a pair of episodes."""
 LEAST = 1e-300
 """Probabilities below this are said to be so: they may be too small for a number."""
 METHOD = (
@@ -45,7 +45,7 @@ METHOD = (
     "tasks the made episodes that move its middle are shared out, after Price and Bonett).",
     "An episode that ended with an error counts as no success.",
 )
-"""How the figures are made, in paragraphs."""
+"""Paragraphs on the methods behind the figures."""
 
 
 def stratum_title(stratum: tuple[str, ...]) -> str:
@@ -73,7 +73,7 @@ def difference_text(difference: Contrast) -> str:
 
 
 def verdict(comparison: Comparison, pair: PairComparison) -> str:
-    """What a pair's test says, in a sentence."""
+    """Result of a pair's test, in a sentence."""
     first, second = comparison.names[pair.first], comparison.names[pair.second]
     if not pair.differs:
         return f"{first} and {second} are not told apart"
@@ -86,7 +86,7 @@ def verdict(comparison: Comparison, pair: PairComparison) -> str:
 
 
 def remarks(comparison: Comparison, contenders: ContenderSet) -> list[str]:
-    """What a reader must know besides the figures: of the runs, and of how their episodes fit together."""
+    """Notes for a reader: on the runs, and on the match of their episodes."""
     found = list(contenders.notes)
     if comparison.left_out:
         found.append(f"Left out, because not all have it: {', '.join(map(stratum_title, comparison.left_out))}.")
@@ -107,7 +107,7 @@ def _title(part: StratumPair) -> str:
 
 
 def _cells(part: StratumPair) -> tuple[str, str, str, str, str]:
-    """How many pairs of episodes ended in each way, where there are pairs; then the successes of both."""
+    """Number of pairs of episodes with each ending, where there are pairs; then the successes of both."""
     counts = part.counts
     each = [str(getattr(counts, name)) if isinstance(counts, PairedCounts) else "" for name in CELLS]
     rates = f"{counts.first}/{counts.first_episodes}, {counts.second}/{counts.second_episodes}"

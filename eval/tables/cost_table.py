@@ -1,4 +1,4 @@
-"""What policies cost: minutes of training and of evaluation, per policy and tracker."""
+"""Cost of policies: minutes of training and of evaluation, per policy and tracker."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class EvaluatedCell:
     wall_s: float | None = None
     """Time that its evaluation took [s], where a suite measured it."""
     device: str = ""
-    """Where it was played, such as `NVIDIA H200`."""
+    """Device on which it was played, such as `NVIDIA H200`."""
     weights: str = ""
     """Hash of the policy's weights, where it says one."""
     training_minutes: float | None = None

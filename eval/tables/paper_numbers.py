@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 FOLDER = Path(__file__).parent / "paper"
-"""Where the files are, with a README that says what each column means."""
+"""Folder of the files, with a README that explains each column."""
 FAMILIES: Mapping[str, str] = {"act": "act", "dp": "diffusion", "fm": "flow", "pi05": "pi05"}
 """Policy as the paper's tables abbreviate it → our name of the family."""
 PAPER_MODES = ("base", "execution", "semantic", "visual")

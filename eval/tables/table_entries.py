@@ -1,4 +1,4 @@
-"""What a table of several evaluations is made of: rows as they are shown, and one record per number for a file."""
+"""Entries of a table of several evaluations: rows as they are shown, and one record per number for a file."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class TableEntry:
     """95 % interval: Wilson's of a cell, `stats.contrast`'s of an average."""
     high: float | None = None
     derived: bool = False
-    """Whether successes and interval are derived from a printed rate."""
+    """True if successes and interval are derived from a printed rate."""
     afr: float | None = None
     """Falls of all episodes; in the paper's rows of its whole table row."""
     matched_sr: float | None = None
