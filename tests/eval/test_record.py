@@ -169,7 +169,7 @@ def test_ctrl_c_leaves_nothing_behind(recorded, tmp_path, processes):
     folder = tmp_path / "interrupted"
     program = (
         "import sys\n"
-        "from arena_newton.eval import recording\n"
+        "from arena_newton.eval.play import recording\n"
         "from arena_newton.eval.__main__ import main\n"
         f"recording.encoding_processes = lambda: {processes}\n"
         "sys.exit(main(sys.argv[1:]))\n"
