@@ -20,7 +20,8 @@ from arena_newton.physics.scene import load_scene
 SCRIPT = """
 import hashlib, json, sys
 import torch, warp
-from arena_newton import kernel_loading, trackers
+from arena_newton import trackers
+from arena_newton.kernel_cache import kernel_loading
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.pictures.settings import CameraConfig
@@ -42,7 +43,7 @@ print(json.dumps([built, loaded(), hashlib.sha256(bits + picture.numpy().tobytes
 BEGINNING = """
 import json, threading
 import warp as wp
-from arena_newton import kernel_loading
+from arena_newton.kernel_cache import kernel_loading
 from arena_newton.cli.quiet import quiet_warp
 quiet_warp()
 begun, plain = [], wp.Device._init_streams
@@ -234,7 +235,7 @@ def test_adjoints_are_left_out_where_nobody_takes_them():
     """Newton's and mujoco_warp's modules have no adjoints; those of the differentiable kernels keep theirs."""
     kernel_loading.forward_only()
     assert not any(wp.get_module(name).options["enable_backward"] for name in kernel_loading.FORWARD_MODULES)
-    for name in ("canonical", "success_hoi", "success_hsi"):
+    for name in ("canonical", "rules.success_hoi", "rules.success_hsi"):
         assert wp.get_module(f"arena_newton.kernels.{name}").options["enable_backward"]
 
 

@@ -122,3 +122,26 @@ def test_a_failed_recording_leaves_launches_plain():
         launching.record(fails)
     _launch(a, 7.0, out)
     assert (out.numpy()[0], other.numpy()[0]) == (7.0, 4.0)
+
+
+@wp.kernel
+def _judge_kernel(height: wp.array[float], round: int, least: float, success: wp.array[int], margin: wp.array[float]):
+    """Heights above a limit."""
+    w = wp.tid()
+    margin[w] = height[w] - least
+    success[w] = wp.where(margin[w] >= 0.0 and round == 1, 1, 0)
+
+
+def test_a_wrapper_takes_the_kernels_arguments():
+    """Arrays by position or name, flags as numbers, defaults where nothing is given; what is missing is an error."""
+    launch_judge = launching.launcher(_judge_kernel, least=0.5)
+    assert launch_judge.__name__ == "launch_judge" and launch_judge.__doc__ == "Heights above a limit."
+    height = wp.array([0.0, 1.0], dtype=float, device="cpu")
+    outputs = {"success": wp.zeros(2, dtype=int, device="cpu"), "margin": wp.zeros(2, dtype=float, device="cpu")}
+    launch_judge(height, round=True, **outputs)
+    assert outputs["success"].numpy().tolist() == [0, 1] and outputs["margin"].numpy().tolist() == [-0.5, 0.5]
+    launch_judge(height=height, round=True, least=-1.0, **outputs)
+    assert outputs["success"].numpy().tolist() == [1, 1]
+    for wrong in ({}, {"round": True, "rond": True}):
+        with pytest.raises(TypeError):
+            launch_judge(height, **wrong, **outputs)
