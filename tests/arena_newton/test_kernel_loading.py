@@ -20,7 +20,8 @@ from arena_newton.physics.scene import load_scene
 SCRIPT = """
 import hashlib, json, sys
 import torch, warp
-from arena_newton import kernel_loading, trackers
+from arena_newton import trackers
+from arena_newton.kernel_cache import kernel_loading
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.env import ArenaEnv
 from arena_newton.pictures.settings import CameraConfig
@@ -42,7 +43,7 @@ print(json.dumps([built, loaded(), hashlib.sha256(bits + picture.numpy().tobytes
 BEGINNING = """
 import json, threading
 import warp as wp
-from arena_newton import kernel_loading
+from arena_newton.kernel_cache import kernel_loading
 from arena_newton.cli.quiet import quiet_warp
 quiet_warp()
 begun, plain = [], wp.Device._init_streams
@@ -70,6 +71,7 @@ def run(engine: str, threads: int) -> tuple[set[str], set[str], str]:
     return set(built), set(loaded), bits
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_the_lists_are_what_an_environment_launches(engine):
     """Without threads a new process loads every listed module, and of Newton and MuJoCo Warp no other one."""
@@ -80,6 +82,7 @@ def test_the_lists_are_what_an_environment_launches(engine):
     assert own <= listed, f"not listed: {sorted(own - listed)}"
 
 
+@pytest.mark.release
 def test_a_rehearsal_finds_all_modules_and_no_other_one():
     """With threads the building of an environment loads what a run without them launches, and no bit differs."""
     before, launched, bits = run("warp", 1)
@@ -234,7 +237,7 @@ def test_adjoints_are_left_out_where_nobody_takes_them():
     """Newton's and mujoco_warp's modules have no adjoints; those of the differentiable kernels keep theirs."""
     kernel_loading.forward_only()
     assert not any(wp.get_module(name).options["enable_backward"] for name in kernel_loading.FORWARD_MODULES)
-    for name in ("canonical", "success_hoi", "success_hsi"):
+    for name in ("canonical", "rules.success_hoi", "rules.success_hsi"):
         assert wp.get_module(f"arena_newton.kernels.{name}").options["enable_backward"]
 
 
