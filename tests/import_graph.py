@@ -31,7 +31,8 @@ reads their files with their checks, their authors load a scene to look at it.""
 INNER = {
     f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
         | certification studies loop bench | commands | __main__""",
-    f"{PACKAGE}.eval.certification": "stand_ins | context | finding | claims | checks | certificate jobs",
+    f"{PACKAGE}.eval.certification": """certify_options stand_ins | context | finding | claims | checks
+        | certificate jobs | certify""",
     PACKAGE: """errors | files | cli | robot | interfaces rules | kernel_cache tasks | physics | rule_sets | pictures
         | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",

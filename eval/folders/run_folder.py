@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from arena_newton import rule_sets, tasks
+from arena_newton.cli.flags import flag_name
 from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.plan.config import RunConfig, plain_facts
@@ -140,8 +141,7 @@ class ResultsFolder:
             default = getattr(RunOptions, name)
             kept, given = stored["options"].get(name, default), getattr(self.config.flags, name)
             if given != (tuple(kept) if isinstance(kept, list) else kept):
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"{folder}: was begun with {flag} {setting(kept)}; choose another --out")
+                raise InputError(f"{folder}: was begun with {flag_name(name)} {setting(kept)}; choose another --out")
         known = [moving_versions(versions) for versions in _versions(stored)]
         present = moving_versions(self.installed)
         if present not in known and not self.config.flags.accept_versions:

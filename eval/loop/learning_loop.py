@@ -11,13 +11,13 @@ import dataclasses
 import fcntl
 import json
 import os
-import shlex
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from arena_newton.cli.flags import check_least, flag_name, shell_command, words
 from arena_newton.data.datasets import lerobot_dataset
 from arena_newton.data.datasets.data_options import BuildOptions
 from arena_newton.doctor import versions
@@ -25,11 +25,12 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.loop import loop_report
+from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING, LoopRecord, StageRecord
 from arena_newton.eval.loop.loop_requirements import check_disk, check_folder, check_libraries, recorded_bytes
 from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_SEEDS
-from arena_newton.eval.plan.options import LoopOptions, RecordOptions, RunOptions
+from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.reports.progress import duration
@@ -131,10 +132,7 @@ def resolved(options: LoopOptions) -> LoopOptions:
     options = dataclasses.replace(options, **opened)  # type: ignore[arg-type]  # each is of its flag's kind
     if options.steps is not None and options.minutes is not None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
-    for name in ("episodes", "repeats", "worlds", "steps", "max_steps"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise InputError(f"--{name.replace('_', '-')} {value}: expected at least 1")
+    check_least(options, 1, "episodes", "repeats", "worlds", "steps", "max_steps")
     if options.minutes is not None and not options.minutes > 0:
         raise InputError(f"--minutes {options.minutes:g}: expected more than 0")
     check_numbers(dataclasses.replace(_training(options, Path()), dataset=(Path(),)))  # its dataset is not there yet
@@ -143,8 +141,8 @@ def resolved(options: LoopOptions) -> LoopOptions:
     if any((camera.width, camera.height) != (picture, picture) for camera in cameras.values()):
         raise InputError(f"{flag}: recipe {options.policy}/{options.recipe} takes {picture}x{picture}")
     if options.out is None:
-        words = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
-        options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(words))))
+        named = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
+        options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(named))))
     resolve(recording_run(_recording(options, Path())))  # tasks, tracker, engine and size, before anything is written
     resolve(dataclasses.replace(_evaluation(options, Path()), policy="stand"))
     return options
@@ -266,7 +264,7 @@ class _Loop:
             "train": self._train,
             "evaluate": self._evaluate,
         }
-        command = "python -m arena_newton.eval loop " + " ".join(_words(self.options))
+        command = shell_command("arena_newton.eval", "loop", *words(self.options))
         code = 0
         for number, (name, work) in enumerate(stages.items(), 1):
             stage = self.stages.setdefault(name, StageRecord())
@@ -319,8 +317,7 @@ class _Loop:
         for name, now in mine.items():
             was = stored.options.get(name)
             if name not in UNRESOLVED and was != now:
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"--out {self.out}: was begun with {flag} {_said(was)}, now {_said(now)}")
+                raise InputError(f"--out {self.out}: was begun with {flag_name(name)} {_said(was)}, now {_said(now)}")
         self.stages = stored.stages
 
     def _write(self) -> None:
@@ -377,16 +374,3 @@ class _Loop:
 
 def _said(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else "-" if value is None else str(value)
-
-
-def _words(options: LoopOptions) -> list[str]:
-    """The flags that give this loop again."""
-    words: list[str] = []
-    for one in dataclasses.fields(options):
-        value = getattr(options, one.name)
-        if value in (None, False):
-            continue
-        words.append("--" + one.name.replace("_", "-"))
-        if value is not True:
-            words += [shlex.quote(str(part)) for part in (value if isinstance(value, tuple) else (value,))]
-    return words

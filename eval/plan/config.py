@@ -15,18 +15,23 @@ from typing import TYPE_CHECKING
 
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
+from arena_newton.cli.flags import check_least, shared
 from arena_newton.data.recording.episode import CAMERAS
 from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
-from arena_newton.eval.plan.flag_checks import DRIVES, RAY_FLAGS, check_flags, flag_name
+from arena_newton.eval.plan.flag_checks import DRIVES, check_flags
 from arena_newton.eval.plan.interaction import check_interactions
 from arena_newton.eval.plan.options import (
     QUICK_REPEATS,
     QUICK_SEEDS,
     QUICK_TRACKERS,
+    Chunks,
+    Ray,
     RecordOptions,
     RunOptions,
+    Viewer,
+    flags_of,
     is_quick,
 )
 from arena_newton.eval.records.document import Identity
@@ -57,7 +62,6 @@ if TYPE_CHECKING:
 __all__ = [
     "DEFAULT_TRACKER",
     "DRIVES",
-    "RAY_FLAGS",
     "RunConfig",
     "plain_facts",
     "recorded_cameras",
@@ -69,15 +73,12 @@ DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
 POLICY_PATH_SCHEMES = ("learned", "lerobot", "replay")
 """Policies whose text after the colon is a path."""
-CHUNK_FLAGS = ("replan", "ensemble", "latency_ticks")
-"""Flags that say how a policy's chunks are executed."""
 MOST_EPISODES = 200
 """Episodes of a task, tracker and mode under --until-width; the widest interval is then 14 points wide."""
 MOST_DISTURBANCE = 10.0
 """Largest factor of the noise; no robot stands far less."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
-ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
-ONE_CALL |= {"ray", *RAY_FLAGS}
+ONE_CALL |= {*flags_of(Viewer), *flags_of(Ray)}
 """Flags that a resumed run does not take over."""
 
 
@@ -171,7 +172,7 @@ class RunConfig:
 
     def _chunks(self) -> Identity:
         """Execution of chunks, where it is not the usual: whole, at once, one after the other."""
-        given = {name: getattr(self.flags, name) for name in CHUNK_FLAGS}
+        given = {name: getattr(self.flags, name) for name in flags_of(Chunks) if name != "labels"}
         return {name: value for name, value in given.items() if value}  # type: ignore[return-value]  # a part of one
 
     @property
@@ -245,20 +246,18 @@ def recording_run(options: RecordOptions) -> RunOptions:
     Raises:
         InputError: A number is out of range.
     """
-    if options.episodes < 1:
-        raise InputError(f"--episodes {options.episodes}: expected at least 1")
-    if options.seed_series < 0:
-        raise InputError(f"--seed-series {options.seed_series}: expected at least 0")
+    check_least(options, 1, "episodes")
+    check_least(options, 0, "seed_series")
     if not 0.0 <= options.disturb_scale <= MOST_DISTURBANCE:
         raise InputError(f"--disturb-scale {options.disturb_scale:g}: expected 0 to {MOST_DISTURBANCE:g}")
     if not options.disturb and options.disturb_scale != 1.0:
         raise InputError("--disturb-scale: belongs to disturbed execution; drop it or --no-disturb")
     if options.accept_differences:
         raise InputError("--accept-differences: belongs to --from, which is not given")
-    shared = {f.name for f in dataclasses.fields(RunOptions)} & {f.name for f in dataclasses.fields(options)}
     attempts = options.episodes * (rounds.ATTEMPTS if options.only_success else 1)
-    run = RunOptions(
-        **{name: getattr(options, name) for name in shared},
+    run = shared(
+        options,
+        RunOptions,
         seeds=(options.seed_series,),
         repeats=attempts,
         record=True,
@@ -459,11 +458,8 @@ def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, 
 
 
 def _policy_options(options: RunOptions) -> JsonObject:
-    """Arguments of a policy besides its spec; flags of another policy are refused."""
+    """Arguments of a policy besides its spec."""
     scheme = options.policy.partition(":")[0]
-    for name in ("replan", "ensemble"):
-        if getattr(options, name) and scheme != "lerobot":
-            raise InputError(f"{flag_name(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
     if scheme == "remote":
         return {
             "timeout": options.remote_timeout,
@@ -472,9 +468,6 @@ def _policy_options(options: RunOptions) -> JsonObject:
             "verify_ssl": not options.remote_insecure,
             "labels": options.labels or "v3.1",
         }
-    for field in dataclasses.fields(options):
-        if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
-            raise InputError(f"{flag_name(field.name)}: belongs to --policy remote:<url>, not {options.policy}")
     return {"replan": options.replan, "ensemble": options.ensemble} if scheme == "lerobot" else {}
 
 

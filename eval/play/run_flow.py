@@ -6,7 +6,6 @@ No library of physics is loaded: a process that leaves the episodes to others ne
 from __future__ import annotations
 
 import contextlib
-import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.cli.command_line import INTERRUPTED
+from arena_newton.cli.flags import shell_command
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.results import Results, RunRecord, load_run
 from arena_newton.eval.folders.run_folder import ResultsFolder
@@ -93,7 +93,7 @@ def reported(folder: ResultsFolder, seconds: float) -> int:
 
 def command(folder: ResultsFolder, name: str) -> str:
     """The command line that does something to a folder."""
-    return f"python -m arena_newton.eval {name} {shlex.quote(str(folder.path))}"
+    return shell_command("arena_newton.eval", name, folder.path)
 
 
 def groups(episodes: Iterable[Episode]) -> dict[Group, list[Episode]]:

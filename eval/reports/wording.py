@@ -6,13 +6,12 @@ as plain names in `videos/` and `strips/`.
 
 from __future__ import annotations
 
-import dataclasses
 import re
-import shlex
 from collections.abc import Mapping, Sequence
 
 from arena_newton import tasks as specs
-from arena_newton.eval.plan.options import RunOptions
+from arena_newton.cli.flags import shell_command, typed
+from arena_newton.eval.plan.options import Remote, flags_of
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.records.schema import Json
@@ -35,7 +34,7 @@ MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head
 """Media of an episode that the page knows → what they show."""
 REPLAYED = ("policy", "checkpoint", "labels", "replan", "rules", "drive", "engine", "device", "variant", "max_steps")
 """Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
-REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
+REMOTE = {name: getattr(Remote, name) for name in flags_of(Remote)}
 """Flags that belong to a policy server → their defaults; others are named in the command."""
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"
@@ -83,33 +82,26 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
 
     `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
-    words: list[object] = ["python", "-m", "arena_newton.eval"]
-    series = options.get("series")
-    words += ["record"] if series is not None else []
-    words += ["--task", record.task, "--mode", record.mode, "--tracker", record.tracker]
+    series, scale = options.get("series"), options.get("disturb_scale")
+    given: dict[str, object] = {"task": record.task, "mode": record.mode, "tracker": record.tracker}
     if series is not None:
-        words += ["--seed-series", record.group_seed, "--episodes", record.repeat + 1]
-        words += [] if options.get("disturb") is True else ["--no-disturb"]
+        given |= {"seed_series": record.group_seed, "episodes": record.repeat + 1}
+        given |= {} if options.get("disturb") is True else {"disturb": False}
     else:
-        words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
-    for name in REPLAYED:
-        value = options.get(name)
-        if value not in (None, "", "auto"):
-            words += ["--" + name.replace("_", "-"), value]
+        given |= {"seeds": record.group_seed, "repeats": record.repeat + 1}
+    given |= {name: options.get(name) for name in REPLAYED if options.get(name) not in ("", "auto")}
     for name, default in REMOTE.items() if plain(options.get("policy")).startswith("remote:") else ():
         value = options.get(name, default)
-        if value is True:
-            words += ["--" + name.replace("_", "-")]
-        elif value is not False and value != default:
-            words += ["--" + name.replace("_", "-"), value]
-    late, scale = options.get("latency_ticks"), options.get("disturb_scale")
-    words += ["--latency-ticks", late] if late else []
-    words += ["--ensemble"] if options.get("ensemble") is True else []
-    words += ["--disturb-scale", scale] if series is not None and scale not in (None, 1.0) else []
-    words += ["--worlds", worlds] if worlds is not None else []
-    words += ["--fast-physics"] if options.get("fast_physics") is True else []
-    words += [] if series is not None else ["--video", "--strip"]
-    return " ".join(shlex.quote(plain(word)) for word in words)
+        given |= {name: value} if value is not False and value != default else {}
+    given |= {
+        "latency_ticks": options.get("latency_ticks") or None,
+        "ensemble": options.get("ensemble") is True or None,
+    }
+    given |= {"disturb_scale": scale} if series is not None and scale != 1.0 else {}
+    given |= {"worlds": worlds, "fast_physics": options.get("fast_physics") is True or None}
+    given |= {} if series is not None else {"video": True, "strip": True}
+    typed_words = [plain(word) for name, value in given.items() for word in typed(name, value)]
+    return shell_command("arena_newton.eval", *(["record"] if series is not None else []), *typed_words)
 
 
 def environment_facts(facts: Mapping[str, Json]) -> list[tuple[str, str]]:

@@ -6,14 +6,12 @@ No library of physics or pictures is loaded: a wrong file, a dry run and an abse
 from __future__ import annotations
 
 import dataclasses
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton.cli.flags import check_least, shell_command, words
 from arena_newton.errors import InputError
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS, check_ray
-from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.plan.suite_options import MatrixOptions
+from arena_newton.eval.plan.flag_checks import check_ray
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.sharding import parse_shard
 from arena_newton.eval.suites.matrix_cells import (
@@ -25,6 +23,7 @@ from arena_newton.eval.suites.matrix_cells import (
     selected,
 )
 from arena_newton.eval.suites.suite_file import SuiteFile, read_suite_file, suite_path
+from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.eval.suites.suite_records import SuiteCell, read_suite
 from arena_newton.files.text import counted
 
@@ -67,9 +66,8 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
-    check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
-    if options.limit is not None and options.limit < 1:
-        raise InputError(f"--limit {options.limit}: expected at least 1")
+    check_ray(options)
+    check_least(options, 1, "limit")
     cells = expand_cells(suite)
     if shard.count > max(len(cells), 1):
         raise InputError(f"--shard {shard}: the suite has {counted(len(cells), 'cell')}, expected no more shards")
@@ -104,13 +102,6 @@ def _out(options: MatrixOptions, suite: SuiteFile) -> Path:
 
 def _again(given: str, options: MatrixOptions) -> str:
     """The command that continues."""
-    parts = ["python", "-m", "arena_newton.eval", "matrix", given]
-    for name in ("out", "only", "shard", "device"):
-        value = getattr(options, name)
-        if value != getattr(MatrixOptions, name):
-            parts += [f"--{name}", value]
-    for name in ("ray", *RAY_FLAGS):
-        value = getattr(options, name)
-        if value != getattr(MatrixOptions, name):
-            parts += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return shlex.join([*parts, *(["--keep-going"] if options.keep_going else [])])
+    once = ("limit", "dry_run", "accept_changes", "accept_code", "retry_errors", "verbose")
+    again = dataclasses.replace(options, **{name: getattr(MatrixOptions, name) for name in once})
+    return shell_command("arena_newton.eval", "matrix", given, *words(again))

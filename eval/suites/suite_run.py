@@ -7,17 +7,16 @@ import dataclasses
 import datetime
 import gc
 import io
-import shlex
 import time
 from collections.abc import Iterator, Sequence
 
 from arena_newton import doctor
+from arena_newton.cli.flags import shell_command
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder, iso, setting
 from arena_newton.eval.plan.config import RunConfig, resolve
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS
-from arena_newton.eval.plan.suite_options import MatrixOptions
+from arena_newton.eval.plan.options import Ray, flags_of
 from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunStopped, execute
 from arena_newton.eval.records.document import SUITE_FILE
@@ -27,6 +26,7 @@ from arena_newton.eval.suites.matrix_cells import matrix_table, run_options
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_file import SuiteFile
 from arena_newton.eval.suites.suite_folder import SuiteFolder
+from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.eval.suites.suite_records import CellEnding, CellEvent, SuiteCell
 from arena_newton.eval.workers.slice_player import device_name
 from arena_newton.files.text import counted, plain_text
@@ -116,7 +116,7 @@ class CellPlayer:
         for name in chosen:
             cell = self.folder.plan.cell(name)
             options = run_options(self.suite, cell, self.folder.path, self.options.device)
-            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", "ray", *RAY_FLAGS)}
+            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", *flags_of(Ray))}
             try:
                 self.configs[name] = resolve(dataclasses.replace(options, **given))
             except InputError as error:
@@ -330,7 +330,7 @@ class CellPlayer:
             print(f"failed: {name}: {message}")
         if errors:
             print(f"{counted(errors, 'episode')} ended with an error; run them again with: {self.again} --retry-errors")
-        print(f"tables: python -m arena_newton.eval tables {shlex.quote(str(self.folder.path))}")
+        print(f"tables: {shell_command('arena_newton.eval', 'tables', self.folder.path)}")
         return 1 if self.failed or errors else 0
 
 

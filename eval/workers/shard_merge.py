@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import re
-import shlex
 import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from arena_newton.cli.flags import flag_name
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import Results, RunRecord, due_episodes, is_complete, load_run
 from arena_newton.eval.folders.run_folder import RECORDING_FLAGS, comparable, setting
-from arena_newton.eval.plan.options import RunMergeOptions, RunOptions
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
@@ -25,9 +25,9 @@ from arena_newton.eval.records.schema import Json, JsonObject, shown
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
 from arena_newton.eval.reports import report
 from arena_newton.files.own_files import PARTIAL, file_label, replace_atomically
-from arena_newton.files.text import counted, plain_text, unprintable
+from arena_newton.files.text import counted, plain_text
 
-__all__ = ["MergedRun", "merge", "run"]
+__all__ = ["MergedRun", "merge"]
 
 TIMES = ("started_at", "finished_at")
 """Keys of a journal line that differ when an episode is played again, as `durations.wall_s` does."""
@@ -59,33 +59,6 @@ class _Kept:
     """Folder that it is from."""
     others: tuple[Path, ...] = ()
     """Folders where the same came of it."""
-
-
-def run(folders: Sequence[Path], options: RunMergeOptions) -> int:
-    """Merge as the command line asks for, and print the table.
-
-    Returns:
-        0: every planned episode is there, with another outcome than error. 1: some are missing or ended so.
-
-    Raises:
-        InputError: The folders cannot be joined, or --out cannot be written to.
-        StorageError: The disk is full.
-    """
-    if options.out is None or not options.out.strip():
-        raise InputError("merge: name a new folder with --out")
-    if (reason := unprintable(options.out)) is not None:
-        raise InputError(f"--out {plain_text(options.out)}: {reason}")
-    out = Path(options.out).expanduser()
-    merged = merge(folders, out, partial=options.partial, accept_versions=options.accept_versions)
-    print(report.table(merged.results))
-    for note in (*report.notes(merged.run, merged.results), *merged.notes):
-        print(note)
-    whole = merged.results["complete"]
-    if not whole:
-        print(f"The rest: python -m arena_newton.eval resume {shlex.quote(str(out))}")
-    print(f"{counted(merged.results['finished'], 'episode')} of {counted(len(folders), 'folder')} -> {out}")
-    print(f"report: {out / 'report.html'}")
-    return 0 if whole and not any(record.outcome == "error" for record in merged.run.records) else 1
 
 
 def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_versions: bool = False) -> MergedRun:
@@ -191,7 +164,7 @@ def _check_alike(first: RunRecord, other: RunRecord, accept_versions: bool) -> N
     for name in RECORDING_FLAGS:
         values = [_plain(run.document["options"].get(name, getattr(RunOptions, name))) for run in (first, other)]
         if values[0] != values[1]:
-            raise refuse(f"--{name.replace('_', '-')}", *values)
+            raise refuse(flag_name(name), *values)
     versions = [moving_versions(run.document.get("versions", {})) for run in (first, other)]
     difference = differing_key(*versions)
     if difference is not None and not accept_versions:

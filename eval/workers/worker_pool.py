@@ -27,8 +27,7 @@ from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS
-from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.plan.options import Ray, RunOptions, flags_of
 from arena_newton.eval.play.run_flow import Group, RunStopped
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
@@ -86,7 +85,7 @@ class Job:
 
     def options(self) -> RunOptions:
         """The flags that a process opens it with."""
-        alone = {name: getattr(RunOptions, name) for name in ("ray", *RAY_FLAGS, "shard", "out")}
+        alone = {name: getattr(RunOptions, name) for name in (*flags_of(Ray), "shard", "out")}
         return dataclasses.replace(self.folder.config.flags, **alone)
 
 

@@ -11,13 +11,13 @@ import dataclasses
 import hashlib
 import json
 import os
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors.torch import save
 
+from arena_newton.cli.flags import shell_command, typed
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import PARTIAL
 from arena_newton.files.untrusted_files import create
@@ -213,19 +213,13 @@ def training_command(options: Mapping[str, object]) -> str:
     flags = options.get("flags")
     if not isinstance(flags, dict):
         return ""
-    words = ["python", "-m", "arena_newton.policies.train"]
+    words: list[str] = []
     for one in dataclasses.fields(PolicyTrainOptions):
         value = flags.get(one.name)
         default = list(one.default) if isinstance(one.default, tuple) else one.default
         if one.name in UNTOLD or value is None or (value == default and one.name not in ("policy", "recipe")):
             continue
-        name = one.name.replace("_", "-")
-        values: Sequence[object] = value if isinstance(value, list) else [value]
-        if isinstance(value, bool):
-            words.append(f"--{name}" if value else f"--no-{name}")
-        else:
-            words += [
-                f"--{name}",
-                *(Path(str(v)).name if one.name in ("dataset", "weights") else str(v) for v in values),
-            ]
-    return " ".join(map(shlex.quote, words))
+        if one.name in ("dataset", "weights"):
+            value = [Path(str(path)).name for path in (value if isinstance(value, list) else [value])]
+        words += typed(one.name, value)
+    return shell_command("arena_newton.policies.train", *words)

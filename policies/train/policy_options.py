@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
@@ -153,7 +153,7 @@ def check_ranges(options: DataclassInstance) -> None:
             low, high = one.metadata["range"]
             value = getattr(options, one.name)
             if value is not None and not (low <= value <= high and math.isfinite(value)):
-                flag = "--" + one.name.replace("_", "-")
+                flag = flag_name(one.name)
                 until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise InputError(f"{flag} {value}: expected a number {until}")
 

@@ -45,7 +45,7 @@ def test_commands_of_the_index_exist():
     for command in COMMANDS:
         assert any(f"{words} ".startswith(f"{command.words} ") for words in listed), command.words
     assert {f"data {name}" for name in data.COMMANDS} <= set(listed)
-    assert {f"eval {name}" for name in evaluation._COMMANDS} - {"eval run"} <= set(listed)
+    assert {f"eval {name}" for name in evaluation.COMMANDS} - {"eval run"} <= set(listed)
     known = {word for command in COMMANDS for word in command.words.split()}
     assert {words.split()[0] for words in listed} <= known | {"validate", "list", "preview", "new"}
 

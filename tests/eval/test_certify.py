@@ -10,14 +10,13 @@ from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification import certificate, claims
+from arena_newton.eval.certification import certificate, certify, claims
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import legs, solvable, swap
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
 from arena_newton.eval.certification.stand_ins.bodies import Body
-from arena_newton.eval.commands import certify
 from arena_newton.eval.plan import options as flags
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.play import run as runs
 from arena_newton.eval.records.journal import ContradictionError
 from arena_newton.eval.statistics.stats import mcnemar

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from arena_newton import rule_sets, tasks, trackers
+from arena_newton.eval.certification import certify
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import agreement, axes, visible
 from arena_newton.eval.certification.checks.swap import retention
 from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell
 from arena_newton.eval.certification.finding import Score, Sheet, discordant
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
-from arena_newton.eval.commands import certify
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.play.run import Factories
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION

@@ -14,9 +14,9 @@ from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.plan.suite_options import MatrixOptions
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
 from arena_newton.eval.suites.suite_call import plan_call
+from arena_newton.eval.suites.suite_options import MatrixOptions
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "visual", "--repeats", "4"]

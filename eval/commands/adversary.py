@@ -6,26 +6,48 @@ import dataclasses
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from arena_newton.cli.flags import check_least
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
-from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.play.run import Factories
-from arena_newton.eval.records.journal import write_atomic
-from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.studies.placed_play import MOST_EPISODES, PlacedWorlds, placement_run
-from arena_newton.eval.studies.placement_axes import Axis
-from arena_newton.eval.studies.placement_files import PlacedRows, PointTally, point_rows, study_folder, tallies
-from arena_newton.eval.studies.placement_options import AdversaryOptions
-from arena_newton.eval.studies.worst_placement import Point, score_of, search, worst_of
+from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.files.text import counted
-from arena_newton.interfaces import EpisodeResult
 from arena_newton.robot.g1 import TICK
 
-__all__ = ["FORMAT", "run"]
+if TYPE_CHECKING:
+    from arena_newton.eval.plan.episode_plan import Episode
+    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.studies.placed_play import PlacedWorlds
+    from arena_newton.eval.studies.placement_axes import Axis
+    from arena_newton.eval.studies.placement_files import PlacedRows, PointTally
+    from arena_newton.eval.studies.worst_placement import Point
+    from arena_newton.interfaces import EpisodeResult
+
+__all__ = ["AdversaryOptions", "run"]
 
 FORMAT = 1
 """Version of adversary.json."""
+
+
+@dataclass(frozen=True)
+class AdversaryOptions(PlacementOptions):
+    """Search the placement of a task at which a policy does worst, and report it beside the mean over the range.
+
+    The cross-entropy method on margins: batches of placements, all played at once; on CUDA thousands of worlds.
+    """
+
+    batch: int = 60
+    """Placements of a batch; the first is drawn from the whole range and gives the mean."""
+    batches: int = 5
+    """Batches, each drawn where the ones before did worst."""
+    confirm: int = 10
+    """Episodes with new seeds at the placement that was found worst."""
+    search_seed: int = 0
+    """Seed of the search itself."""
+    out: str | None = None
+    """Folder to write, which must not exist; results/adversary_<task>_<tracker>_<mode> when none is named."""
 
 
 def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
@@ -38,6 +60,11 @@ def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
         InputError: A flag is unfit; raised before the first episode.
         StorageError: A file cannot be written.
     """
+    from arena_newton.eval.records.journal import write_atomic
+    from arena_newton.eval.studies.placed_play import PlacedWorlds, placement_run
+    from arena_newton.eval.studies.placement_files import PlacedRows, point_rows, study_folder, tallies
+    from arena_newton.eval.studies.worst_placement import search, worst_of
+
     config, axes = placement_run(options)
     _check(options)
     confirming, _ = placement_run(dataclasses.replace(options, seed=options.seed + 1, repeats=options.confirm))
@@ -69,15 +96,11 @@ def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
 
 
 def _check(options: AdversaryOptions) -> None:
-    for flag, value, least in (
-        ("batch", options.batch, 10),
-        ("batches", options.batches, 1),
-        ("confirm", options.confirm, 1),
-    ):
-        if value < least:
-            raise InputError(f"--{flag} {value}: expected at least {least}")
-    if options.search_seed < 0:
-        raise InputError(f"--search-seed {options.search_seed}: expected at least 0")
+    from arena_newton.eval.studies.placed_play import MOST_EPISODES
+
+    check_least(options, 10, "batch")
+    check_least(options, 1, "batches", "confirm")
+    check_least(options, 0, "search_seed")
     count = options.batch * options.batches * options.repeats + options.confirm
     if count > MOST_EPISODES:
         raise InputError(f"--batch, --batches and --repeats: make {count:,} episodes, at most {MOST_EPISODES:,}")
@@ -87,6 +110,8 @@ class _Study:
     """Plays batches and keeps what came of them."""
 
     def __init__(self, worlds: PlacedWorlds, options: AdversaryOptions, rows: PlacedRows):
+        from arena_newton.eval.reports.progress import Progress
+
         self.results: list[EpisodeResult] = []
         self._worlds, self._rows = worlds, rows
         self._budget = worlds.config.episodes[0].max_steps
@@ -105,6 +130,8 @@ class _Study:
 
     def scores(self, points: list[Point]) -> list[float]:
         """Score of each placement."""
+        from arena_newton.eval.studies.worst_placement import score_of
+
         results = self.play(points)
         each = len(results) // len(points)
         return [score_of(results[k * each : (k + 1) * each], self._budget) for k in range(len(points))]

@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arena_newton.cli.flags import user_path
+from arena_newton.cli.flags import Several, user_path
 from arena_newton.errors import InputError
-from arena_newton.eval.commands.table_options import CompareOptions
-from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
-from arena_newton.eval.records.journal import StorageError, write_atomic
-from arena_newton.eval.reports.wording import plain
-from arena_newton.eval.statistics.comparison import Comparison, compare
-from arena_newton.eval.tables.comparison_page import comparison_page
-from arena_newton.eval.tables.comparison_text import as_csv, as_json, as_markdown, p_text, rate_text, remarks, verdict
-from arena_newton.eval.tables.contenders import read_contenders
 
-__all__ = ["run"]
+if TYPE_CHECKING:
+    from arena_newton.eval.statistics.comparison import Comparison
+
+__all__ = ["CompareOptions", "run"]
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Compare policies over the episodes that they share: exact tests, intervals, letters, and who won which episode.
+
+    Results folders are one policy each; a suite has all of its own. Episodes are paired by task, tracker, mode and
+    episode seed; runs of other seeds are compared unpaired. Where each has one tracker, trackers may differ.
+    """
+
+    out: str = "comparison"
+    """Folder to write: compare.html, compare.md, compare.json and compare.csv."""
+    only: Several[str] = ()
+    """Names of those to compare, as the command prints them; all when none is named."""
+    differ: Several[str] = ()
+    """What may differ between them, because it is what is compared: rules engine max_steps variant fast_physics."""
+    per_tracker: bool = False
+    """Each tracker of a folder is compared as one of its own, and against the others."""
 
 
 def run(folders: Sequence[Path], options: CompareOptions) -> int:
@@ -27,6 +42,14 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
         InputError: A folder is unfit, a flag, or the runs cannot be compared.
         StorageError: A file cannot be written.
     """
+    from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
+    from arena_newton.eval.records.journal import StorageError, write_atomic
+    from arena_newton.eval.reports.wording import plain
+    from arena_newton.eval.statistics.comparison import compare
+    from arena_newton.eval.tables.comparison_page import comparison_page
+    from arena_newton.eval.tables.comparison_text import as_csv, as_json, as_markdown, remarks
+    from arena_newton.eval.tables.contenders import read_contenders
+
     if not options.out.strip():
         raise InputError("--out: is empty, name a folder")
     out = user_path(options.out)
@@ -57,6 +80,8 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
 
 def _said(comparison: Comparison) -> list[str]:
     """Rates with letters, best first, and a sentence per pair."""
+    from arena_newton.eval.tables.comparison_text import p_text, rate_text, verdict
+
     width = max(map(len, comparison.names))
     ranked = sorted(zip(comparison.names, comparison.overall, strict=True), key=lambda row: -row[1].rate)
     lines = []

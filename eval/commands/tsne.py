@@ -4,24 +4,46 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from arena_newton import policies, tasks
+from arena_newton.cli.flags import Several
 from arena_newton.errors import InputError
-from arena_newton.eval.commands.table_options import TsneOptions
-from arena_newton.eval.records.journal import StorageError, write_atomic
-from arena_newton.eval.records.schema import JsonObject
-from arena_newton.eval.studies.action_map import ActionMap, Separation, draw, embed, separation, shifted
-from arena_newton.eval.studies.predicted_actions import DatasetObservations, as_many_of_each, predict
 from arena_newton.files.text import counted, plain_text
-from arena_newton.policies.base import Policy
 
-__all__ = ["run"]
+if TYPE_CHECKING:
+    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.eval.studies.action_map import ActionMap, Separation
+    from arena_newton.eval.studies.predicted_actions import DatasetObservations
+    from arena_newton.policies.base import Policy
+
+__all__ = ["TsneOptions", "run"]
 
 FORMAT = 1
 """Version of tsne.json."""
+
+
+@dataclass(frozen=True)
+class TsneOptions:
+    """Map the actions that one policy predicts from the observations of two datasets, as the paper's t-SNE figures."""
+
+    policy: str = ""
+    """Policy that predicts, such as lerobot:<checkpoint>."""
+    datasets: Several[str] = ()
+    """Two LeRobot datasets of the same tasks, such as one recorded through each tracker."""
+    samples: int = 1000
+    """Observations of each dataset and task."""
+    frames: int = 10
+    """Uniformly spaced observations of each episode."""
+    out: str = "tsne"
+    """Folder to write: tsne.json, and one picture per task."""
+    seed: int = 0
+    """Of the embedding and of the policy's noise."""
+    perplexity: float = 30.0
+    """Of the embedding."""
+    batch: int = 50
+    """Observations that the policy is given at once."""
 
 
 def run(options: TsneOptions) -> int:
@@ -31,6 +53,11 @@ def run(options: TsneOptions) -> int:
         InputError: A flag, a dataset or the policy is unfit.
         StorageError: A file cannot be written.
     """
+    from arena_newton import policies, tasks
+    from arena_newton.eval.records.journal import StorageError, write_atomic
+    from arena_newton.eval.studies.action_map import draw
+    from arena_newton.eval.studies.predicted_actions import DatasetObservations
+
     _check(options)
     first, second = (DatasetObservations(Path(name).expanduser()) for name in options.datasets)
     names = _names(first, second)
@@ -95,6 +122,11 @@ def _task(
     task: str,
     options: TsneOptions,
 ) -> tuple[ActionMap, JsonObject]:
+    import numpy as np
+
+    from arena_newton.eval.studies.action_map import ActionMap, embed, separation, shifted
+    from arena_newton.eval.studies.predicted_actions import as_many_of_each, predict
+
     samples = as_many_of_each(datasets, task, options.samples, options.frames)  # so that 0.5 is chance
     most = len(samples[0])
     answers = [

@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arena_newton import rule_sets
 from arena_newton.cli.extras import require
-from arena_newton.cli.flags import user_path
+from arena_newton.cli.flags import Several, shell_command, user_path
 from arena_newton.errors import InputError
-from arena_newton.eval.commands.table_options import FORMATS, TablesOptions
-from arena_newton.eval.records.journal import StorageError, write_atomic
-from arena_newton.eval.tables import findings_text, paper_claims, table_text
-from arena_newton.eval.tables.evaluated_cells import CellSet, read_cells
-from arena_newton.eval.tables.paper_numbers import paper_numbers
-from arena_newton.eval.tables.suite_tables import suite_tables
 
-__all__ = ["run"]
+if TYPE_CHECKING:
+    from arena_newton.eval.tables.evaluated_cells import CellSet
 
+__all__ = ["BEGIN", "END", "TablesOptions", "run"]
+
+FORMATS = ("md", "tex", "csv", "png")
+"""Forms in which tables are written."""
 BEGIN, END = "<!-- findings: written by eval tables --findings -->", "<!-- end of findings -->"
 """Lines of a README.md between which the table of findings is written."""
+
+
+@dataclass(frozen=True)
+class TablesOptions:
+    """Write the paper's tables filled with the episodes of suites and results folders, next to the paper's numbers."""
+
+    out: str = "tables"
+    """Folder to write: tables.md, tables.tex, cells.csv and one picture per table that has one."""
+    format: Several[str] = FORMATS
+    """Forms to write, one or several: md tex csv png (png needs the extra [plots])."""
+    rules: str = "paper"
+    """Rule set whose episodes count: paper or released."""
+    findings: bool = False
+    """Also test the paper's claims on these trainings: print them and write findings.md, and the table of findings
+    between its marks in a README.md of the folder; of files cells.csv nothing else is made."""
 
 
 def run(folders: Sequence[Path], options: TablesOptions) -> int:
@@ -29,6 +44,13 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
         InputError: A folder is unfit, or a flag.
         StorageError: A file cannot be written.
     """
+    from arena_newton import rule_sets
+    from arena_newton.eval.records.journal import StorageError, write_atomic
+    from arena_newton.eval.tables import findings_text, paper_claims, table_text
+    from arena_newton.eval.tables.evaluated_cells import read_cells
+    from arena_newton.eval.tables.paper_numbers import paper_numbers
+    from arena_newton.eval.tables.suite_tables import suite_tables
+
     unknown = [name for name in options.format if name not in FORMATS]
     if unknown or not options.format:
         raise InputError(f"--format {' '.join(unknown)}: known are {' '.join(FORMATS)}")
@@ -80,8 +102,7 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
 
 def _sources(folders: Sequence[Path], cells: CellSet) -> list[str]:
     """Of what findings are made, and by which command."""
-    names = " ".join(map(str, folders))
-    return [f"Made by python -m arena_newton.eval tables {names} --findings", *cells.notes]
+    return [f"Made by {shell_command('arena_newton.eval', 'tables', *folders, '--findings')}", *cells.notes]
 
 
 def _into_page(page: Path, table: str) -> list[str]:
@@ -90,6 +111,8 @@ def _into_page(page: Path, table: str) -> list[str]:
     Raises:
         StorageError: It cannot be read or written.
     """
+    from arena_newton.eval.records.journal import StorageError, write_atomic
+
     try:
         text = page.read_text(encoding="utf-8") if page.is_file() else ""
     except (OSError, UnicodeDecodeError) as error:

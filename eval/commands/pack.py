@@ -3,31 +3,62 @@
 from __future__ import annotations
 
 import itertools
-import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arena_newton import tasks
+from arena_newton.cli.flags import Several, shell_command, words
 from arena_newton.errors import InputError
-from arena_newton.eval.commands.pack_options import ENOUGH, PackOptions
-from arena_newton.eval.folders.results import RunRecord, is_complete, load_run
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell, read_cells
 from arena_newton.files.text import counted
-from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, CellResult, PolicyCard, read_card
-from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
-from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
-from arena_newton.policies.train.checkpoint_packing import pack, packed_digest, training_command
-from arena_newton.rules.rule_types import MODES
 
-__all__ = ["run"]
+if TYPE_CHECKING:
+    from arena_newton.eval.folders.results import RunRecord
+    from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+    from arena_newton.policies.learned.learned_card import CellResult, PolicyCard
+
+__all__ = ["PackOptions", "run"]
+
+ENOUGH = 0.75
+"""Success rate from which on a task counts as solved."""
+PROGRAM = "arena_newton.eval"
 
 
-def run(given: Path, options: PackOptions) -> int:
+@dataclass(frozen=True)
+class PackOptions:
+    """Pack a trained checkpoint into the form that ships: float16, a card, at most 32 MB; ACT only.
+
+    `eval run --policy learned:<out>` runs it, without LeRobot. Without --out it becomes the policy of this package,
+    `--policy learned`.
+    """
+
+    out: str | None = None
+    """Folder to write; that of the policy that comes with the package when none is named."""
+    tasks: Several[str] = ()
+    """Tasks that it is offered for, the one first that the default run shows; with results those that it solves at
+    75 % in mode base through every tracker of its training, otherwise those of its training."""
+    results: Several[str] = ()
+    """Results folders or suites of eval whose cells of this checkpoint go into the card; a packed policy that is
+    packed again keeps its other cells."""
+    command: str = ""
+    """Command of the training, if not as the checkpoint remembers it."""
+    note: str = ""
+    """A sentence for the card."""
+
+
+def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     """Write the packed policy, and print what it is.
 
     Raises:
         InputError: The checkpoint or a flag is unfit, or the results are of another policy.
     """
+    from arena_newton import tasks
+    from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, PolicyCard, read_card
+    from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
+    from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
+    from arena_newton.policies.train.checkpoint_packing import pack, packed_digest, training_command
+
+    (given,) = checkpoints
     if options.out is not None and not options.out.strip():
         raise InputError("--out: is empty, name a folder")
     folder = checkpoint_folder(given, "pack")
@@ -53,13 +84,12 @@ def run(given: Path, options: PackOptions) -> int:
         why = f"none is solved at {100 * ENOUGH:.0f} %" if found else "the checkpoint names none"
         raise InputError(f"--tasks: {why}; name those that it is offered for")
     out = SHIPPED if options.out is None else Path(options.out).expanduser()
-    words = ["python", "-m", "arena_newton.eval", "pack", given.name or given.resolve().name]
-    for flag, values in (("--tasks", options.tasks), ("--results", [Path(name).name for name in options.results])):
-        words += [flag, *values] if values else []
+    flags = PackOptions(tasks=options.tasks, results=tuple(Path(name).name for name in options.results))
+    packed_by = shell_command(PROGRAM, "pack", given.name or given.resolve().name, *words(flags))
     card = PolicyCard(
         tasks=tuple(dict.fromkeys(chosen)),
         command=options.command or training_command(facts.options) or (before.command if before is not None else ""),
-        packed_by="; then ".join([*([before.packed_by] if before and kept else []), " ".join(map(shlex.quote, words))]),
+        packed_by="; then ".join([*([before.packed_by] if before and kept else []), packed_by]),
         note=options.note or (before.note if before is not None else ""),
         results=_in_order(found, chosen, facts.trackers),
     )
@@ -68,7 +98,7 @@ def run(given: Path, options: PackOptions) -> int:
     for one in card.results:
         print(f"  {one.task} {one.tracker} {one.mode}: {one.successes}/{one.episodes}")
     spec = "learned" if out == SHIPPED else f"learned:{out}"
-    print(f"run it: python -m arena_newton.eval --task {card.tasks[0]} --policy {shlex.quote(spec)}")
+    print(f"run it: {shell_command(PROGRAM, '--task', card.tasks[0], '--policy', spec)}")
     return 0
 
 
@@ -81,6 +111,10 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
     """
     if not folders:
         return ()
+    from arena_newton.eval.folders.results import load_run
+    from arena_newton.eval.tables.evaluated_cells import read_cells
+    from arena_newton.policies.learned.learned_card import CellResult
+
     read = read_cells(folders)
     cells = [cell for cell in read.cells if cell.weights in digests]
     plain = [cell for cell in cells if not cell.latency and cell.replan is None and not cell.ensemble]
@@ -124,6 +158,8 @@ def _check_usual(run: RunRecord) -> None:
     Raises:
         InputError: It is one of these.
     """
+    from arena_newton.eval.folders.results import is_complete
+
     where = f"--results {run.folder}"
     if not is_complete(run):
         # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
@@ -140,6 +176,8 @@ def _names(cell: EvaluatedCell | CellResult) -> tuple[str, str, str]:
 
 def _in_order(cells: Sequence[CellResult], offered: Sequence[str], trackers: Sequence[str]) -> tuple[CellResult, ...]:
     """Cells as a card lists them: tasks that it is offered for and trackers of its training come first."""
+    from arena_newton import tasks
+    from arena_newton.rules.rule_types import MODES
 
     def place(name: str, known: Sequence[str]) -> tuple[int, str]:
         return (known.index(name) if name in known else len(known)), name

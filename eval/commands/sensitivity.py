@@ -7,28 +7,42 @@ import itertools
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from arena_newton.cli.flags import Several
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
-from arena_newton.eval.play.run import Factories
-from arena_newton.eval.records.journal import write_atomic
-from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.studies.placed_play import MOST_EPISODES, PlacedWorlds, placement_run
-from arena_newton.eval.studies.placement_axes import Axis
-from arena_newton.eval.studies.placement_files import PlacedRows, PointTally, point_rows, study_folder, tallies
-from arena_newton.eval.studies.placement_map import draw_grid
-from arena_newton.eval.studies.placement_options import SensitivityOptions
-from arena_newton.eval.tables.suite_figures import save
+from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.files.text import counted
-from arena_newton.interfaces import EpisodeResult
 from arena_newton.robot.g1 import TICK
 
-__all__ = ["FORMAT", "run"]
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.studies.placement_axes import Axis
+    from arena_newton.eval.studies.placement_files import PointTally
+    from arena_newton.interfaces import EpisodeResult
+
+__all__ = ["SensitivityOptions", "run"]
 
 FORMAT = 1
 """Version of sensitivity.json."""
 MOST_AXES = 2
 """Axes of a picture."""
+
+
+@dataclass(frozen=True)
+class SensitivityOptions(PlacementOptions):
+    """Map success and margin of a policy over the placements of a task: a grid over one or two numbers.
+
+    At every point the same seeds are played (common random numbers), so that neighbours differ by the placement alone.
+    Needs the extra [plots].
+    """
+
+    grid: Several[int] = (7, 7)
+    """Points along each axis, the ends of its range among them."""
+    out: str | None = None
+    """Folder to write, which must not exist; results/sensitivity_<task>_<tracker>_<mode> when none is named."""
 
 
 def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
@@ -41,11 +55,18 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
         InputError: A flag is unfit; raised before the first episode.
         StorageError: A file cannot be written.
     """
+    from arena_newton.eval.records.journal import write_atomic
+    from arena_newton.eval.reports.progress import Progress
+    from arena_newton.eval.studies.placed_play import MOST_EPISODES, PlacedWorlds, placement_run
+    from arena_newton.eval.studies.placement_files import PlacedRows, point_rows, study_folder, tallies
+    from arena_newton.eval.studies.placement_map import draw_grid
+    from arena_newton.eval.tables.suite_figures import save
+
     config, all_axes = placement_run(options)
     axes = all_axes if options.axes else _widest(all_axes)
     if len(axes) > MOST_AXES:
         raise InputError(f"--axes {' '.join(options.axes)}: a map has one or two")
-    grid = _grid(axes, options.grid)
+    grid = _grid(axes, options.grid, MOST_EPISODES)
     points = list(itertools.product(*grid))
     count = len(points) * len(config.episodes)
     if count > MOST_EPISODES:
@@ -87,12 +108,12 @@ def _widest(axes: Sequence[Axis]) -> tuple[Axis, ...]:
     return tuple(axis for axis in axes if not axis.counts)[:MOST_AXES] or tuple(axes[:MOST_AXES])
 
 
-def _grid(axes: Sequence[Axis], points: Sequence[int]) -> list[tuple[float, ...]]:
+def _grid(axes: Sequence[Axis], points: Sequence[int], most: int) -> list[tuple[float, ...]]:
     shown = " ".join(map(str, points))
     if len(points) not in (1, len(axes)) and not (len(axes) == 1 and points == SensitivityOptions.grid):
         raise InputError(f"--grid {shown}: expected one number, or one for each of the {len(axes)} axes")
-    if any(not 1 <= number <= MOST_EPISODES for number in points):
-        raise InputError(f"--grid {shown}: expected at least 1 point along an axis, at most {MOST_EPISODES:,}")
+    if any(not 1 <= number <= most for number in points):
+        raise InputError(f"--grid {shown}: expected at least 1 point along an axis, at most {most:,}")
     numbers = list(points) * len(axes) if len(points) == 1 else points
     return [axis.grid(number) for axis, number in zip(axes, numbers, strict=False)]
 
