@@ -6,6 +6,7 @@ Handles (bodies, joints, geoms, markers, frames) are found by prim path; of a ta
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import math
 import warnings
@@ -322,6 +323,32 @@ def _find_latch(scene: Scene, handle: int, release_deg: float) -> Latch:
     return Latch(equality, address, rest - math.radians(release_deg))
 
 
+def _empty() -> newton.ModelBuilder:
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    builder.rigid_gap = 0.0
+    return builder
+
+
+_OWN: dict[tuple[Path, str | None, str], newton.ModelBuilder] = {}
+"""What the importer made of the project's own scenes: it takes nearly all of a scene's building."""
+
+
+def _imported(stage: Usd.Stage, path: Path, variant: str | None, hands: str) -> newton.ModelBuilder:
+    """What Newton's importer makes of a stage; the project's own scenes are imported once per process."""
+    key = (path.resolve(), variant, hands)
+    if key in _OWN:
+        return copy.deepcopy(_OWN[key])
+    if not _is_own(path):
+        check_buildable(stage, path)
+    template = _empty()
+    with _naming(path):
+        template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False)
+    if _is_own(path):
+        _OWN[key] = copy.deepcopy(template)
+    return template
+
+
 def load_scene(
     task: str | Path,
     *,
@@ -358,17 +385,7 @@ def load_scene(
     path = scene_path(variant_file or task)
     stage = _open_stage(path, variant, hands)
 
-    def empty() -> newton.ModelBuilder:
-        builder = newton.ModelBuilder()
-        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-        builder.rigid_gap = 0.0
-        return builder
-
-    template = empty()
-    if not _is_own(path):
-        check_buildable(stage, path)
-    with _naming(path):
-        template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False)
+    template = _imported(stage, path, variant, hands)
     _set_drives(template, drive)
     _free_fixtures(template)
     latch = _add_latch(template, stage)
@@ -376,7 +393,7 @@ def load_scene(
         add_skin(template)
 
     def finalize(count: int) -> newton.Model:
-        builder = empty()
+        builder = _empty()
         builder.replicate(template, count)
         return builder.finalize(device=device)
 

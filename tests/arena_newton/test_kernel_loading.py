@@ -71,6 +71,7 @@ def run(engine: str, threads: int) -> tuple[set[str], set[str], str]:
     return set(built), set(loaded), bits
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_the_lists_are_what_an_environment_launches(engine):
     """Without threads a new process loads every listed module, and of Newton and MuJoCo Warp no other one."""
@@ -81,6 +82,7 @@ def test_the_lists_are_what_an_environment_launches(engine):
     assert own <= listed, f"not listed: {sorted(own - listed)}"
 
 
+@pytest.mark.release
 def test_a_rehearsal_finds_all_modules_and_no_other_one():
     """With threads the building of an environment loads what a run without them launches, and no bit differs."""
     before, launched, bits = run("warp", 1)

@@ -9,17 +9,23 @@ import pytest
 import warp as wp
 
 from arena_newton import rule_sets, tasks
-from arena_newton.physics.scene import load_scene
+from arena_newton.physics.scene import Scene, load_scene
 from arena_newton.robot import g1
+
+
+@cache
+def scene(task: str) -> Scene:
+    """Built once per file, for both rule sets."""
+    return load_scene(task, device="cpu", native=True)
 
 
 class Bench:
     """One world of a task on native MuJoCo, seen by its judge as the physics would show it."""
 
     def __init__(self, task: str, rules: str):
-        """Build scene and judge."""
+        """Build the judge."""
         rule_set, self.spec = rule_sets.get(rules), tasks.get(task)
-        self.scene = load_scene(task, device="cpu", native=True)
+        self.scene = scene(task)
         self.judge = self.spec.judge(self.scene, rule_set)
         self.draws = self.spec.draw(1, "base", rule_set)
 

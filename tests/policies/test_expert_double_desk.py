@@ -100,14 +100,15 @@ def test_the_free_wrist_shows_the_time_of_a_grasp(env, played):
         assert decided[-1] > 1.5, "the roll goes on until the hammer is lifted"
 
 
-def test_worlds_are_independent(env):
+def test_worlds_are_independent(env, played):
     """An episode's actions are the same bits in either world, next to either episode."""
-    first, second = Actions(), Actions()
-    Rollout(env, policies.get("expert"), episodes(env), recorder=[first], max_steps=250).run()
-    Rollout(env, policies.get("expert"), episodes(env, (5, *EPISODES[:1])), recorder=[second], max_steps=250).run()
-    (shared,) = set(first.of) & set(second.of)
-    assert np.array_equal(first.of[shared], second.of[shared])
-    assert not np.array_equal(*first.of.values())
+    _, first, _ = played
+    second = Actions()
+    Rollout(env, policies.get("expert"), episodes(env, (5, *EPISODES[:1])), recorder=[second], max_steps=200).run()
+    (shared,) = set(first) & set(second.of)
+    again = second.of[shared]
+    assert len(again) >= 200 and np.array_equal(first[shared][: len(again)], again)
+    assert not np.array_equal(*second.of.values())
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ def test_eval_run_gives_the_same_results_for_any_number_of_worlds(fast, tmp_path
             "--repeats",
             "3",
             "--max-steps",
-            "40",
+            "20",
         ]
         flags += ["--engine", "mujoco", "--device", "cpu", "--worlds", str(worlds), "--out", str(out)]
         assert main(["run", *flags]) == 0

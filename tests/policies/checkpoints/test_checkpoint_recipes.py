@@ -23,7 +23,7 @@ from made_stats import made_stats
 
 @pytest.mark.parametrize("family", ["act", "diffusion", "flow", "pi05"])
 def test_what_is_trained_is_run(family, tmp_path):
-    """Saved, opened and asked: the recipe's facts, and the same actions for 1, 3 and 20 worlds, bit for bit.
+    """Saved, opened and asked: the recipe's facts, and the same actions for 1, 3 and 8 worlds, bit for bit.
 
     What LeRobot saves of a family is taken for no other one.
     """
@@ -40,8 +40,8 @@ def test_what_is_trained_is_run(family, tmp_path):
     side = (policy.camera.height, policy.camera.width)
     seeds = (11, 12, 13)
     few = follow(policy, seeds, 2, asks=(0, 3, 5), side=side)
-    many = follow(policy, [*range(100, 117), *seeds], 2, side=side)
-    assert all(torch.equal(few[seed], many[seed]) for seed in seeds)
+    many = follow(policy, [*range(100, 105), *seeds], 1, side=side)
+    assert all(torch.equal(few[seed][: len(many[seed])], many[seed]) for seed in seeds)
     assert torch.equal(follow(policy, [12], 2, side=side)[12], few[12])
     assert not torch.equal(few[11], few[12])
     assert torch.isfinite(few[11]).all()

@@ -286,7 +286,7 @@ def still(page: Chromium) -> np.ndarray:
 
     def check() -> bool:
         tick, now = int(page.value("Number(document.body.dataset.tick)")), place(page)
-        if tick - before[1] < 50:
+        if tick - before[1] < 30:
             return False
         stands = bool(np.linalg.norm(now - before[0]) < 0.02)
         before[:] = [now, tick]
@@ -321,6 +321,8 @@ def test_the_view_needs_token_and_origin(running):
     for url, origin in ((inner, FOREIGN), (inner.rsplit("/", 1)[0], own), (inner[:-3] + "abc", own)):
         with pytest.raises(InvalidStatus):
             connect(url, origin=origin, **options)
+    # A browser that draws the world without a GPU takes more time than all the rest, and nobody looks any more.
+    page.value("document.getElementById('frame').src = 'about:blank'")
 
 
 def test_a_held_key_walks_and_a_released_one_stops(running):
@@ -380,6 +382,7 @@ def test_a_recorded_episode_is_saved(running):
     assert episode.text("arena_policy") == "teleop-browser"
 
 
+@pytest.mark.release
 def test_a_socket_that_closes_or_stalls_stops_the_robot(running):
     """No message for 0.3 s is nobody: a page that hangs, and one that goes, leave a robot that stands."""
     one, page, _ = running
@@ -389,18 +392,18 @@ def test_a_socket_that_closes_or_stalls_stops_the_robot(running):
     page.key("w", True)
     walked(page, start, 0.3)
     # The page hangs with the key held; the socket stays open.
-    page.value("{ const end = performance.now() + 6000; while (performance.now() < end); }")
+    page.value("{ const end = performance.now() + 3000; while (performance.now() < end); }")
     hung = page.value("document.body.dataset.position")
     page.key("w", False)
     at = still(page)
-    assert np.linalg.norm((at - start)[:2]) < 2.0, "6 s of walking are 3.5 m"
+    assert np.linalg.norm((at - start)[:2]) < 1.2, "3 s of walking are 1.7 m"
     assert hung is not None
     start = still(page)
     page.key("w", True)
     walked(page, start, 0.2)
     page.open("about:blank")
     token_page = one.url
-    time.sleep(3.0)
+    time.sleep(1.5)
     page.open(token_page)
     page.wait("Number(document.body?.dataset.tick) > 0", "world that runs")
     first = place(page)

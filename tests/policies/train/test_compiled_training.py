@@ -55,6 +55,7 @@ def losses(out):
     return [float(row[key]) for key in ("loss", "held_out_loss") for row in rows if row.get(key)]
 
 
+@pytest.mark.release
 def test_a_compiled_training_is_the_training(dataset, tmp_path, compiler):
     """Losses, also of held-out rows, and weights are those without a compiler; LeRobot loads it; it resumes without."""
     plain = train(options(dataset, tmp_path / "plain"))

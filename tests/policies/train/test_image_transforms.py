@@ -20,6 +20,7 @@ from arena_newton.policies.train.frames.image_transforms import (
     transformed,
 )
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
+from tests.policies.train import narrow_network
 
 CPU = torch.device("cpu")
 NAMES = list(RANGES)
@@ -140,6 +141,7 @@ def test_a_training_applies_what_its_recipe_says(monkeypatch):
         drawn.append(shape)
         return drawn_transforms(*shape)
 
+    narrow_network.install(monkeypatch.setattr)
     monkeypatch.setattr(augmentation, "drawn_transforms", watch)
     losses = []
     for transforms in (False, True):

@@ -229,6 +229,7 @@ sys.exit(main(sys.argv[1:]))
 TESTS = str(Path(__file__).resolve().parents[2])
 
 
+@pytest.mark.release
 def test_a_killed_training_goes_on(dataset, tmp_path):
     """After kill -9 at any moment `last` is a whole checkpoint, with which the training goes on."""
     out = tmp_path / "run"
@@ -250,6 +251,7 @@ def test_a_killed_training_goes_on(dataset, tmp_path):
     assert not list(out.rglob("*.part"))
 
 
+@pytest.mark.release
 def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
     """As under torchrun on the CPU: both processes hold the same weights at each checkpoint, which the first writes."""
     out, agreed = tmp_path / "run", []
