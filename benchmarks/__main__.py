@@ -22,6 +22,7 @@ from benchmarks.bench_options import (
     PolicyBenchOptions,
     RecordingBenchOptions,
     RoundsBenchOptions,
+    ServerBenchOptions,
     TrainingBenchOptions,
 )
 
@@ -54,6 +55,9 @@ BENCHES = {
     "policy": Item(PolicyBenchOptions, "policy_bench:policy_figures", "episodes of a policy that sees", ("policies",)),
     "camera": Item(CameraBenchOptions, "single_figures:camera_speeds", "pictures of the head camera per second"),
     "pictures": Item(PlainBenchOptions, "single_figures:picture_costs", "time that strips and videos add"),
+    "server": Item(
+        ServerBenchOptions, "server_load:load_figures", "a policy server beside clients with large pictures", ("serve",)
+    ),
     "generator": Item(RoundsBenchOptions, "single_figures:generator_times", "a tick of the reference generator"),
     "episodes": Item(PlainBenchOptions, "single_figures:episode_times", "60 Football episodes on two cores"),
     "overview": Item(PlainBenchOptions, "single_figures:overview_times", "python -m arena_newton.eval --help"),

@@ -16,6 +16,7 @@ __all__ = [
     "PolicyBenchOptions",
     "RecordingBenchOptions",
     "RoundsBenchOptions",
+    "ServerBenchOptions",
     "TrainingBenchOptions",
 ]
 
@@ -122,6 +123,20 @@ class DatasetBenchOptions(PlainBenchOptions):
     """So many copies of the recordings under other seeds are built, verified and read instead of --dataset."""
     seed: int = 0
     """Of the order in which pictures are read."""
+
+
+@dataclass(frozen=True)
+class ServerBenchOptions(PlainBenchOptions):
+    """Measure what clients with the largest pictures cost the other clients of a policy server."""
+
+    protocol: str = "openpi"
+    """Protocol: openpi, which sends pictures as they are, or vla-eval, which packs them."""
+    normal: int = 170
+    """Clients that ask every two seconds with a picture of 224 x 224."""
+    large: int = 30
+    """Clients that ask without a pause with one of 1920 x 1200."""
+    seconds: float = 20.0
+    """Length of each of the three phases: without, with and again without those [s]."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch
         return made_frames(options.frames, settings.picture, device, network=network), made_statistics()
     datasets, stats = _read(options, settings)
     ones = torch.ones(len({episode.task for dataset in datasets for episode in dataset.episodes}))
-    stats[VECTOR_KEY] = {"mean": 0 * ones, "std": ones}
+    stats = {**stats, VECTOR_KEY: {"mean": 0 * ones, "std": ones}}
     return load_frames(datasets, device, network=network), stats
 
 

@@ -99,10 +99,9 @@ def camera_figures(options: PeerOptions) -> Iterator[BenchFigure]:
                 camera.lights.set(world, LIGHT if shadows else None)
             camera.render(state)  # the poses
             theirs = NewtonPictures(env.scene.model, camera, lens, shadows)
-            sides = partial(camera.render, state), partial(theirs.render, state)
-            for draw in sides:  # kernels are compiled
-                draw()
-            rounds = [tuple(worlds / seconds_of(draw) for draw in sides) for _ in range(options.rounds)]
+            ours, peer = partial(camera.render, state), partial(theirs.render, state)
+            ours(), peer()  # kernels are compiled
+            rounds = [(worlds / seconds_of(ours), worlds / seconds_of(peer)) for _ in range(options.rounds)]
             light = "one light's shadows" if shadows else "no shadows"
             label = f"head-camera pictures/s / Newton's SensorCamera, {worlds} worlds, {size}x{size}, {light}"
             yield PAIR.judge(options, label, rounds, unjudged=on_cpu(cuda))

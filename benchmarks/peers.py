@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -13,12 +11,11 @@ from pathlib import Path
 
 import torch
 import warp as wp
+from torchvision.models import resnet18
 
 from arena_newton import trackers
-from arena_newton.errors import ArenaError
 from arena_newton.eval.bench.bench_tick import RATES, tick_times
 from arena_newton.eval.bench.timing import NEEDS_CUDA, BenchFigure, Figures, chosen
-from arena_newton.files.own_processes import environment
 from arena_newton.trackers.front_end import NetworkTracker
 from arena_newton.trackers.inference.blocks import BlockRunner
 from benchmarks.bench_options import PeerOptions, TrainingBenchOptions
@@ -100,19 +97,9 @@ def _world_ticks(options: PeerOptions) -> Iterator[BenchFigure]:
 
 
 def new_vision_weights(folder: Path) -> Path:
-    """A file of weights that nobody trained, for the paper's vision encoder, so that its speed needs no download.
-
-    Raises:
-        ArenaError: They could not be made.
-    """
+    """A file of weights that nobody trained, for the paper's vision encoder, so that its speed needs no download."""
     path = folder / "resnet18.pth"
-    program = (
-        "import sys, torch, torchvision; m = torchvision.models.resnet18(); torch.save(m.state_dict(), sys.argv[1])"
-    )
-    command = [sys.executable, "-P", "-c", program, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment(), check=False)
-    if done.returncode or not path.is_file():
-        raise ArenaError(f"the vision encoder's weights could not be made: {done.stderr[-200:]}")
+    torch.save(resnet18().state_dict(), path)
     return path
 
 

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import inspect
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
 
-__all__ = ["Recorded", "launch", "record"]
+__all__ = ["Recorded", "launch", "launcher", "record"]
+
+OUTPUTS = ("counter", "success", "margin", "event")
+"""Names of arguments from which on those of a kernel are outputs."""
 
 
 class Recorded:
@@ -95,3 +99,34 @@ def launch(
     else:
         command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
         _recording.into.add(command)
+
+
+def launcher(kernel: wp.Kernel, **defaults: object) -> Callable[..., None]:
+    """The launch wrapper of a kernel that has one thread per world and whose outputs are `OUTPUTS`.
+
+    Its arguments are the kernel's, by position up to the first that is no array, and by name; flags become 0 and 1.
+
+    Args:
+        kernel: The kernel, whose docstring is the wrapper's.
+        **defaults: Values of arguments that may be left out.
+    """
+    arguments, kind = [], inspect.Parameter.POSITIONAL_OR_KEYWORD
+    for argument in kernel.adj.args:
+        if not getattr(argument.type, "ndim", 0):  # no array
+            kind = inspect.Parameter.KEYWORD_ONLY
+        default = defaults.get(argument.label, inspect.Parameter.empty)
+        arguments.append(inspect.Parameter(argument.label, kind, default=default))
+    signature = inspect.Signature(arguments)
+    first_output = min(number for number, argument in enumerate(arguments) if argument.name in OUTPUTS)
+
+    def wrapper(*state: wp.array, **named: object) -> None:
+        bound = signature.bind(*state, **named)
+        bound.apply_defaults()
+        values = [int(value) if isinstance(value, bool) else value for value in bound.arguments.values()]
+        outputs = values[first_output:]
+        launch(kernel, outputs[0].shape[0], values[:first_output], outputs)
+
+    wrapper.__name__ = wrapper.__qualname__ = f"launch_{kernel.func.__name__.removesuffix('_kernel')}"
+    wrapper.__doc__, wrapper.__module__ = kernel.func.__doc__, kernel.func.__module__
+    wrapper.__signature__ = signature  # type: ignore[attr-defined]  # `inspect` reads it
+    return wrapper

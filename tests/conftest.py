@@ -32,6 +32,26 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser):
+    """How many damaged files each reader gets."""
+    help = "damaged files per reader: 30, or 200 in the tests that damage files alone"
+    parser.addoption("--fuzz", choices=("brief", "full"), default="brief", help=help)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Play the tests that damage files alone, where they are asked for all of them."""
+    if config.getoption("--fuzz") == "full":
+        others = [item for item in items if "mutants" not in item.fixturenames]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if "mutants" in item.fixturenames]
+
+
+@pytest.fixture(scope="session")
+def mutants(request) -> int:
+    """Damaged files per reader."""
+    return 200 if request.config.getoption("--fuzz") == "full" else 30
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder of reference material; tests that need it skip without it."""

@@ -58,6 +58,7 @@ def test_example_says_what_it_shows(path):
     assert not re.search(r"\b(?!self)\w+\._[a-z]|import _[a-z]", text)
 
 
+@pytest.mark.release
 def test_examples_have_the_types_that_they_say():
     """The examples pass mypy, as CONTRIBUTING asks: a reader who copies one begins without errors."""
     pytest.importorskip("mypy")

@@ -17,9 +17,9 @@ from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan
-from arena_newton.interfaces import Disturbance, Recorder
+from arena_newton.interfaces import Disturbance, EpisodeResult, Recorder
 from arena_newton.policies.base import Policy
-from arena_newton.rollout import EpisodeResult, Rollout
+from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 
 __all__ = ["NEEDS_CUDA", "BenchFigure", "RepeatedEpisodes", "chosen", "cores", "print_figures", "seconds_of"]

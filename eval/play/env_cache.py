@@ -30,8 +30,9 @@ class CachedEnv(ArenaEnv):
 class EnvCache:
     """Makes environments (`Factories.env`) and keeps the last one."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: type[CachedEnv] = CachedEnv) -> None:
         """Begin without any."""
+        self._kind = kind
         self._key: object = None
         self._env: CachedEnv | None = None
         self.built = 0
@@ -46,7 +47,7 @@ class EnvCache:
         key = (task, type(tracker), description, tuple(sorted(options.items(), key=lambda item: item[0])))
         if self._env is None or self._key != key:
             self.drop()
-            self._env = CachedEnv(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
+            self._env = self._kind(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
             self._key, self.built = key, self.built + 1
         return self._env
 

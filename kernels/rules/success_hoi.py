@@ -18,7 +18,7 @@ from arena_newton.kernels.boxes import (
     slack_xy,
     world_half,
 )
-from arena_newton.kernels.launching import launch
+from arena_newton.kernels.launching import launch, launcher
 from arena_newton.kernels.rotations import load_vec3
 
 __all__ = [
@@ -33,7 +33,7 @@ __all__ = [
 def football_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
-    ball: int,
+    ball_body: int,
     goal: Boxes,
     pitch: Boxes,
     rear_bound: int,
@@ -43,9 +43,19 @@ def football_kernel(
     margin: wp.array[float],
     event: wp.array[int],
 ):
-    """One thread per world."""
+    """Football: the ball's centre inside the goal's volume, with (`paper`) or without (`released`) its rear face.
+
+    Args:
+        ball_body: The ball.
+        goal: One box whose +y face is the rear of the net.
+        pitch: One box; xy beyond its upright faces is out.
+        rear_bound: Whether the +y face bounds the goal.
+        judge_out: Whether leaving the field is an event.
+        min_z: A ball below this height [m] has left the field.
+        event: Output, 1 = the ball left the field without a goal, int32, shape [worlds].
+    """
     w = wp.tid()
-    p = load_vec3(xpos, w, ball)
+    p = load_vec3(xpos, w, ball_body)
     q = box_rotation(xquat, goal, w, 0)
     c = box_centre(xpos, xquat, goal, w, 0)
     v = wp.quat_rotate_inv(q, p - c)
@@ -65,33 +75,7 @@ def football_kernel(
     event[w] = wp.where(m >= 0.0, 0, out)
 
 
-def launch_football(
-    xpos: wp.array,
-    xquat: wp.array,
-    *,
-    ball_body: int,
-    goal: Boxes,
-    pitch: Boxes,
-    rear_bound: bool,
-    judge_out: bool,
-    min_z: float,
-    success: wp.array,
-    margin: wp.array,
-    event: wp.array,
-) -> None:
-    """Football: the ball's centre inside the goal's volume, with (`paper`) or without (`released`) its rear face.
-
-    Args:
-        ball_body: The ball.
-        goal: One box whose +y face is the rear of the net.
-        pitch: One box; xy beyond its upright faces is out.
-        rear_bound: Whether the +y face bounds the goal.
-        judge_out: Whether leaving the field is an event.
-        min_z: A ball below this height [m] has left the field.
-        event: Output, 1 = the ball left the field without a goal, int32, shape [worlds].
-    """
-    inputs = [xpos, xquat, ball_body, goal, pitch, int(rear_bound), int(judge_out), min_z]
-    launch(football_kernel, success.shape[0], inputs, [success, margin, event])
+launch_football = launcher(football_kernel)
 
 
 @wp.kernel
@@ -269,7 +253,15 @@ def pp_box_released_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
+    """P&PBox, `released`: box centre in the target deck's world-axis span less the box's half, bottom near a plane.
+
+    Args:
+        box: One box, the one to move; half its xy extents shrink the span, half its z is taken off its centre's height.
+        decks: The shelf's decks.
+        deck: Which of them is the target.
+        plane_below: How far the target plane is below that deck's upper face [m].
+        height_tolerance: Largest distance to the plane [m], 0.06.
+    """
     w = wp.tid()
     p = box_centre(xpos, xquat, box, w, 0)
     half = box.half[0]
@@ -281,26 +273,4 @@ def pp_box_released_kernel(
     success[w] = holds(m)
 
 
-def launch_pp_box_released(
-    xpos: wp.array,
-    xquat: wp.array,
-    *,
-    box: Boxes,
-    decks: Boxes,
-    deck: int,
-    plane_below: float,
-    height_tolerance: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
-    """P&PBox, `released`: box centre in the target deck's world-axis span less the box's half, bottom near a plane.
-
-    Args:
-        box: One box, the one to move; half its xy extents shrink the span, half its z is taken off its centre's height.
-        decks: The shelf's decks.
-        deck: Which of them is the target.
-        plane_below: How far the target plane is below that deck's upper face [m].
-        height_tolerance: Largest distance to the plane [m], 0.06.
-    """
-    inputs = [xpos, xquat, box, decks, deck, plane_below, height_tolerance]
-    launch(pp_box_released_kernel, success.shape[0], inputs, [success, margin])
+launch_pp_box_released = launcher(pp_box_released_kernel)

@@ -18,7 +18,7 @@ from arena_newton.kernels.boxes import (
     slack_xy,
     world_half,
 )
-from arena_newton.kernels.launching import launch
+from arena_newton.kernels.launching import launcher
 from arena_newton.kernels.rotations import load_quat3, load_vec3
 
 __all__ = [
@@ -36,7 +36,7 @@ def open_door_paper_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
     qpos: wp.array2d[float],
-    root: int,
+    root_qpos_adr: int,
     doorway: Boxes,
     half_width: float,
     min_y: float,
@@ -45,31 +45,6 @@ def open_door_paper_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
-    w = wp.tid()
-    p = wp.vec3(qpos[w, root], qpos[w, root + 1], qpos[w, root + 2])
-    q = box_rotation(xquat, doorway, w, 0)
-    v = wp.quat_rotate_inv(q, p - box_centre(xpos, xquat, doorway, w, 0))
-    m = wp.min(half_width - wp.abs(v[0]), v[1] - min_y)
-    m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
-    margin[w] = m
-    success[w] = holds(m)
-
-
-def launch_open_door_paper(
-    xpos: wp.array,
-    xquat: wp.array,
-    qpos: wp.array,
-    *,
-    root_qpos_adr: int,
-    doorway: Boxes,
-    half_width: float,
-    min_y: float,
-    stand_height: float,
-    stand_up: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
     """OpenDoor, `paper`: the root has passed the frame's plane y = 0 within the doorway, and the robot stands.
 
     Args:
@@ -77,15 +52,24 @@ def launch_open_door_paper(
         half_width: Largest |x| [m], 0.55.
         min_y: Smallest y [m], 0.02.
     """
-    inputs = [xpos, xquat, qpos, root_qpos_adr, doorway, half_width, min_y, stand_height, stand_up]
-    launch(open_door_paper_kernel, success.shape[0], inputs, [success, margin])
+    w = wp.tid()
+    p = wp.vec3(qpos[w, root_qpos_adr], qpos[w, root_qpos_adr + 1], qpos[w, root_qpos_adr + 2])
+    q = box_rotation(xquat, doorway, w, 0)
+    v = wp.quat_rotate_inv(q, p - box_centre(xpos, xquat, doorway, w, 0))
+    m = wp.min(half_width - wp.abs(v[0]), v[1] - min_y)
+    m = wp.min(m, slack_standing(qpos, w, root_qpos_adr, stand_height, stand_up))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+launch_open_door_paper = launcher(open_door_paper_kernel)
 
 
 @wp.kernel
 def open_door_released_kernel(
     qpos: wp.array2d[float],
-    root: int,
-    leaf: int,
+    root_qpos_adr: int,
+    leaf_qpos_adr: int,
     latched: wp.array[int],
     min_angle: float,
     stand_height: float,
@@ -93,28 +77,6 @@ def open_door_released_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
-    w = wp.tid()
-    m = -min_angle
-    if latched[w] == 0:
-        m = wp.abs(qpos[w, leaf]) - min_angle
-    m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
-    margin[w] = m
-    success[w] = holds(m)
-
-
-def launch_open_door_released(
-    qpos: wp.array,
-    *,
-    root_qpos_adr: int,
-    leaf_qpos_adr: int,
-    latched: wp.array,
-    min_angle: float,
-    stand_height: float,
-    stand_up: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
     """OpenDoor, `released`: the latch is released, the leaf has opened far enough, and the robot stands.
 
     Angles enter the margin as the arc [m] at 1 m from the hinge; a latched leaf counts as closed.
@@ -124,15 +86,23 @@ def launch_open_door_released(
         latched: 1 = the latch still holds the leaf, int32, shape [worlds].
         min_angle: Smallest |angle| of the leaf [rad], 60 deg, positive.
     """
-    inputs = [qpos, root_qpos_adr, leaf_qpos_adr, latched, min_angle, stand_height, stand_up]
-    launch(open_door_released_kernel, success.shape[0], inputs, [success, margin])
+    w = wp.tid()
+    m = -min_angle
+    if latched[w] == 0:
+        m = wp.abs(qpos[w, leaf_qpos_adr]) - min_angle
+    m = wp.min(m, slack_standing(qpos, w, root_qpos_adr, stand_height, stand_up))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+launch_open_door_released = launcher(open_door_released_kernel)
 
 
 @wp.kernel
 def sit_sofa_paper_kernel(
     qpos: wp.array2d[float],
-    root: int,
     seat_force: wp.array[float],
+    root_qpos_adr: int,
     min_force: float,
     max_root_z: float,
     stiffness: float,
@@ -141,28 +111,6 @@ def sit_sofa_paper_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
-    w = wp.tid()
-    m = wp.min(max_root_z - qpos[w, root + 2], (seat_force[w] - min_force) / stiffness)
-    count = count_up(m, counter[w])
-    counter[w] = count
-    margin[w] = m
-    success[w] = wp.where(count >= confirm_ticks, 1, 0)
-
-
-def launch_sit_sofa_paper(
-    qpos: wp.array,
-    seat_force: wp.array,
-    *,
-    root_qpos_adr: int,
-    min_force: float,
-    max_root_z: float,
-    confirm_ticks: int,
-    stiffness: float = 500.0,
-    counter: wp.array,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
     """SitSofa, `paper`: pelvis, hips and thighs press the seat hard enough and the root is low, several ticks in a row.
 
     Args:
@@ -172,8 +120,15 @@ def launch_sit_sofa_paper(
         confirm_ticks: Ticks in a row, 25.
         stiffness: Turns force into length for the margin alone [N/m]; 500 puts no force 0.1 m away from 50 N.
     """
-    inputs = [qpos, root_qpos_adr, seat_force, min_force, max_root_z, stiffness, confirm_ticks]
-    launch(sit_sofa_paper_kernel, success.shape[0], inputs, [counter, success, margin])
+    w = wp.tid()
+    m = wp.min(max_root_z - qpos[w, root_qpos_adr + 2], (seat_force[w] - min_force) / stiffness)
+    count = count_up(m, counter[w])
+    counter[w] = count
+    margin[w] = m
+    success[w] = wp.where(count >= confirm_ticks, 1, 0)
+
+
+launch_sit_sofa_paper = launcher(sit_sofa_paper_kernel, stiffness=500.0)
 
 
 @wp.func
@@ -270,7 +225,17 @@ def sit_sofa_released_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
+    """SitSofa, `released`: one listed body in the seat volume with contact, or two in it without; one tick.
+
+    Args:
+        contact_force: Norm of the net contact force on each body [N], shape [worlds, nbody].
+        bodies: Bodies that count, at least one, int32, shape [k]; one that is listed twice counts as two.
+        seat: One box; its world-axis box is the seat.
+        below: How far below the seat's bottom a body still counts [m], 0.10.
+        above: How far above the seat's top a body still counts [m], 0.35.
+        min_force: Smallest contact force [N], 5.
+        stiffness: Turns force into length for the margin alone [N/m].
+    """
     w = wp.tid()
     c = box_centre(xpos, xquat, seat, w, 0)
     h = world_half(box_rotation(xquat, seat, w, 0), seat.half[0])
@@ -283,33 +248,7 @@ def sit_sofa_released_kernel(
     success[w] = holds(m)
 
 
-def launch_sit_sofa_released(
-    xpos: wp.array,
-    xquat: wp.array,
-    contact_force: wp.array,
-    *,
-    bodies: wp.array,
-    seat: Boxes,
-    below: float,
-    above: float,
-    min_force: float,
-    stiffness: float = 500.0,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
-    """SitSofa, `released`: one listed body in the seat volume with contact, or two in it without; one tick.
-
-    Args:
-        contact_force: Norm of the net contact force on each body [N], shape [worlds, nbody].
-        bodies: Bodies that count, at least one, int32, shape [k]; one that is listed twice counts as two.
-        seat: One box; its world-axis box is the seat.
-        below: How far below the seat's bottom a body still counts [m], 0.10.
-        above: How far above the seat's top a body still counts [m], 0.35.
-        min_force: Smallest contact force [N], 5.
-        stiffness: Turns force into length for the margin alone [N/m].
-    """
-    inputs = [xpos, xquat, contact_force, bodies, seat, below, above, min_force, stiffness]
-    launch(sit_sofa_released_kernel, success.shape[0], inputs, [success, margin])
+launch_sit_sofa_released = launcher(sit_sofa_released_kernel, stiffness=500.0)
 
 
 @wp.func
@@ -361,7 +300,15 @@ def boxing_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
+    """Boxing: a palm within max(bounding radius, min_radius) + pad of the target's centre.
+
+    Args:
+        palm_body: Bodies that carry the palms, int32, shape [k].
+        palm_offset: Palms in those bodies' frames [m], vec3, shape [k].
+        target: One box; half of its largest extent is the bounding radius.
+        min_radius: 0 in `paper`, 0.10 in `released` [m].
+        pad: Reach beyond the radius [m], 0.08.
+    """
     w = wp.tid()
     centre = box_centre(xpos, xquat, target, w, 0)
     h = target.half[0]
@@ -372,29 +319,7 @@ def boxing_kernel(
     success[w] = holds(m)
 
 
-def launch_boxing(
-    xpos: wp.array,
-    xquat: wp.array,
-    *,
-    palm_body: wp.array,
-    palm_offset: wp.array,
-    target: Boxes,
-    min_radius: float,
-    pad: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
-    """Boxing: a palm within max(bounding radius, min_radius) + pad of the target's centre.
-
-    Args:
-        palm_body: Bodies that carry the palms, int32, shape [k].
-        palm_offset: Palms in those bodies' frames [m], vec3, shape [k].
-        target: One box; half of its largest extent is the bounding radius.
-        min_radius: 0 in `paper`, 0.10 in `released` [m].
-        pad: Reach beyond the radius [m], 0.08.
-    """
-    inputs = [xpos, xquat, palm_body, palm_offset, target, min_radius, pad]
-    launch(boxing_kernel, success.shape[0], inputs, [success, margin])
+launch_boxing = launcher(boxing_kernel)
 
 
 @wp.func
@@ -442,7 +367,7 @@ def vis_navi_kernel(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
     qpos: wp.array2d[float],
-    root: int,
+    root_qpos_adr: int,
     feet: wp.array[int],
     zone: Boxes,
     round_zone: int,
@@ -451,31 +376,6 @@ def vis_navi_kernel(
     success: wp.array[int],
     margin: wp.array[float],
 ):
-    """One thread per world."""
-    w = wp.tid()
-    q = box_rotation(xquat, zone, w, 0)
-    c = box_centre(xpos, xquat, zone, w, 0)
-    worst = worst_foot(xpos, feet, c, q, zone.half[0], round_zone, w)
-    m = foot_slack(xpos, feet, c, q, zone.half[0], round_zone, w, worst)
-    m = wp.min(m, slack_standing(qpos, w, root, stand_height, stand_up))
-    margin[w] = m
-    success[w] = holds(m)
-
-
-def launch_vis_navi(
-    xpos: wp.array,
-    xquat: wp.array,
-    qpos: wp.array,
-    *,
-    root_qpos_adr: int,
-    feet: wp.array,
-    zone: Boxes,
-    round_zone: bool = False,
-    stand_height: float,
-    stand_up: float,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
     """VisNavi: the origins of all foot links inside the zone, seen from above, and the robot stands.
 
     Args:
@@ -483,5 +383,14 @@ def launch_vis_navi(
         zone: One box.
         round_zone: Whether the zone is the upright cylinder inscribed in the box, its diameter the smaller extent.
     """
-    inputs = [xpos, xquat, qpos, root_qpos_adr, feet, zone, int(round_zone), stand_height, stand_up]
-    launch(vis_navi_kernel, success.shape[0], inputs, [success, margin])
+    w = wp.tid()
+    q = box_rotation(xquat, zone, w, 0)
+    c = box_centre(xpos, xquat, zone, w, 0)
+    worst = worst_foot(xpos, feet, c, q, zone.half[0], round_zone, w)
+    m = foot_slack(xpos, feet, c, q, zone.half[0], round_zone, w, worst)
+    m = wp.min(m, slack_standing(qpos, w, root_qpos_adr, stand_height, stand_up))
+    margin[w] = m
+    success[w] = holds(m)
+
+
+launch_vis_navi = launcher(vis_navi_kernel, round_zone=False)

@@ -1,6 +1,9 @@
 """Pairs with other programs: ratios are medians of rounds, what was not measured says so, history names versions."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +14,8 @@ from benchmarks import __main__ as benches
 from benchmarks import peers
 from benchmarks.__main__ import BENCHES, main
 from benchmarks.bench_options import PeerOptions
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def figures_of(options):
@@ -95,7 +100,18 @@ def test_training_needs_no_download(tmp_path):
     assert torch.load(path, weights_only=True)["conv1.weight"].shape == (64, 3, 7, 7)
 
 
-def test_vision_weights_that_cannot_be_made(tmp_path):
-    """A folder that is not there is one error."""
-    with pytest.raises(ArenaError, match="vision encoder's weights"):
-        peers.new_vision_weights(tmp_path / "missing")
+def test_the_overview_lists_every_bench():
+    """`--help` names every bench with one line and loads nothing heavy, as the flags of each do."""
+    code = (
+        "import sys; from benchmarks.__main__ import BENCHES, main\n"
+        "assert main(['--help']) == 0\n"
+        "for name in BENCHES:\n"
+        "    try: main([name, '--help'])\n"
+        "    except SystemExit as stop: assert not stop.code\n"
+        "heavy = {'warp', 'torch', 'mujoco', 'newton', 'lerobot', 'numpy'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert all(f"python -m benchmarks {name} " in done.stdout for name in BENCHES)
+    assert main(["nothing"]) == 2 and main([]) == 2

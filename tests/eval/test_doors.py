@@ -223,6 +223,7 @@ def test_every_door_gives_the_same_episodes(checkpoint, tmp_path, capsys):
     assert "lerobot.scripts.lerobot_eval" in text and text.count("policies.serve") == 4
 
 
+@pytest.mark.release
 def test_our_runner_as_a_door(checkpoint, tmp_path):
     """One door alone: its program runs, and what it did is read from its files."""
     flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "1", "--max-steps", str(TICKS)]

@@ -229,6 +229,7 @@ def submit(folder, *arguments, **variables):
     return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.release
 def test_the_batch_file(tmp_path):
     """The batch file plays a shard per task of an array, again on demand, and merge joins what it wrote."""
     file = ROOT / "examples" / "shards.sbatch"

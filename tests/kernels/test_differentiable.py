@@ -246,7 +246,7 @@ def test_first_call_of_a_process(call):
             "differentiable.reference_step(x, state)[0].sum().backward()\n"
         ),
         "margin": (
-            "from arena_newton.kernels import success\n"
+            "from arena_newton.kernels.rules import success\n"
             "x = torch.zeros(2, 9); x[:, 2], x[:, 3] = 0.8, 1.0; x.requires_grad_()\n"
             "differentiable.success_margin(success.launch_open_door_released, qpos=x, root_qpos_adr=0,\n"
             "    leaf_qpos_adr=7, latched=torch.zeros(2, dtype=torch.int32), min_angle=1.0, stand_height=0.45,\n"
