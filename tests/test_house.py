@@ -137,6 +137,28 @@ def test_the_page_of_rooms_names_each():
         assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), f"{file}: no {name}"
 
 
+QUESTION = re.compile(r"(What|Who|Whose|Whether|Where|When|Which|How)\b")
+"""Words with which no docstring begins: it begins with a noun of the field or a verb."""
+QUESTIONS = {
+    "eval/commands": "help texts move with the tables of flags",
+    "eval/plan": "help texts move with the tables of flags",
+    "eval/tables": "its readers of episodes become one",
+}
+"""Folders with docstrings that still begin with them, and why."""
+
+
+def test_docstrings_name_what_they_describe():
+    """No docstring of the product begins like a question: `True if …`, not `Whether …`."""
+    found = collections.defaultdict(list)
+    for module in KNOWN.values():
+        for node in ast.walk(module.tree):
+            text = node.value.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) else None
+            if isinstance(text, str) and QUESTION.match(text):
+                found[str(module.path.parent.relative_to(ROOT))].append(f"{place(module, node.lineno)}: {text[:60]}")
+    report([line for folder, lines in found.items() if folder not in QUESTIONS for line in lines])
+    assert not set(QUESTIONS) - set(found), "no longer needed"
+
+
 def private(name: str) -> bool:
     """True if a name is one module's own."""
     return name.startswith("_") and not name.startswith("__")
