@@ -29,7 +29,7 @@ FLAGS += ["--steps", "6", "--max-steps", "12", "--worlds", "2", "--seed", "3"]
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from arena_newton.eval import learning_loop
+from arena_newton.eval.loop import learning_loop
 from arena_newton.eval.__main__ import main
 from arena_newton.policies.train import policy_trainer
 at = sys.argv.pop(1)
@@ -42,7 +42,7 @@ if at == "record":
     append = Journal.append
     Journal.append = lambda self, record: (append(self, record), kill())
 if at == "build":
-    from arena_newton.data import lerobot_dataset
+    from arena_newton.data.datasets import lerobot_dataset
     lerobot_dataset.build = lambda folders, options: kill()
 if at == "train":
     advance = policy_trainer.PolicyTrainer.advance
