@@ -11,13 +11,13 @@ import dataclasses
 import fcntl
 import json
 import os
-import shlex
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from arena_newton.cli.flags import check_least, flag_name, shell_command, words
 from arena_newton.data.datasets import lerobot_dataset
 from arena_newton.data.datasets.data_options import BuildOptions
 from arena_newton.doctor import versions
@@ -25,11 +25,12 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.loop import loop_report
+from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING, LoopRecord, StageRecord
 from arena_newton.eval.loop.loop_requirements import check_disk, check_folder, check_libraries, recorded_bytes
 from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_SEEDS
-from arena_newton.eval.plan.options import LoopOptions, RecordOptions, RunOptions
+from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.reports.progress import duration
@@ -43,7 +44,7 @@ from arena_newton.policies.train.policy_options import PolicyTrainOptions, check
 __all__ = ["LOOP_FILE", "LoopParts", "held", "resolved", "run"]
 
 LOOP_FILE = "loop.json"
-"""What was asked, and which stages are finished."""
+"""Options of the loop, and its finished stages."""
 LOCK_FILE = "loop.lock"
 """Locked while a process works in the folder."""
 FORMAT = 1
@@ -51,12 +52,12 @@ FORMAT = 1
 RECORD_WORLDS = {True: 100, False: 20}
 """Episodes simulated at once, with CUDA and without."""
 FULL = {"episodes": 100, "repeats": 20, "recipe": "fast", "size": "224x224"}
-"""What is left open in a loop."""
+"""Options that a loop leaves open."""
 SMALL_STEPS = 20
 """Optimizer steps of a small loop."""
 SMALL = {"episodes": 3, "repeats": 1, "recipe": "small", "size": "64x64", "max_steps": 60, "worlds": 3}
 SMALL |= {"steps": SMALL_STEPS}
-"""What is left open in one that only tries the machinery."""
+"""Options that a loop leaves open which only tries the machinery."""
 UNRESOLVED = ("out",)
 """Flags that may differ when a loop goes on."""
 
@@ -77,7 +78,7 @@ def _check_training(options: PolicyTrainOptions) -> int:
 
 @dataclass(frozen=True)
 class LoopParts:
-    """What the stages call; tests put their own in."""
+    """Calls of the stages; tests put their own in."""
 
     check: Callable[[PolicyTrainOptions], int] = _check_training
     """Refuses a training that cannot begin, and gives the bytes of its checkpoints."""
@@ -131,10 +132,7 @@ def resolved(options: LoopOptions) -> LoopOptions:
     options = dataclasses.replace(options, **opened)  # type: ignore[arg-type]  # each is of its flag's kind
     if options.steps is not None and options.minutes is not None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
-    for name in ("episodes", "repeats", "worlds", "steps", "max_steps"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise InputError(f"--{name.replace('_', '-')} {value}: expected at least 1")
+    check_least(options, 1, "episodes", "repeats", "worlds", "steps", "max_steps")
     if options.minutes is not None and not options.minutes > 0:
         raise InputError(f"--minutes {options.minutes:g}: expected more than 0")
     check_numbers(dataclasses.replace(_training(options, Path()), dataset=(Path(),)))  # its dataset is not there yet
@@ -143,8 +141,8 @@ def resolved(options: LoopOptions) -> LoopOptions:
     if any((camera.width, camera.height) != (picture, picture) for camera in cameras.values()):
         raise InputError(f"{flag}: recipe {options.policy}/{options.recipe} takes {picture}x{picture}")
     if options.out is None:
-        words = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
-        options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(words))))
+        named = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
+        options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(named))))
     resolve(recording_run(_recording(options, Path())))  # tasks, tracker, engine and size, before anything is written
     resolve(dataclasses.replace(_evaluation(options, Path()), policy="stand"))
     return options
@@ -266,7 +264,7 @@ class _Loop:
             "train": self._train,
             "evaluate": self._evaluate,
         }
-        command = "python -m arena_newton.eval loop " + " ".join(_words(self.options))
+        command = shell_command("arena_newton.eval", "loop", *words(self.options))
         code = 0
         for number, (name, work) in enumerate(stages.items(), 1):
             stage = self.stages.setdefault(name, StageRecord())
@@ -319,8 +317,7 @@ class _Loop:
         for name, now in mine.items():
             was = stored.options.get(name)
             if name not in UNRESOLVED and was != now:
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"--out {self.out}: was begun with {flag} {_said(was)}, now {_said(now)}")
+                raise InputError(f"--out {self.out}: was begun with {flag_name(name)} {_said(was)}, now {_said(now)}")
         self.stages = stored.stages
 
     def _write(self) -> None:
@@ -377,16 +374,3 @@ class _Loop:
 
 def _said(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else "-" if value is None else str(value)
-
-
-def _words(options: LoopOptions) -> list[str]:
-    """The flags that give this loop again."""
-    words: list[str] = []
-    for one in dataclasses.fields(options):
-        value = getattr(options, one.name)
-        if value in (None, False):
-            continue
-        words.append("--" + one.name.replace("_", "-"))
-        if value is not True:
-            words += [shlex.quote(str(part)) for part in (value if isinstance(value, tuple) else (value,))]
-    return words

@@ -5,9 +5,7 @@ Markdown and one HTML page; what comes from the folder is text to both, pictures
 
 from __future__ import annotations
 
-import base64
 import csv
-import hashlib
 import json
 import math
 from collections import Counter
@@ -19,11 +17,13 @@ from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run
 from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
-from arena_newton.eval.reports.html_report import FOLDER, page_template
+from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.reports.progress import duration
-from arena_newton.eval.reports.wording import escaped, markdown_table, media_of, plain
+from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.statistics.stats import wilson
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
+from arena_newton.pages.html import FILES, render
+from arena_newton.pages.tables import Table, between, escaped
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 
 __all__ = [
@@ -48,8 +48,6 @@ MOST_POINTS = 400
 """Points of a curve; of more, every second, third ... is drawn."""
 MAX_BYTES = 1 << 20
 """Largest loop.json that is read."""
-SOURCES = "default-src 'none'; img-src 'self' file:; base-uri 'none'; form-action 'none'"
-"""Content-Security-Policy of the page, without its style."""
 STAGES = {
     "record": "record demonstrations",
     "build": "build the dataset",
@@ -189,11 +187,9 @@ def _rate_rows(run: RunRecord) -> list[list[str]]:
     for cell in dict.fromkeys((r.task, r.tracker, r.mode) for r in run.records):
         own = [r for r in run.records if (r.task, r.tracker, r.mode) == cell]
         ends = Counter(r.outcome for r in own)
-        interval = wilson(ends["success"], len(own))
-        between = "-" if interval is None else f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f}"
-        rate = f"{100 * ends['success'] / len(own):.1f}"
+        rates = [f"{100 * ends['success'] / len(own):.1f}", between(wilson(ends["success"], len(own)))]
         rows.append(
-            [*map(plain, cell), f"{ends['success']}/{len(own)}", rate, between]
+            [*map(plain, cell), f"{ends['success']}/{len(own)}", *rates]
             + [str(ends[outcome]) for outcome in ("fall", "timeout", "error")]
         )
     return rows
@@ -203,7 +199,7 @@ RATE_HEAD = ["task", "tracker", "mode", "successes", "SR %", "95 % Wilson", "fal
 
 
 def _facts(out: Path, loop: LoopRecord) -> list[tuple[str, str]]:
-    """What was recorded and trained, in words."""
+    """Recording and training in words."""
     found = []
     if (out / RECORDINGS / "config.json").is_file():
         recorded = load_run(out / RECORDINGS).records
@@ -226,7 +222,7 @@ def _facts(out: Path, loop: LoopRecord) -> list[tuple[str, str]]:
 
 
 def lines(out: Path, loop: LoopRecord) -> list[str]:
-    """What the command prints at its end: times and rates."""
+    """Last lines of the command: times and rates."""
     times = ", ".join(f"{name} {duration(stage.seconds)}" for name, stage in loop.stages.items())
     found = [f"time: {times}; together {duration(sum(stage.seconds for stage in loop.stages.values()))}"]
     for row in _rate_rows(load_run(out / EVALUATION)):
@@ -245,12 +241,12 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
     rates, stages = _rate_rows(run), _stage_rows(loop)
     notes = ["A small loop, which tries the machinery: no result."] if loop.options.get("small") is True else []
     text = [f"# The loop of {escaped(' '.join(map(str, _listed(loop.options.get('task')))))}", ""]
-    text += [f"`{plain(command).replace('`', '')}`", "", "## Result", "", markdown_table(RATE_HEAD, rates, 3)]
+    text += [f"`{plain(command).replace('`', '')}`", "", "## Result", "", Table(RATE_HEAD, rates, "lllr").markdown()]
     text += [f"> {note}" for note in notes] + [
         "",
         "## Time",
         "",
-        markdown_table(["stage", "seconds", ""], stages, 1),
+        Table(["stage", "seconds", ""], stages, "lr").markdown(),
         "## What was made",
         "",
     ]
@@ -266,11 +262,10 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
         text += [f"{escaped(title)}: {escaped(record.outcome)} after {record.steps} ticks", ""]
         text += [f"![{escaped(title)}]({path})" for path in strips] + [""]
     write_atomic(out / "loop.md", "\n".join(text).rstrip() + "\n")
-    style = (FOLDER / "report.css").read_text(encoding="utf-8")
-    named = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    page = page_template("loop.html").render(
-        policy=f"{SOURCES}; style-src 'sha256-{named}'",
-        style=style,
+    page = render(
+        FOLDER / "loop.html",
+        styles=["report.css"],
+        sources=FILES,
         title=" ".join(map(str, _listed(loop.options.get("task")))),
         command=command,
         head=RATE_HEAD,

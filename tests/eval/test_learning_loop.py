@@ -20,8 +20,8 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.loop import learning_loop, loop_report
 from arena_newton.eval.loop.learning_loop import LOOP_FILE, LoopParts, resolved
+from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import StageRecord
-from arena_newton.eval.plan.options import LoopOptions
 from tests.fuzz.mutants import damaged
 
 FLAGS = ["--small", "--task", "boxing", "--tracker", "pd", "--engine", "mujoco", "--device", "cpu", "--episodes", "2"]
