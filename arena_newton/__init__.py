@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from arena_newton import differentiable, policies, rule_sets, tasks, trackers
+    from arena_newton import differentiable, policies, rule_sets, rules, tasks, trackers
     from arena_newton.env import ArenaEnv
     from arena_newton.pictures.camera import Camera
     from arena_newton.pictures.recorder import EpisodeRecorder
     from arena_newton.pictures.settings import CameraConfig
+    from arena_newton.robot import canonical
     from arena_newton.rollout import Rollout
 
 __all__ = [
@@ -24,10 +25,10 @@ __all__ = [
     "EpisodeRecorder",
     "Rollout",
     "__version__",
+    "canonical",
     "differentiable",
     "policies",
     "rule_sets",
-    "robot",
     "rules",
     "tasks",
     "trackers",
@@ -43,6 +44,8 @@ _HOMES = {
     "Rollout": "arena_newton.rollout",
 }
 """Public class → its module; the other public names are modules of this package."""
+_ROOMS = {"canonical": "robot."}
+"""Public module → its room, where it has one."""
 
 _CHECKOUT = Path(__file__).resolve().parent.parent
 # The checkout root holds a folder `kernels/`, which would shadow the package of that name that transformers imports.
@@ -55,7 +58,7 @@ def __getattr__(name: str) -> object:
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
     if name in __all__:
-        return importlib.import_module(f"{__name__}.{name}")
+        return importlib.import_module(f"{__name__}.{_ROOMS.get(name, '')}{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

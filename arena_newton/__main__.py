@@ -19,10 +19,6 @@ from arena_newton.errors import InputError
 __all__ = ["COMMANDS", "Command", "main"]
 
 PROG = "arena-newton"
-_EVAL = (
-    "evaluate: run resume record merge report film list compare tables tsne matrix loop pack sensitivity adversary "
-    "bench doors engines certify"
-)
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Command:
     """One command, with flags and subcommands of its own."""
 
     words: str
-    """What is typed, such as `trackers evaluate`."""
+    """Words as typed, such as `trackers evaluate`."""
     module: str
     """Module whose `main` takes the arguments and returns the exit code."""
     purpose: str
@@ -40,13 +36,11 @@ class Command:
 COMMANDS = (
     Command("doctor", "arena_newton.doctor", "versions, devices, engines, kernel cache, and what to repair"),
     Command("data", "arena_newton.data.__main__", "demonstrations: clean, build, verify, merge, split, inspect, stats"),
-    Command("eval", "arena_newton.eval.__main__", _EVAL),
+    Command("eval", "arena_newton.eval.__main__", "evaluate:"),
     Command("policies check", "arena_newton.policies.policy_check", "try what the interface promises on a policy"),
     Command("policies serve", "arena_newton.policies.serve.__main__", "serve a policy: openpi, vla-eval, HTTP"),
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
-    Command(
-        "policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; bench, teachable"
-    ),
+    Command("policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; teachable"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
     Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
@@ -64,7 +58,9 @@ DOCTORS = {"--tracker": "trackers check", "--policy": "policies check"}
 def _overview(within: str) -> str:
     shown = [c for c in COMMANDS if f"{c.words} ".startswith(f"{within} ".lstrip())]
     width = max(len(c.words) for c in shown)
-    lines = [f"  {PROG} {c.words:<{width}}  {c.purpose}" for c in shown]
+    names = " ".join(importlib.import_module("arena_newton.eval.__main__").COMMANDS)
+    purposes = {c.words: f"{c.purpose} {names}" if c.words == "eval" else c.purpose for c in shown}
+    lines = [f"  {PROG} {words:<{width}}  {purpose}" for words, purpose in purposes.items()]
     words = f"{within} COMMAND".strip()
     return "\n".join(
         [

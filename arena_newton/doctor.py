@@ -15,7 +15,7 @@ from pathlib import Path
 
 from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.extras import EXTRAS
-from arena_newton.files.probe import faults
+from arena_newton.files.sandboxed_load import faults
 
 __all__ = ["Finding", "examine", "examine_extras", "main", "versions"]
 
@@ -82,7 +82,7 @@ class Finding:
     status: str = "ok"
     """``ok``, ``note`` (works, but something is absent) or ``bad`` (a run fails)."""
     advice: str = ""
-    """What to do about it."""
+    """Advice to the user."""
 
 
 def versions() -> dict[str, str | None]:
@@ -114,7 +114,7 @@ def _packages() -> list[Finding]:
 
 
 def examine_extras() -> list[Finding]:
-    """Which extras are installed, and whether the data extra's video reader works."""
+    """Check of the installed extras, and of the data extra's video reader."""
     findings = []
     for extra, modules in EXTRAS.items():
         absent = [module for module in modules if importlib.util.find_spec(module) is None]
@@ -130,7 +130,7 @@ def examine_extras() -> list[Finding]:
 
 
 def _torchcodec() -> Finding:
-    """Whether torchcodec loads: it is installed without FFmpeg's shared libraries, and does not without them."""
+    """Check that torchcodec loads: it is installed without FFmpeg's shared libraries, but needs them."""
     try:
         fault = faults("module", ["torchcodec"], memory=_TORCHCODEC_MEMORY, seconds=_TORCHCODEC_TIME)[0]
     except (OSError, subprocess.SubprocessError) as error:

@@ -126,7 +126,7 @@ class ArenaEnv:
         self.judge = self.spec.judge(self.scene, self.rules)
         self.judge.bind(self.physics)
         self.loop = TrackerLoop(self.physics, self.scene.robot, tracker)
-        """What turns actions into actuator targets."""
+        """Turns actions into actuator targets."""
         self.startup_ticks: int = self.rules.startup.ticks
         """Length of the start-up [ticks]."""
         self.tick = np.zeros(self.worlds, dtype=np.int64)
@@ -136,7 +136,7 @@ class ArenaEnv:
         self.budget = self.spec.max_steps(self.rules)
         """Step budget of the rule set [ticks]."""
         self.draws: list[Draws | None] = [None] * self.worlds
-        """What was drawn for each world's episode."""
+        """Random numbers drawn for each world's episode."""
         self._anchored = np.zeros(self.worlds, dtype=bool)
         self._stand = torch.tensor(STAND_ACTION, device=self.torch_device)
         self._chosen, self._stepping = WorldMask(self.worlds, self.device), WorldMask(self.worlds, self.device)
@@ -145,7 +145,7 @@ class ArenaEnv:
         self.camera: Camera | None = None
         """Head camera of policies that see."""
         self.camera_config = camera
-        """What it was made from."""
+        """Configuration that it was made from."""
         if camera is not None:
             self.camera = Camera.from_scene(self.scene, lights=self.lights, **dataclasses.asdict(camera))
         self._bind_kernels()
@@ -182,7 +182,7 @@ class ArenaEnv:
         self._rule = record(launch_rules)
 
     def describe(self) -> dict[str, object]:
-        """What ran, for results to record: engine, physics rate, drive, start-up and tracker."""
+        """Configuration to record with every result: engine, physics rate, drive, start-up and tracker."""
         return {
             "engine": self.engine,
             "device": str(self.device),
@@ -400,7 +400,7 @@ class ArenaEnv:
             view.copy_(torch.where(mask.view(-1, *[1] * (view.ndim - 1)), view, before))
 
     def verdict(self, world: int) -> Verdict:
-        """What judge and physics say of a world's episode so far.
+        """Judgement of a world's episode so far, by the judge and the physics.
 
         Args:
             world: World index.

@@ -11,7 +11,7 @@ class ArenaError(Exception):
     """Base of every error that arena_newton raises on purpose."""
 
     exit_code: ClassVar[int] = 1
-    """What a command line that ends with the error returns."""
+    """Exit code of a command line that ends with the error."""
 
 
 class InputError(ArenaError):

@@ -1,4 +1,4 @@
-"""What passes between the world, a tracker and a policy, and what each of them promises: records and Protocols.
+"""Interfaces of the world, the trackers and the policies: the records that pass between them, and each one's promises.
 
 Nothing here behaves, and nothing here imports a room above it.
 """
@@ -49,7 +49,7 @@ Spawn = Callable[[int], tuple[Sequence[float], Sequence[float]]]
 
 @dataclass
 class Observation:
-    """What a policy sees; rows are worlds."""
+    """Observation of a policy; rows are worlds."""
 
     state: torch.Tensor
     """Canonical state, float32, shape [worlds, 64]."""
@@ -111,7 +111,7 @@ class Predicate:
 
     name: str
     sentence: str
-    """When it holds, in one sentence."""
+    """Condition of the predicate, in one sentence."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class EpisodeEvent:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the judge and the physics say of one world's episode so far."""
+    """Judgement of one world's episode so far, by the judge and the physics."""
 
     margin: float
     """Signed distance to success [m or the task's unit]."""
@@ -144,7 +144,7 @@ class Verdict:
 
 @dataclass
 class EpisodeResult:
-    """How one planned episode ended."""
+    """Ending of one planned episode."""
 
     episode: Any
     """The plan's object, a `Planned`."""
@@ -217,7 +217,7 @@ class Tracker(Protocol):
         """
 
     def describe(self) -> dict[str, Any]:
-        """What a result must record to name this tracker exactly, as JSON."""
+        """Facts to record with every result so that this tracker is named exactly, as JSON."""
 
 
 class Policy(Protocol):
@@ -287,7 +287,7 @@ class Physics(Protocol):
         """Write body poses into a Newton state, for rendering."""
 
     def overflowed(self, world: int) -> bool:
-        """Whether a contact or constraint buffer overflowed in this world since its reset."""
+        """True if a contact or constraint buffer overflowed in this world since its reset."""
 
     def close(self) -> None:
         """Release threads; the physics steps no more."""
@@ -321,7 +321,7 @@ class World(Protocol):
     scene: Scene
     tracker: Any
     loop: TrackerLoop
-    """What turns actions into actuator targets; holds what was executed at the last tick."""
+    """Turns actions into actuator targets; holds what was executed at the last tick."""
     mode: str
     """Evaluation mode."""
     worlds: int
@@ -337,11 +337,11 @@ class World(Protocol):
     camera: Camera | None
     """Head camera of policies that see."""
     camera_config: CameraConfig | None
-    """What it was made from."""
+    """Configuration that it was made from."""
 
     @property
     def physics(self) -> Physics:
-        """What moves the worlds."""
+        """Physics engine that moves the worlds."""
 
     @property
     def lights(self) -> WorldLights:
@@ -374,10 +374,10 @@ class World(Protocol):
         """Picture of one camera, uint8, shape [worlds, H, W, 3]."""
 
     def verdict(self, world: int) -> Verdict:
-        """What judge and physics say of a world's episode so far."""
+        """Judgement of a world's episode so far, by the judge and the physics."""
 
     def describe(self) -> dict[str, Any]:
-        """What ran, for results to record, as JSON."""
+        """Configuration to record with every result, as JSON."""
 
     def close(self) -> None:
         """Release the physics' threads; the environment steps no more."""
@@ -387,7 +387,7 @@ class Recorder:
     """Base of what looks on while episodes run; `rollout.Rollout` calls it, a subclass overrides what it needs."""
 
     wants_observation: bool = False
-    """Whether `before_physics` needs the observation of every tick, which costs a kernel launch."""
+    """True if `before_physics` needs the observation of every tick, which costs a kernel launch."""
 
     def start(self, env: World, world: int, episode: Any) -> None:
         """An episode begins in a world: it was reset."""

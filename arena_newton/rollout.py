@@ -122,7 +122,7 @@ class Rollout:
         self._next, self._length = np.zeros(env.worlds, np.int64), np.zeros(env.worlds, np.int64)
         """Next action of each world's chunk, and its length; it begins with what is left of the chunk before."""
         self._stand = torch.tensor(STAND_ACTION, device=env.torch_device).expand(env.worlds, latency, ACTION_WIDTH)
-        """What is played before an episode's first chunk begins, shape [worlds, latency, 40]."""
+        """Actions before an episode's first chunk begins, shape [worlds, latency, 40]."""
         self._rows = torch.arange(env.worlds, device=env.torch_device)
 
     def run(self) -> list[EpisodeResult]:
@@ -210,7 +210,7 @@ class Rollout:
         self._next[asks], self._length[asks] = 0, actions.shape[1]
 
     def _left(self, length: int) -> torch.Tensor:
-        """What every world plays until a chunk of a length begins, shape [worlds, latency, 40].
+        """Actions of every world until a chunk of a length begins, shape [worlds, latency, 40].
 
         Whoever is asked again before its answer has begun would have to decide twice at once; only one that gives a
         longer chunk in pieces does not.

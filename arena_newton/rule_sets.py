@@ -9,6 +9,7 @@ import functools
 import sys
 
 from arena_newton import tasks
+from arena_newton.pages.tables import Table
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 from arena_newton.rules.rule_types import (
     ByRules,
@@ -205,6 +206,25 @@ def _departures() -> list[tuple[str, str, str]]:
 def markdown() -> str:
     """The documentation page `docs/rules.md`."""
     sets = [get(name) for name in names()]
+    specs = [tasks.get(t.task) for t in sets[0].tasks]
+    items = [
+        [cell.replace("|", "\\|") for cell in (item, first, "the same" if first == second else second)]
+        for (item, first), (_, second) in zip(*map(table, sets), strict=True)
+    ]
+    steps = [(spec.name, predicate.name, predicate.sentence) for spec in specs for predicate in spec.predicates]
+    ranges = [
+        (ours.task, a.record, _range_text(a.base), wide, "the same" if wide == original else original)
+        for ours, theirs in zip(*(s.tasks for s in sets), strict=True)
+        for a, b in zip(ours.objects, theirs.objects, strict=True)
+        for wide, original in [(_range_text(a.execution), _range_text(b.execution))]
+    ]
+    overlaps = [
+        (spec.name, things, ", ".join(case.rules), ", ".join(case.modes), case.episodes, num(case.depth), case.why)
+        for spec in specs
+        for case in spec.overlaps
+        for things in [" and ".join(path.removeprefix("/World/") for path in (case.first, case.second))]
+    ]
+    head = ("task", "things", "`--rules`", "`--mode`", "episodes of 60", "deepest [m]", "because")
     lines = [
         "# Rule sets",
         "",
@@ -212,32 +232,18 @@ def markdown() -> str:
         "follows its released code. A run prints the set it uses and stores the set's hash with every result.",
         "This page is generated: `python -m arena_newton.rule_sets > docs/rules.md`.",
         "",
-        "| item | " + " | ".join(f"`{s.name}`" for s in sets) + " |",
-        "|---|" + "---|" * len(sets),
-    ]
-    for (item, first), (_, second) in zip(*(table(s) for s in sets), strict=True):
-        cells = [item, first, "the same" if first == second else second]
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    lines += [
+        *Table(("item", *(f"`{s.name}`" for s in sets)), items).compact(),
         "",
         "## Where both sets depart from the original",
         "",
-        "| item | here | in the original |",
-        "|---|---|---|",
-        *("| " + " | ".join(row) + " |" for row in _departures()),
+        *Table(("item", "here", "in the original"), _departures()).compact(),
         "",
         "## Steps on the way to success",
         "",
         "Predicates say how far an episode came; they decide nothing. Every tick tests all of them, each by itself.",
         "The last one of a task is its success.",
         "",
-        "| task | predicate | holds when |",
-        "|---|---|---|",
-        *(
-            f"| {spec.name} | {predicate.name} | {predicate.sentence} |"
-            for spec in map(tasks.get, (t.task for t in sets[0].tasks))
-            for predicate in spec.predicates
-        ),
+        *Table(("task", "predicate", "holds when"), steps).compact(),
         "",
         "## Where objects are put",
         "",
@@ -245,33 +251,15 @@ def markdown() -> str:
         "turns it into a world pose. Base ranges, and with them the draws of base, semantic and visual mode, are the",
         "same in both sets.",
         "",
-        "| task | object | base | execution, `paper` | execution, `released` |",
-        "|---|---|---|---|---|",
-    ]
-    for ours, theirs in zip(*(s.tasks for s in sets), strict=True):
-        for a, b in zip(ours.objects, theirs.objects, strict=True):
-            wide, original = _range_text(a.execution), _range_text(b.execution)
-            lines.append(
-                f"| {ours.task} | {a.record} | {_range_text(a.base)} | {wide} | "
-                f"{'the same' if wide == original else original} |"
-            )
-    lines += [
+        *Table(("task", "object", "base", "execution, `paper`", "execution, `released`"), ranges).compact(),
         "",
         "## Episodes that start with things inside each other",
         "",
         "All the cases deeper than 1 cm in the protocol's 60 episodes (3 seeds × 20) of any mode and rule set; physics",
         "pushes the things apart in the first ticks. The original's own ranges make them, and its draws are kept.",
         "",
-        "| task | things | `--rules` | `--mode` | episodes of 60 | deepest [m] | because |",
-        "|---|---|---|---|--:|--:|---|",
+        *Table(head, overlaps, "llllrrl").compact(),
     ]
-    for name in (t.task for t in sets[0].tasks):
-        for case in tasks.get(name).overlaps:
-            things = " and ".join(path.removeprefix("/World/") for path in (case.first, case.second))
-            lines.append(
-                f"| {name} | {things} | {', '.join(case.rules)} | {', '.join(case.modes)} | {case.episodes} | "
-                f"{num(case.depth)} | {case.why} |"
-            )
     return "\n".join(lines) + "\n"
 
 

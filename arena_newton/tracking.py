@@ -82,7 +82,7 @@ class TrackerLoop:
         self.reference = canonical.ReferencePose.allocate(
             self.worlds, self.device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK
         )
-        """What the actions of each world integrate to."""
+        """Integrated actions of each world."""
         self.bad_action = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)
         """Flag of `kernels.canonical` of the last tick's action, 0 = it could be executed, shape [worlds]."""
         self.bad_targets = wp.zeros(self.worlds, dtype=wp.int32, device=self.device)

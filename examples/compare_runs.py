@@ -15,7 +15,7 @@ from arena_newton.eval.folders.results import load_run
 
 
 def won(folder: Path) -> dict[tuple[str, str, int, int], bool]:
-    """Whether each episode of a run is a success, by task, mode, group seed and repeat."""
+    """True for each episode of a run that is a success, by task, mode, group seed and repeat."""
     return {(r.task, r.mode, r.group_seed, r.repeat): r.outcome == "success" for r in load_run(folder).records}
 
 

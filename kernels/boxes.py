@@ -33,7 +33,7 @@ FAR = wp.constant(1.0e6)
 
 
 class BoxLike(Protocol):
-    """What a marker of a scene offers."""
+    """Attributes that a scene's box marker has."""
 
     @property
     def body_id(self) -> int:

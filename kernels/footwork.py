@@ -1,4 +1,4 @@
-"""What the feet do: footsteps planned ahead of the body, the sway that goes with them, and kicks.
+"""Motion of the feet: footsteps planned ahead of the body, the sway that goes with them, and kicks.
 
 `GaitState` is what one tick hands to the next; each function here advances one world's part of it by one tick.
 """
@@ -129,7 +129,7 @@ class CommandColumns:
 
 @wp.struct
 class GaitModel:
-    """What all ticks of a generator have in common."""
+    """Constants that all ticks of a generator share."""
 
     tick: float
     """Time of a tick [s]."""
@@ -154,12 +154,12 @@ class GaitModel:
     acceleration: wp.array[float]
     """Largest acceleration [unit/s²], same shape."""
     per_arm_speed: wp.array[wp.bool]
-    """Whether rate and acceleration are multiplied by the channel `arm_speed`, same shape."""
+    """True where rate and acceleration are multiplied by the channel `arm_speed`, same shape."""
 
 
 @wp.struct
 class GaitState:
-    """What the generator remembers; rows are worlds. Ground and world are those of the odometry."""
+    """State of the generator between ticks; rows are worlds. Ground and world are those of the odometry."""
 
     body: wp.array[wp.vec3]
     """Course of the body: x, y [m], yaw [rad]."""
@@ -168,23 +168,23 @@ class GaitState:
     rates: wp.array2d[float]
     """Their rates [unit/s], same shape."""
     targets: wp.array2d[float]
-    """Where the present tick moves them, same shape."""
+    """Joint targets of the present tick, same shape."""
     feet: wp.array2d[vec5f]
     """Left and right ankle: x, y, z [m], yaw, pitch [rad], shape [worlds, 2]."""
     lift_off: wp.array[wp.vec3]
-    """Where the moving foot left the ground: x, y [m], yaw [rad]."""
+    """Pose from which the moving foot left the ground: x, y [m], yaw [rad]."""
     landing: wp.array[wp.vec3]
-    """Where it will land, likewise."""
+    """Pose at which it will land, likewise."""
     stepping: wp.array[wp.bool]
-    """Whether a step is under way."""
+    """True while a step is under way."""
     side: wp.array[int]
     """Foot of the present or last step, `LEFT` or `RIGHT`."""
     phase: wp.array[float]
     """Phase of the step, 0 to 1; below 0 leads into the first, above 1 out of the last one."""
     first: wp.array[wp.bool]
-    """Whether the step is the first of a walk."""
+    """True if the step is the first of a walk."""
     final: wp.array[wp.bool]
-    """Whether it is the last of a walk."""
+    """True if it is the last of a walk."""
     gait: wp.array[wp.vec2]
     """From 0 standing to 1 walking, and its rate [1/s]."""
     ground: wp.array[float]
@@ -331,7 +331,7 @@ def velocity_of(m: GaitModel, s: GaitState, w: int) -> wp.vec3:
 
 @wp.func
 def at_rest(v: wp.vec3) -> bool:
-    """Whether a body of this velocity no longer moves."""
+    """True if a body of this velocity no longer moves."""
     return wp.abs(v[0]) < STANDSTILL and wp.abs(v[1]) < STANDSTILL and wp.abs(v[2]) < STANDSTILL
 
 
@@ -360,7 +360,7 @@ def nominal_foot(m: GaitModel, s: GaitState, w: int, side: int, ahead: float) ->
 
 @wp.func
 def stance_error(m: GaitModel, s: GaitState, w: int, side: int) -> wp.vec2:
-    """How far a foot is from its position under the body [m, rad]."""
+    """Distance and turn of a foot from its position under the body [m, rad]."""
     nominal = nominal_foot(m, s, w, side, 0.0)
     foot = s.feet[w, side]
     dx = foot[0] - nominal[0]
@@ -370,7 +370,7 @@ def stance_error(m: GaitModel, s: GaitState, w: int, side: int) -> wp.vec2:
 
 @wp.func
 def beyond(error: wp.vec2, limit: wp.vec2) -> bool:
-    """Whether one of two errors is larger than its limit."""
+    """True if one of two errors is larger than its limit."""
     return error[0] > limit[0] or error[1] > limit[1]
 
 
@@ -418,7 +418,7 @@ def advance_phase(m: GaitModel, s: GaitState, w: int, moving: bool, free: bool, 
 
 @wp.func
 def plan_landing(m: GaitModel, s: GaitState, w: int, begin: bool, swing: float, step_time: float):
-    """Where the swing foot lands, and on which ground."""
+    """Landing pose of the swing foot, and the ground it lands on."""
     side = s.side[w]
     remaining = wp.max(1.0 - s.phase[w], 0.0) * step_time
     planned = nominal_foot(m, s, w, side, remaining + FOOT_LEAD * step_time)

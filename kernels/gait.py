@@ -89,7 +89,7 @@ _HANDS = wp.constant(FRAME["hands"].start)
 
 @dataclass
 class Presented:
-    """What a tick gives; rows are worlds."""
+    """Outputs of a tick; rows are worlds."""
 
     frame: wp.array
     """Rows laid out as `FRAME`, shape [worlds, `FRAME_WIDTH`]."""

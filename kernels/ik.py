@@ -134,7 +134,7 @@ class Model:
 
 @dataclass
 class IkState:
-    """What the solver remembers and gives; rows are worlds."""
+    """State and outputs of the solver; rows are worlds."""
 
     pelvis: wp.array
     """Position of the pelvis [m], shape [worlds, 2]."""

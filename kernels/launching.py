@@ -65,7 +65,7 @@ def _prepared(command: wp.Launch) -> Callable[[], object] | None:
 
 
 class _Recording(threading.local):
-    """What this thread is recording into, if anything."""
+    """Launches that this thread is recording, if any."""
 
     into: Recorded | None = None
 

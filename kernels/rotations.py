@@ -74,7 +74,7 @@ def rot6d_from_quat(q: wp.quat) -> vec6:
 
 @wp.func
 def rot6d_is_degenerate(v: vec6) -> bool:
-    """Whether the two columns of a rot6d (row layout) span no plane."""
+    """True if the two columns of a rot6d (row layout) span no plane."""
     c0 = wp.vec3(v[0], v[2], v[4])
     c1 = wp.vec3(v[1], v[3], v[5])
     return not (wp.length(wp.cross(c0, c1)) >= DEGENERATE)

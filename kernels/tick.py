@@ -164,7 +164,7 @@ def launch_status(success, fallen, event, bad_state, bad_action, bad_targets, st
 
 @dataclass
 class EpisodeLog:
-    """What happened first at which tick of each world's episode; int32, stored on the device."""
+    """First tick of each event in each world's episode; int32, stored on the device."""
 
     tick: wp.array
     """Ticks since step 0, negative in the start-up, shape [worlds]."""

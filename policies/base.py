@@ -1,4 +1,4 @@
-"""What a policy is: it looks at all worlds that ask and answers a chunk of canonical actions for each."""
+"""Policies: a policy observes all worlds that ask and returns a chunk of canonical actions for each."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Policy:
     name: str = "policy"
     """Name in reports."""
     needs_image: bool = False
-    """Whether the head camera must be rendered for `act`."""
+    """True if the head camera must be rendered for `act`."""
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
     labels: str | None = None
@@ -75,11 +75,11 @@ class Policy:
     chunk_size: int = 1
     """Actions per chunk, where the policy knows it in advance."""
     in_pieces: bool = False
-    """Whether a chunk is given in pieces, so that the policy is shown more ticks than those at which it decides. A
+    """True if a chunk is given in pieces, so that the policy observes more ticks than those at which it decides. A
     piece may be shorter than the latency of a run; the chunk must not."""
     depends_on_worlds: bool = False
-    """Whether an episode may depend on how many worlds ask at once; the number is then part of a run's identity. Final
-    after `check`."""
+    """True if an episode may depend on the number of worlds that ask at once; the number is then part of a run's
+    identity. Final after `check`."""
 
     def check(self) -> None:
         """Validate the policy before the first episode.
@@ -120,7 +120,7 @@ class Policy:
         raise TypeError(f"policy {self.name!r} defines no act()")
 
     def describe(self) -> Json:
-        """What a result must record to name this policy exactly."""
+        """Facts to record with every result so that this policy is named exactly."""
         return {"name": self.name}
 
     def close(self) -> None:
@@ -169,7 +169,7 @@ def dataset_target(argument: str) -> tuple[Path, str | None]:
 
 
 def hub_name(argument: str) -> bool:
-    """Whether text names a repository of the Hugging Face hub, `owner/name`, and no file or folder here."""
+    """True if text names a repository of the Hugging Face hub, `owner/name`, and no file or folder here."""
     return bool(re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", argument)) and not Path(argument).expanduser().exists()
 
 

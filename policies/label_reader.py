@@ -116,7 +116,7 @@ class V4Policy(Policy):
         return Chunk(self._decoder.decode(actions, observation.mask), answer.errors, answer.phases)
 
     def describe(self) -> Json:
-        """What the policy says of itself, and how it is read."""
+        """Policy's own description, and the labels by which it is read."""
         return self.policy.describe() | {"labels": "v4"}
 
     def close(self) -> None:

@@ -36,7 +36,7 @@ class RecordedEpisodes(Policy):
         """Play nothing yet."""
         self.path = Path()
         self.playing: list[np.ndarray | None] = []
-        """What each world plays, shape [ticks, 40]."""
+        """Actions of each world, shape [ticks, 40]."""
         self._mode = "base"
         self._asked: list[tuple[str, str, int]] = []
         self._steps = np.zeros(0, dtype=np.int64)

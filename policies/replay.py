@@ -11,7 +11,7 @@ import numpy as np
 from arena_newton import tasks as task_registry
 from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_arrays
+from arena_newton.files.untrusted_files import read_arrays
 from arena_newton.policies.base import DATASET_FILE, Chunk, Json, Mask, Observation, Policy, dataset_target, world_mask
 from arena_newton.policies.open_loop import RecordedEpisodes, played
 from arena_newton.rules import seeding

@@ -13,7 +13,7 @@ from arena_newton import tasks as task_registry
 from arena_newton.data.readers.dataset_files import PARQUET_BYTES
 from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
 from arena_newton.policies.base import Json, Mask
 from arena_newton.policies.open_loop import RecordedEpisodes
 from arena_newton.rules import seeding
@@ -57,7 +57,7 @@ class ReplayDataset(RecordedEpisodes):
         self._tracker, self._read = "", dict[int, np.ndarray]()
 
     def _all(self) -> None:
-        """Which of our episodes are recorded."""
+        """Find the recorded ones among our episodes."""
         for number, seed in enumerate(self.dataset.seeds()):
             if seed.task not in task_registry.names():
                 raise InputError(f"{self.dataset.where}: arena: episode {number}: no task {seed.task[:80]!r}")

@@ -8,10 +8,16 @@ import tomllib
 from pathlib import Path
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+# Two threads that wait for each other on a busy machine make small networks a hundred times slower, in children too.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+import benchmarks  # noqa: E402, F401  before the package takes the root of a checkout off the path
+
+sys.path.remove(str(ROOT))
 SHARED = Path(os.environ.get("ARENA_REFERENCE", ROOT.parent / "shared"))
 
 if sys.dont_write_bytecode:
@@ -24,6 +30,26 @@ if sys.dont_write_bytecode:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's background job ignores Ctrl-C, and so would every process that a test starts in order to interrupt it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_addoption(parser):
+    """How many damaged files each reader gets."""
+    help = "damaged files per reader: 30, or 200 in the tests that damage files alone"
+    parser.addoption("--fuzz", choices=("brief", "full"), default="brief", help=help)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Play the tests that damage files alone, where they are asked for all of them."""
+    if config.getoption("--fuzz") == "full":
+        others = [item for item in items if "mutants" not in item.fixturenames]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if "mutants" in item.fixturenames]
+
+
+@pytest.fixture(scope="session")
+def mutants(request) -> int:
+    """Damaged files per reader."""
+    return 200 if request.config.getoption("--fuzz") == "full" else 30
 
 
 @pytest.fixture(scope="session")

@@ -1,35 +1,40 @@
-"""The product's imports: read from the sources, checked by `test_house.py`, and drawn.
+"""Imports of the product: read from the sources, checked by `test_house.py`, and drawn by rooms.
 
     python tests/import_graph.py --out docs/design/imports_after.png
     python tests/import_graph.py --root ../before --out imports_before.png    # another checkout
 
-Rooms are columns, from those that know nobody on the left to those that know everybody on the right; every module is a
-row of its room's column. Grey: an import that runs towards the left. Red: one that runs to the right, or one that is
-part of a circle. Imports inside functions count, imports for type checkers do not.
+A box is a room, or a single module of a folder that has rooms; it is above all that it imports. An arrow is as thick as
+there are imports. Red: rooms that import each other. Imports inside functions count, imports for type checkers do not.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-from collections.abc import Iterator
+import collections
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
 
 import matplotlib
 from matplotlib import pyplot
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 PACKAGE = "arena_newton"
-ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4}
-"""Folder → level; a module imports from its own level and from those below. Scenes stand next to the world: the world
+BENCHMARKS = "benchmarks"
+"""Measurements outside of the package: they import everything, and nothing imports them."""
+ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4, BENCHMARKS: 6}
+"""Folder → level; a module imports from its own level and from those below. Scenes are next to the world: the world
 reads their files with their checks, their authors load a scene to look at it."""
 INNER = {
     f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
-        | certification studies loop | commands | bench | __main__""",
-    f"{PACKAGE}.eval.certification": "stand_ins | context | finding | claims | checks | certificate jobs",
-    PACKAGE: """errors | files | cli | robot | interfaces rules | kernel_cache tasks | physics | rule_sets | pictures
-        | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
+        | certification studies loop bench | commands | __main__""",
+    f"{PACKAGE}.eval.certification": """certify_options stand_ins | context | finding | claims | checks
+        | certificate jobs | certify""",
+    PACKAGE: """errors | files | cli pages | robot | interfaces rules | kernel_cache tasks | physics | rule_sets
+        | pictures | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
     f"{PACKAGE}.policies": """recipes | base | label_reader open_loop stand serve_example | protocols | replay_dataset
         | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
@@ -65,18 +70,17 @@ class Module:
     name: str
     path: Path
     tree: ast.Module
-    lines: int
 
     @property
     def room(self) -> str:
         """Top-level folder."""
-        second = self.name.split(".")[1] if "." in self.name else ""
-        return second if second in ROOMS else PACKAGE
+        parts = self.name.split(".")
+        return next((part for part in (parts[0], *parts[1:2]) if part in ROOMS and part != PACKAGE), PACKAGE)
 
     @property
     def level(self) -> int:
-        """Level of the room; the front door is above all."""
-        return max(ROOMS.values()) + 1 if self.name == FRONT_DOOR else ROOMS[self.room]
+        """Level of the room; the front door is above all rooms of the package."""
+        return ROOMS["eval"] + 1 if self.name == FRONT_DOOR else ROOMS[self.room]
 
 
 def modules(root: Path) -> dict[str, Module]:
@@ -87,15 +91,15 @@ def modules(root: Path) -> dict[str, Module]:
             parts = path.relative_to(root).with_suffix("").parts
             if room == PACKAGE and len(parts) > 1 and parts[1] in ROOMS:
                 continue  # the link to another room
-            parts = parts if parts[0] == PACKAGE else (PACKAGE, *parts)
+            parts = parts if parts[0] in (PACKAGE, BENCHMARKS) else (PACKAGE, *parts)
             name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
             text = path.read_text(encoding="utf-8")
-            found[name] = Module(name, path, ast.parse(text), text.count("\n"))
+            found[name] = Module(name, path, ast.parse(text))
     return found
 
 
 def statements(tree: ast.AST, *, checking: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Import statements that run, or those for type checkers, and whether each stands inside a function."""
+    """Import statements that run, or those for type checkers, and whether each is inside a function."""
 
     def walk(node: ast.AST, late: bool, runs: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
         for child in ast.iter_child_nodes(node):
@@ -197,75 +201,89 @@ def upward_rooms(edges: list[Import]) -> list[Import]:
     return found
 
 
+SPLIT = (PACKAGE, f"{PACKAGE}.data", *(f"{PACKAGE}.{room}" for room in ("trackers", "policies", "eval")))
+"""Folders of which a picture shows the parts."""
+COLOURS = dict(zip(ROOMS, ("#8d6e63", "#c0a030", "#2e7d32", "#1565c0", "#6a1b9a", "#37474f"), strict=False))
+"""Colour of each top-level folder in a picture."""
+
+
+def node_of(module: Module) -> str:
+    """Room of a module in a picture: the part of the innermost divided folder, such as `eval.plan` or `env`."""
+    inner = {part for folder in SPLIT if (part := part_of(module.name, folder)) and f"{folder}.{part}" not in SPLIT}
+    folders = [f for f in SPLIT if part_of(module.name, f) in inner]
+    name = f"{folders[-1]}.{part_of(module.name, folders[-1])}" if folders else f"{PACKAGE}.{module.room}"
+    return name.removeprefix(f"{PACKAGE}.")
+
+
+def levels(edges: Collection[tuple[str, str]], nodes: Iterable[str]) -> dict[str, int]:
+    """Level of each room: one above the highest room that it imports; rooms of a circle share theirs."""
+    groups = circles([Import(source, target, 0, False) for source, target in edges])
+    one = {name: group[0] for group in groups for name in group}
+    below: dict[str, set[str]] = {}
+    for source, target in edges:
+        if one.get(source, source) != one.get(target, target):
+            below.setdefault(one.get(source, source), set()).add(one.get(target, target))
+    found: dict[str, int] = {}
+
+    def level(node: str) -> int:
+        if node not in found:
+            found[node] = 1 + max((level(other) for other in below.get(node, ())), default=-1)
+        return found[node]
+
+    return {node: level(one.get(node, node)) for node in nodes}
+
+
 def draw(root: Path, out: Path, title: str) -> None:
-    """Write the picture of a checkout's imports."""
+    """Write the picture of a checkout's rooms and their imports."""
     matplotlib.use("Agg")
     known = modules(root)
     edges = imports(known)
-    group_of = {name: number for number, group in enumerate(circles(edges)) for name in group}
-    wrong = set(upward(edges, known))
-    wrong |= {e for e in edges if e.source in group_of and group_of[e.source] == group_of.get(e.target)}
-    columns: dict[str, list[str]] = {}
+    used = {name for edge in edges for name in (edge.source, edge.target)}
+    rooms: dict[str, list[Module]] = {}
     for name, module in known.items():
-        inner = name.split(".")
-        if module.path.name == "__init__.py" and not any(name in (e.source, e.target) for e in edges):
-            continue
-        folder = inner[1:-1] if module.room == PACKAGE else inner[2:-1]
-        wide = module.room in (PACKAGE, "trackers") and folder
-        columns.setdefault(f"{module.room}/{folder[0]}" if wide else module.room, []).append(name)
-    order = [c for room in ROOMS for c in sorted(columns) if c == room or c.startswith(f"{room}/")]
-    across = {column: 2.0 * i for i, column in enumerate(order)}
-    height = max(len(names) for names in columns.values())
+        if name in used or module.path.name != "__init__.py":
+            rooms.setdefault(node_of(module), []).append(module)
+    room = {module.name: name for name, inside in rooms.items() for module in inside}
+    count = collections.Counter((room[e.source], room[e.target]) for e in edges if room[e.source] != room[e.target])
+    rows: dict[int, list[str]] = {}
+    for name, level in levels(count, rooms).items():
+        rows.setdefault(level, []).append(name)
+    both = {pair for group in circles([Import(*pair, 0, False) for pair in count]) for pair in permutations(group, 2)}
     at: dict[str, tuple[float, float]] = {}
-    for column in order:
-        names = sorted(columns[column])
-        gap = height / (len(names) + 1)
-        for row, name in enumerate(names):
-            at[name] = (across[column], height - gap * (row + 1))
-    figure, axes = pyplot.subplots(figsize=(2.3 * len(order), 0.36 * height + 1.6), dpi=95)
-    for edge in sorted(edges, key=lambda e: e in wrong):
-        if edge.source not in at or edge.target not in at:
-            continue
-        red = edge in wrong
-        axes.annotate(
-            "",
-            xy=at[edge.target],
-            xytext=at[edge.source],
-            arrowprops={
-                "arrowstyle": "-|>" if red else "-",
-                "color": "#c62828" if red else "#78909c",
-                "alpha": 0.9 if red else 0.22,
-                "linewidth": 1.6 if red else 0.6,
-                "connectionstyle": "arc3,rad=0.25" if at[edge.source][0] == at[edge.target][0] else "arc3,rad=0.03",
-                "shrinkA": 3,
-                "shrinkB": 3,
-            },
-            zorder=3 if red else 1,
-        )
-    bad = {name for edge in wrong for name in (edge.source, edge.target)}
+    wide = 7.0 + 0.5 * max(map(len, rows.values()))
+    for level in sorted(rows):  # a room stands above the middle of what it imports
+        middle = {
+            name: sum(at[b][0] * n for (a, b), n in count.items() if a == name and b in at)
+            / max(1, sum(n for (a, b), n in count.items() if a == name and b in at))
+            for name in rows[level]
+        }
+        for number, name in enumerate(sorted(rows[level], key=lambda name: (middle[name], name))):
+            at[name] = (wide * (number + 0.5) / len(rows[level]) + 0.12 * (level % 2), level)
+    figure, axes = pyplot.subplots(figsize=(1.35 * wide, 0.6 * len(rows) + 1.2), dpi=min(80.0, 1250 / wide))
+    for pair, number in sorted(count.items(), key=lambda item: (item[0] in both, item[1])):
+        shade = [0.35 * part + 0.65 for part in to_rgb(COLOURS[rooms[pair[0]][0].room])]
+        colour = "#c62828" if pair in both else shade
+        line = {"arrowstyle": "-|>", "color": colour, "linewidth": 0.5 * number**0.6, "shrinkA": 9, "shrinkB": 9}
+        line |= {"connectionstyle": "arc3,rad=0.08"}
+        axes.annotate("", xy=at[pair[1]], xytext=at[pair[0]], arrowprops=line)
     for name, (x, y) in at.items():
-        short = name.removeprefix(f"{PACKAGE}.")
-        for prefix in sorted(order, key=len, reverse=True):
-            short = short.removeprefix(prefix.removeprefix(f"{PACKAGE}/").replace("/", ".") + ".")
-        box = {"boxstyle": "round,pad=0.2", "facecolor": "#fdecea" if name in bad else "white", "linewidth": 0.5}
-        box["edgecolor"] = "#c62828" if name in bad else "#b0bec5"
-        axes.text(x, y, short, ha="center", va="center", fontsize=7.5, bbox=box, zorder=4)
-    for column in order:
-        label = column.replace("/", "/\n")
-        axes.text(across[column], height + 0.4, label, ha="center", va="bottom", fontsize=11, fontweight="bold")
-    lines, count = sum(m.lines for m in known.values()), len(circles(edges))
-    up = len(upward(edges, known))
-    note = f"{len(known)} modules, {lines} lines, {len(edges)} imports ({sum(e.late for e in edges)} inside functions)"
-    axes.set_title(f"{title}\n{note}; {up} upward, {count} circles", fontsize=12, pad=34)
-    axes.set_xlim(-1.0, across[order[-1]] + 1.0)
-    axes.set_ylim(-0.5, height + 1.4)
+        inside = rooms[name]
+        number = sum(module.path.name != "__init__.py" for module in inside)
+        files = f"\n{number} files" if number > 1 else ""
+        box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": COLOURS[inside[0].room]}
+        axes.text(x, y, name + files, ha="center", va="center", fontsize=8.5 if files else 7, bbox=box, zorder=4)
+    loose = sum(len(inside) == 1 and inside[0].path.name != "__init__.py" for inside in rooms.values())
+    note = f"{len(rooms) - loose} rooms, {loose} single modules, {len(count)} arrows; red: rooms that import each other"
+    axes.set_title(
+        f"{title}\n{len(known)} modules, {len(edges)} imports, {note} ({len(both & set(count))})", fontsize=11
+    )
+    axes.set_xlim(-0.4, wide + 0.4)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.axis("off")
     figure.tight_layout()
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out)
-    Image.open(out).convert("RGB").quantize(64, method=Image.Quantize.FASTOCTREE).save(
-        out, optimize=True
-    )  # a fifth of the size
+    Image.open(out).convert("RGB").quantize(64, method=Image.Quantize.FASTOCTREE).save(out, optimize=True)
 
 
 def main() -> None:

@@ -43,17 +43,6 @@ SAYS = {
 """Example → what its output holds."""
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Two threads that wait for each other on a busy machine make small networks a hundred times slower."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def test_every_example_is_run():
     """No example is without a test, and no test without its example."""
     assert {path.stem for path in EXAMPLES} == set(SHORT) == set(SAYS)
@@ -69,6 +58,7 @@ def test_example_says_what_it_shows(path):
     assert not re.search(r"\b(?!self)\w+\._[a-z]|import _[a-z]", text)
 
 
+@pytest.mark.release
 def test_examples_have_the_types_that_they_say():
     """The examples pass mypy, as CONTRIBUTING asks: a reader who copies one begins without errors."""
     pytest.importorskip("mypy")

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from arena_newton import tasks
+from arena_newton.eval.__main__ import COMMANDS
 from tests.import_graph import (
+    BENCHMARKS,
     INNER,
     PACKAGE,
     Module,
@@ -42,13 +44,14 @@ STARTS = (
 STARTS += ("trackers.train.__main__", "trackers.motions.__main__", "usd_scenes.__main__")
 STARTS += ("policies.train.__main__",)
 STARTS += ("trackers.tracker_check", "policies.policy_check", "policies.teleop.__main__", "policies.serve.__main__")
+STARTS += tuple(f"eval.commands.{name}" for name in COMMANDS)
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
 PLANNING = ("eval.plan.config", "eval.folders.run_folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are
 imported by name."""
 LATE = {
     "arena_newton.doctor": "it reports libraries that do not import",
-    "arena_newton.files.probe": "its other process imports only the library that it tries",
+    "arena_newton.files.sandboxed_load": "its other process imports only the library that it tries",
     "arena_newton.cli.quiet": "light modules call it before they import Warp",
 }
 """Other modules that import heavy libraries inside functions, and why."""
@@ -57,7 +60,7 @@ OPTIONAL = {"matplotlib": "an extra; a test without it must pass"}
 MOST_ANY = 35
 ANY = {
     "arena_newton/differentiable/kernel_gradients.py": "a context of autograd keeps whatever it is given",
-    "arena_newton/files/foreign.py": "NumPy's dtypes",
+    "arena_newton/files/untrusted_files.py": "NumPy's dtypes",
     "arena_newton/interfaces.py": "JSON, opaque snapshots and the plan's own episodes",
     "arena_newton/physics/policy_view.py": "a view has the attributes of what it shows",
     "arena_newton/cli/registry.py": "what a maker takes is its own business",
@@ -102,7 +105,7 @@ def test_imports_have_no_circle():
 
 
 def test_imports_run_one_way():
-    """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval."""
+    """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval, benchmarks."""
     report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in upward(EDGES, KNOWN)])
 
 
@@ -121,8 +124,21 @@ def test_rooms_are_small():
     assert count[ROOT / "eval"] <= 2 and count[ROOT / PACKAGE] <= 9
 
 
+def test_the_page_of_rooms_names_each():
+    """`docs/design/rooms.md` lists the rooms of each folder from the bottom to the top, and the names at its places."""
+    page = (ROOT / "docs" / "design" / "rooms.md").read_text()
+    packages = {module.name for module in KNOWN.values() if module.path.name == "__init__.py"}
+    for folder in (PACKAGE, f"{PACKAGE}.data", f"{PACKAGE}.policies", f"{PACKAGE}.eval"):
+        title = folder.replace(".", "/") if folder.endswith("data") else f"{folder.split('.')[-1]}/"
+        listed = re.findall(r"^\| `(\w+)` \|", page.split(f"### `{title}`")[1].split("\n#")[0], flags=re.MULTILINE)
+        groups = [[p for p in part.split() if f"{folder}.{p}" in packages] for part in INNER[folder].split("|")]
+        assert listed == [name for group in groups for name in sorted(group, key=[*listed, *group].index)], folder
+    for file, name in re.findall(r"\]\(../../(\S+)\): `(\w+)`", page):
+        assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), f"{file}: no {name}"
+
+
 def private(name: str) -> bool:
-    """Whether a name is one module's own."""
+    """True if a name is one module's own."""
     return name.startswith("_") and not name.startswith("__")
 
 
@@ -131,7 +147,7 @@ def test_private_names_stay_at_home():
     found = []
     for module in KNOWN.values():
         for statement, _ in statements(module.tree):
-            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(PACKAGE):
+            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, BENCHMARKS)):
                 names = [a.name for a in statement.names if private(a.name)]
                 found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
         nodes = list(ast.walk(module.tree))
@@ -143,7 +159,7 @@ def test_private_names_stay_at_home():
         for statement, _ in statements(module.tree):
             source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
             for alias in statement.names:
-                if not (source or alias.name).startswith(PACKAGE):
+                if not (source or alias.name).startswith((PACKAGE, BENCHMARKS)):
                     strangers.add((alias.asname or alias.name).split(".")[0])
         inherited = {"_replace", "_asdict"}
         for node in nodes:
@@ -188,7 +204,7 @@ def light() -> set[str]:
         if not edge.late:
             following[edge.source].add(edge.target)
     found: set[str] = set()
-    todo = [f"{PACKAGE}.{start}" for start in STARTS + PLANNING]
+    todo = [f"{BENCHMARKS}.__main__", *(f"{PACKAGE}.{start}" for start in STARTS + PLANNING)]
     while todo:
         name = todo.pop()
         if name not in found:
@@ -231,7 +247,8 @@ def test_a_stem_names_one_thing():
     """Two modules have one name only where a table says why."""
     homes = collections.defaultdict(list)
     for module in KNOWN.values():
-        if not module.path.stem.startswith("__"):
+        named = f"{PACKAGE}.eval.commands.{module.path.stem}"  # a command's file has the name of what it calls
+        if not module.path.stem.startswith("__") and module.name != named:
             homes[module.path.stem].append(module)
     doubled = {stem: found for stem, found in homes.items() if len(found) > 1}
     report([place(m, 1) for stem, found in doubled.items() if stem not in STEMS for m in found])
@@ -249,3 +266,14 @@ def test_a_class_name_names_one_thing():
     described = {"Judge", "Physics", "Policy", "Tracker"}
     doubled = {name: found for name, found in homes.items() if len(found) > 1 + (name in described)}
     report([f"{where}: {name}" for name, found in doubled.items() for where in found])
+
+
+def test_few_tests_are_long():
+    """At most twenty tests wait for `pytest -m release`."""
+    marks = [
+        f"{path.relative_to(ROOT)}: {line}"
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        for line in path.read_text().splitlines()
+        if re.search(r"\bmark\.release$|marks=.*\bmark\.release\b", line)
+    ]
+    assert len(marks) <= 20, marks

@@ -29,18 +29,7 @@ def files(shared):
 
 
 @pytest.fixture(scope="module")
-def one_thread():
-    """Torch on one thread while the comparison runs."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="module")
-def rows(files, one_thread):
+def rows(files):
     """The five references on both sides, 5 ms physics, 8 s of each clip."""
     checkpoint, mjcf, clips = files
     return oracle.compare(checkpoint, mjcf, clips, fast=True, clip_seconds=8.0)

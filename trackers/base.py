@@ -1,4 +1,4 @@
-"""What a tracker is: it turns the reference of one 50 Hz tick into 29 joint targets for every world at once.
+"""Trackers: a tracker turns the reference of one 50 Hz tick into 29 joint targets for every world at once.
 
 Torch is imported only by the trackers themselves, so that listing their names stays quick.
 """
@@ -81,7 +81,7 @@ class Tracker:
         raise TypeError(f"tracker {self.name!r} defines no step()")
 
     def describe(self) -> dict[str, Any]:
-        """What a result must record to name this tracker exactly; drive and physics rate are the environment's."""
+        """Facts to record with every result to name this tracker exactly; drive and rate are the environment's."""
         return {"name": self.name, "checkpoint_hash": self.checkpoint_hash, "ignores": list(self.ignores)}
 
 

@@ -1,4 +1,4 @@
-"""How well trackers follow references: `python -m arena_newton.trackers.evaluate --help`.
+"""Tracker suite, which measures reference following: `python -m arena_newton.trackers.evaluate --help`.
 
 One suite of references for any number of trackers, every rollout of a tracker in one batch of worlds; tables to
 Markdown, JSON and CSV. Figures that have a bar are printed with their verdict.
@@ -42,14 +42,14 @@ class Entry:
 
     @property
     def label(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         if self.given_label:
             return self.given_label
         return self.name if self.checkpoint is None else f"{self.name} {Path(self.checkpoint.split(',')[0]).stem}"
 
     @property
     def official(self) -> bool:
-        """Whether the weights are not ours, which are safetensors."""
+        """True if the weights are not ours, which are safetensors."""
         return self.checkpoint is not None and not self.checkpoint.endswith(".safetensors")
 
     def make(self) -> Tracker:

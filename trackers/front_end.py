@@ -1,4 +1,4 @@
-"""What a tracker has around its network: command and state in, observation out; raw output in, joint targets out.
+"""Layers of a tracker around its network: command and state in, observation out; raw output in, joint targets out.
 
 Training and deployment share it, so that a network sees in a rollout what it saw in training:
 
@@ -88,16 +88,16 @@ class FrontEnd(abc.ABC):
     default_pose: tuple[float, ...] = (0.0,) * JOINTS
     """Pose that measured joints are taken relative to [rad], MuJoCo order."""
     graphable: bool = False
-    """Whether a tick on CUDA is the same operations on the same buffers each time, so that a CUDA graph may hold it."""
+    """True if a tick on CUDA is the same operations on the same buffers each time, so that a CUDA graph may hold it."""
 
     device: torch.device = torch.device("cpu")
-    """Where the buffers live; set by `bind`."""
+    """Device of the buffers; set by `bind`."""
     obs: torch.Tensor
     """The observation's buffer, float32, shape [worlds, obs_width]."""
     last_action: torch.Tensor
     """Last raw output, unclipped, shape [worlds, action_width]."""
     base: torch.Tensor
-    """What the scaled action is added to [rad], MuJoCo order, shape [worlds, 29]."""
+    """Joint positions to which the scaled action is added [rad], MuJoCo order, shape [worlds, 29]."""
 
     def __init__(self, action_form: ActionForm):
         """Keep the action form; `bind` allocates."""
@@ -183,7 +183,7 @@ class NetworkTracker(Tracker):
     """A front end and the network behind it."""
 
     card: Mapping[str, Any] = {}
-    """How our own weights came to be; empty for other checkpoints."""
+    """Origin of our own weights; empty for other checkpoints."""
 
     def __init__(
         self,
@@ -229,14 +229,14 @@ class NetworkTracker(Tracker):
         self.reset()
 
     def describe(self) -> dict[str, Any]:
-        """What a result must record to name this tracker exactly; once it is bound, what runs its network too."""
+        """Facts to record with every result to name this tracker exactly; once bound, the network's runner too."""
         if (runner := getattr(self, "_runner", None)) is None:
             return super().describe()
         return super().describe() | {"inference": runner.path + (", CUDA graph" if self._graph is not None else "")}
 
     @property
     def _graphable(self) -> bool:
-        """Whether a CUDA graph may hold a tick: everything runs on the device, by the same operations each time."""
+        """True if a CUDA graph may hold a tick: everything runs on the device, by the same operations each time."""
         return self.front_end.graphable and not any(getattr(m, "on_host", False) for m in self.network.modules())
 
     @property

@@ -33,7 +33,7 @@ _WIDEST = 8192
 
 @dataclass(frozen=True)
 class ActionForm:
-    """How a network's raw output becomes joint targets: base + scale * clip(raw)."""
+    """Conversion of a network's raw output to joint targets: base + scale * clip(raw)."""
 
     kind: str
     """`default`: the base is the tracker's default pose. `residual`: the base is the reference of the tick."""
@@ -62,7 +62,7 @@ def slices(layout: Mapping[str, int]) -> dict[str, slice]:
 
 @dataclass(frozen=True)
 class Interface:
-    """What a trainable tracker's network sees, and under which physics and bars it is trained and judged."""
+    """Inputs of a trainable tracker's network, and the physics and bars for its training and evaluation."""
 
     name: str
     """Name in weights files and on the command line."""

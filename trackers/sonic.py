@@ -108,7 +108,7 @@ RELATIVE_AND_DOWN = (
 """conj(a) b; then the negative last row of a's rotation matrix without the identity's, the direction down seen from the
 body. From a_i (a, b)_j (index 8 i + j)."""
 DOWN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
-"""What these lack: nothing, and the identity's negative last row."""
+"""Constants added to these: 0 to the relative rotation, the identity's negative last row to down."""
 
 
 _MIRROR = (

@@ -121,7 +121,7 @@ def fixture(stage: Usd.Stage, path: str, position: Vec) -> Usd.Prim:
 
 
 class Finish(TypedDict, total=False):
-    """What a geom is to touch and to the eye; by default it collides, is drawn, and has no material."""
+    """Contact properties and look of a geom; by default it collides, is drawn, and has no material."""
 
     collide: bool
     visual: bool

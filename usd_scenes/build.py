@@ -15,7 +15,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def parts() -> tuple[str, ...]:
-    """What can be built, in order; without tasks that bring their own layer."""
+    """Parts that can be built, in order; without tasks that bring their own layer."""
     return ("textures", "g1", *(name for name in tasks.names() if tasks.get(name).scene is None), "lab")
 
 

@@ -1,4 +1,4 @@
-"""What the importer and MuJoCo make of a scene, by prim path, and how two of them differ in plain sentences."""
+"""Compiled scenes as the importer and MuJoCo make them, by prim path, and the differences of two in plain sentences."""
 
 from __future__ import annotations
 
@@ -89,21 +89,21 @@ Facts = dict[str, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Reported:
-    """What is already reported, so that the cause of a change and its effect are not reported twice."""
+    """Changes reported so far, so that the cause of a change and its effect are not reported twice."""
 
     sentences: tuple[str, ...] = ()
 
     def about(self, path: str, words: Iterable[str]) -> bool:
-        """Whether a sentence names the prim together with one of the words."""
+        """True if a sentence names the prim together with one of the words."""
         return any(f" {path}: " in text and any(word in text for word in words) for text in self.sentences)
 
     def gravity(self) -> bool:
-        """Whether a sentence says what gravity is."""
+        """True if a sentence reports the value of gravity."""
         one_more = any("one more PhysicsScene" in text for text in self.sentences)
         return not one_more and any(text.startswith("gravity: ") for text in self.sentences)
 
     def gone(self, path: str) -> bool:
-        """Whether a sentence says that the prim is gone."""
+        """True if a sentence reports that the prim is gone."""
         return any(text.endswith(f" {path} is gone") for text in self.sentences)
 
 
@@ -239,7 +239,7 @@ def _meets(scene: Scene) -> frozenset[tuple[str, str]]:
 
 
 def compiled_changes(theirs: Compiled, ours: Compiled, reported: Reported, needed: Iterable[str] = ()) -> Iterator[str]:
-    """What is different in the compiled model and is not reported already.
+    """Changes of the compiled model that are not reported already.
 
     Args:
         theirs: A variant.
@@ -299,7 +299,7 @@ def _grouped(changes: dict[tuple[str, str, str], list[tuple[str, str]]], noun: s
 
 
 def _contact_changes(theirs: Compiled, ours: Compiled) -> Iterator[str]:
-    """Which things meet that did not, and which do not that did, where both scenes have them."""
+    """Pairs that collide now and did not, and pairs that no longer do, where both scenes have them."""
     known = set(ours.geoms) & set(theirs.geoms) | set(ours.geoms) & theirs.colliders
     lost = _by_thing(pair for pair in ours.meets - theirs.meets if set(pair) <= known)
     won = _by_thing(pair for pair in theirs.meets - ours.meets if set(pair) <= known)

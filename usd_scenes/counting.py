@@ -1,4 +1,4 @@
-"""How many prims a scene would have, counted through its layers before USD composes one of them."""
+"""Number of prims that a scene would have, counted through its layers before USD composes one of them."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from arena_newton.files import limits
 __all__ = ["Arc", "Contents", "count_prims"]
 
 Key = Any
-"""What the caller knows a layer by; hashable."""
+"""Identity of a layer, chosen by the caller; hashable."""
 
 
 @dataclass(eq=False)
@@ -18,7 +18,7 @@ class Arc:
     """One reference of a layer to another, or a prim of its own."""
 
     prim: str
-    """Where it is written: a prim or property, empty for the whole layer."""
+    """Prim or property that holds the path; empty for the whole layer."""
     asset: str
     """The asset path as written; empty for the layer itself."""
     target: str = ""
@@ -26,12 +26,12 @@ class Arc:
     of_class: bool = False
     """An inherit or a specialize, which also reaches the class of that name in every layer above."""
     location: Key = None
-    """What the asset path leads to."""
+    """Layer that the asset path leads to."""
 
 
 @dataclass
 class Contents:
-    """What one layer consists of."""
+    """Contents of one layer."""
 
     default_prim: str
     """Name of its default prim."""
@@ -48,7 +48,7 @@ class _TooMany(Exception):
 
 
 def count_prims(graph: Mapping[Key, Contents], start: Key) -> tuple[str, str] | None:
-    """What is wrong with the number of prims, as (prim path, message); None if nothing is.
+    """Fault of the number of prims, as (prim path, message); None if there is none.
 
     The count is at least that of the composed prims: a prim counts once for every layer with an opinion about it,
     and every variant counts.

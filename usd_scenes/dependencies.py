@@ -21,18 +21,18 @@ from pxr import Ar, Gf, Sdf, Tf
 
 import arena_newton
 from arena_newton.errors import InputError
-from arena_newton.files import limits, probe
+from arena_newton.files import limits, sandboxed_load
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
 __all__ = ["LAYERS", "PACKAGE", "Dependencies", "Problem", "check_files", "collect", "layers", "probe_layers", "reason"]
 __all__ += ["search_context"]
 
 LAYERS = (".usda", ".usd", ".usdc", ".usdz")
-"""What a sublayer, reference or payload may be."""
+"""File types of a sublayer, reference or payload."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
-"""What an asset attribute (a texture) may name; Newton reads textures with Pillow."""
+"""File types that an asset attribute (a texture) may name; Newton reads textures with Pillow."""
 PACKAGE = "arena_newton/usd_scenes/"
-"""What an asset path begins with that names a scene of this package, wherever the naming file is stored."""
+"""Prefix of an asset path that names a scene of this package, wherever the naming file is stored."""
 _ROOT = Path(arena_newton.__file__).resolve().parent.parent
 """Folder in which `PACKAGE` is searched: the checkout, or an installation's `site-packages`."""
 _CRATE = b"PXR-USDC"
@@ -60,7 +60,7 @@ class Problem:
     prim: str
     """Path of the prim, or of the property; empty for a fault of the whole layer."""
     message: str
-    """What is wrong and what was expected."""
+    """The fault, and the expected value."""
 
     def __str__(self) -> str:
         """One line: file, prim, message."""
@@ -77,13 +77,13 @@ class Location:
     """Name within the package."""
 
     def __str__(self) -> str:
-        """What USD calls it."""
+        """Location in USD's own notation."""
         return f"{self.file}[{self.entry}]" if self.entry else str(self.file)
 
 
 @dataclass
 class Dependencies:
-    """What following every asset path of a layer found."""
+    """Result of following every asset path of a layer."""
 
     files: list[Path] = field(default_factory=list)
     """Every file reached, layers and images, the first layer first."""
@@ -171,12 +171,12 @@ def collect(path: Path) -> Dependencies:
 
 
 def search_context() -> Ar.DefaultResolverContext:
-    """What a stage is opened with so that USD finds asset paths that begin with `PACKAGE`."""
+    """Resolver context with which USD finds asset paths that begin with `PACKAGE`."""
     return Ar.DefaultResolverContext([str(_ROOT)])
 
 
 def _read_layer(location: Location, shown: str, found: Dependencies, *, built_on: bool) -> Contents:
-    """What a layer names; faults of its units and numbers go to `found`."""
+    """Contents of a layer; faults of its units and numbers go to `found`."""
     _check_layer(location)
     try:
         layer = Sdf.Layer.FindOrOpen(str(location))
@@ -224,7 +224,7 @@ def _too_large(size: int, most: int) -> str:
 
 
 _CRATE_FAULTS: dict[tuple[str, int, int, int], str | None] = {}
-"""What was found in binary layers, by name, file, size and time: a scene is walked more than once."""
+"""Faults found in binary layers, by name, file, size and time: a scene is walked more than once."""
 
 
 def _known_as(location: Location) -> tuple[str, int, int, int]:
@@ -241,7 +241,7 @@ def _crate_fault(location: Location) -> str | None:
 
 def _probe(locations: list[Location]) -> None:
     names = [str(location) for location in locations]
-    faults = probe.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
+    faults = sandboxed_load.faults("crate", names, memory=limits.CRATE_MEMORY, seconds=limits.CRATE_SECONDS)
     _CRATE_FAULTS.update({_known_as(location): fault for location, fault in zip(locations, faults, strict=True)})
 
 
@@ -424,7 +424,7 @@ def _contents(layer: Sdf.Layer) -> tuple[Contents, list[tuple[str, str]]]:
 
 
 def _names_file(spec: Sdf.AttributeSpec) -> bool:
-    """Whether a string is used where a shader expects a texture; the importer would open it, URLs too, unchecked."""
+    """True if a string is used where a shader expects a texture; the importer would open it, URLs too, unchecked."""
     if str(spec.typeName).removesuffix("[]") not in ("string", "token") or not spec.name.startswith(_SHADER):
         return False
     value = spec.default
@@ -466,7 +466,7 @@ def _units(layer: Sdf.Layer, shown: str) -> Iterator[Problem]:
 
 
 def reason(error: Exception) -> str:
-    """What USD complains about, on one printable line, without the line of USD's own source."""
+    """USD's complaint on one printable line, without the line of USD's own source."""
     try:
         text = str(error)
     except UnicodeDecodeError as bytes_error:

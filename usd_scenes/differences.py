@@ -1,4 +1,4 @@
-"""What a variant changes that moves, weighs or judges, against the task's own scene, in plain sentences."""
+"""Changes of a variant that move, weigh or judge, against the task's own scene, in plain sentences."""
 
 import math
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ _CLOSE = 1e-6
 
 @dataclass
 class _Part:
-    """What counts of one prim."""
+    """Compared properties of one prim."""
 
     kind: str
     """`gravity`, `collisions`, `robot`, `rule`, `joint`, `surface` or `object`: what a sentence begins with."""
@@ -45,7 +45,7 @@ class _Part:
 
 
 def differences(path: str | Path, task: str) -> list[str]:
-    """What a layer changes of a task's gravity, collisions, robot, rules, joints, surfaces, masses and colliders.
+    """Changes that a layer makes to a task's gravity, collisions, robot, rules, joints, surfaces, masses and colliders.
 
     The layers are compared attribute by attribute, and so are the MuJoCo models that they are compiled to: what changes
     in other ways (a scaled parent, a collision group, another surface bound) shows there. Looks, lights and the world

@@ -20,7 +20,7 @@ from arena_newton.usd_scenes.shapes import open_stage
 __all__ = ["MODES", "preview"]
 
 MODES = ("base", "semantic", "visual")
-"""What a scene can be shown in; visual is the base variant under a drawn distant light."""
+"""Variants in which a scene can be shown; visual is the base variant under a drawn distant light."""
 _LIGHT_SEED = 0
 """Episode seed of the light drawn for visual mode."""
 _SETTLE = 1.5

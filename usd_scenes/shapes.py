@@ -113,7 +113,7 @@ def mesh_faults(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
 
 
 def _mesh_fault(mesh: Usd.Typed) -> tuple[str | None, int]:
-    """What is wrong with a mesh, and how many points it has."""
+    """Fault of a mesh, and its number of points."""
     names = ("points", "faceVertexCounts", "faceVertexIndices")
     points, counts, indices = values = [mesh.GetPrim().GetAttribute(name).Get() for name in names]
     for name, value in zip(names, values, strict=True):

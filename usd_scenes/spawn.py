@@ -1,4 +1,4 @@
-"""What starts inside something else: the contacts at the reset of one episode per mode."""
+"""Bodies that start inside something else: the contacts at the reset of one episode per mode."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ COMMON = (
     Required("/World/WorldCamera", "camera"),
     Required("/World/Light", "light"),
 )
-"""What every scene needs; `TaskSpec.requires` says what a task needs in addition."""
+"""Prims that every scene needs; `TaskSpec.requires` names those that a task needs in addition."""
 
 
 def validate(path: str | Path, task: str | None = None) -> list[Problem]:
@@ -201,7 +201,7 @@ def _selections(stage: Usd.Stage) -> Iterator[tuple[str, str]]:
 
 
 def _composition(stage: Usd.Stage, file: Path) -> Iterator[Problem]:
-    """What USD could not compose: a reference to a prim that is not there, a cycle."""
+    """Composition errors of USD: a reference to a prim that is not there, a cycle."""
     for error in stage.GetCompositionErrors():
         where = error.rootSite.path
         yield Problem(str(file), "" if where.IsAbsoluteRootPath() else str(where), reason(error))
@@ -216,7 +216,7 @@ def _strangers(stage: Usd.Stage, file: Path, found: Dependencies) -> Iterator[Pr
 
 
 def _fault(stage: Usd.Stage, item: Required) -> tuple[str, str] | None:
-    """What a required prim lacks, as (prim path, message)."""
+    """Fault of a required prim, as (prim path, message)."""
     prim = stage.GetPrimAtPath(item.path)
     wanted = _KIND_WORDS[item.kind]
     if not prim or not prim.IsActive() or not prim.IsDefined():

@@ -1,4 +1,4 @@
-"""What a command line answers when its work fails."""
+"""Exit code and one line of a command line whose work fails."""
 
 import atexit
 import contextlib
@@ -44,7 +44,7 @@ REFUSALS = {
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 NO_HOME = "Could not determine home directory."
-"""What `pathlib` says of a path such as `~nobody/x`."""
+"""Message of `pathlib` for a path such as `~nobody/x`."""
 
 
 def program(words: str, module: str) -> str:

@@ -28,7 +28,7 @@ _LEROBOT = frozenset({"data", "policies", "train"})
 
 
 def _no_torchcodec(record: logging.LogRecord) -> bool:
-    """Whether a warning of LeRobot's imports is kept: all but pages of tracebacks on a machine without FFmpeg.
+    """True for warnings of LeRobot's imports that are kept: all but pages of tracebacks on a machine without FFmpeg.
 
     Videos are read and written by PyAV here, which brings its own.
     """

@@ -6,21 +6,79 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import itertools
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
 from arena_newton.errors import InputError
 
-__all__ = ["Several", "folders_named", "parse_flags", "user_path"]
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+__all__ = [
+    "Several",
+    "check_least",
+    "shell_command",
+    "flag_name",
+    "folders_named",
+    "parse_flags",
+    "shared",
+    "typed",
+    "user_path",
+    "words",
+]
 
 _T = TypeVar("_T")
 Several = Annotated[
     tuple[_T, ...], tyro.conf.arg(help_behavior_hint=lambda shown: f"(default: {shown})" if shown else "")
 ]
-"""Values of a flag that takes several; help shows no default where it is none of them."""
+"""Values of a flag that takes at least one; help shows no default where it is none of them."""
+
+
+def flag_name(field: str) -> str:
+    """A flag as it is typed, from the name of its field."""
+    return f"--{field.replace('_', '-')}"
+
+
+def typed(field: str, value: object) -> list[str]:
+    """A flag as it is typed with its value: nothing for None, `--no-x` for False, each of several values."""
+    name = flag_name(field)
+    if isinstance(value, bool):
+        return [name if value else f"--no-{name[2:]}"]
+    return [] if value is None else [name, *map(str, value if isinstance(value, list | tuple) else (value,))]
+
+
+def words(options: DataclassInstance) -> list[str]:
+    """Options as they are typed: those that have another value than the default."""
+    given = [(one, getattr(options, one.name)) for one in dataclasses.fields(options)]
+    return [word for one, value in given if value != one.default for word in typed(one.name, value)]
+
+
+def shell_command(module: str, *words: object) -> str:
+    """A command as it is typed into a shell."""
+    return shlex.join(["python", "-m", module, *map(str, words)])
+
+
+def shared[T: DataclassInstance](options: DataclassInstance, kind: type[T], **others: object) -> T:
+    """Options of another kind: the flags that both have, and others."""
+    names = {one.name for one in dataclasses.fields(options)} & {one.name for one in dataclasses.fields(kind)}
+    return kind(**{name: getattr(options, name) for name in names} | others)
+
+
+def check_least(options: DataclassInstance, least: int, *names: str) -> None:
+    """Refuse numbers of these fields that are smaller.
+
+    Raises:
+        InputError: One is; None is not.
+    """
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise InputError(f"{flag_name(name)} {value}: expected at least {least}")
 
 
 def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | None = None) -> T:
@@ -36,6 +94,10 @@ def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | 
         InputError: A flag is unknown or its value unfit.
         SystemExit: Help was asked for and printed.
     """
+    lists = {flag_name(one.name) for one in dataclasses.fields(kind) if str(one.type).startswith("Several[")}  # type: ignore[arg-type]
+    for flag, after in itertools.pairwise([*arguments, "--"]):  # as an empty variable of a shell leaves it
+        if flag in lists and after.startswith("--"):
+            raise InputError(f"{flag}: cannot read it without a value")
     missing = tyro.MISSING_NONPROP if default is None else default
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # what it draws there is said again in one line
@@ -47,7 +109,7 @@ def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | 
 
 
 def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
-    """What is wrong with arguments that tyro refuses: each flag with its values is given to it alone.
+    """Fault of arguments that tyro refuses: each flag with its values is given to it alone.
 
     tyro shows its own complaints as a drawing for a terminal; all flags of this command line have defaults.
     """
@@ -65,7 +127,7 @@ def _complaint(kind: type, arguments: Sequence[str], prog: str) -> str:
         except SystemExit:
             return f"{flag}: cannot read {' '.join(alone[1:]) or 'it without a value'}"
         if unknown:
-            known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(kind)]
+            known = [flag_name(field.name) for field in dataclasses.fields(kind)]
             near = difflib.get_close_matches(unknown[0], known, 1)
             hint = f", did you mean {near[0]}?" if near else f"; see {prog} --help"
             return f"{unknown[0]}: unknown argument{hint}"
@@ -85,7 +147,13 @@ def user_path(given: str) -> Path:
 
 
 def folders_named(
-    arguments: list[str], command: str, prog: str, *, noun: str = "a folder", shown: str = "<folder>"
+    arguments: list[str],
+    command: str,
+    prog: str,
+    *,
+    noun: str = "a folder",
+    shown: str = "<folder>",
+    most: int | None = None,
 ) -> list[Path]:
     """Take the folders or files that a command begins with out of its arguments, each once.
 
@@ -95,12 +163,13 @@ def folders_named(
         prog: How the program is called.
         noun: What the message of a missing one asks for.
         shown: How its line shows one.
+        most: How many it takes; None: as many as there are.
 
     Raises:
         InputError: None is named, or one twice.
     """
     found: list[Path] = []
-    while arguments and not arguments[0].startswith("-"):
+    while arguments and not arguments[0].startswith("-") and len(found) != most:
         found.append(user_path(arguments.pop(0)))
     if not found:
         raise InputError(f"{command}: name {noun}: {prog} {command} {shown}")

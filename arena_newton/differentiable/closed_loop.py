@@ -74,7 +74,7 @@ def central_differences(
 
 
 class Played(NamedTuple):
-    """What became of one sequence of actions per world."""
+    """Outcome of one sequence of actions per world."""
 
     margin: torch.Tensor
     """Margin to success after each tick [m], shape [ticks, worlds]; −inf from the tick on in which a world fell or

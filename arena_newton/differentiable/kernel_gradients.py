@@ -29,7 +29,7 @@ _FLOAT_STATE = ("position", "quat", "joints", "prev_yaw", "prev_z")
 
 
 class ReferenceState(NamedTuple):
-    """What one step of the reference hands to the next, as torch tensors."""
+    """State of the reference between two steps, as torch tensors."""
 
     position: torch.Tensor
     """World position [m], shape [worlds, 3]."""

@@ -138,7 +138,7 @@ def ball_flight(
     ticks: int,
     spin: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Where balls are, tick by tick, differentiable in where and how fast they start.
+    """Positions of balls, tick by tick, differentiable in their initial positions and velocities.
 
     They know gravity and the ground z = 0, nothing else. Gradients are exact in the air, in sliding and in rolling.
     Behind a bounce, those to what decides when it lands (height and vertical speed) are wrong: the steps are

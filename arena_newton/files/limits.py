@@ -1,4 +1,4 @@
-"""How much of a foreign file is read: one table of limits, each with its reason.
+"""Limits on reading files of others: one table of limits, each with its reason.
 
 A limit is some ten times what a real file needs, and small enough that reading up to it stays below 1 GiB of memory.
 Whoever needs more changes the number here.
@@ -51,7 +51,7 @@ PENETRATION = 0.01
 ARRAY_BYTES = 256 * MIB
 """Arrays of an `.npz` file: 9 hours of motion at 50 Hz. A larger file may hold `ARRAY_GROWTH` times its own size."""
 ARRAY_GROWTH = 4
-"""How much an archive may grow when it is read; compressed motions grow by less than 2, zeros by 1000."""
+"""Largest growth of an archive when it is read; compressed motions grow by less than 2, zeros by 1000."""
 HEADER_BYTES = 10_000
 """Header of an array: type and shape. NumPy's own limit."""
 PICKLE_BYTES = 256 * MIB

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from arena_newton.files.foreign import create
+from arena_newton.files.untrusted_files import create
 
 __all__ = ["MAX_LABEL", "PARTIAL", "file_label", "replace_atomically"]
 

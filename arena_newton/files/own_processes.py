@@ -1,4 +1,4 @@
-"""What programs of this package that run as processes need: an environment, and memory that a GPU reaches itself."""
+"""Environment of this package's own processes, and memory that a GPU reaches itself."""
 
 from __future__ import annotations
 

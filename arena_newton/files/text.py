@@ -8,7 +8,7 @@ import sys
 import unicodedata
 from collections.abc import Collection
 
-__all__ = ["counted", "is_printable", "plain_text", "unprintable"]
+__all__ = ["counted", "is_printable", "plain", "plain_text", "unprintable"]
 
 _ESCAPES = re.compile(
     r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[PX^_][^\x1b]*(?:\x1b\\)?|[@-Z\\-_])?"
@@ -37,6 +37,11 @@ def plain_text(value: object, limit: int | None = 2000, *, mark: str | None = No
     return text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
 
 
+def plain(value: object) -> str:
+    """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
+    return plain_text(value, None, mark="\ufffd")
+
+
 def _dumped(value: object) -> str:
     return json.dumps(value, ensure_ascii=False, sort_keys=isinstance(value, dict))
 
@@ -50,7 +55,7 @@ def _clean(text: str, mark: str, marks: Collection[str]) -> str:
 
 
 def is_printable(text: str) -> bool:
-    """Whether a text has no control characters, unpaired surrogates or marks that turn its direction."""
+    """True if a text has no control characters, unpaired surrogates or marks that turn its direction."""
     return text.isprintable() or _clean(text, "", _TURNING) == text
 
 

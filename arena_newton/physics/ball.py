@@ -22,7 +22,7 @@ BALL_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
 BALL_SKIN = f"{BALL}/Skin"
 """Label of the sphere around a ball on which it rests and rolls, see `add_skin`."""
 SKIN_HEIGHT = 0.001
-"""How much larger that sphere is [m]: its contact carries a ball at rest before the inner one is touched."""
+"""Extra radius of that sphere [m]: its contact carries a ball at rest before the inner one is touched."""
 SKIN_SOLREF = (-0.01, -0.01)
 SKIN_SOLIMP = (0.9, 0.001, 0.002, 0.5, 2.0)
 """Stiffness 10,000/s² and damping 10/s, times the last impedance by which MuJoCo divides them; the impedance fades from

@@ -1,4 +1,4 @@
-"""What both physics engines share: state views, reset, forces, snapshots and one 50 Hz tick.
+"""Base of both physics engines: state views, reset, forces, snapshots and one 50 Hz tick.
 
 State arrays are Warp arrays, float32, MuJoCo layout, shape [worlds, n]; the free joint's quaternion is wxyz, its
 angular velocity is in the body frame.

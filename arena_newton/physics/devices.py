@@ -1,4 +1,4 @@
-"""Which engine and device a run gets; asked while it is planned, so Warp is loaded only where a GPU is looked for."""
+"""Engine and device of a run, chosen while it is planned: Warp is loaded only where a GPU is looked for."""
 
 from pathlib import Path
 

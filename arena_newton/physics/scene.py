@@ -104,7 +104,7 @@ class Scene:
         return self.body_ids[prim_path]
 
     def has_body(self, prim_path: str) -> bool:
-        """Whether the stage has that rigid body."""
+        """True if the stage has that rigid body."""
         return prim_path in self.body_ids
 
     def link(self, name: str) -> int:
@@ -231,7 +231,7 @@ class Scene:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a scene is the project's own: other scenes are checked before they are built."""
+    """True if a scene is the project's own: other scenes are checked before they are built."""
     return path.resolve().is_relative_to(SCENES.resolve())
 
 

@@ -124,7 +124,7 @@ class WorldLights:
 
     @property
     def any_distant(self) -> bool:
-        """Whether any world has a distant light."""
+        """True if any world has a distant light."""
         return bool(self._host["distant"].any())
 
     def upload(self) -> None:
@@ -151,7 +151,7 @@ def _stage_light(stage: Usd.Stage | None) -> tuple[tuple[float, ...] | None, flo
 
 
 class _Tracer:
-    """What the cameras of one model share: triangles and textures, and Newton's ray tracer for comparison."""
+    """Resources that the cameras of one model share: triangles and textures, and Newton's ray tracer for comparison."""
 
     _of_model: ClassVar[weakref.WeakKeyDictionary[newton.Model, _Tracer]] = weakref.WeakKeyDictionary()
 
@@ -199,7 +199,7 @@ class _Tracer:
 
 @dataclass
 class Buffers:
-    """What a render fills before it shades, one row per view."""
+    """Buffers that a render fills before it shades, one row per view."""
 
     albedo: wp.array
     """sRGB packed as RGBA, uint32, shape [views, H, W]."""

@@ -78,7 +78,7 @@ def follow_pose(
 
 
 def visible(camera: Camera, view: int, pose: np.ndarray, pelvis: Sequence[float] | np.ndarray) -> int:
-    """How many of `HEIGHTS` nothing hides in a picture that was just drawn.
+    """Number of `HEIGHTS` that nothing hides in a picture that was just drawn.
 
     Args:
         camera: The camera.

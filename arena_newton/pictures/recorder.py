@@ -46,7 +46,7 @@ BRIGHT = {"success": (120, 240, 170), "fall": (255, 130, 100), "timeout": (255, 
 
 
 class EpisodeKey(Protocol):
-    """What a plan's episode must have so that its pictures find a name."""
+    """Attributes that a plan's episode needs so that its pictures find a name."""
 
     task: str
     mode: str
@@ -58,7 +58,7 @@ class EpisodeKey(Protocol):
 
 @dataclass
 class _Stream:
-    """What is recorded of one world's episode."""
+    """Recorded poses of one world's episode."""
 
     label: str
     rows: torch.Tensor
@@ -219,7 +219,7 @@ class EpisodeRecorder(Recorder):
             self._take(env, wanted)
 
     def _due(self, world: int, tick: int) -> bool:
-        """Whether a strip keeps the poses of this tick."""
+        """True if a strip keeps the poses of this tick."""
         return self.strip and tick % (self.every * self._streams[world].stride) == 0
 
     def _take(self, env: World, worlds: Sequence[int], *, final: bool = False) -> None:

@@ -50,7 +50,7 @@ class CameraConfig:
 
 
 def robot_fit(width: int, height: int) -> Fit:
-    """How a robot's camera fills a size [px] where nobody says: whole where the size is its own 4:3, else padded."""
+    """Default fit of a robot's camera into a size [px]: whole where the size is its own 4:3, else padded."""
     return "native" if 3 * width == 4 * height else "pad"
 
 

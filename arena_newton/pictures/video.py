@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from arena_newton.errors import ArenaError
-from arena_newton.files.foreign import create
 from arena_newton.files.own_files import PARTIAL, replace_atomically
+from arena_newton.files.untrusted_files import create
 
 if TYPE_CHECKING:  # a process that encodes pictures starts without torch
     import torch

@@ -361,7 +361,7 @@ def _look(viewer: newton.viewer.ViewerViser, env: World, follow: bool, world: in
 
 
 def _offset(viewer: newton.viewer.ViewerViser) -> np.ndarray:
-    """Where the viewer puts the first world [m]."""
+    """Position at which the viewer puts the first world [m]."""
     if viewer.world_offsets is None:
         return np.zeros(3)
     first: np.ndarray = viewer.world_offsets.numpy()[0].astype(np.float64)

@@ -103,7 +103,7 @@ class DriveGains:
     """Implicit PD drive of the 29 body joints, MuJoCo order, and of the fingers."""
 
     name: str
-    """What the set is called in reports."""
+    """Name of the set in reports."""
     kp: tuple[float, ...]
     """Stiffness [N·m/rad], 29."""
     kd: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""What a rule set is made of: what counts as success and as a fall, how long an episode lasts, where objects are put.
+"""Parts of a rule set: what counts as success and as a fall, how long an episode lasts, where objects are put.
 
 A rule set is frozen and hashed; its hash is stored with every result. No task is known here: the numbers that belong to
 one task are in that task's file, `arena_newton.rule_sets` assembles them.
@@ -67,7 +67,7 @@ class CylinderRange:
 
 @dataclass(frozen=True)
 class ObjectRule:
-    """Where one randomised object may be put and how its sample becomes a world pose."""
+    """Range of one randomised object's position, and the conversion of its sample to a world pose."""
 
     record: str
     """Name in the original's records, which seeds the object's generator."""
@@ -136,7 +136,7 @@ class SuccessRule:
     """Numbers of one task's success condition; each task derives its own and says them in words."""
 
     def sentence(self) -> str:
-        """When an episode succeeds, with every number of this rule that the judge reads."""
+        """Condition of success, with every number of this rule that the judge reads."""
         raise NotImplementedError
 
     def notes(self) -> tuple[tuple[str, str], ...]:
@@ -184,7 +184,7 @@ class FallRule:
 
 @dataclass(frozen=True)
 class StartupRule:
-    """What happens between a reset and the policy's first action."""
+    """Phases between a reset and the policy's first action."""
 
     ticks: int
     """Length [50 Hz ticks] under a standing command; 0: the policy is asked at the spawn pose."""
@@ -194,13 +194,13 @@ class StartupRule:
 
     @property
     def history(self) -> str:
-        """What the tracker's history holds at the reset, in one phrase."""
+        """Content of the tracker's history at the reset, in one phrase."""
         return "first frame" if self.prefill else "as the original"
 
 
 @dataclass(frozen=True)
 class StandingRule:
-    """What the predicates of OpenDoor and VisNavi call standing."""
+    """Standing, as the predicates of OpenDoor and VisNavi define it."""
 
     min_root_z: float = 0.45
     """[m]."""

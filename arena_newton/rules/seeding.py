@@ -23,7 +23,7 @@ _U64 = (1 << 64) - 1
 _EPISODE_STEP = 0x9E3779B185EBCA87
 """Step of the object seed between the episodes of one process; every evaluation episode is the first of its process."""
 _FIRST_WORLD = 0x85EBCA77
-"""What the original's first world adds to the key of an object's generator."""
+"""Addend of the original's first world to the key of an object's generator."""
 _RECORDED = 1 << 31
 """Bit of the seeds of recordings."""
 _LIGHT_KEY = 0x1A2B3C4D

@@ -1,4 +1,4 @@
-"""What a task is: one record of everything that the project knows about it.
+"""Tasks: one record holds everything that the project knows about a task.
 
 Drawing is pure: an episode's draws depend on its seed, its mode and the rule set only.
 """
@@ -156,7 +156,7 @@ class ObjectSpec:
     lower, the object starts that much higher or lower. None: it stays at the sample's height."""
 
     def raised(self, scene: Scene) -> float:
-        """What a scene's own geoms add to the height of a sample [m]; 0 in our own scene."""
+        """Height that a scene's own geoms add to a sample [m]; 0 in our own scene."""
         added = 0.0
         if self.rest_height is not None:
             added += -scene.lowest(self.prim) - self.rest_height
@@ -166,7 +166,7 @@ class ObjectSpec:
         return added if abs(added) > SAME_HEIGHT else 0.0
 
     def rule(self, rules_name: str) -> ObjectRule:
-        """What a rule set says about this object."""
+        """Rule of this object in a rule set."""
         execution = self.execution
         if rules_name == "paper" and self.paper_execution is not None:
             execution = self.paper_execution
@@ -283,11 +283,11 @@ class Overlap:
     """Names of the rule sets."""
     modes: tuple[str, ...]
     episodes: int
-    """How many of the 60 episodes of each of these modes."""
+    """Number among the 60 episodes of each of these modes."""
     depth: float
     """The deepest of them [m]: the shortest shift that separates the two."""
     why: str
-    """Which of the original's ranges meet."""
+    """The original's ranges that meet here."""
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,8 @@ class Required:
 
     path: str
     kind: str
-    """What it must be: a key of the validator's table of kinds, such as `body`, `fixture`, `marker` or `collider`."""
+    """Required kind of prim: a key of the validator's table of kinds, such as `body`, `fixture`, `marker` or
+    `collider`."""
     variants: tuple[str, ...] = ()
     """Variants of `semantics` that need it; empty: all of them."""
 
@@ -358,7 +359,7 @@ class TaskSpec:
 
     @property
     def rules(self) -> ByRules[TaskRules]:
-        """What each rule set says about this task."""
+        """Rules of this task in each rule set."""
         return ByRules(*(self._rules(name) for name in ("paper", "released")))
 
     def _rules(self, rules_name: str) -> TaskRules:

@@ -42,9 +42,9 @@ class FootballRule(SuccessRule):
     """Numbers of the success condition; the goal's box itself is the marker `Goal/Volume` of the stage."""
 
     rear_bound: bool
-    """Whether a ball behind the net no longer counts."""
+    """True if a ball behind the net no longer counts."""
     ball_out: bool
-    """Whether leaving the field ends the episode."""
+    """True if leaving the field ends the episode."""
     ball_restitution: float
     """Speed of parting over speed of approach, which the scene's ball takes at every physics rate."""
     out_z: float = -0.5

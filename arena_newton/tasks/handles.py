@@ -36,7 +36,7 @@ class Marker(BodyFrame):
 
 @dataclass(frozen=True)
 class Latch:
-    """What locks a door's leaf until its handle is pressed."""
+    """Latch that locks a door's leaf until its handle is pressed."""
 
     equality: int
     """MuJoCo equality constraint that holds the leaf while it is active."""

@@ -37,7 +37,7 @@ class Condition:
     """One measured quantity against a limit; a predicate holds where all of its conditions do."""
 
     kind: Literal["near", "clear", "angle", "toward", "away", "unlatched", "margin"]
-    """What is measured; `kernels.rules.predicates` says what each kind compares."""
+    """Measured quantity, described in `kernels.rules.predicates`."""
     limit: float = 0.0
     """In the unit of the kind."""
     points: Sequence[BodyFrame] = ()

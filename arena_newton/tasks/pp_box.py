@@ -70,7 +70,7 @@ class PPBoxOneDeckRule(SuccessRule):
     """The box is near the one layer that the original's code accepts, at any speed."""
 
     plane_below: float = 0.0223
-    """How far the accepted plane is below the deck's surface [m]: the original's is 0.6477 m, its deck at 0.67 m."""
+    """Depth of the accepted plane below the deck's surface [m]: the original's is 0.6477 m, its deck at 0.67 m."""
     height_tolerance: float = 0.06
     """[m]."""
     deck: int = 1
@@ -85,7 +85,7 @@ class PPBoxOneDeckRule(SuccessRule):
 
 
 def on_deck(deck: Marker, half: float) -> Marker:
-    """Where the centre of a box of half height `half` [m] is when it rests on a deck."""
+    """Centre of a box of half height `half` [m] that rests on a deck."""
     x, y, z = deck.pos
     height = z + deck.half[2] + half
     return dataclasses.replace(deck, pos=(x, y, height), half=(deck.half[0], deck.half[1], ON_DECK))

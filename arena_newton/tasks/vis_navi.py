@@ -46,7 +46,7 @@ class VisNaviRule(SuccessRule):
     """The area is the marker `TargetSign/Frame/Zone` of the stage."""
 
     round_signs: bool
-    """Whether a zone that the stage marks as round (semantic mode's ring) is the disc in its box instead of the box."""
+    """True if a zone that the stage marks as round (semantic mode's ring) is the disc in its box instead of the box."""
     feet: tuple[str, ...] = FEET
     """Links whose origins must be inside."""
 

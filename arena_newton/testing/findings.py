@@ -1,4 +1,4 @@
-"""What a conformance check finds, and how a list of checks is made."""
+"""Findings of conformance checks, and lists of checks."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Promise:
     """One promise of an interface, and how it is tried."""
 
     name: str
-    """What findings call it."""
+    """Name in findings."""
     promise: str
-    """What must hold, in one sentence."""
+    """Condition that must hold, in one sentence."""
     attempt: Callable[[], str | None]
     """Tries it; returns a remark, or None.
 
@@ -37,14 +37,14 @@ class Promise:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What one check found."""
+    """Finding of one check."""
 
     name: str
     """The check's name."""
     ok: bool
-    """Whether the promise holds."""
+    """True if the promise holds."""
     message: str
-    """How it is broken; where it holds, the promise."""
+    """Fault if it is broken; the promise if it holds."""
 
 
 class ConformanceError(ArenaError, AssertionError):

@@ -1,4 +1,4 @@
-"""What `interfaces.Policy` promises, tried on a policy: made-up observations, or those of real worlds, go in.
+"""Promises of `interfaces.Policy`, tried on a policy with made-up observations or with those of real worlds.
 
 What a made-up world shows follows from its episode seed and the number of actions it has played, so that the same
 episode can be followed alone, among others, and next to worlds that wait. A policy that reads the world itself in
@@ -36,7 +36,7 @@ SEEDS = (11, 12, 13)
 ONLY = 1
 """The world that is asked, begins again or has a broken state while the others do not."""
 ASKS = 4
-"""How often a world is asked in a comparison."""
+"""Queries of a world in a comparison."""
 MAX_CHUNK = 4096
 """Most actions of one answer, 82 s of blind execution; the limit of policy servers too."""
 TOLERANCE = 1e-4
@@ -48,7 +48,7 @@ MakeWorlds = Callable[[int], World]
 
 
 class _Stage(Protocol):
-    """Where episodes are played."""
+    """Worlds in which episodes are played."""
 
     worlds: int
     task: str
@@ -58,7 +58,7 @@ class _Stage(Protocol):
         """Start episodes in some worlds."""
 
     def observe(self, asking: np.ndarray) -> Observation:
-        """What the worlds show now."""
+        """Present observation of the worlds."""
 
     def play(self, actions: torch.Tensor, playing: np.ndarray) -> None:
         """Execute a chunk, shape [worlds, n, 40], in some worlds."""

@@ -1,4 +1,4 @@
-"""What `interfaces.Tracker` promises, tried on a tracker without any world: made-up commands and states go in.
+"""Promises of `interfaces.Tracker`, tried on a tracker without any world, with made-up commands and states.
 
 The input of a row follows from the row's own number and the tick alone, so that the same robot can be followed alone,
 among others, and next to robots that wait.

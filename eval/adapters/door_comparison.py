@@ -26,12 +26,12 @@ from arena_newton.cli.extras import require
 from arena_newton.cli.flags import user_path
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
-from arena_newton.eval.adapters.picture_differences import picture_rows, picture_table
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.files.own_processes import environment
+from arena_newton.pages.tables import Table
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
 from arena_newton.robot.canonical import ACTION_WIDTH
@@ -43,16 +43,16 @@ SERVED = ("openpi", "roboarena", "vla-eval", "arena")
 SAME_BITS = tuple(name for name in DOOR_NAMES if name != "learned")
 """Doors that promise the bits of `lerobot` on engine mujoco and the CPU."""
 START_S = 300.0
-"""How long a server may take until it listens [s]."""
+"""Longest wait until a server listens [s]."""
 END_S = 30.0
-"""How long it may take to end [s]."""
+"""Longest wait until it ends [s]."""
 ADDRESS = "eval asks it by --policy "
 """Beginning of the line in which a server says how it is asked."""
 
 
 @dataclass(frozen=True)
 class DoorEpisode:
-    """What became of an episode."""
+    """Result of an episode."""
 
     key: str
     """`s<group seed>/r<repeat>`."""
@@ -67,7 +67,7 @@ class DoorEpisode:
 
 @dataclass(frozen=True)
 class DoorPlay:
-    """What a door's program did."""
+    """Result of a protocol's program."""
 
     door: str
     episodes: tuple[DoorEpisode, ...]
@@ -97,13 +97,13 @@ class DoorRow:
     parts_at: int | None
     """First tick at which an action differs, over all episodes; None where none does."""
     promised: bool
-    """Whether it must be the same."""
+    """True if it must be the same."""
     seconds: float
     commands: tuple[str, ...] = field(default=())
 
     @property
     def kept(self) -> bool:
-        """Whether what is promised holds."""
+        """True if the promise holds."""
         return not self.promised or (self.same_endings and self.same_everything)
 
 
@@ -127,10 +127,6 @@ def run(options: DoorOptions) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
-    pictures = ""
-    if options.pictures:
-        pictures = picture_table(picture_rows(options, checkpoint))
-        print(pictures, flush=True)
     plays = []
     for door in doors:
         plays.append(_play(door, options, checkpoint, out / door))
@@ -142,7 +138,7 @@ def run(options: DoorOptions) -> int:
     said = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
     text = door_table(rows, options.first)
     commands = "\n".join(f"- {row.door}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
-    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n" + (f"\n{pictures}" if pictures else ""))
+    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n")
     facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": [asdict(row) for row in rows]}
     write_atomic(out / "doors.json", json.dumps(facts, indent=2) + "\n")
     print(f"\n{said}\n\n{text}")
@@ -193,20 +189,15 @@ def compare_doors(plays: Sequence[DoorPlay], first: int, promised: Sequence[str]
 
 def door_table(rows: Sequence[DoorRow], first: int) -> str:
     """The comparison as a table in Markdown."""
-    lines = [
-        f"| door | successes | steps | first {first} actions | largest difference | all actions, margins | first "
-        "difference at tick |",
-        "|---|--:|---|---|--:|---|--:|",
-    ]
+    head = ("door", "successes", "steps", f"first {first} actions", "largest difference", "all actions, margins")
+    lines = []
     for row in rows:
         actions, all_of_it = ("same bits" if same else "differ" for same in (row.same_actions, row.same_everything))
         steps = " ".join(str(number) for number in row.steps)
         parts = "–" if row.parts_at is None else str(row.parts_at)
-        lines.append(
-            f"| `{row.door}` | {row.successes} of {row.episodes} | {steps} | {actions} | {row.largest:.1e} | "
-            f"{all_of_it} | {parts} |"
-        )
-    return "\n".join(lines) + "\n"
+        won = f"{row.successes} of {row.episodes}"
+        lines.append((f"`{row.door}`", won, steps, actions, f"{row.largest:.1e}", all_of_it, parts))
+    return "\n".join(Table((*head, "first difference at tick"), lines, "lrllrlr").compact()) + "\n"
 
 
 def _parts_at(ours: np.ndarray, theirs: np.ndarray) -> int | None:
@@ -361,7 +352,7 @@ type Ending = tuple[str, str | None, int, float | None]
 
 
 def _run_endings(folder: Path) -> Mapping[str, Ending]:
-    """How the episodes of a results folder ended."""
+    """Endings of the episodes of a results folder."""
     return {
         f"s{one.group_seed}/r{one.repeat}": (one.outcome, one.reason, one.steps, one.margin)
         for one in load_run(folder).records
@@ -369,7 +360,7 @@ def _run_endings(folder: Path) -> Mapping[str, Ending]:
 
 
 def _stock_endings(door: str, folder: Path, options: DoorOptions) -> Mapping[str, Ending]:
-    """How the episodes ended that the environment of `lerobot-eval` wrote, checked against LeRobot's own file."""
+    """Endings of the episodes that the environment of `lerobot-eval` wrote, checked against LeRobot's own file."""
     lines = [json.loads(line) for line in (folder / OUTCOMES_FILE).read_text().splitlines()]
     info = json.loads((folder / "lerobot" / "eval_info.json").read_text())
     successes = info["per_task"][0]["metrics"]["successes"]

@@ -36,8 +36,5 @@ class DoorOptions:
     """Physics engine: mujoco or warp."""
     device: str = "cpu"
     """Device of worlds and networks: cpu, cuda."""
-    pictures: bool = False
-    """Also show the policy each episode's first look as PNG, as JPEG, scaled and through the other lens, and print what
-    it decides otherwise."""
     out: str = "doors"
     """Folder of the episodes, the programs' output and the table; must be empty or new."""

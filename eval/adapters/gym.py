@@ -44,11 +44,11 @@ if TYPE_CHECKING:
 __all__ = ["ArenaGymEnv", "ArenaVectorEnv", "env_id", "register"]
 
 NAMESPACE = "arena_newton"
-"""What every id begins with."""
+"""Prefix of every id."""
 IMAGE_SIZE = (224, 224)
 """Width and height of observed pictures [px], as policies of the original see them."""
 SETTLE = ("steps", "reset")
-"""Where an episode's start-up happens: in steps whose action is ignored, or inside the reset."""
+"""Calls in which an episode's start-up happens: steps whose action is ignored, or the reset."""
 REWARDS = ("success", "margin")
 """1 at success; or the change of the task's margin per tick, and 1 at success."""
 RESET_MASK = "reset_mask"
@@ -399,7 +399,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         return {name: shown[name] for name in self._observed}
 
     def _facts(self) -> dict[str, np.ndarray]:
-        """What `info` says of every world."""
+        """Values of `info` for every world."""
         return {
             "settling": (self.env.tick < 0) & ~self._over,
             "seed": self._seed.copy(),

@@ -21,8 +21,7 @@ from arena_newton import trackers
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError
-from arena_newton.eval.bench.bench_figure import BenchFigure
-from arena_newton.eval.plan.options import BenchOptions
+from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.kernel_cache import kernel_loading
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import STAND_ACTION
@@ -65,7 +64,7 @@ def first_tick(task: str, worlds: int, threads: int) -> None:
     print(json.dumps(parts))
 
 
-def start_figures(options: BenchOptions) -> Iterator[BenchFigure]:
+def start_figures() -> Iterator[BenchFigure]:
     """A start with an empty cache, the next one with the full cache, and one that compiles module by module."""
     cuda = bool(wp.is_cuda_available())
     where, worlds = ("CUDA", 60) if cuda else ("CPU", 2)

@@ -1,11 +1,11 @@
-"""Seconds of a tick with tracker, of its bare physics, and of the tracker's network alone."""
+"""Seconds of a tick with tracker and of its bare physics, on the CPU and on CUDA."""
 
 from __future__ import annotations
 
 import contextlib
 import statistics
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,13 +13,12 @@ import warp as wp
 
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
+from arena_newton.eval.bench.timing import NEEDS_CUDA, BenchFigure, seconds_of
 from arena_newton.interfaces import Physics
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.robot.g1 import PhysicsRate
-from arena_newton.trackers.front_end import NetworkTracker
-from arena_newton.trackers.inference.blocks import BlockRunner
 
-__all__ = ["RATES", "network_seconds", "tick_times"]
+__all__ = ["RATES", "throughput_figures", "tick_figures", "tick_times"]
 
 RATES = {"1 ms x 20": PhysicsRate(dt=0.001, substeps=20), "5 ms x 4": PhysicsRate(dt=0.005, substeps=4)}
 """The two rates of the physics at which ticks are measured, whatever rate the weights were trained at."""
@@ -65,51 +64,45 @@ def tick_times(
         for _ in range(number):
             env.physics.mj_step_only()
 
-    def sync() -> None:
-        if env.device.is_cuda:
-            wp.synchronize_device(env.device)
-
-    def timed(work: Callable[[int], None]) -> float:
-        sync()
-        began = time.perf_counter()
-        work(count)
-        sync()
-        return (time.perf_counter() - began) / count
-
     ticks(env.startup_ticks + 10)
     with _as_before(env.physics):
         bare(2)
     pairs = []
     for _ in range(rounds):
         with _as_before(env.physics):
-            alone = timed(bare)
-        pairs.append((timed(ticks), alone))
+            alone = seconds_of(partial(bare, count)) / count
+        pairs.append((seconds_of(partial(ticks, count)) / count, alone))
         ended = np.flatnonzero(status)
         if len(ended):  # as in an evaluation, a world that ended starts its next episode
             env.reset([int(w) for w in ended], ended)
     return pairs
 
 
-def network_seconds(checkpoint: str | None = None, rounds: int = 20, count: int = 100) -> float:
-    """Median time of TWIST2's network for one world on the CPU, as it runs in a tick, without its observation [s].
+def _medians(worlds: int, engine: str, rate: str, rounds: int, checkpoint: str | None) -> tuple[float, float, str]:
+    """Median seconds of a full tick and of its bare physics, and both as text."""
+    pairs = tick_times(worlds, engine, RATES[rate], rounds, checkpoint)
+    full, alone = (statistics.median(column) for column in zip(*pairs, strict=True))
+    return full, alone, f"{1e3 * full:.2f} ms / {1e3 * alone:.2f} ms"
 
-    No tick takes less than this and its physics.
 
-    Args:
-        checkpoint: Weights of TWIST2; those of the package when None.
-        rounds: Rounds, of which the median is taken.
-        count: Runs of a round.
-    """
-    tracker = trackers.get("twist2", checkpoint)
-    assert isinstance(tracker, NetworkTracker)
-    runner = BlockRunner(tracker.network, tracker.front_end.obs_width, 1)
-    runner.input.normal_(generator=torch.Generator().manual_seed(0))
-    for _ in range(count):  # the first run compiles
-        runner.run()
-    measured = []
-    for _ in range(rounds):
-        began = time.perf_counter()
-        for _ in range(count):
-            runner.run()
-        measured.append((time.perf_counter() - began) / count)
-    return statistics.median(measured)
+def tick_figures(worlds: int, rounds: int, checkpoint: str | None) -> Iterator[BenchFigure]:
+    """Time of a tick as a multiple of its bare physics, on the CPU."""
+    for rate, bar in (("1 ms x 20", 1.3), ("5 ms x 4", 2.0)):
+        full, alone, times = _medians(worlds, "mujoco", rate, rounds, checkpoint)
+        name = f"tick / bare mj_step, engine mujoco, {worlds} worlds, {rate}"
+        yield BenchFigure(name, bar, "x", True, full / alone, times)
+
+
+def throughput_figures(worlds: int, rounds: int, checkpoint: str | None) -> Iterator[BenchFigure]:
+    """Time of a tick as a multiple of the bare solver's, and world-ticks per second, on CUDA."""
+    ratio = f"tick / bare solver graph, engine warp, {worlds} worlds, "
+    rate = f"world-ticks, engine warp, {worlds} worlds, football, dex3, "
+    if not wp.is_cuda_available():
+        yield BenchFigure(ratio + "5 ms x 4", 1.4, "x", True, None, NEEDS_CUDA)
+        yield BenchFigure(rate + "5 ms x 4", 250_000, "world-ticks/s", False, None, NEEDS_CUDA)
+        return
+    for physics in ("5 ms x 4", "1 ms x 20"):
+        full, alone, times = _medians(worlds, "warp", physics, rounds, checkpoint)
+        yield BenchFigure(ratio + physics, 1.4, "x", True, full / alone, times)
+        if physics == "5 ms x 4":
+            yield BenchFigure(rate + physics, 250_000, "world-ticks/s", False, worlds / full)

@@ -6,19 +6,19 @@ A page begins with the verdict and the claims, in the order of a reader's questi
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TypedDict
 
 from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed, verdict_of
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import JsonObject
-from arena_newton.eval.reports.html_report import FOLDER, page_template
-from arena_newton.eval.reports.wording import escaped
+from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.files.text import counted
+from arena_newton.pages.html import EMBEDDED, render
+from arena_newton.pages.tables import Table, escaped
 
 __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 
@@ -35,7 +35,7 @@ MEANING = {
 
 
 class Facts(TypedDict):
-    """What was certified."""
+    """Facts about the certified benchmark."""
 
     tasks: list[str]
     without_expert: list[str]
@@ -103,8 +103,8 @@ def document(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding])
     }
 
 
-def _sheet(sheet: Sheet) -> JsonObject:
-    return {"title": sheet.title, "head": list(sheet.head), "rows": [list(row) for row in sheet.rows]}
+def _sheet(sheet: Table) -> JsonObject:
+    return {"title": sheet.title, "head": list(sheet.head), "rows": [list(map(str, row)) for row in sheet.rows]}
 
 
 def _said(facts: Facts) -> list[tuple[str, str]]:
@@ -124,7 +124,7 @@ def _said(facts: Facts) -> list[tuple[str, str]]:
 
 
 def _warnings(facts: Facts) -> list[str]:
-    """What limits the certificate as a whole."""
+    """Limits of the certificate as a whole."""
     found = []
     if facts["quick"]:
         found.append(f"--quick: {facts['episodes']} episodes of each cell, so the intervals are wide.")
@@ -155,33 +155,30 @@ def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as Markdown, without pictures."""
     lines = ["# Certificate", "", f"**{escaped(verdict_of(findings, len(facts['planned'])))}**", ""]
     lines += [line for text in _warnings(facts) for line in (f"> {escaped(text)}", "")]
-    lines += ["| claim | verdict | measured |", "|---|---|---|"]
-    claims = claimed(findings)
+    claims, rows = claimed(findings), []
     for one in claims:
         verdicts = {check.name: finding.verdict for check, finding in one.findings}
         told = [f"[{name}](#{name}-{verdicts[name]}): {escaped(text)}" for name, text in _measured(one)]
-        lines.append(f"| {escaped(one.text)} | {one.verdict} | {'<br>'.join(told)} |")
+        rows.append((escaped(one.text), one.verdict, "<br>".join(told)))
+    lines += Table(("claim", "verdict", "measured"), rows).compact()
     lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
     lines += ["## What was certified", ""]
     lines += [f"- {name}: {escaped(text)}" for name, text in _said(facts)]
     for check, finding in (part for one in claims for part in one.findings):
         lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", escaped(finding.summary), ""]
         for sheet in finding.sheets:
-            lines += [f"{escaped(sheet.title)}:", "", "| " + " | ".join(map(escaped, sheet.head)) + " |"]
-            lines.append("|" + "---|" * len(sheet.head))
-            lines += ["| " + " | ".join(map(escaped, row)) + " |" for row in sheet.rows] + [""]
+            lines += [f"{escaped(sheet.title)}:", "", *sheet.compact(escaped), ""]
         lines += [f"- {escaped(note)}" for note in finding.notes]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     """The certificate as one page that needs no other file."""
-    style = (FOLDER / "report.css").read_text(encoding="utf-8") + (FOLDER / "certify.css").read_text(encoding="utf-8")
-    known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     claims = claimed(findings)
-    return page_template("certify.html").render(
-        policy=f"default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
-        style=style,
+    return render(
+        FOLDER / "certify.html",
+        styles=["report.css", "certify.css"],
+        sources=EMBEDDED,
         verdict=verdict_of(findings, len(facts["planned"])),
         claims=[{"text": one.text, "verdict": one.verdict, "measured": _measured(one)} for one in claims],
         facts=_said(facts),

@@ -1,4 +1,4 @@
-"""What the benchmark claims of itself, in the order in which a reader of the paper asks, and which checks show it."""
+"""Claims of the benchmark, in the order in which a reader of the paper asks, each with the checks that show it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class ClaimFinding:
-    """What was found about a claim."""
+    """Finding about a claim."""
 
     claim: Claim
     findings: tuple[tuple[Check, CheckFinding], ...]

@@ -1,4 +1,4 @@
-"""What the checks of one certification share: what to measure, and evaluations that are resumed instead of repeated."""
+"""Context that the checks of one certification share: what to measure, and evaluations to resume instead of repeat."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from arena_newton import tasks
+from arena_newton.cli.flags import shared
 from arena_newton.doctor import versions
 from arena_newton.errors import InputError
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, Body
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
-from arena_newton.eval.plan.options import CertifyOptions, RunOptions
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
 from arena_newton.eval.records.identity import PACKAGE, config_hash, hash_paths, package_files
 from arena_newton.eval.records.journal import ContradictionError, EpisodeRecord, write_atomic
@@ -27,7 +29,7 @@ from arena_newton.rules import seeding
 
 __all__ = ["CertifyCell", "Context", "with_expert"]
 
-QUICK_EPISODES = 4
+QUICK_EPISODES = 2
 """Episodes of each cell under --quick."""
 FULL_EPISODES = 60
 """Episodes of each cell otherwise: the protocol's."""
@@ -73,7 +75,7 @@ class CertifyCell:
 
 @dataclass
 class Context:
-    """What the checks measure with."""
+    """Context of the checks."""
 
     options: CertifyOptions
     folder: Path
@@ -127,22 +129,18 @@ class Context:
             KeyboardInterrupt: The run was interrupted; what was played is kept.
         """
         seeds, repeats = self.plan(cell.first_seed, cell.episodes)
-        options = RunOptions(
+        options = shared(
+            cell,
+            RunOptions,
             task=(cell.task,),
             tracker=(cell.tracker,),
-            checkpoint=cell.checkpoint,
-            policy=cell.policy,
             mode=(cell.mode,),
-            rules=cell.rules,
             seeds=seeds,
             repeats=repeats,
             worlds=min(self.options.worlds, cell.episodes or self.episodes),
             engine=cell.engine or self.options.engine,
             device="cpu" if cell.engine == "mujoco" else self.options.device,
-            actions=cell.actions,
-            strip=cell.strip,
             follow=cell.strip,
-            failures=cell.failures,
             out=str(self.path(cell)),
         )
         return self.play(options, cell.folder.replace("/", " "), self.bodies[cell.body])
@@ -194,7 +192,7 @@ class Context:
         settings: Mapping[str, Json],
         measure: Callable[[], Json],
     ) -> Json:
-        """What a measurement gave that is no evaluation; taken from the folder where the same was measured before.
+        """Value of a measurement that is no evaluation; read from the folder where the same was measured before.
 
         Args:
             name: Name of the measurement, unique for a task and tracker; it becomes a file's.

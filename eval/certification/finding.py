@@ -1,4 +1,4 @@
-"""What a check is and what it finds: records that the page, the JSON and the console say in their own ways."""
+"""Checks and their findings: records that the page, the JSON and the console show in their own ways."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.eval.statistics.stats import paired_rates
+from arena_newton.pages.tables import Table, percent
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
@@ -19,10 +20,8 @@ __all__ = [
     "CheckFinding",
     "Picture",
     "Score",
-    "Sheet",
     "Verdict",
     "discordant",
-    "percent",
     "pooled_score",
     "score",
     "skipped",
@@ -30,15 +29,6 @@ __all__ = [
 
 Verdict = Literal["pass", "fail", "note", "skip"]
 """`note`: something that a reader must know and that no change of the benchmark repairs; `skip`: was not measured."""
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A table of numbers."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -51,14 +41,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class CheckFinding:
-    """What a check measured and what follows from it."""
+    """Measurement of a check and its conclusion."""
 
     verdict: Verdict
     summary: str
-    """What it measured, in one line."""
-    sheets: tuple[Sheet, ...] = ()
+    """Measurement in one line."""
+    sheets: tuple[Table, ...] = ()
     notes: tuple[str, ...] = ()
-    """What a reader must know besides the numbers: causes, exceptions, limits."""
+    """Notes for a reader besides the numbers: causes, exceptions, limits."""
     pictures: tuple[Picture, ...] = ()
     claim: str = ""
     """Words for the line of the claim itself."""
@@ -95,14 +85,9 @@ class Score:
 
     def cells(self) -> tuple[str, str]:
         """Count and interval as a table shows them."""
-        low, high = self.interval
+        low, high = (percent(bound, 0) for bound in self.interval)
         errors = f", {self.errors} errors" if self.errors else ""
-        return f"{self.successes}/{self.episodes}{errors}", f"{percent(low)} to {percent(high)}"
-
-
-def percent(fraction: float, decimals: int = 0) -> str:
-    """A fraction in per cent."""
-    return f"{100.0 * fraction:.{decimals}f} %"
+        return f"{self.successes}/{self.episodes}{errors}", f"{low} % to {high} %"
 
 
 def score(records: Sequence[EpisodeRecord]) -> Score:

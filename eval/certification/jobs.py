@@ -9,15 +9,15 @@ import contextlib
 import dataclasses
 import os
 import queue
-import shlex
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 
+from arena_newton.cli.flags import shell_command, words
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.agreement import BATCHED_TASKS
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.physics.devices import resolve_engine
 
 __all__ = ["Piece", "command_line", "flags", "play_ahead"]
@@ -25,13 +25,13 @@ __all__ = ["Piece", "command_line", "flags", "play_ahead"]
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """What one process plays."""
+    """Part that one process plays."""
 
     checks: tuple[str, ...]
     tasks: tuple[str, ...]
     trackers: tuple[str, ...]
     cores: bool = True
-    """Whether it keeps to cores of its own."""
+    """True if it keeps to cores of its own."""
 
     def __str__(self) -> str:
         """Names of checks, tasks and trackers."""
@@ -181,25 +181,11 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
 
 def flags(options: CertifyOptions, piece: Piece) -> list[str]:
     """Command line of a process that plays one piece."""
-    return _written(
+    return words(
         dataclasses.replace(options, resume=True, jobs=0, checks=piece.checks, task=piece.tasks, tracker=piece.trackers)
     )
 
 
 def command_line(options: CertifyOptions) -> str:
     """The command line that makes the certificate from nothing."""
-    program = ("python", "-m", "arena_newton.eval", "certify")
-    return shlex.join([*program, *_written(dataclasses.replace(options, resume=False))])
-
-
-def _written(options: CertifyOptions) -> list[str]:
-    """Options as flags: those that differ from the default."""
-    given = []
-    for one in dataclasses.fields(CertifyOptions):
-        value, flag = getattr(options, one.name), f"--{one.name.replace('_', '-')}"
-        if value == one.default:
-            continue
-        given.append(flag)
-        if not isinstance(value, bool):
-            given += map(str, value) if isinstance(value, tuple) else [str(value)]
-    return given
+    return shell_command("arena_newton.eval", "certify", *words(dataclasses.replace(options, resume=False)))

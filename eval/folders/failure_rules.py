@@ -20,7 +20,7 @@ __all__ = ["BARS", "BAND", "Bars", "Judged", "near_bars", "sees_at_start", "stag
 
 
 class Judged(Protocol):
-    """What the rules read of an episode's line (`journal.EpisodeRecord`)."""
+    """Fields of an episode's line that the rules read (`journal.EpisodeRecord`)."""
 
     @property
     def task(self) -> str:
@@ -178,5 +178,5 @@ def waits_in_view(episode: Judged) -> bool:
 
 
 def sees_at_start(signals: EpisodeSignals) -> bool:
-    """Whether the first picture shows the object."""
+    """True if the first picture shows the object."""
     return signals.first_pixels >= SEEN

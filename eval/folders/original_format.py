@@ -6,8 +6,6 @@ with `episodes/*.json`, `summary.csv`, `summary.jsonl`, `summary.json` and `fina
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections import Counter
@@ -19,6 +17,7 @@ from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import population_std, seed_rates
 from arena_newton.files.own_files import file_label
+from arena_newton.pages.tables import Table
 
 __all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]
 
@@ -152,11 +151,7 @@ def _fraction(part: int, whole: int) -> str:
 
 
 def _csv(rows: Iterable[JsonObject], columns: Sequence[str]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return Table(columns, [[row[name] for name in columns] for row in rows]).csv()
 
 
 def write_original(

@@ -1,4 +1,4 @@
-"""What a results folder holds, read and checked, and the figures that results.json gives of it."""
+"""Contents of a results folder, read and checked, and the figures that results.json gives of it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ OWN_FOLDER = "own"
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a results folder holds."""
+    """Contents of a results folder."""
 
     folder: Path
     document: Document
@@ -53,7 +53,7 @@ class RunRecord:
 
     @property
     def status(self) -> Status | None:
-        """How the last run or resume ended; None in a folder of a version without status."""
+        """Ending of the last run or resume; None in a folder of a version without status."""
         return self.document.get("status")
 
 
@@ -133,7 +133,7 @@ def changed_conditions(run: RunRecord) -> list[str]:
 
 
 def is_complete(run: RunRecord) -> bool:
-    """Whether every planned episode is finished, or as many successes are recorded as were wanted."""
+    """True if every planned episode is finished, or as many successes are recorded as were wanted."""
     planned, keep = run.document["planned"], run.config.get("keep")
     rule = width_rule(run.config)
     if keep is None and rule is None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from arena_newton import rule_sets, tasks
+from arena_newton.cli.flags import flag_name
 from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.plan.config import RunConfig, plain_facts
@@ -45,7 +46,7 @@ SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f
 RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
 """Flags that all episodes of a folder share, though they change none of them."""
 BREAK_FILE = "break.txt"
-"""Where the trace of a break is kept for who looks into it."""
+"""File with the trace of a break, for a later look."""
 
 
 def results_folder(out: str | None, shard: Shard | None = None) -> Path:
@@ -140,8 +141,7 @@ class ResultsFolder:
             default = getattr(RunOptions, name)
             kept, given = stored["options"].get(name, default), getattr(self.config.flags, name)
             if given != (tuple(kept) if isinstance(kept, list) else kept):
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"{folder}: was begun with {flag} {setting(kept)}; choose another --out")
+                raise InputError(f"{folder}: was begun with {flag_name(name)} {setting(kept)}; choose another --out")
         known = [moving_versions(versions) for versions in _versions(stored)]
         present = moving_versions(self.installed)
         if present not in known and not self.config.flags.accept_versions:
@@ -267,7 +267,7 @@ class ResultsFolder:
         return plain
 
     def hashes(self, tracker: str, environment: JsonObject) -> dict[str, str | None]:
-        """What a journal line names its run by, given the tracker and what the episode's environment said of itself."""
+        """Names of a journal line's run, from the tracker and the environment's own description."""
         config = self.config
         return {
             "config": self.document["config_hash"],

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton.cli.flags import flag_name, shell_command, words
 from arena_newton.data.datasets import lerobot_dataset
 from arena_newton.data.datasets.data_options import BuildOptions
 from arena_newton.doctor import versions
@@ -20,11 +20,12 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.folders.run_folder import ResultsFolder, results_folder, setting
 from arena_newton.eval.loop import loop_report
+from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING
 from arena_newton.eval.loop.loop_requirements import check_disk, check_folder, check_libraries, recorded_bytes
 from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_SEEDS
-from arena_newton.eval.plan.options import LoopOptions, RecordOptions, RunOptions
+from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.records.document import read_document
 from arena_newton.eval.records.journal import write_atomic
@@ -96,8 +97,8 @@ def resolved(options: LoopOptions) -> LoopOptions:
     if any((camera.width, camera.height) != (picture, picture) for camera in cameras.values()):
         raise InputError(f"{flag}: recipe {options.policy}/{options.recipe} takes {picture}x{picture}")
     if options.out is None:
-        words = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
-        options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(words))))
+        named = ["loop", *options.task, options.tracker, options.policy, str(options.recipe)]
+        options = dataclasses.replace(options, out=str(Path("results") / file_label("_".join(named))))
     resolve(recording_run(_recording(options, Path())))  # tasks, tracker, engine and size, before anything is written
     resolve(dataclasses.replace(_evaluation(options, Path()), policy="stand"))
     return options
@@ -180,7 +181,7 @@ def is_begun(out: Path, options: LoopOptions) -> bool:
         raise InputError(f"{path}: expected an object with the options of a loop")
     for name, now in _flags(options).items():
         if stored.get(name) != now:
-            flag, was = f"--{name.replace('_', '-')}", plain_text(setting(stored.get(name)), 200)
+            flag, was = flag_name(name), plain_text(setting(stored.get(name)), 200)
             raise InputError(f"--out {out}: was begun with {flag} {was}, now {setting(now)}")
     return True
 
@@ -234,7 +235,7 @@ class _Loop:
     def play(self) -> int:
         """Play what is left, and report."""
         stages = {"record": self._record, "build": self._build, "train": self._train, "evaluate": self._evaluate}
-        command = "python -m arena_newton.eval loop " + " ".join(_words(self.options))
+        command = shell_command("arena_newton.eval", "loop", *words(self.options))
         finished = self.finished()
         for number, (name, work) in enumerate(stages.items(), 1):
             print(f"[{number}/{len(stages)}] {name}{': finished before' if number <= finished else ''}", flush=True)
@@ -290,16 +291,3 @@ class _Loop:
     def _evaluate(self) -> int:
         checkpoint = checkpoint_folder(last_checkpoint(self.out / TRAINING))
         return self._run(dataclasses.replace(_evaluation(self.options, self.out), policy=f"lerobot:{checkpoint}"))
-
-
-def _words(options: LoopOptions) -> list[str]:
-    """The flags that give this loop again."""
-    words: list[str] = []
-    for one in dataclasses.fields(options):
-        value = getattr(options, one.name)
-        if value in (None, False):
-            continue
-        words.append("--" + one.name.replace("_", "-"))
-        if value is not True:
-            words += [shlex.quote(str(part)) for part in (value if isinstance(value, tuple) else (value,))]
-    return words

@@ -5,9 +5,7 @@ Markdown and one HTML page; what comes from the folder is text to both, pictures
 
 from __future__ import annotations
 
-import base64
 import csv
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -16,14 +14,16 @@ from typing import Any
 
 from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.eval.folders.results import RunRecord, load_run
-from arena_newton.eval.plan.options import LoopOptions
+from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
-from arena_newton.eval.reports.html_report import FOLDER, page_template
+from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.reports.progress import duration
-from arena_newton.eval.reports.wording import escaped, markdown_table, media_of, plain
+from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.statistics.stats import aggregate
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
+from arena_newton.pages.html import FILES, render
+from arena_newton.pages.tables import Table, between, escaped
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 
 __all__ = ["DATASET", "EVALUATION", "RECORDINGS", "TRAINING", "curve", "worked_seconds", "write"]
@@ -36,8 +36,6 @@ WIDTH, HEIGHT = 640, 180
 """Size of the curve [px]."""
 MOST_POINTS = 400
 """Points of a curve; of more, every second, third ... is drawn."""
-SOURCES = "default-src 'none'; img-src 'self' file:; base-uri 'none'; form-action 'none'"
-"""Content-Security-Policy of the page, without its style."""
 RATE_HEAD = ["task", "tracker", "mode", "successes", "SR %", "95 % Wilson", "falls", "timeouts", "errors"]
 
 
@@ -120,8 +118,7 @@ def worked_seconds(run: RunRecord) -> float:
 def _rate_rows(run: RunRecord) -> list[list[str]]:
     rows = []
     for cell in aggregate(run.records)["cells"]:
-        low, high = cell["ci95"] or (math.nan, math.nan)
-        rates = [f"{100 * (cell['sr'] or 0.0):.1f}", f"{100 * low:.0f} to {100 * high:.0f}"]
+        rates = [f"{100 * (cell['sr'] or 0.0):.1f}", between(cell["ci95"])]
         names = [plain(name) for name in (cell["task"], cell["tracker"], cell["mode"])]
         ends = [str(cell[ending]) for ending in ("falls", "timeouts", "errors")]
         rows.append([*names, f"{cell['successes']}/{cell['episodes']}", *rates, *ends])
@@ -163,8 +160,8 @@ def write(out: Path, options: LoopOptions, command: str) -> list[str]:
     notes = ["A small loop, which tries the machinery: no result."] if options.small else []
     title = " ".join(options.task)
     text = [f"# The loop of {escaped(title)}", "", f"`{plain(command).replace('`', '')}`", ""]
-    text += ["## Result", "", markdown_table(RATE_HEAD, rates, 3), *(f"> {note}" for note in notes), ""]
-    text += ["## Time", "", markdown_table(["stage", "seconds"], stages, 1), "## What was made", ""]
+    text += ["## Result", "", Table(RATE_HEAD, rates, "lllr").markdown(), *(f"> {note}" for note in notes), ""]
+    text += ["## Time", "", Table(["stage", "seconds"], stages, "lr").markdown(), "## What was made", ""]
     text += [f"- {escaped(name)}: {escaped(value)}" for name, value in facts]
     if drawn is not None:
         ends = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in drawn["ends"].items())
@@ -175,11 +172,10 @@ def write(out: Path, options: LoopOptions, command: str) -> list[str]:
         text += [f"{named}: {escaped(record.outcome)} after {record.steps} ticks", ""]
         text += [f"![{named}]({path})" for path in strips] + [""]
     write_atomic(out / "loop.md", "\n".join(text).rstrip() + "\n")
-    style = (FOLDER / "report.css").read_text(encoding="utf-8")
-    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    page = page_template("loop.html").render(
-        policy=f"{SOURCES}; style-src 'sha256-{digest}'",
-        style=style,
+    page = render(
+        FOLDER / "loop.html",
+        styles=["report.css"],
+        sources=FILES,
         title=title,
         command=command,
         head=RATE_HEAD,

@@ -1,4 +1,4 @@
-"""What the stages of a loop need besides each other, checked before the first one."""
+"""Requirements of a loop's stages besides each other, checked before the first one."""
 
 from __future__ import annotations
 

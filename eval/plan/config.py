@@ -15,18 +15,23 @@ from typing import TYPE_CHECKING
 
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
+from arena_newton.cli.flags import check_least, shared
 from arena_newton.data.recording.episode import CAMERAS
 from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
-from arena_newton.eval.plan.flag_checks import DRIVES, RAY_FLAGS, check_flags, flag_name
+from arena_newton.eval.plan.flag_checks import DRIVES, check_flags
 from arena_newton.eval.plan.interaction import check_interactions
 from arena_newton.eval.plan.options import (
     QUICK_REPEATS,
     QUICK_SEEDS,
     QUICK_TRACKERS,
+    Chunks,
+    Ray,
     RecordOptions,
     RunOptions,
+    Viewer,
+    flags_of,
     is_quick,
 )
 from arena_newton.eval.records.document import Identity
@@ -57,7 +62,6 @@ if TYPE_CHECKING:
 __all__ = [
     "DEFAULT_TRACKER",
     "DRIVES",
-    "RAY_FLAGS",
     "RunConfig",
     "plain_facts",
     "recorded_cameras",
@@ -69,15 +73,12 @@ DEFAULT_TRACKER = "twist2"
 """Tracker of a run that names tasks or weights, but no tracker."""
 POLICY_PATH_SCHEMES = ("learned", "lerobot", "replay")
 """Policies whose text after the colon is a path."""
-CHUNK_FLAGS = ("replan", "ensemble", "latency_ticks")
-"""Flags that say how a policy's chunks are executed."""
 MOST_EPISODES = 200
 """Episodes of a task, tracker and mode under --until-width; the widest interval is then 14 points wide."""
 MOST_DISTURBANCE = 10.0
 """Largest factor of the noise; no robot stands far less."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
-ONE_CALL |= {"viewer", "viewer_follow", "viewer_port", "viewer_real_time"}
-ONE_CALL |= {"ray", *RAY_FLAGS}
+ONE_CALL |= {*flags_of(Viewer), *flags_of(Ray)}
 """Flags that a resumed run does not take over."""
 
 
@@ -88,7 +89,7 @@ class RunConfig:
     flags: RunOptions
     """The flags with every default filled in and every path absolute."""
     episodes: tuple[episode_plan.Episode, ...]
-    """What is to be played: the plan, or its part that the shard has."""
+    """Episodes to play: the plan, or its part that the shard has."""
     planned: int
     """Episodes of the whole plan."""
     repeats: int
@@ -104,7 +105,7 @@ class RunConfig:
     video_size: tuple[int, int] | None
     """Size of the world camera's pictures [px]; None: the usual one."""
     policy_options: JsonObject
-    """What the policy is made with besides its spec."""
+    """Arguments of the policy besides its spec."""
     checkpoint_hashes: Mapping[str, str | None]
     """Weights by tracker."""
     policy_hash: str | None
@@ -125,14 +126,14 @@ class RunConfig:
     camera: CameraConfig | None = None
     """Camera that the policy asks for; None for one that does not see."""
     worlds_matter: bool = False
-    """Whether the policy depends on how many worlds ask at once; known when it was made and checked."""
+    """True if the policy depends on how many worlds ask at once; known when it was made and checked."""
     tracker_facts: JsonObject | None = None
     """`Tracker.describe()` by tracker, once the trackers are made."""
     policy_facts: JsonObject | None = None
     """`Policy.describe()` and, of one that takes the world itself, `privileged`, once the policy is made."""
 
     def identity(self) -> Identity:
-        """What the results depend on, by flag name; two runs with equal identity may share a results folder.
+        """Identity of the results, by flag name; two runs with equal identity may share a results folder.
 
         Videos, viewers, the folder and shards are absent: they do not change an episode. So is the number of worlds,
         except for a policy that depends on it. Files count by content. What each environment was built with and the
@@ -170,13 +171,13 @@ class RunConfig:
         }
 
     def _chunks(self) -> Identity:
-        """How chunks are executed, as far as it is not the usual: whole, at once, one after the other."""
-        given = {name: getattr(self.flags, name) for name in CHUNK_FLAGS}
+        """Execution of chunks, where it is not the usual: whole, at once, one after the other."""
+        given = {name: getattr(self.flags, name) for name in flags_of(Chunks) if name != "labels"}
         return {name: value for name, value in given.items() if value}  # type: ignore[return-value]  # a part of one
 
     @property
     def width_rule(self) -> rounds.WidthRule | None:
-        """When a task, tracker and mode has enough episodes; None: when all are played."""
+        """Rule by which a task, tracker and mode has enough episodes; None: all are played."""
         flags = self.flags
         if flags.until_width is None:
             return None
@@ -188,7 +189,7 @@ class RunConfig:
         return {} if rule is None else {"until_width": rule.width, "max": rule.most}  # type: ignore[typeddict-item]
 
     def _demonstrations(self) -> Identity:
-        """What tells a run of `eval record` from an evaluation; nothing for one."""
+        """Identity of a run of `eval record` as against an evaluation; nothing for one."""
         if self.flags.series is None:
             return {}  # type: ignore[typeddict-item]  # a part of one
         scales = {task: self.noise_scale(task) for task in self.flags.task}
@@ -210,7 +211,7 @@ class RunConfig:
         return config_hash(self.identity())
 
     def stored_flags(self) -> JsonObject:
-        """What `resume` starts from: all flags but those of one call."""
+        """Flags that `resume` starts from: all flags but those of one call."""
         once = {field.name: field.default for field in dataclasses.fields(self.flags) if field.name in ONE_CALL}
         flags: JsonObject = json.loads(json.dumps(dataclasses.asdict(self.flags) | once))
         return flags
@@ -228,7 +229,7 @@ class RunConfig:
 
 
 def _facts(part: Tracker | Policy) -> JsonObject:
-    """What a tracker or policy says of itself as JSON, and the hash of its code where that is another package's."""
+    """Own description of a tracker or policy, and the hash of its code if it is of another package, as JSON."""
     code = own_code(part)
     return plain_facts(part.describe() | ({} if code is None else {"code": code}))
 
@@ -245,20 +246,18 @@ def recording_run(options: RecordOptions) -> RunOptions:
     Raises:
         InputError: A number is out of range.
     """
-    if options.episodes < 1:
-        raise InputError(f"--episodes {options.episodes}: expected at least 1")
-    if options.seed_series < 0:
-        raise InputError(f"--seed-series {options.seed_series}: expected at least 0")
+    check_least(options, 1, "episodes")
+    check_least(options, 0, "seed_series")
     if not 0.0 <= options.disturb_scale <= MOST_DISTURBANCE:
         raise InputError(f"--disturb-scale {options.disturb_scale:g}: expected 0 to {MOST_DISTURBANCE:g}")
     if not options.disturb and options.disturb_scale != 1.0:
         raise InputError("--disturb-scale: belongs to disturbed execution; drop it or --no-disturb")
     if options.accept_differences:
         raise InputError("--accept-differences: belongs to --from, which is not given")
-    shared = {f.name for f in dataclasses.fields(RunOptions)} & {f.name for f in dataclasses.fields(options)}
     attempts = options.episodes * (rounds.ATTEMPTS if options.only_success else 1)
-    run = RunOptions(
-        **{name: getattr(options, name) for name in shared},
+    run = shared(
+        options,
+        RunOptions,
         seeds=(options.seed_series,),
         repeats=attempts,
         record=True,
@@ -459,11 +458,8 @@ def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, 
 
 
 def _policy_options(options: RunOptions) -> JsonObject:
-    """What a policy is made with besides its spec; flags of another policy are refused."""
+    """Arguments of a policy besides its spec."""
     scheme = options.policy.partition(":")[0]
-    for name in ("replan", "ensemble"):
-        if getattr(options, name) and scheme != "lerobot":
-            raise InputError(f"{flag_name(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
     if scheme == "remote":
         return {
             "timeout": options.remote_timeout,
@@ -472,9 +468,6 @@ def _policy_options(options: RunOptions) -> JsonObject:
             "verify_ssl": not options.remote_insecure,
             "labels": options.labels or "v3.1",
         }
-    for field in dataclasses.fields(options):
-        if field.name.startswith("remote_") and getattr(options, field.name) != field.default:
-            raise InputError(f"{flag_name(field.name)}: belongs to --policy remote:<url>, not {options.policy}")
     return {"replan": options.replan, "ensemble": options.ensemble} if scheme == "lerobot" else {}
 
 
@@ -487,7 +480,7 @@ def _shown(path: Path) -> str:
 
 
 def _decisive(scheme: str, path: Path) -> Path:
-    """What of a policy's path counts by content: of a training the checkpoint, of a dataset its description.
+    """Part of a policy's path that counts by content: of a training the checkpoint, of a dataset its description.
 
     The policy itself says the hash of the actions that it plays.
     """

@@ -134,7 +134,7 @@ def _cut(number: int) -> str:
 
 
 def listed(episode: Episode) -> JsonObject:
-    """What `list --json` prints of an episode.
+    """Entry of an episode in `list --json`.
 
     `sampled` and `placed` are keyed by the object's name in the original's records. A placed object names its prim, its
     `position` [m] and its `orientation` (wxyz). `light` is the episode's distant light, or null under the scene's dome.

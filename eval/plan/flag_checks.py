@@ -8,17 +8,16 @@ import re
 from collections.abc import Mapping
 
 from arena_newton.cli.extras import require
+from arena_newton.cli.flags import check_least, flag_name
 from arena_newton.errors import InputError
-from arena_newton.eval.plan.options import RunOptions, is_quick
+from arena_newton.eval.plan.options import Ray, Recording, Remote, RunOptions, Viewer, flags_of, is_quick
 from arena_newton.eval.records.sharding import parse_shard
 from arena_newton.files.text import plain_text, unprintable
 from arena_newton.pictures.settings import MOST_PORT, VIEWERS
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 
-__all__ = ["DRIVES", "LABELS", "RAY_FLAGS", "check_flags", "check_ray", "check_width", "flag_name"]
+__all__ = ["DRIVES", "LABELS", "check_flags", "check_ray", "check_width"]
 
-RAY_FLAGS = ("ray_actors", "ray_cpus", "ray_gpus", "ray_minutes", "ray_attempts")
-"""Flags that belong to --ray."""
 DRIVES: Mapping[str, DriveGains | None] = {
     "auto": None,
     "twist2": TWIST2_DRIVE,
@@ -27,11 +26,6 @@ DRIVES: Mapping[str, DriveGains | None] = {
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
 LABELS = ("v3.1", "v4")
 """Label protocols, `data.readers.label_protocols.LABELS`, which loads torch."""
-
-
-def flag_name(field: str) -> str:
-    """A flag as it is typed, from the name of its field."""
-    return f"--{field.replace('_', '-')}"
 
 
 def check_flags(options: RunOptions) -> None:
@@ -51,14 +45,12 @@ def check_flags(options: RunOptions) -> None:
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     _check_chunks(options)
     _check_shard(options)
-    if options.video_episodes is not None and options.video_episodes < 1:
-        raise InputError(f"--video-episodes {options.video_episodes}: expected at least 1")
+    check_least(options, 1, "video_episodes", "worlds")
     for name in ("video_episodes", "video_size", "follow"):
         if getattr(options, name) and not (options.video or options.strip or is_quick(options)):
             raise InputError(f"{flag_name(name)}: belongs to --video or --strip, neither is given")
-    for name in ("record_cameras", "record_size", "record_depth"):
-        if getattr(options, name) != getattr(RunOptions, name) and not options.record:
-            raise InputError(f"{flag_name(name)}: belongs to --record, which is not given")
+    _check_belonging(options, Recording, "--record", options.record)
+    _check_policy(options)
     _check_viewer(options)
     check_ray(options)
     check_width(options)
@@ -66,8 +58,24 @@ def check_flags(options: RunOptions) -> None:
         raise InputError("--task all: must be alone, name either all or single tasks")
     if options.seeds and min(options.seeds) < 0:
         raise InputError(f"--seeds {min(options.seeds)}: expected numbers of at least 0")
-    if options.worlds < 1:
-        raise InputError(f"--worlds {options.worlds}: expected at least 1")
+
+
+def _check_belonging(options: Ray | RunOptions, group: type, flag: str, given: bool) -> None:
+    """Refuse flags of a group whose first one is not given."""
+    for name in () if given else flags_of(group):
+        if getattr(options, name) != getattr(group, name):
+            raise InputError(f"{flag_name(name)}: belongs to {flag}, which is not given")
+
+
+def _check_policy(options: RunOptions) -> None:
+    """Refuse flags of other policies."""
+    scheme = options.policy.partition(":")[0]
+    for name in ("replan", "ensemble"):
+        if getattr(options, name) and scheme != "lerobot":
+            raise InputError(f"{flag_name(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
+    for name in () if scheme == "remote" else flags_of(Remote):
+        if getattr(options, name) != getattr(Remote, name):
+            raise InputError(f"{flag_name(name)}: belongs to --policy remote:<url>, not {options.policy}")
 
 
 def _check_shard(options: RunOptions) -> None:
@@ -86,10 +94,8 @@ def _check_shard(options: RunOptions) -> None:
 def _check_chunks(options: RunOptions) -> None:
     """Refuse ways to execute chunks that contradict each other; chunks that are too short show at the first look."""
     replan, late = options.replan, options.latency_ticks
-    if replan is not None and replan < 1:
-        raise InputError(f"--replan {replan}: expected at least 1")
-    if late < 0:
-        raise InputError(f"--latency-ticks {late}: expected at least 0")
+    check_least(options, 1, "replan")
+    check_least(options, 0, "latency_ticks")
     if replan is not None and 0 < replan <= late:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
     if options.ensemble and replan is None and late:
@@ -100,11 +106,8 @@ def _check_chunks(options: RunOptions) -> None:
 
 def _check_viewer(options: RunOptions) -> None:
     """Refuse a viewer that cannot be started, before anything is."""
-    if options.viewer is None:
-        for name in ("viewer_follow", "viewer_port", "viewer_real_time"):
-            if getattr(options, name) != getattr(RunOptions(), name):
-                raise InputError(f"{flag_name(name)}: belongs to --viewer, which is not given")
-    elif options.viewer not in VIEWERS:
+    _check_belonging(options, Viewer, "--viewer", options.viewer is not None)
+    if options.viewer not in (None, *VIEWERS):
         raise InputError(f"--viewer {options.viewer}: unknown, choose from {', '.join(VIEWERS)}")
     if options.viewer_follow and options.viewer != "viser":
         raise InputError(f"--viewer-follow: belongs to --viewer viser, not {options.viewer}")
@@ -131,35 +134,29 @@ def check_width(options: RunOptions) -> None:
         return
     if not 0 < width < 1:
         raise InputError(f"--until-width {width:g}: expected more than 0 and less than 1, such as 0.14")
-    if most is not None and most < 1:
-        raise InputError(f"--max {most}: expected at least 1")
+    check_least(options, 1, "max")
     if options.shard is not None:
         raise InputError("--shard: does not go with --until-width, whose episodes follow from the earlier ones")
 
 
-def check_ray(options: RunOptions) -> None:
+def check_ray(options: Ray) -> None:
     """Refuse a cluster that cannot be asked for, before one is looked for.
 
     Raises:
         InputError: A number is out of range, a flag does not go with it, or the extra is missing.
     """
+    _check_belonging(options, Ray, "--ray", options.ray is not None)
     if options.ray is None:
-        for name in RAY_FLAGS:
-            if getattr(options, name) != getattr(RunOptions, name):
-                raise InputError(f"{flag_name(name)}: belongs to --ray, which is not given")
         return
     addresses = [text for text in options.ray if text == "auto" or re.fullmatch(r"[^/\s]+:[0-9]{1,5}", text)]
     if len(options.ray) > 1 or len(addresses) < len(options.ray):
         raise InputError(f"--ray {' '.join(options.ray)}: expected one address, such as 10.0.0.1:6379, auto, or none")
-    for name in ("ray_actors", "ray_cpus", "ray_attempts"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise InputError(f"{flag_name(name)} {value}: expected at least 1")
+    check_least(options, 1, "ray_actors", "ray_cpus", "ray_attempts")
     gpus, minutes = options.ray_gpus, options.ray_minutes
     if gpus is not None and not 0 < gpus <= 1:
         raise InputError(f"--ray-gpus {gpus:g}: expected more than 0 and at most 1; an environment is on one GPU")
     if not 0 < minutes < math.inf:
         raise InputError(f"--ray-minutes {minutes:g}: expected more than 0, and finite")
-    if options.viewer is not None:
+    if getattr(options, "viewer", None) is not None:
         raise InputError("--viewer: shows worlds of this process, and with --ray none are; drop one of both")
     require("ray", "--ray")

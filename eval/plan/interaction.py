@@ -1,4 +1,4 @@
-"""What a robot must find, come to and touch in a task: what the signals of a failure are measured against.
+"""Interaction of a robot with the things that a task has it find, approach and touch, by which failures are measured.
 
 Nothing heavy is imported here: a plan reads it, too.
 """

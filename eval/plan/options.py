@@ -1,7 +1,12 @@
-"""Flags of the commands, as a user gives them."""
+"""Flags of a run and of a recording, as a user gives them, and the groups of flags that other commands share.
+
+A command's dataclass inherits the groups that it has, the last one of its `--help` first: fields of a dataclass stand
+in the order of its bases from the last to the first, then its own.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -13,14 +18,17 @@ __all__ = [
     "QUICK_REPEATS",
     "QUICK_SEEDS",
     "QUICK_TRACKERS",
-    "BenchOptions",
-    "CertifyOptions",
-    "FilmOptions",
-    "LoopOptions",
+    "Batch",
+    "Chunks",
+    "Conditions",
+    "Stepping",
+    "Ray",
     "RecordOptions",
-    "ReportOptions",
-    "RunMergeOptions",
+    "Recording",
+    "Remote",
     "RunOptions",
+    "Viewer",
+    "flags_of",
     "is_quick",
 ]
 
@@ -32,15 +40,14 @@ QUICK_TRACKERS = ("twist2", "sonic")
 """Trackers of the default run: those whose weights come with the package."""
 
 
-@dataclass(frozen=True)
-class RunOptions:
-    """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
+def flags_of(group: type) -> tuple[str, ...]:
+    """Names of a group's fields."""
+    return tuple(one.name for one in dataclasses.fields(group))
 
-    Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
-    both trackers, a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where
-    one comes with the package, and the report opens with film strips. As soon as one of them is given, the rest follows
-    the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
-    """
+
+@dataclass(frozen=True)
+class Tested:
+    """Tasks, and the trackers and the policy that do them."""
 
     task: Several[str] = ()
     """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
@@ -53,6 +60,12 @@ class RunOptions:
     """Policy that decides it: expert, stand, learned (the one that comes with the package; learned:<folder of eval
     pack>), lerobot:<checkpoint or training>, replay:<clip, or actions of --actions>, replay:<LeRobot
     dataset>#<episode, or all>, remote:<url>."""
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """How a policy's actions are understood, and how many of a chunk are executed."""
+
     labels: str | None = None
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
     itself when none is named, and v3.1 where it says nothing."""
@@ -63,33 +76,48 @@ class RunOptions:
     --replan says."""
     latency_ticks: int = 0
     """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions under which tasks are done."""
+
     mode: Several[str] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"
     """Gains of the joints' drives: auto (what rule set and tracker ask for), twist2, humanoidarena."""
-    seeds: Several[int] = ()
-    """Group seeds; the protocol's are 0 1 2."""
-    repeats: int | None = None
-    """Episodes per group seed; the protocol's are 20."""
-    until_width: float | None = None
-    """Instead of --repeats: play each task, tracker and mode until the 95 % interval of its success rate is as narrow,
-    such as 0.14; looked at every 20 episodes, group seeds in turn."""
-    max: int | None = None
-    """With --until-width: episodes of each task, tracker and mode at most, 200 when not given."""
+    variant: str | None = None
+    """USD file that replaces or extends the scene of the one task named."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Worlds, and what simulates them."""
+
     worlds: int = 20
     """Episodes simulated at once."""
     engine: str = "auto"
     """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
     device: str | None = None
     """Device of engine warp and of the networks: cpu, cuda, cuda:1; the best there is when none is named."""
-    variant: str | None = None
-    """USD file that replaces or extends the scene of the one task named."""
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """Rate and length of the simulation."""
+
     fast_physics: bool = False
     """Run a 1 ms tracker at 5 ms x 4 substeps."""
     max_steps: int | None = None
     """Cap on the step budget of the rule set [ticks of 0.02 s]."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Videos and film strips."""
+
     video: bool = False
     """Write ego and world videos (H.264 MP4), one pair per episode."""
     strip: bool = False
@@ -100,6 +128,12 @@ class RunOptions:
     """Size of the world camera's pictures, such as 960x540 [px]."""
     follow: bool = False
     """Let the world camera follow the robot."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Episodes as files of which datasets are built."""
+
     record: bool = False
     """Write what a dataset is built of: an NPZ per episode and an MP4 per camera, one frame per tick, in episodes/."""
     record_cameras: tuple[str, ...] = ("front",)
@@ -108,6 +142,12 @@ class RunOptions:
     """Size of their pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """Worlds shown while they run."""
+
     viewer: str | None = None
     """Show the first 16 worlds while they run: viser (a page on this machine), rerun (its page), usd (<out>/viewer)."""
     viewer_port: int = 8080
@@ -116,16 +156,12 @@ class RunOptions:
     """Let the page's camera go with the first robot."""
     viewer_real_time: bool = False
     """Hold the run back to real time while a viewer shows it."""
-    viewer_failures: bool = False
-    """Write a .viser recording of each episode that fails, to walk around in."""
-    actions: bool = False
-    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
-    tracker in a run."""
-    failures: bool = False
-    """Keep the signals that tell why an episode failed (docs/failures.md); looks at the head camera twice a second."""
-    shard: str | None = None
-    """Play part n of N of the plan, such as 3/16, into a folder of its own; `merge` joins them. slurm: the part of this
-    task of a Slurm array; slurm/16 where the array has not all 16."""
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Processes of a cluster."""
+
     ray: tuple[str, ...] | None = None
     """Let processes of a Ray cluster play, and keep the journal here: its address, such as 10.0.0.1:6379, or auto; with
     no address, a Ray of its own on this machine."""
@@ -136,20 +172,28 @@ class RunOptions:
     ray_gpus: float | None = None
     """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
     ray_minutes: float = 60.0
-    """With --ray: a slice of the plan, at most two batches of worlds, that takes longer is stopped and played again."""
+    """With --ray: a slice of a run, at most two batches of worlds, that takes longer is stopped and played again."""
     ray_attempts: int = 3
     """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """Part of the plan, folder and what is printed."""
+
+    shard: str | None = None
+    """Play part n of N of the plan, such as 3/16, into a folder of its own; `merge` joins them. slurm: the part of this
+    task of a Slurm array; slurm/16 where the array has not all 16."""
     out: str | None = None
     """Results folder; results/<date>_<time> when none is named."""
     verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
     """Print the whole configuration."""
-    accept_versions: bool = False
-    """Continue a folder that was begun with other versions of the libraries; the journal then names both."""
-    skip_broken: bool = False
-    """When simulator or tracker break down as a whole, end the episodes that were running as errors and go on.
-    Without it such a break stops the run and leaves them unplayed."""
-    retry_errors: bool = False
-    """On resume, run episodes again that ended with an error."""
+
+
+@dataclass(frozen=True)
+class Remote:
+    """Requests to a policy server."""
+
     remote_timeout: float = 60.0
     """For --policy remote: deadline of a request with all its attempts [s]."""
     remote_retries: int = 4
@@ -158,6 +202,47 @@ class RunOptions:
     """For --policy remote: ask for one world after the other, in their order."""
     remote_insecure: bool = False
     """For --policy remote: do not check the certificate of an https server."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Episodes of an evaluation."""
+
+    seeds: Several[int] = ()
+    """Group seeds; the protocol's are 0 1 2."""
+    repeats: int | None = None
+    """Episodes per group seed; the protocol's are 20."""
+    until_width: float | None = None
+    """Instead of --repeats: play each task, tracker and mode until the 95 % interval of its success rate is as narrow,
+    such as 0.14; looked at every 20 episodes, group seeds in turn."""
+    max: int | None = None
+    """With --until-width: episodes of each task, tracker and mode at most, 200 when not given."""
+
+
+@dataclass(frozen=True)
+class RunOptions(Remote, Output, Ray, Viewer, Recording, Pictures, Stepping, Batch, _Plan, Conditions, Chunks, Tested):
+    """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
+
+    Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
+    both trackers, a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where
+    one comes with the package, and the report opens with film strips. As soon as one of them is given, the rest follows
+    the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
+    """
+
+    viewer_failures: bool = False
+    """Write a .viser recording of each episode that fails, to walk around in."""
+    actions: bool = False
+    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
+    tracker in a run."""
+    failures: bool = False
+    """Keep the signals that tell why an episode failed (docs/failures.md); looks at the head camera twice a second."""
+    accept_versions: bool = False
+    """Continue a folder that was begun with other versions of the libraries; the journal then names both."""
+    skip_broken: bool = False
+    """When simulator or tracker break down as a whole, end the episodes that were running as errors and go on.
+    Without it such a break stops the run and leaves them unplayed."""
+    retry_errors: bool = False
+    """On resume, run episodes again that ended with an error."""
     seeing: Annotated[bool, tyro.conf.Suppress] = False
     """Also play a few episodes of the policy that comes with the package (the default run)."""
     series: Annotated[int | None, tyro.conf.Suppress] = None
@@ -177,27 +262,9 @@ def is_quick(options: RunOptions) -> bool:
 
 
 @dataclass(frozen=True)
-class RecordOptions:
-    """Record demonstrations: episodes as files, of which `python -m arena_newton.data build` makes a dataset.
+class _Demonstrations:
+    """Number and kind of demonstrations."""
 
-    Seeds are of a range of their own, which no evaluation plays. `python -m arena_newton.eval resume <out>` continues.
-    With --from FOLDER recorded episodes are played again, action by action, for more cameras.
-    """
-
-    task: Several[str] = ()
-    """Task names, or `all`; all when none is named."""
-    tracker: Several[str] = ()
-    """Trackers that execute the 40D action: twist2 (when none is named) sonic ..."""
-    checkpoint: str | None = None
-    """Weights of the one tracker named; those that come with the package when none are named."""
-    policy: str = "expert"
-    """Policy that is recorded."""
-    mode: Several[str] = ()
-    """Modes: base (when none is named) execution semantic visual."""
-    rules: str = "paper"
-    """Rule set: paper or released."""
-    drive: str = "auto"
-    """Gains of the joints' drives: auto, twist2, humanoidarena."""
     episodes: int = 100
     """Episodes of each task, tracker and mode."""
     only_success: bool = False
@@ -214,225 +281,17 @@ class RecordOptions:
     """Size of the pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     depth: bool = False
     """Write the depth of each picture too, float16 [m]."""
-    worlds: int = 20
-    """Episodes simulated at once."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
-    variant: str | None = None
-    """USD file that replaces or extends the scene of the one task named."""
-    fast_physics: bool = False
-    """Run a 1 ms tracker at 5 ms x 4 substeps."""
-    max_steps: int | None = None
-    """Cap on the step budget of the rule set [ticks of 0.02 s]."""
-    shard: str | None = None
-    """Record part n of N of the plan, such as 3/16 or slurm, into a folder of its own; not with --only-success."""
-    ray: tuple[str, ...] | None = None
-    """Let processes of a Ray cluster play, and keep the journal here: its address, such as 10.0.0.1:6379, or auto; with
-    no address, a Ray of its own on this machine."""
-    ray_actors: int | None = None
-    """With --ray: processes that play at once; as many as the cluster has room for when not given."""
-    ray_cpus: int | None = None
-    """With --ray: cores of each of them; 4, or all of the smallest node where it has fewer, when not given."""
-    ray_gpus: float | None = None
-    """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
-    ray_minutes: float = 60.0
-    """With --ray: a slice of the plan, at most two batches of worlds, that takes longer is stopped and played again."""
-    ray_attempts: int = 3
-    """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
-    out: str | None = None
-    """Folder; results/<date>_<time> when none is named."""
-    verbose: Annotated[bool, tyro.conf.arg(aliases=["-v"])] = False
-    """Print the whole configuration."""
+
+
+@dataclass(frozen=True)
+class RecordOptions(Output, Ray, Stepping, Batch, _Demonstrations, Conditions, Tested):
+    """Record demonstrations: episodes as files, of which `python -m arena_newton.data build` makes a dataset.
+
+    Seeds are of a range of their own, which no evaluation plays. `python -m arena_newton.eval resume <out>` continues.
+    With --from FOLDER recorded episodes are played again, action by action, for more cameras.
+    """
+
     source: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Play the recorded episodes of this folder again, and write them with these cameras to --out."""
     accept_differences: bool = False
     """With --from: go on although code, tracker, rules or scene are not those of the recording."""
-
-
-@dataclass(frozen=True)
-class LoopOptions:
-    """Record demonstrations, build a dataset, train a policy, evaluate it, and report: the whole loop in one command.
-
-    Each stage resumes: after an interruption the same command continues, and what is finished is not repeated.
-    """
-
-    task: tuple[str, ...] = ("vis_navi",)
-    """Tasks, which one policy learns together."""
-    tracker: str = "twist2"
-    """Tracker that records and executes."""
-    policy: str = "act"
-    """Family: act, diffusion, flow or pi05."""
-    recipe: str | None = None
-    """Settings of the training: fast (when none is named), paper, released, compact."""
-    minutes: float | None = None
-    """Time of the training [min]; the schedule is fitted to it. The recipe's number of steps when none is given."""
-    steps: int | None = None
-    """Optimizer steps instead of the recipe's."""
-    episodes: int | None = None
-    """Successes to record of each task: 100, or 3 episodes under --small."""
-    repeats: int | None = None
-    """Episodes of the evaluation for each of the group seeds 0 1 2: 20, or 1 under --small."""
-    seed: int = 0
-    """Seed of the training, and series of the recorded seeds."""
-    worlds: int | None = None
-    """Episodes simulated at once: 100 on CUDA and 20 on the CPU when none is given."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine, networks and training: cpu, cuda, cuda:1."""
-    size: str | None = None
-    """Size of the recorded pictures, which is what the policy sees: 224x224, or 64x64 under --small [px]."""
-    max_steps: int | None = None
-    """Cap on the step budget of the rule set [ticks of 0.02 s]."""
-    weights: str | None = None
-    """Pretrained weights for the training: a name on the hub or a local folder."""
-    small: bool = False
-    """A loop for tests of the machinery: few episodes, small pictures, the recipe `small`; it learns nothing."""
-    out: str | None = None
-    """Folder; results/loop_<tasks>_<tracker>_<policy>_<recipe> when none is named."""
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """Write tables and reports of a results folder again from its journal; of several folders print one table."""
-
-    table: bool = False
-    """Print a table of successes per task, tracker and mode as Markdown, and write nothing."""
-    json: bool = False
-    """Print results.json instead of the table."""
-    own_tracker: str | None = None
-    """Of a swapped run with --failures and --actions: first play its actions through this tracker, the one that the
-    policy was trained with, into <out>/own; the report then says how many failures succeed so."""
-
-
-@dataclass(frozen=True)
-class RunMergeOptions:
-    """Join the folders of shards into one results folder, as if one machine had played the plan.
-
-    Recordings are copied, tables and report are written from the joined journal. Nothing in the shards changes.
-    """
-
-    out: str | None = None
-    """Folder to write; it must be new."""
-    partial: bool = False
-    """Join what there is although shards are missing or unfinished; `resume <out>` plays the rest."""
-    accept_versions: bool = False
-    """Join shards that were played with other versions of the libraries; the folder then names all."""
-
-
-@dataclass(frozen=True)
-class FilmOptions:
-    """Show one success per task of one or several results folders in a single film or picture."""
-
-    out: str = "film.webp"
-    """File to write: .webp, .gif or .mp4 is a film of the world videos side by side (run --video), .jpg or .png the
-    world strips one below the other (run --strip)."""
-    seconds: float = 12.0
-    """Length of the film [s]; every episode is played from its start to its end in it."""
-    width: int = 960
-    """Width of the film or picture [px]."""
-    max_mb: float = 3.0
-    """Largest size of a .webp film [MB]; its quality is lowered until it fits."""
-
-
-@dataclass(frozen=True)
-class BenchOptions:
-    """Measure this machine against the figures to reach; ratios are taken side by side in one run."""
-
-    what: tuple[str, ...] = ("all",)
-    """What to measure: help tick generator throughput camera pictures recording episodes policy learned start tests, or
-    `all`
-    (all but tests)."""
-    checkpoint: str | None = None
-    """Weights of TWIST2; those that come with the package when none are named."""
-    worlds: int = 20
-    """Worlds of engine mujoco."""
-    cuda_worlds: int = 4096
-    """Worlds on CUDA."""
-    camera_worlds: int = 1024
-    """Worlds of the camera on CUDA."""
-    rounds: int = 20
-    """Rounds of each ratio; their medians are compared."""
-    recording_episodes: int = 2
-    """Episodes of `recording`; the figure to reach is for 100 VisNavi ones."""
-    recording_worlds: int = 2
-    """Worlds of `recording`; 100 on CUDA for the figure to reach."""
-    recording_size: str = "224x224"
-    """Size of the recorded pictures [px]."""
-    recording_task: str = "vis_navi"
-    """Task that is recorded."""
-    policy_checkpoint: str | None = None
-    """Checkpoint of `policy`; one of `--policy-family` of full size with random weights when none is named."""
-    policy_family: str = "act"
-    """Family of those random weights: act, diffusion, flow or pi05 (4 billion, which takes minutes to make)."""
-    policy_tasks: tuple[str, ...] = ("vis_navi", "boxing")
-    """Tasks of `policy`."""
-    policy_episodes: int = 0
-    """Episodes of `policy`, all at once; 0: 60 on CUDA, for which the figures to reach are, and 2 on the CPU."""
-    policy_steps: int = 0
-    """Ticks of an episode of `policy` at most; 0: what the rules or the length of usual successes say."""
-    learned_ticks: int = 300
-    """Ticks of an episode of `learned`, and of the expert's beside it."""
-    peers: Several[str] = ()
-    """Measure beside other programs instead: tick world_ticks act_training tracker_training lerobot_eval camera, or
-    `all`."""
-    peers_dataset: str | None = None
-    """Dataset of `act_training`, read by both sides."""
-    mjlab_python: str | None = None
-    """Interpreter that has mjlab, for `tracker_training`."""
-    peers_worlds: Several[int] = ()
-    """Worlds of `tracker_training`; 4096 and 8192 on CUDA, 4 on the CPU when none are named."""
-    peers_iterations: int = 10
-    """Iterations of PPO in a round of `tracker_training`."""
-    peers_rounds: int = 3
-    """Rounds of `tracker_training` and `lerobot_eval`."""
-    peers_episodes: int = 0
-    """Episodes of `lerobot_eval`, all at once, by `--policy-checkpoint` or the policy of the package; 0: 60 on CUDA, 2
-    on the CPU."""
-    peers_steps: int = 0
-    """Cap on the ticks of an episode of `lerobot_eval`; 0: what the rules say."""
-    peers_size: int = 224
-    """Width and height of the pictures of `camera` [px]."""
-    peers_history: str | None = None
-    """File to which each pair that was measured is appended as a JSON line."""
-    json: bool = False
-    """Print one JSON array instead of the table."""
-
-
-@dataclass(frozen=True)
-class CertifyOptions:
-    """Measure what the benchmark claims of itself: solvable tasks that need legs, clean axes, engines that agree.
-
-    The tasks' experts play in all checks but policy-inputs, execution, physics, camera and statistics. Exit code 0: no
-    check fails; 1: one fails; 2: bad input.
-    """
-
-    out: str = "results/certify"
-    """Folder of the certificate and of the evaluations behind it."""
-    quick: bool = False
-    """A few episodes of everything by two processes: minutes instead of hours, and wide intervals."""
-    task: Several[str] = ()
-    """Tasks; all that have an expert when none is named."""
-    tracker: tuple[str, ...] = ("twist2", "sonic")
-    """Trackers, with the weights they come with; the first one alone where one is enough."""
-    checks: Several[str] = ()
-    """Names of checks to run: journal recording solvable policy-inputs tracker-inputs frozen-legs gliding-base visual
-    semantic execution physics camera rules engines batches official shards ray swap visible sill failures statistics
-    gradients; all when none is named."""
-    episodes: int | None = None
-    """Episodes of each cell: 60, the protocol's, or 4 under --quick."""
-    worlds: int = 20
-    """Episodes simulated at once."""
-    engine: str = "mujoco"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
-    twist2_checkpoint: str | None = None
-    """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
-    jobs: int = 1
-    """Processes that play at once, each on cores of its own, 2 under --quick (0: only play and write no page, as each
-    of them does)."""
-    resume: bool = False
-    """Continue a certification in its folder; what was played is kept."""

@@ -25,7 +25,7 @@ LOOK_EVERY = 20
 
 @dataclass(frozen=True)
 class WidthRule:
-    """When a task, tracker and mode has enough episodes; said before the first one is played."""
+    """Rule by which a task, tracker and mode has enough episodes; printed before the first one is played."""
 
     width: float
     """Of the 95 % interval of the success rate, 0 to 1."""
@@ -82,6 +82,6 @@ def due(group: Sequence[int], ended: Mapping[int, str], keep: int | None, rule: 
 def complete(
     planned: int, groups: int, ended: Mapping[int, str], keep: int | None, rule: WidthRule | None = None
 ) -> bool:
-    """Whether a plan of equally large groups, one after the other, is played."""
+    """True if a plan of equally large groups, one after the other, is played."""
     size = planned // max(groups, 1)
     return not any(due(range(g * size, (g + 1) * size), ended, keep, rule) for g in range(groups))

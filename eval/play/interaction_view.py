@@ -1,4 +1,4 @@
-"""How far a robot is from what its task wants touched: an `interaction.Interaction` measured in running worlds."""
+"""Distances of an `interaction.Interaction`, measured in running worlds: of robot and hands to the things to touch."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import OWN_FOLDER
 from arena_newton.eval.folders.run_folder import stored_options
-from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.plan.options import Batch, Conditions, RunOptions, Stepping, flags_of
 
 __all__ = ["own_options"]
 
@@ -31,20 +31,6 @@ def own_options(folder: Path, tracker: str) -> RunOptions:
         raise InputError(f"{where}: {folder} was played through it; name the tracker that the policy was trained with")
     if (folder / OWN_FOLDER).is_symlink():
         raise InputError(f"{where}: {folder / OWN_FOLDER} is a link; a run writes inside its own folder only")
-    return RunOptions(
-        task=stored.task,
-        tracker=(tracker,),
-        policy=f"replay:{actions}",
-        mode=stored.mode,
-        rules=stored.rules,
-        drive=stored.drive,
-        seeds=stored.seeds,
-        repeats=stored.repeats,
-        worlds=stored.worlds,
-        engine=stored.engine,
-        device=stored.device,
-        variant=stored.variant,
-        fast_physics=stored.fast_physics,
-        max_steps=stored.max_steps,
-        out=str(folder / OWN_FOLDER),
-    )
+    groups = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping))
+    same = {name: getattr(stored, name) for name in ("task", "seeds", "repeats", *groups)}
+    return RunOptions(**same | {"tracker": (tracker,), "policy": f"replay:{actions}", "out": str(folder / OWN_FOLDER)})

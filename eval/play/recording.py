@@ -47,7 +47,7 @@ PROCESS_CORES = 4
 def facts_of(
     config: RunConfig, task: str, tracker: str, environment: JsonObject, versions: Mapping[str, str | None]
 ) -> JsonObject:
-    """What an episode's file says of the run: what its bytes depend on, and no time, folder or number of worlds.
+    """Facts about the run in an episode's file: all that its bytes depend on, and no time, folder or number of worlds.
 
     Only what concerns the episode's own task and tracker, so that its bytes do not depend on what else was played.
     """
@@ -104,12 +104,12 @@ def encoding_processes() -> int:
 
 
 def disturbance_of(config: RunConfig, task: str, ticks: int) -> ActionNoise | None:
-    """What disturbs the execution of a task's episodes of so many ticks at most; None where nothing does."""
+    """Disturbance of the execution of a task's episodes of so many ticks at most; None without one."""
     return ActionNoise(ticks, NoiseLevels().scaled(config.noise_scale(task))) if config.flags.disturb else None
 
 
 def is_recorded(config: RunConfig, folder: Path, record: EpisodeRecord, episode: Episode) -> bool:
-    """Whether the files of a journalled episode are whole, or it has none to write.
+    """True if the files of a journalled episode are whole, or it has none to write.
 
     Files get their names when they are complete, so that this finds what was removed, cut or exchanged later.
     """
@@ -129,7 +129,7 @@ def is_recorded(config: RunConfig, folder: Path, record: EpisodeRecord, episode:
 
 
 def _whole(file: EpisodeFile, cameras: Iterable[str]) -> bool:
-    """Whether each video has a frame per row, by its index."""
+    """True if each video has a frame per row, by its index."""
     for camera in cameras:
         try:
             with av.open(str(file.video(camera))) as video:
@@ -141,7 +141,7 @@ def _whole(file: EpisodeFile, cameras: Iterable[str]) -> bool:
 
 
 def outcome_lines(config: RunConfig, folder: Path, records: Sequence[EpisodeRecord]) -> list[str]:
-    """What was recorded, what was dropped, where it is, and how a dataset is made of it."""
+    """Lines on the recorded and dropped episodes, their folder, and the command that makes a dataset of them."""
     if config.recording is None:
         return []
     keep = config.flags.keep

@@ -19,6 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from arena_newton.cli.flags import flag_name
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.data.recording.demonstration import DemonstrationRecorder, RecordedEpisode
 from arena_newton.data.recording.episode import (
@@ -34,8 +35,8 @@ from arena_newton.doctor import versions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.plan.config import RunConfig, plain_facts, recorded_cameras, resolve
-from arena_newton.eval.plan.flag_checks import DRIVES, RAY_FLAGS
-from arena_newton.eval.plan.options import RecordOptions, RunOptions
+from arena_newton.eval.plan.flag_checks import DRIVES
+from arena_newton.eval.plan.options import Ray, RecordOptions, RunOptions, flags_of
 from arena_newton.eval.play import recording
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.records.identity import differing_key
@@ -118,21 +119,13 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
     source = Path(str(options.source)).expanduser()
     if options.out is None:
         raise InputError("record --from: name a folder for the new files with --out")
-    given = {"task": (), "tracker": (), "mode": (), "policy": "expert", "rules": "paper", "episodes": 100}
-    given |= {
-        "only_success": False,
-        "disturb": True,
-        "disturb_scale": 1.0,
-        "seed_series": 0,
-        "max_steps": None,
-        "drive": "auto",
-        "shard": None,
-    }
-    given |= {name: getattr(RecordOptions, name) for name in ("ray", *RAY_FLAGS)}
-    for name, default in given.items():
-        if getattr(options, name) != default:
+    recorded = (
+        "task tracker mode policy rules episodes only_success disturb disturb_scale seed_series max_steps drive shard"
+    )
+    for name in (*recorded.split(), *flags_of(Ray)):
+        if getattr(options, name) != getattr(RecordOptions, name):
             why = "plays a plan" if name.startswith("ray") else "is in the recording"
-            raise InputError(f"--{name.replace('_', '-')}: {why}; drop it beside --from")
+            raise InputError(f"{flag_name(name)}: {why}; drop it beside --from")
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")
     pictures = RunOptions(record_cameras=options.cameras, record_size=options.size, record_depth=options.depth)
@@ -149,7 +142,7 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
 
 
 def _done(out: Path, source: EpisodeFile, config: RunConfig) -> bool:
-    """Whether an earlier call wrote the episode with these cameras."""
+    """True if an earlier call wrote the episode with these cameras."""
     path = out / EPISODES / source.path.name
     try:
         if not path.is_file() or path.is_symlink():
@@ -168,7 +161,7 @@ def _done(out: Path, source: EpisodeFile, config: RunConfig) -> bool:
 
 
 def _checked(options: RecordOptions, key: tuple[str, ...], group: Sequence[EpisodeFile], made: Factories) -> RunConfig:
-    """How the episodes of a group are played: as they were recorded.
+    """Configuration with which the episodes of a group are played: as they were recorded.
 
     Raises:
         InputError: It was recorded with something else than what is installed here.
@@ -377,7 +370,7 @@ def _planned(number: int, file: EpisodeFile) -> RecordedEpisode:
 
 
 def _result(number: int, file: EpisodeFile) -> EpisodeResult:
-    """How the recorded episode ended."""
+    """Ending of the recorded episode."""
     return EpisodeResult(
         number, file.text("arena_outcome"), file.text("arena_reason"), file.rows, float(file.array("arena_margin"))
     )

@@ -28,8 +28,7 @@ from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import DRIVES
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import recording
-from arena_newton.eval.play.signal_recorder import SignalRecorder
-from arena_newton.eval.play.whole_run import (
+from arena_newton.eval.play.run_flow import (
     Group,
     RunStopped,
     begun,
@@ -42,6 +41,7 @@ from arena_newton.eval.play.whole_run import (
     run_and_report,
     told_how_to_go_on,
 )
+from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.episode_signals import EpisodeSignals
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, StorageError
 from arena_newton.eval.reports import console
@@ -73,7 +73,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Factories:
-    """What a run builds its parts with; tests put their own in."""
+    """Constructors of a run's parts; tests put their own in."""
 
     env: Callable[..., World] = ArenaEnv
     tracker: Callable[[str, Path | None], Tracker] = trackers.get
@@ -189,7 +189,7 @@ def _play(
 
 
 class EpisodeLines(Protocol):
-    """Where finished episodes go: the journal, or what passes them on to it."""
+    """Sink of finished episodes: the journal, or what passes them on to it."""
 
     records: list[EpisodeRecord]
 
@@ -198,7 +198,7 @@ class EpisodeLines(Protocol):
 
 
 class ProgressSink(Protocol):
-    """What is told of episodes while they run (`progress.Progress`)."""
+    """Sink of the progress of episodes while they run (`progress.Progress`)."""
 
     def tick(self, active: int) -> None:
         """One tick of so many worlds is over."""
@@ -223,17 +223,17 @@ class RunPlayer:
     factories: Factories
     policy: Policy
     viewer: WorldViewer | None = None
-    """What shows the worlds, if anything does."""
+    """Viewer of the worlds, if any."""
     batch: int | None = None
     """Worlds of every environment; None: as --worlds says, no more than there are episodes."""
     progress: ProgressSink = field(init=False)
     hashes: dict[str, str | None] = field(default_factory=dict)
-    """What the present environment's episodes name their run by; empty before it is built."""
+    """Hashes by which the present environment's episodes name their run; empty before it is built."""
     ended: dict[int, EpisodeRecord] = field(default_factory=dict)
     """Episodes that are in the journal, their files whole, by number; of two lines the last."""
 
     def kept(self) -> str:
-        """How many of the planned episodes are in the journal, in words."""
+        """Number of planned episodes in the journal, in words."""
         return kept(self.config, self.journal.records)
 
     def play(self, ended: dict[int, EpisodeRecord], waiting: Mapping[Group, list[Episode]]) -> None:
@@ -394,7 +394,7 @@ class RunPlayer:
 
 
 def _recorder(config: RunConfig, folder: Path, tracker: str) -> EpisodeRecorder | None:
-    """What takes the pictures; None when none are wanted. Of several trackers each has its name in its files' names."""
+    """Recorder of the pictures; None when none are wanted. File names name the tracker where there are several."""
     flags = config.flags
     if not (flags.video or flags.strip):
         return None

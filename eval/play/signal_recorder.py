@@ -156,7 +156,7 @@ class SignalRecorder(Recorder):
         self._follow(mask, tick, root)
 
     def _follow(self, mask: Tensor, tick: Tensor, root: Tensor) -> None:
-        """What posture and tracker do; it counts a second later."""
+        """Update the signals of posture and tracker; a signal counts a second later."""
         now, loop = self._now, self.env.loop
         error = loop.command.joints[:, self._legs] - loop.state.joint_pos[:, self._legs]
         error = error.square().mean(dim=1).sqrt()
@@ -212,7 +212,7 @@ _BEGIN |= dict.fromkeys("nearest_distance reach_distance stop_distance height_mi
 
 
 def _shapes_of(env: World, prim: str) -> Tensor:
-    """Which shapes of the model belong to a prim, bool, shape [shapes]."""
+    """Shapes of the model that belong to a prim, bool, shape [shapes]."""
     labels = env.scene.model.shape_label
     return torch.tensor([f"{label}/".startswith(f"{prim}/") for label in labels], device=env.torch_device)
 

@@ -76,7 +76,7 @@ class _Identity(TypedDict):
 
 
 class Identity(_Identity, total=False):
-    """What the results depend on, by flag name; only the first four were in every version's config.json."""
+    """Identity of the results, by flag name; only the first four were in every version's config.json."""
 
     version: Name
     task: Annotated[list[Name], Fit("names of tasks", _distinct)]
@@ -111,13 +111,13 @@ class Identity(_Identity, total=False):
     seed_range: Annotated[str, Fit("a range of seeds", lambda value: value in SEED_RANGES)]
     """Absent in an evaluation."""
     disturbance: FactsOrNone
-    """What disturbed the execution of recorded episodes."""
+    """Disturbance of the execution of recorded episodes."""
     keep: Annotated[Positive | None, Fit("a number or null")]
     """Successes to record of each task, tracker and mode."""
 
 
 class Status(TypedDict):
-    """How the last `run` or `resume` in its folder ended."""
+    """Ending of the last `run` or `resume` in its folder."""
 
     state: Literal["started", "success", "cancelled", "error", "partial"]
     """`started`: is running, or was killed; `success`: every planned episode is in the journal; `partial`: was joined
@@ -143,7 +143,7 @@ class Document(_Document, total=False):
 
     versions: Versions
     environments: Annotated[dict[Name, Facts], Fit("facts by task, tracker and mode")]
-    """What each environment said of itself, by task, tracker and mode."""
+    """Each environment's own description, by task, tracker and mode."""
     variant_changes: Annotated[list[str], Fit("sentences")]
     later_versions: Annotated[list[Versions], Fit("versions by library")]
     """Of the libraries that a later `resume --accept-versions` ran with."""
@@ -254,7 +254,7 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
 
 
 def _recorded_again(before: EpisodeRecord, record: EpisodeRecord) -> bool:
-    """Whether an episode was played again because its recording was missing: it ended as before."""
+    """True if an episode was played again because its recording was missing: it ended as before."""
     same = all(getattr(before, key) == getattr(record, key) for key in ("outcome", "reason", "steps"))
     return same and "episode" in (record.media or {})
 

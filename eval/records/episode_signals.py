@@ -1,4 +1,4 @@
-"""What is kept of an episode to tell why it failed: a few running numbers, no trajectory."""
+"""Signals of an episode that tell why it failed: a few running numbers, no trajectory."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class EpisodeSignals:
     reach_distance: Length
     """Smallest distance between an effector and the object [m]."""
     touches: Count
-    """How often an effector came to touch the object."""
+    """Number of times that an effector came to touch the object."""
     first_touch: MaybeTick
     touch_distance: MaybeLength
     """Root to object at the first touch [m]."""

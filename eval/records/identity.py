@@ -1,4 +1,4 @@
-"""What a run is known by: hashes of files, code and scenes, and how two identities are compared."""
+"""Identity of a run: hashes of files, code and scenes, and the comparison of two identities."""
 
 from __future__ import annotations
 
@@ -54,6 +54,7 @@ UNHASHED = (
     "eval/suites",
     "eval/tables",
     "eval/workers",
+    "pages",
     "policies/recipes",
     "policies/train",
     "trackers/evaluation",

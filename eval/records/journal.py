@@ -119,9 +119,9 @@ class EpisodeRecord:
     progress: Fraction | None = None
     """Fraction of the task's predicates that have held; None in a line of schema 1."""
     events: Annotated[tuple[EpisodeEvent, ...], Fit("objects with kind, tick and detail")] = ()
-    """What happened once in the episode, in the order of its ticks."""
+    """Single events of the episode, in the order of its ticks."""
     signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
-    """What tells why it failed; None, and absent in the line, without `eval run --failures`."""
+    """Signals that tell why it failed; None, and absent in the line, without `eval run --failures`."""
 
     @property
     def shown_policy(self) -> str:
@@ -170,6 +170,8 @@ def contradiction(record: EpisodeRecord) -> str | None:
     if record.outcome == "success":
         if record.margin is not None and record.margin < 0.0:
             return f"a success with a margin of {record.margin:g}"
+        if record.progress is not None and record.progress < 1.0:
+            return f"a success with a progress of {record.progress:g}"
         if last != record.steps:
             return f"a success at step {record.steps}, whose last predicate held first at {last}"
     elif record.outcome == "timeout" and record.reason == "timeout" and record.steps != record.max_steps:

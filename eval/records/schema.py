@@ -1,4 +1,4 @@
-"""What files of a results folder may hold: values that others may have written are read and checked before use.
+"""Contents of the files of a results folder: values that others may have written are read and checked before use.
 
 Everything that is derived from a journal (tables, pages, the original's files) is written by names that are stored in
 it, and whoever reads a report may have been sent the folder. A value that fits its type here has a known name or a
@@ -131,10 +131,10 @@ def parse(data: bytes) -> Json:
 
 @dataclass(frozen=True)
 class Fit:
-    """What a stored value must be beyond its type; a part of its annotation."""
+    """Constraint on a stored value beyond its type; a part of its annotation."""
 
     expected: str
-    """What messages say, such as `a number of ticks`."""
+    """Noun phrase for messages, such as `a number of ticks`."""
     test: Callable[[Json], bool] = lambda value: True
 
 
@@ -145,17 +145,17 @@ class Known:
     names: Callable[[], Collection[str]]
 
     def test(self, value: Json) -> bool:
-        """Whether a text is one of the names."""
+        """True if a text is one of the names."""
         return value in self.names()
 
 
 def is_name(value: Json) -> bool:
-    """Whether a value is a text that names something: not empty, not long, printable."""
+    """True if a value is a text that names something: not empty, not long, printable."""
     return isinstance(value, str) and 0 < len(value) <= MAX_NAME and is_printable(value)
 
 
 def _facts(value: Json) -> bool:
-    """Whether the numbers in an object, at any depth, are such that a float can hold them."""
+    """True if the numbers in an object, at any depth, are such that a float can hold them."""
     waiting = [value]
     while waiting:
         part = waiting.pop()
@@ -169,7 +169,7 @@ def _facts(value: Json) -> bool:
 
 
 def _number(value: Json) -> bool:
-    """Whether a value is a number that a float can hold: JSON's integers have no end."""
+    """True if a value is a number that a float can hold: JSON's integers have no end."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -183,7 +183,7 @@ Facts = Annotated[dict[str, Json], Fit("facts by name", _facts)]
 
 
 def tester(hint: object) -> Callable[[Json], bool]:
-    """What decides whether a stored value fits an annotation; arrays stand for tuples."""
+    """Test of whether a stored value fits an annotation; arrays stand for tuples."""
     if isinstance(hint, typing.TypeAliasType):
         return tester(hint.__value__)
     origin, parts = typing.get_origin(hint), typing.get_args(hint)

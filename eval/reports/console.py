@@ -1,4 +1,4 @@
-"""What a run prints besides the progress: its beginning, what broke, and its end."""
+"""Console output of a run besides the progress: its beginning, what broke, and its end."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, s
 
 
 def environment(group: str, facts: JsonObject) -> str:
-    """What an environment says of itself, in one line."""
+    """Environment's own description, in one line."""
     listed = ", ".join(f"{key} {setting(value)}" for key, value in facts.items() if key != "tracker")
     return f"  {group}: {listed}, tracker {setting(facts.get('tracker'))}"
 
 
 def broken(group: str, message: str, running: Sequence[Episode]) -> str:
-    """What is said of an environment that broke."""
+    """Message about an environment that broke."""
     text = f"{group}: {message}"
     if "out of memory" in message.lower() or message.startswith("MemoryError"):
         text += " (fewer --worlds need less)"
@@ -80,7 +80,7 @@ def broken(group: str, message: str, running: Sequence[Episode]) -> str:
 
 
 def failed(group: str, error: OSError) -> str:
-    """What is said of a file that could not be written or a connection that broke."""
+    """Message about a file that could not be written or a connection that broke."""
     cause = plain_text(error.strerror or error)
     named = f"{plain_text(error.filename)}: {cause}" if error.filename else cause
     return f"{group}: {type(error).__name__}: {named}; running episodes stay unplayed; trace in {BREAK_FILE}"

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from arena_newton.eval.folders.failure_counts import FailureCell, SeenRate
 from arena_newton.eval.folders.failure_stage import FailureStage
-from arena_newton.eval.reports.wording import markdown_table, plain
+from arena_newton.files.text import plain
+from arena_newton.pages.tables import Table, between
 
 __all__ = ["SENTENCES", "WAITS", "StageBar", "failures_markdown", "stage_bars"]
 
@@ -33,8 +34,7 @@ def _names(cell: FailureCell) -> list[str]:
 def _rate(rate: SeenRate) -> list[str]:
     if rate["ci95"] is None:
         return ["-", "-"]
-    low, high = rate["ci95"]
-    return [f"{rate['successes']}/{rate['episodes']}", f"{100 * low:.0f} to {100 * high:.0f}"]
+    return [f"{rate['successes']}/{rate['episodes']}", between(rate["ci95"])]
 
 
 def _endings(cell: FailureCell) -> tuple[int, int]:
@@ -62,7 +62,7 @@ def failures_markdown(cells: Sequence[FailureCell]) -> list[str]:
         for cell in cells
     ]
     seen = [[*_names(cell), *_rate(cell["seen"]), *_rate(cell["unseen"])] for cell in cells]
-    lines = ["## Failures by stage", "", markdown_table(_HEAD, rows, left=4)]
+    lines = ["## Failures by stage", "", Table(_HEAD, rows, "llllr").markdown()]
     lines += [f"- {stage}: {sentence}" for stage, sentence in SENTENCES.items()]
     lines += [
         f"- {WAITS}: failures, counted at their stage too, that stayed slow near what they saw for half of the episode",
@@ -70,7 +70,7 @@ def failures_markdown(cells: Sequence[FailureCell]) -> list[str]:
     ]
     own = [(" ".join(_names(cell)), _own(cell)) for cell in cells]
     lines += ["", *(f"{name}: {said}." for name, said in own if said)] if any(said for _, said in own) else []
-    lines += ["", "## Success by what the first picture shows", "", markdown_table(_SEEN_HEAD, seen, left=4)]
+    lines += ["", "## Success by what the first picture shows", "", Table(_SEEN_HEAD, seen, "llllr").markdown()]
     return [*lines, "An object that is not in the first picture must be searched for, or guessed.", ""]
 
 

@@ -7,15 +7,12 @@ so nothing in a journal can become an element or an attribute; media are linked 
 
 from __future__ import annotations
 
-import base64
 import functools
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
 from markupsafe import Markup
 
 from arena_newton.eval.folders.failure_rules import near_bars, stage_of, waits_in_view
@@ -28,15 +25,17 @@ from arena_newton.eval.reports.wording import (
     MEDIA,
     environment_facts,
     media_of,
-    plain,
     replay_command,
     rules_that_ran,
     tasks_of,
 )
 from arena_newton.eval.statistics.stats import ErrorReason, ResultCell
+from arena_newton.files.text import plain
+from arena_newton.pages.html import FILES, render
+from arena_newton.pages.tables import percent
 from arena_newton.robot.g1 import TICK
 
-__all__ = ["FOLDER", "page", "page_template"]
+__all__ = ["FOLDER", "page"]
 
 FOLDER = Path(__file__).resolve().parent / "page"
 """Templates and style sheets of pages."""
@@ -73,41 +72,6 @@ COLUMNS = (
 )
 
 
-@functools.cache
-def page_template(name: str) -> jinja2.Template:
-    """A page of the folder `page` by its file name; what it shows is escaped, undefined names are errors."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(FOLDER),
-        autoescape=True,
-        finalize=lambda value: value if hasattr(value, "__html__") else plain(value),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template(name)
-
-
-@functools.cache
-def _source(name: str) -> str:
-    """Style or script of the page: the only texts that are not escaped, and the only ones that are ours alone."""
-    return (FOLDER / name).read_text(encoding="utf-8")
-
-
-@functools.cache
-def _policy() -> str:
-    """Content-Security-Policy of the page."""
-
-    def named(text: str) -> str:
-        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-    # A page opened from a disk has no origin that 'self' could mean in every browser, hence `file:`.
-    return (
-        "default-src 'none'; img-src 'self' file:; media-src 'self' file:; base-uri 'none'; form-action 'none'; "
-        f"style-src {named(_source('report.css'))}; script-src {named(_source('report.js'))}"
-    )
-
-
 def _linked(note: str) -> str:
     """A note whose last word is the folder of the learned policy's row, with a link to the report in it."""
     before, name, after = note.rpartition(f"{ROW_FOLDER}/.")
@@ -134,10 +98,11 @@ def page(
     opening = _opening(records)
     # The policy's number of worlds is in the configuration only where its answers depend on it.
     command = functools.partial(replay_command, document["options"], worlds=document["config"].get("worlds"))
-    return page_template("report.html").render(
-        policy=_policy(),
-        style=_source("report.css"),
-        script=_source("report.js"),
+    return render(
+        FOLDER / "report.html",
+        styles=["report.css"],
+        script="report.js",
+        sources=FILES | {"media-src": FILES["img-src"]},
         results=results,
         facts=_facts(document, results),
         notes=[_linked(note) for note in notes],
@@ -160,7 +125,7 @@ def page(
 
 
 def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
-    """What the page opens with, by name."""
+    """Facts at the top of the page, by name."""
     config = document["config"]
     found = [("episodes", f"{results['finished']} of {results['planned']}")]
     found += [(name, plain(config.get(name))) for name in ("policy", "rules") if name in config]
@@ -196,10 +161,6 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], cells: int) -> di
     }
 
 
-def _per_cent(fraction: float | None) -> str:
-    return f"{100 * (fraction or 0.0):.2f}%"
-
-
 def _bars(cells: Sequence[ResultCell]) -> list[dict[str, object]]:
     """A bar of outcomes per cell; under it the success rate with its interval and the rates of the group seeds."""
 
@@ -216,7 +177,7 @@ def _bar(title: str, cell: ResultCell) -> dict[str, object]:
     parts, done = [], 0
     for outcome, count in counts.items():
         if count:
-            x, width = _per_cent(done / cell["episodes"]), _per_cent(count / cell["episodes"])
+            x, width = (percent(number / cell["episodes"], 2) + "%" for number in (done, count))
             parts.append({"outcome": outcome, "count": count, "x": x, "width": width})
             done += count
     same: dict[float, int] = {}
@@ -225,15 +186,15 @@ def _bar(title: str, cell: ResultCell) -> dict[str, object]:
         # Seeds of one rate are drawn next to each other.
         same[rate] = same.get(rate, -1) + 1
         towards = -SEED_SPACING if rate > 0.5 else SEED_SPACING
-        seeds.append({"name": seed, "rate": _per_cent(rate), "cx": towards * same[rate]})
+        seeds.append({"name": seed, "rate": percent(rate, 2) + "%", "cx": towards * same[rate]})
     return {
         "title": title,
         "episodes": cell["episodes"],
         "all": ", ".join(f"{count} {outcome}" for outcome, count in counts.items()),
         "counts": ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count),
         "parts": parts,
-        "interval": [_per_cent(bound) for bound in cell["ci95"]] if cell["ci95"] is not None else None,
-        "rate": _per_cent(cell["sr"]),
+        "interval": [percent(bound, 2) + "%" for bound in cell["ci95"]] if cell["ci95"] is not None else None,
+        "rate": percent(cell["sr"] or 0.0, 2) + "%",
         "seeds": seeds,
     }
 

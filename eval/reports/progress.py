@@ -1,4 +1,4 @@
-"""What a run says while it runs: a bar on a terminal, a line now and then in a log file."""
+"""Progress of a run: a bar on a terminal, a line now and then in a log file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def simulated(ticks: int) -> str:
 
 
 def kernels_to_compile(cache: Path, engine: str, device: str) -> bool:
-    """Whether Warp's cache lacks kernels of ours for a device, so that the first steps compile them.
+    """True if Warp's cache lacks kernels of ours for a device, so that the first steps compile them.
 
     A look at the folder's names, which costs nothing; kernels that a newer version changed are not noticed. Engine
     `warp` has kernels of its own.

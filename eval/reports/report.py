@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 
 from arena_newton.eval.folders.original_format import write_original
@@ -13,17 +11,10 @@ from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.reports import html_report
 from arena_newton.eval.reports.failure_text import failures_markdown
 from arena_newton.eval.reports.learned_row import ROW_FOLDER, row_results
-from arena_newton.eval.reports.wording import (
-    environment_facts,
-    escaped,
-    markdown_table,
-    media_of,
-    plain,
-    rules_that_ran,
-    tasks_of,
-)
+from arena_newton.eval.reports.wording import environment_facts, media_of, rules_that_ran, tasks_of
 from arena_newton.eval.statistics.stats import ResultCell, Suite, error_reasons, outside_suites
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
+from arena_newton.pages.tables import Table, between, escaped, percent
 from arena_newton.robot.g1 import TICK
 
 __all__ = ["notes", "table", "write_reports"]
@@ -32,19 +23,14 @@ _COLUMNS = """task tracker policy mode episodes successes falls startup_falls ti
     sr sr_seed_std ci95_low ci95_high afr mean_steps""".split()
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}"
-
-
 def _cell_text(cell: ResultCell) -> list[str]:
-    low_high = "-" if cell["ci95"] is None else f"{100 * cell['ci95'][0]:.1f} to {100 * cell['ci95'][1]:.1f}"
     running = cell["falls"] - cell["startup_falls"]
     return [
         *map(plain, (cell["task"], cell["tracker"], cell["policy"], cell["mode"])),
         str(cell["episodes"]),
-        f"{_percent(cell['sr'])} ± {_percent(cell['sr_seed_std'])}",
-        low_high,
-        _percent(cell["afr"]),
+        f"{percent(cell['sr'])} ± {percent(cell['sr_seed_std'])}",
+        between(cell["ci95"], 1),
+        percent(cell["afr"]),
         f"{running} + {cell['startup_falls']}",
         str(cell["timeouts"]),
         str(cell["errors"]),
@@ -60,9 +46,9 @@ def _suite_text(suite: Suite) -> list[str]:
     return [
         *map(plain, (suite["suite"], suite["tracker"], suite["policy"], suite["mode"])),
         str(suite["episodes"]),
-        f"{_percent(suite['sr'])} ± {_percent(suite['sr_std'])}",
+        f"{percent(suite['sr'])} ± {percent(suite['sr_std'])}",
         "",
-        _percent(suite["afr"]),
+        percent(suite["afr"]),
         str(suite["falls"]),
         "",
         str(suite["errors"]),
@@ -84,19 +70,17 @@ def table(results: Results, beside: Results | None = None) -> str:
 
     `beside` are the results of `learned_row`, whose cells come after the run's own.
     """
-    return markdown_table(_HEAD, _rows(results, beside), left=4)
+    return Table(_HEAD, _rows(results, beside), "llllr").markdown()
 
 
 def table_csv(results: Results) -> str:
     """The cells as CSV, rates as fractions."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
+    rows = []
     for cell in results["cells"]:
         low, high = cell["ci95"] or (None, None)
-        row = {key: plain(value) if isinstance(value, str) else value for key, value in cell.items()}
-        writer.writerow(row | {"ci95_low": low, "ci95_high": high})
-    return text.getvalue()
+        row = dict(cell) | {"ci95_low": low, "ci95_high": high}
+        rows.append([plain(value) if isinstance(value := row.get(name), str) else value for name in _COLUMNS])
+    return Table(_COLUMNS, rows).csv()
 
 
 _STATES = {
@@ -108,7 +92,7 @@ _STATES = {
 
 
 def notes(run: RunRecord, results: Results) -> list[str]:
-    """What a reader of the table must know besides it."""
+    """Notes for a reader of the table."""
     found = []
     if run.status is not None and run.status["state"] != "success":
         found.append(_STATES[run.status["state"]] + (f": {run.status['error']}" if run.status["error"] else ""))
@@ -170,8 +154,9 @@ def _markdown(run: RunRecord, results: Results) -> str:
     lines += failures_markdown(results.get("failures", []))
     reasons = error_reasons(run.records)
     if reasons:
-        lines += ["## Errors", "", "| reason | message | episodes |", "|---|---|---:|"]
-        lines += [f"| {escaped(r['reason'])} | {escaped(r['message'])} | {r['count']} |" for r in reasons]
+        rows = [(r["reason"], r["message"], r["count"]) for r in reasons]
+        errors = Table(("reason", "message", "episodes"), rows, "llr")
+        lines += ["## Errors", "", *errors.compact(escaped, ("---", "---:"))]
         lines += ["", "Run them again, in this folder: `python -m arena_newton.eval resume . --retry-errors`", ""]
     strips = [(r, media_of(r)) for r in run.records if media_of(r)]
     if strips:

@@ -15,11 +15,10 @@ from PIL import Image
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord
-from arena_newton.eval.plan.options import FilmOptions
 from arena_newton.eval.records.journal import EpisodeRecord, StorageError
-from arena_newton.eval.reports.wording import media_of, plain
+from arena_newton.eval.reports.wording import media_of
 from arena_newton.files.own_files import replace_atomically
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
 from arena_newton.pictures.settings import STRIP_SIZES
 from arena_newton.pictures.video import VideoWriter, caption
 from arena_newton.robot.g1 import TICK
@@ -44,8 +43,15 @@ LEAST_WIDTH, MOST_WIDTH = 200, 4096
 MOST_SECONDS = 120.0
 
 
-def write(runs: Sequence[RunRecord], options: FilmOptions) -> list[str]:
+def write(runs: Sequence[RunRecord], target: Path, seconds: float, width: int, max_mb: float) -> list[str]:
     """Write the film or picture.
+
+    Args:
+        runs: Runs whose successes it shows.
+        target: The file.
+        seconds: Length of a film [s].
+        width: Its width [px].
+        max_mb: Largest size of a .webp film [MB].
 
     Returns:
         What it shows and where it is, in lines.
@@ -54,13 +60,12 @@ def write(runs: Sequence[RunRecord], options: FilmOptions) -> list[str]:
         InputError: No recorded success, an unfit recording, or an option out of range.
         StorageError: The file cannot be written.
     """
-    target = Path(options.out).expanduser()
     if target.suffix not in FILMS + PICTURES:
-        raise InputError(f"--out {options.out}: expected a file that ends with {' '.join(FILMS + PICTURES)}")
-    if not LEAST_WIDTH <= options.width <= MOST_WIDTH:
-        raise InputError(f"--width {options.width}: expected {LEAST_WIDTH} to {MOST_WIDTH} px")
-    if not 1.0 <= options.seconds <= MOST_SECONDS:
-        raise InputError(f"--seconds {options.seconds:g}: expected 1 to {MOST_SECONDS:g}")
+        raise InputError(f"--out {target}: expected a file that ends with {' '.join(FILMS + PICTURES)}")
+    if not LEAST_WIDTH <= width <= MOST_WIDTH:
+        raise InputError(f"--width {width}: expected {LEAST_WIDTH} to {MOST_WIDTH} px")
+    if not 1.0 <= seconds <= MOST_SECONDS:
+        raise InputError(f"--seconds {seconds:g}: expected 1 to {MOST_SECONDS:g}")
     film = target.suffix in FILMS
     chosen = _successes(runs, "world" if film else "world strip")
     if not chosen:
@@ -68,9 +73,9 @@ def write(runs: Sequence[RunRecord], options: FilmOptions) -> list[str]:
         raise InputError(f"{runs[0].folder}: no success with a recording of the world camera (run {flag})")
     try:
         if film:
-            _film(chosen, target, options)
+            _film(chosen, target, seconds, width, max_mb)
         else:
-            _sheet(chosen, target, options.width)
+            _sheet(chosen, target, width)
     except OSError as error:
         raise StorageError(f"{target}: cannot be written ({error.strerror or error})") from None
     lines = [f"{_said(record)}: {path}" for record, path in chosen]
@@ -94,10 +99,12 @@ def _successes(runs: Sequence[RunRecord], medium: str) -> list[tuple[EpisodeReco
     return [found[name] for name in tasks.names() if name in found]
 
 
-def _film(chosen: Sequence[tuple[EpisodeRecord, Path]], target: Path, options: FilmOptions) -> None:
+def _film(
+    chosen: Sequence[tuple[EpisodeRecord, Path]], target: Path, seconds: float, whole: int, max_mb: float
+) -> None:
     """Play the episodes side by side, each from its start to its end in the same time."""
-    count, columns = round(options.seconds * FPS), min(COLUMNS, len(chosen))
-    width = (options.width - (columns - 1) * GAP) // columns // 2 * 2
+    count, columns = round(seconds * FPS), min(COLUMNS, len(chosen))
+    width = (whole - (columns - 1) * GAP) // columns // 2 * 2
     clips = [_clip(path, count, width, plain(record.task)) for record, path in chosen]
     frames = [tiled([clip[k] for clip in clips], columns) for k in range(count)]
     if target.suffix == ".mp4":
@@ -113,7 +120,7 @@ def _film(chosen: Sequence[tuple[EpisodeRecord, Path]], target: Path, options: F
         pictures[0].save(file, target.suffix[1:], save_all=True, **rest, **how)
         return file.getvalue()
 
-    data = encoded() if target.suffix == ".gif" else _fitting(encoded, options.max_mb)
+    data = encoded() if target.suffix == ".gif" else _fitting(encoded, max_mb)
     with replace_atomically(target) as out:
         out.write(data)
 

@@ -6,25 +6,21 @@ as plain names in `videos/` and `strips/`.
 
 from __future__ import annotations
 
-import dataclasses
 import re
-import shlex
 from collections.abc import Mapping, Sequence
 
 from arena_newton import tasks as specs
-from arena_newton.eval.plan.options import RunOptions
+from arena_newton.cli.flags import shell_command, typed
+from arena_newton.eval.plan.options import Remote, flags_of
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.records.schema import Json
-from arena_newton.files.text import plain_text
+from arena_newton.files.text import plain
 
 __all__ = [
     "MEDIA",
     "environment_facts",
-    "escaped",
-    "markdown_table",
     "media_of",
-    "plain",
     "replay_command",
     "rules_that_ran",
     "safe_media",
@@ -35,35 +31,11 @@ MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head
 """Media of an episode that the page knows → what they show."""
 REPLAYED = ("policy", "checkpoint", "labels", "replan", "rules", "drive", "engine", "device", "variant", "max_steps")
 """Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
-REMOTE = {field.name: field.default for field in dataclasses.fields(RunOptions) if field.name.startswith("remote_")}
+REMOTE = {name: getattr(Remote, name) for name in flags_of(Remote)}
 """Flags that belong to a policy server → their defaults; others are named in the command."""
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"
 _PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
-
-
-def plain(value: object) -> str:
-    """A value as text that a page, a terminal and a file can show; unfit characters are marked."""
-    return plain_text(value, None, mark="\ufffd")
-
-
-def escaped(text: object) -> str:
-    """Text of a results folder as Markdown that stays text, also where a backslash does not keep a tag shut."""
-    shown = re.sub(r"([\\`*\[\]>|])", r"\\\1", re.sub(r"&(?=#?\w+;)", "&amp;", plain(text)))
-    return re.sub(r"<(?=[A-Za-z/!?]|$)", "&lt;", shown)
-
-
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A Markdown table with aligned columns, the first `left` of them flush left; cells are texts and stay so."""
-    lines = [list(head), *([escaped(text) for text in row] for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-
-    def row(cells: Sequence[str]) -> str:
-        padded = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
-        return f"| {' | '.join(padded)} |"
-
-    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([row(head), rule, *map(row, lines[1:])]) + "\n"
 
 
 def safe_media(path: object) -> str | None:
@@ -83,37 +55,30 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
 
     `options` are the run's flags as in config.json; `worlds` asked at once, where the policy depends on their number.
     """
-    words: list[object] = ["python", "-m", "arena_newton.eval"]
-    series = options.get("series")
-    words += ["record"] if series is not None else []
-    words += ["--task", record.task, "--mode", record.mode, "--tracker", record.tracker]
+    series, scale = options.get("series"), options.get("disturb_scale")
+    given: dict[str, object] = {"task": record.task, "mode": record.mode, "tracker": record.tracker}
     if series is not None:
-        words += ["--seed-series", record.group_seed, "--episodes", record.repeat + 1]
-        words += [] if options.get("disturb") is True else ["--no-disturb"]
+        given |= {"seed_series": record.group_seed, "episodes": record.repeat + 1}
+        given |= {} if options.get("disturb") is True else {"disturb": False}
     else:
-        words += ["--seeds", record.group_seed, "--repeats", record.repeat + 1]
-    for name in REPLAYED:
-        value = options.get(name)
-        if value not in (None, "", "auto"):
-            words += ["--" + name.replace("_", "-"), value]
+        given |= {"seeds": record.group_seed, "repeats": record.repeat + 1}
+    given |= {name: options.get(name) for name in REPLAYED if options.get(name) not in ("", "auto")}
     for name, default in REMOTE.items() if plain(options.get("policy")).startswith("remote:") else ():
         value = options.get(name, default)
-        if value is True:
-            words += ["--" + name.replace("_", "-")]
-        elif value is not False and value != default:
-            words += ["--" + name.replace("_", "-"), value]
-    late, scale = options.get("latency_ticks"), options.get("disturb_scale")
-    words += ["--latency-ticks", late] if late else []
-    words += ["--ensemble"] if options.get("ensemble") is True else []
-    words += ["--disturb-scale", scale] if series is not None and scale not in (None, 1.0) else []
-    words += ["--worlds", worlds] if worlds is not None else []
-    words += ["--fast-physics"] if options.get("fast_physics") is True else []
-    words += [] if series is not None else ["--video", "--strip"]
-    return " ".join(shlex.quote(plain(word)) for word in words)
+        given |= {name: value} if value is not False and value != default else {}
+    given |= {
+        "latency_ticks": options.get("latency_ticks") or None,
+        "ensemble": options.get("ensemble") is True or None,
+    }
+    given |= {"disturb_scale": scale} if series is not None and scale != 1.0 else {}
+    given |= {"worlds": worlds, "fast_physics": options.get("fast_physics") is True or None}
+    given |= {} if series is not None else {"video": True, "strip": True}
+    typed_words = [plain(word) for name, value in given.items() for word in typed(name, value)]
+    return shell_command("arena_newton.eval", *(["record"] if series is not None else []), *typed_words)
 
 
 def environment_facts(facts: Mapping[str, Json]) -> list[tuple[str, str]]:
-    """What an environment said of itself, in words: engine, physics rate, drive, start-up and the rest."""
+    """Environment's own description, in words: engine, physics rate, drive, start-up and the rest."""
     left = dict(facts)
     found: list[tuple[str, str]] = [(name, plain(left.pop(name))) for name in ("engine", "device") if name in left]
     dt, substeps = left.pop("physics_dt", None), left.pop("substeps", None)

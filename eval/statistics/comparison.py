@@ -27,14 +27,14 @@ LEVEL = 0.05
 """Probability, after adjustment, below which two rates count as different."""
 
 type Stratum = tuple[str, ...]
-"""What names episodes that are compared with each other: a task, and what of tracker and mode varies."""
+"""Name of episodes that are compared with each other: a task, and what of tracker and mode varies."""
 type StratumOutcomes = Mapping[Hashable, bool]
-"""Whether each episode of a stratum was a success, by what names the episode in every contender."""
+"""Success of each episode of a stratum, by the name that the episode has in every contender."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """What is compared: usually a policy, as one results folder has it."""
+    """Side of a comparison: usually a policy, as one results folder has it."""
 
     name: str
     outcomes: Mapping[Stratum, StratumOutcomes]
@@ -72,7 +72,7 @@ class PairComparison:
 
     @property
     def differs(self) -> bool:
-        """Whether the contenders are told apart over all strata."""
+        """True if the contenders are told apart over all strata."""
         return self.p_holm <= LEVEL
 
 
@@ -198,7 +198,7 @@ def _standings(outcomes: Sequence[Sequence[bool]], differing: Sequence[tuple[int
 
 
 def _nothing_common(contenders: Sequence[Contender]) -> str:
-    """What each has, and which pairs share something."""
+    """Error that lists each contender's strata, and the pairs that share one."""
     said = "; ".join(
         f"{one.name} has {', '.join(' '.join(stratum) for stratum in one.outcomes) or 'no episode'}"
         for one in contenders

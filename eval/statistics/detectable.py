@@ -1,4 +1,4 @@
-"""What a plan can tell: the smallest difference of two success rates that a paired comparison finds."""
+"""Power of a plan: the smallest difference of two success rates that a paired comparison finds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEGLIGIBLE = 1e-12
 
 
 def detectable_text(cells: Sequence[int]) -> str:
-    """What a plan can tell, in one line, from the numbers of episodes of its cells; empty without episodes.
+    """Line on the difference that a plan can detect, from the numbers of episodes of its cells; empty without episodes.
 
     The cell with the fewest episodes is named, and all of them together.
     """

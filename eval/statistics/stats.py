@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 type Outcomes = Mapping[Hashable, bool]
-"""Whether something held (a success, a fall) in each episode, by what names the episode in both of two conditions."""
+"""Event (a success, a fall) in each episode: True if it happened, by the episode's name in both of two conditions."""
 
 
 class Figures(TypedDict):

@@ -1,4 +1,4 @@
-"""How far apart two sources of observations are in what a policy answers to them: t-SNE, and numbers without it.
+"""Distance between two sources of observations in a policy's answers: t-SNE, and numbers without it.
 
 t-SNE shows, and its distances mean nothing beyond one map. The numbers that do: how often a linear classifier tells the
 source of an action it has not seen, with all actions of an episode on one side of each split, and the same of the
@@ -47,7 +47,7 @@ OTHERS = ("#2ca02c", "#9467bd")
 
 @dataclass(frozen=True)
 class Separation:
-    """How well a linear classifier tells two sources apart, over episodes that it was not fitted to."""
+    """Separability of two sources by a linear classifier, over episodes that it was not fitted to."""
 
     accuracy: float
     """Mean over episodes of the fraction of their samples whose source is told; 0.5 is chance."""

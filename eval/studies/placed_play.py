@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from arena_newton import rule_sets
 from arena_newton import tasks as task_specs
+from arena_newton.cli.flags import check_least, shared
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
 from arena_newton.eval.plan.config import RunConfig, resolve
@@ -39,7 +40,7 @@ class PlacedEpisode:
     point: int
     """Number of the placement."""
     episode: Episode
-    """What else is played there: seed, mode, budget."""
+    """Other parameters of the episode: seed, mode, budget."""
 
     @property
     def episode_seed(self) -> int:
@@ -57,31 +58,19 @@ def placement_run(options: PlacementOptions) -> tuple[RunConfig, tuple[Axis, ...
         raise InputError("--task: name the task whose placements are moved")
     if options.task == "all":
         raise InputError("--task all: name one task; each has axes of its own")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: expected at least 0")
-    if options.repeats < 1:
-        raise InputError(f"--repeats {options.repeats}: expected at least 1")
+    check_least(options, 0, "seed")
+    check_least(options, 1, "repeats")
     if not 1 <= options.worlds <= MOST_WORLDS:
         raise InputError(f"--worlds {options.worlds}: expected 1 to {MOST_WORLDS:,}")
     config = resolve(
-        RunOptions(
+        shared(
+            options,
+            RunOptions,
             task=(options.task,),
             tracker=(options.tracker,),
-            checkpoint=options.checkpoint,
-            policy=options.policy,
-            labels=options.labels,
-            replan=options.replan,
-            ensemble=options.ensemble,
-            latency_ticks=options.latency_ticks,
             mode=(options.mode,),
-            rules=options.rules,
             seeds=(options.seed,),
-            repeats=options.repeats,
-            worlds=options.worlds,
-            engine=options.engine,
-            device=options.device,
-            fast_physics=options.fast_physics,
-            max_steps=options.max_steps,
+            out=None,
         )
     )
     task = config.flags.task[0]

@@ -44,12 +44,12 @@ class Axis:
 
     @property
     def counts(self) -> bool:
-        """Whether its values are whole numbers."""
+        """True if its values are whole numbers."""
         return self.key == "bag"
 
     @property
     def turns(self) -> bool:
-        """Whether its range is a full circle."""
+        """True if its range is a full circle."""
         return self.unit == "rad" and self.high - self.low > 2.0 * math.pi - SAME_ANGLE
 
     def grid(self, points: int) -> tuple[float, ...]:
@@ -69,7 +69,7 @@ class Axis:
         return self.low + part * (self.high - self.low)
 
     def part(self, value: float) -> float:
-        """Where a value lies in the range, from 0 to 1; of a number the middle of its part."""
+        """Fraction of the range at which a value lies, from 0 to 1; of a number the middle of its part."""
         if self.counts:
             return (value - self.low + 0.5) / (self.high - self.low + 1.0)
         return (value - self.low) / (self.high - self.low)
@@ -125,7 +125,7 @@ def moved(
 
 
 def _on_cylinder(rule: ObjectRule, sample: Sample, mode: str) -> None:
-    """Where bag and azimuth put a sample on a cylinder; nothing for another one."""
+    """Set the position that bag and azimuth give on a cylinder; nothing for another range."""
     ranges = object_range(rule, mode)
     if isinstance(ranges, PoseRange):
         return

@@ -1,4 +1,4 @@
-"""What a study of placements writes: one row per episode as they end, and one per placement."""
+"""Files of a study of placements: one row per episode as they end, and one per placement."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EPISODES = "episodes.csv"
 
 @dataclass(frozen=True)
 class PointTally:
-    """What the episodes at one placement came to."""
+    """Results of the episodes at one placement."""
 
     values: tuple[float, ...]
     """Value of each axis."""

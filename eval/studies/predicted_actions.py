@@ -1,4 +1,4 @@
-"""What a policy answers to observations of a dataset: the first action of each chunk, as the paper's t-SNE figures.
+"""Actions of a policy on observations of a dataset: the first action of each chunk, as the paper's t-SNE figures.
 
 "10 uniformly spaced frames from each of the 100 episodes per source"; the front picture and the state go through the
 policy's own pipeline, and the first action of the predicted chunk is taken (the paper's appendix "Predicted Action

@@ -24,9 +24,9 @@ ELITE = 0.2
 EXPLORING = 0.25
 """Part of a batch that is drawn from the whole range."""
 SMOOTHING = 0.7
-"""How far the distributions move to the elite's mean and spread."""
+"""Fraction by which the distributions move to the elite's mean and spread."""
 LEAST_FAILURE = 1e-9
-"""How far below 0 the score of a failure is whose margin says success, as of a fall behind the goal."""
+"""Largest score of a failure whose margin is that of a success, as of a fall behind the goal."""
 NEIGHBOURS = 10
 """Most placements, itself among them, whose outcomes a placement is named the worst by."""
 PER_NEIGHBOUR = 50
@@ -38,7 +38,7 @@ Point = tuple[float, ...]
 
 
 def score_of(results: Sequence[EpisodeResult], budget: int) -> float:
-    """How well the episodes at one placement went; the search looks for the lowest.
+    """Score of the episodes at one placement; the search looks for the lowest.
 
     A failure counts its margin [m], a little below 0 at most, and success the part of the budget that was left, 0 to
     1: an order in which every failure is worse than every success, far failures are worse than near ones, and slow

@@ -17,10 +17,10 @@ from arena_newton.eval.plan import episode_plan
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_NAME, JsonObject, parse, read_regular
 from arena_newton.eval.reports.progress import simulated
-from arena_newton.eval.reports.wording import markdown_table
 from arena_newton.eval.suites.suite_file import SELECTORS, PolicyEntry, Selector, SuiteFile
 from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.files.text import counted, plain_text
+from arena_newton.pages.tables import Table
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, CheckpointFacts, checkpoint_folder
 
 __all__ = [
@@ -145,7 +145,7 @@ def _ruled(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCell]:
 
 
 def _fields(cell: SuiteCell) -> dict[str, tuple[str, ...]]:
-    """What a selector compares, by its key."""
+    """Fields that a selector compares, by its key."""
     matched = "none" if cell.matched is None else str(cell.matched).lower()
     plain = {key: (str(getattr(cell, key)),) for key in SELECTORS if key not in ("trained_on", "matched")}
     return plain | {"trained_on": cell.trained_on or ("none",), "matched": (matched,)}
@@ -261,7 +261,7 @@ def _check_chunk(where: str, cell: SuiteCell, executed: int | None, predicted: i
 
 
 def _said(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, tuple[int | None, int | None]]:
-    """What the checkpoint of a spec says of itself, and of how many actions it executes and predicts at most.
+    """Facts of the checkpoint of a spec, and the largest numbers of actions that it executes and predicts.
 
     None for what it does not say, such as one that is somebody else's.
     """
@@ -360,7 +360,7 @@ def matrix_table(cells: Sequence[SuiteCell], *, each: bool = False) -> str:
     for key in sorted(rows, key=lambda row: (order.index(row[0]), row[1:])):
         states = [rows[key].get(task, []) for task in shown]
         lines.append([*key, *("–" if not s else f"{sum(c.status == 'done' for c in s)}/{len(s)}" for s in states)])
-    text = markdown_table(["policy", "trained on", "tracker", *shown], lines, 3)
+    text = Table(["policy", "trained on", "tracker", *shown], lines, "lllr").markdown()
     if each:
         text += "\n" + "\n".join(
             f"{cell.status:<8} {cell.id}  {counted(cell.episodes, 'episode')}  {cell.spec}" for cell in cells

@@ -1,4 +1,4 @@
-"""``eval matrix --ray``: one crew of a Ray cluster plays the cells of a suite, several at once.
+"""``eval matrix --ray``: one pool of a Ray cluster plays the cells of a suite, several at once.
 
 A cell is begun when a process has opened it, and is an ordinary results folder with a journal of its own, as `ray_run`
 writes it. Processes keep their environment from cell to cell where the next one asks for the same.
@@ -15,15 +15,15 @@ from ray.exceptions import RayError
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.play.run import Factories, RunStopped
-from arena_newton.eval.play.whole_run import Group, begun, reported
+from arena_newton.eval.play.run_flow import Group, begun, reported
 from arena_newton.eval.records.journal import Journal, StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_folder import SuiteFolder
 from arena_newton.eval.suites.suite_run import CellPlayer
-from arena_newton.eval.workers.ray_crew import Crew, Done, Job, Lease, Lost, Member, in_cluster
 from arena_newton.eval.workers.ray_run import DealtRun
 from arena_newton.eval.workers.slice_events import Event, Opened
+from arena_newton.eval.workers.worker_pool import Assignment, Done, Job, Lost, Worker, WorkerPool, in_cluster
 from arena_newton.files.text import counted, plain_text
 
 __all__ = ["run"]
@@ -62,9 +62,9 @@ class _Cell:
     """Not yet in its journal."""
     job: Job
     opening: bool = False
-    """Whether a process opens it that has not been opened before."""
+    """True if a process opens it that has not been opened before."""
     dealt: DealtRun | None = None
-    """What is dealt out, once it has begun."""
+    """Run whose episodes are assigned, once it has begun."""
     held: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """Journal and status, while it is played."""
     error: ArenaError | None = None
@@ -73,14 +73,14 @@ class _Cell:
 
     @property
     def open(self) -> bool:
-        """Whether a process could be of use now."""
+        """True if a process could be of use now."""
         if self.ended or self.opening or self.error is not None:
             return False
         return self.dealt is None or self.dealt.waiting > 0
 
 
 class _RayPlayer(CellPlayer):
-    """Plays cells by a crew."""
+    """Plays cells by a pool."""
 
     def play_cells(self, todo: Sequence[str]) -> bool:
         """Play cells that were checked; False when it was interrupted."""
@@ -93,11 +93,11 @@ class _RayPlayer(CellPlayer):
         self.done = 0
         self.played_ticks, self.began = 0.0, time.monotonic()
         with in_cluster(self.options.ray or ()), contextlib.ExitStack() as ended:
-            self.crew = Crew(self.configs[todo[0]], planned, self.given)
-            self.crew.shown = self.shown
-            self.shown.group(counted(len(self.crew.members), "Ray actor"))
+            self.pool = WorkerPool(self.configs[todo[0]], planned, self.given)
+            self.pool.shown = self.shown
+            self.shown.group(counted(len(self.pool.workers), "Ray actor"))
             ended.callback(self.shown.close)
-            ended.callback(self.crew.dismiss)
+            ended.callback(self.pool.dismiss)
             try:
                 self._play()
             except RayError as error:
@@ -127,47 +127,49 @@ class _RayPlayer(CellPlayer):
     def _play(self) -> None:
         """Play until nothing is left."""
         while not all(cell.ended for cell in self.cells):
-            for member in self.crew.idle():
-                self._give(member)
-            for job, lease, said in self.crew.heard():
-                self._hear(self.jobs[job], lease, said)
+            for worker in self.pool.idle():
+                self._give(worker)
+            for job, assignment, message in self.pool.messages():
+                self._hear(self.jobs[job], assignment, message)
             for cell in self.cells:
                 if not cell.ended and (cell.error is not None or cell.dealt is not None) and not self._is_played(cell):
                     self._finish(cell)
 
-    def _give(self, member: Member) -> None:
+    def _give(self, worker: Worker) -> None:
         """Give work to a process that waits: a slice of the run that it has open, or another run to open."""
-        busy = {one.lease.group for one in self.crew.members if one.lease is not None}
+        busy = {one.assignment.group for one in self.pool.workers if one.assignment is not None}
 
         def wanted(cell: _Cell) -> bool:
-            if not cell.open or cell.dealt is None or cell.job is member.job:
+            if not cell.open or cell.dealt is None or cell.job is worker.job:
                 return cell.open
-            coming = [one for one in self.crew.members if one.job is cell.job and one.lease is None]
+            coming = [one for one in self.pool.workers if one.job is cell.job and one.assignment is None]
             return len(coming) < cell.dealt.slices  # no more open it than find something to play
 
         def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int]:
             fresh = cell.dealt is None
-            return cell.job is not member.job, cell.group != member.last, fresh, cell.group in busy, cell.number
+            return cell.job is not worker.job, cell.group != worker.last, fresh, cell.group in busy, cell.number
 
         found = min(filter(wanted, self.cells), key=order, default=None)
         if found is None:
             return
-        if found.job is not member.job:
+        if found.job is not worker.job:
             found.opening = found.job.opened is None
-            self.crew.prepare(member, found.job)
-        elif found.dealt is not None and (lease := found.dealt.next(member)) is not None:
-            self.crew.lend(member, lease)
+            self.pool.prepare(worker, found.job)
+        elif found.dealt is not None and (assignment := found.dealt.next(worker)) is not None:
+            self.pool.assign(worker, assignment)
 
-    def _hear(self, cell: _Cell, lease: Lease | None, said: Opened | Event | Done | Lost | ArenaError) -> None:
+    def _hear(
+        self, cell: _Cell, assignment: Assignment | None, message: Opened | Event | Done | Lost | ArenaError
+    ) -> None:
         """Take what a process tells of a cell."""
         try:
-            if lease is not None and cell.dealt is not None and not isinstance(said, Opened):
-                cell.dealt.take(lease, said)
+            if assignment is not None and cell.dealt is not None and not isinstance(message, Opened):
+                cell.dealt.take(assignment, message)
                 return
             cell.opening = False
-            if isinstance(said, ArenaError):
-                raise said
-            if isinstance(said, Opened) and cell.dealt is None and cell.error is None:
+            if isinstance(message, ArenaError):
+                raise message
+            if isinstance(message, Opened) and cell.dealt is None and cell.error is None:
                 self._begin(cell)
         except StorageError:
             raise
@@ -188,7 +190,7 @@ class _RayPlayer(CellPlayer):
             done, waiting = begun(config, folder, journal)
             if waiting:
                 cell.held.enter_context(folder.running())
-            cell.dealt = DealtRun(cell.job, journal, self.crew, done, waiting, self.shown, lambda: self._besides(cell))
+            cell.dealt = DealtRun(cell.job, journal, self.pool, done, waiting, self.shown, lambda: self._besides(cell))
 
     def _besides(self, cell: _Cell) -> int:
         """Episodes of other cells that nobody plays yet."""
@@ -196,10 +198,10 @@ class _RayPlayer(CellPlayer):
         return sum(one.episodes if one.dealt is None else one.dealt.waiting for one in others)
 
     def _is_played(self, cell: _Cell) -> bool:
-        """Whether a process plays something of a cell, or is to."""
+        """True if a process plays something of a cell, or is to."""
         if cell.dealt is None:
             return False
-        return cell.dealt.leased or (cell.error is None and cell.dealt.waiting > 0)
+        return cell.dealt.assigned or (cell.error is None and cell.dealt.waiting > 0)
 
     def _finish(self, cell: _Cell) -> None:
         """End a cell of which nothing is left to play, or no more can be played."""
@@ -226,7 +228,7 @@ class _RayPlayer(CellPlayer):
 
     def _leave(self, interrupt: KeyboardInterrupt | None) -> None:
         """End all cells that have begun, before they are whole."""
-        self.crew.dismiss()  # who writes files has ended
+        self.pool.dismiss()  # who writes files has ended
         stop = interrupt or KeyboardInterrupt()
         for cell in self.cells:
             if cell.dealt is not None and not cell.ended:

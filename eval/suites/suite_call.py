@@ -6,14 +6,12 @@ No library of physics or pictures is loaded: a wrong file, a dry run and an abse
 from __future__ import annotations
 
 import dataclasses
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton.cli.flags import check_least, shell_command, words
 from arena_newton.errors import InputError
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS, check_ray
-from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.plan.suite_options import MatrixOptions
+from arena_newton.eval.plan.flag_checks import check_ray
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.sharding import parse_shard
 from arena_newton.eval.suites.matrix_cells import (
@@ -25,18 +23,16 @@ from arena_newton.eval.suites.matrix_cells import (
     selected,
 )
 from arena_newton.eval.suites.suite_file import SuiteFile, read_suite_file, suite_path
+from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.eval.suites.suite_records import SuiteCell, read_suite
 from arena_newton.files.text import counted
 
 __all__ = ["SuiteCall", "plan_call"]
 
-MOST_PROCESSES = 9_999
-"""Processes of one estimate, as many as a plan has shards; each is a place in a queue."""
-
 
 @dataclass(frozen=True)
 class SuiteCall:
-    """What a call is to play."""
+    """Cells and options of a call."""
 
     suite: SuiteFile
     options: MatrixOptions
@@ -70,13 +66,8 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
-    if options.estimate and min(options.estimate) < 1:
-        raise InputError(f"--estimate {min(options.estimate)}: expected at least 1")
-    if options.estimate and max(options.estimate) > MOST_PROCESSES:
-        raise InputError(f"--estimate {max(options.estimate)}: expected at most {MOST_PROCESSES:,}")
-    check_ray(RunOptions(**{name: getattr(options, name) for name in ("ray", *RAY_FLAGS)}))
-    if options.limit is not None and options.limit < 1:
-        raise InputError(f"--limit {options.limit}: expected at least 1")
+    check_ray(options)
+    check_least(options, 1, "limit")
     cells = expand_cells(suite)
     if shard.count > max(len(cells), 1):
         raise InputError(f"--shard {shard}: the suite has {counted(len(cells), 'cell')}, expected no more shards")
@@ -86,7 +77,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     try:
         checked = {c.id: c for c in check_policies(suite, [cell for cell in cells if cell.id in chosen])}
     except InputError as error:
-        if not options.dry_run and options.estimate is None:  # which show the matrix first, or need no checkpoint
+        if not options.dry_run:  # which shows the matrix first
             raise
         problem = error
     return SuiteCall(
@@ -111,13 +102,6 @@ def _out(options: MatrixOptions, suite: SuiteFile) -> Path:
 
 def _again(given: str, options: MatrixOptions) -> str:
     """The command that continues."""
-    parts = ["python", "-m", "arena_newton.eval", "matrix", given]
-    for name in ("out", "only", "shard", "device"):
-        value = getattr(options, name)
-        if value != getattr(MatrixOptions, name):
-            parts += [f"--{name}", value]
-    for name in ("ray", *RAY_FLAGS):
-        value = getattr(options, name)
-        if value != getattr(MatrixOptions, name):
-            parts += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return shlex.join([*parts, *(["--keep-going"] if options.keep_going else [])])
+    once = ("limit", "dry_run", "accept_changes", "accept_code", "retry_errors", "verbose")
+    again = dataclasses.replace(options, **{name: getattr(MatrixOptions, name) for name in once})
+    return shell_command("arena_newton.eval", "matrix", given, *words(again))

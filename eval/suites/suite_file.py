@@ -82,9 +82,9 @@ class PolicyEntry:
     """Table [[policies]]: a policy, or by a pattern one for each task and each tracker of its demonstrations."""
 
     name: str = ""
-    """How tables call it; unique, letters, digits, `_`, `-` and `+`."""
+    """Name in tables; unique, letters, digits, `_`, `-` and `+`."""
     spec: str = ""
-    """What --policy is given; `{task}` and `{tracker}` stand for task and tracker of its training."""
+    """Value of --policy; `{task}` and `{tracker}` stand for task and tracker of its training."""
     family: str = ""
     """Such as `act`; a checkpoint of ours says it itself."""
     trained_on: tuple[str, ...] = ()

@@ -160,7 +160,7 @@ class SuiteFolder:
         return load_run(path) if (path / CONFIG_FILE).exists() else None
 
     def stored(self, name: str) -> RunRecord | None:
-        """What the folder of a cell holds; None where it has no results.
+        """Contents of a cell's folder; None where it has no results.
 
         Raises:
             InputError: It was changed by hand, or is a link.

@@ -1,4 +1,4 @@
-"""What a suite says of its cells: `suite.json` with the plan, journals with what was played, the one reader of both.
+"""Records of a suite: `suite.json` with the plan, journals with what was played, the one reader of both.
 
 A suite is a folder that `python -m arena_newton.eval matrix` writes. Each cell is an ordinary results folder below it.
 
@@ -87,7 +87,7 @@ class SuiteCell:
     family: Text
     """`act`, `diffusion`, `flow`, `pi05`, or what the entry says; empty where nothing is known."""
     spec: Name
-    """What `--policy` is given."""
+    """Value of `--policy`."""
     trained_on: tuple[Name, ...]
     """Trackers through which the demonstrations of its training were recorded; none for a policy without training."""
     trained_tasks: tuple[Name, ...]
@@ -104,7 +104,7 @@ class SuiteCell:
     replan: Annotated[Positive | None, Fit("a number of actions or null")] = None
     """Actions of a chunk that are executed before the next look; None: all."""
     ensemble: bool = False
-    """Whether all chunks that cover a tick are averaged."""
+    """True if all chunks that cover a tick are averaged."""
     folder: Folder
     """Results folder, below the suite's."""
     episodes: Positive
@@ -123,23 +123,23 @@ class SuiteCell:
     wall_s: Seconds = 0.0
     """Time that it took, attempts that were broken off included [s]."""
     device: Text = ""
-    """Where it was played, such as `NVIDIA H200` or `cpu`."""
+    """Device on which it was played, such as `NVIDIA H200` or `cpu`."""
     error: Annotated[str | None, Fit("text or null")] = None
     """Why it is `failed`."""
 
     @property
     def matched(self) -> bool | None:
-        """Whether the executing tracker is among those of its training; None for a policy without training."""
+        """True if the executing tracker is among those of its training; None for a policy without training."""
         return self.tracker in self.trained_on if self.trained_on else None
 
     @property
     def merged(self) -> bool:
-        """Whether the policy was trained on several tasks or through several trackers at once."""
+        """True if the policy was trained on several tasks or through several trackers at once."""
         return len(self.trained_tasks) > 1 or len(self.trained_on) > 1
 
 
 type CellEnding = Literal["done", "failed", "interrupted", "killed"]
-"""How a call left a cell."""
+"""Ending of a call's work on a cell."""
 PROGRESS_FIELDS = ("status", "finished", "successes", "errors", "wall_s", "device", "error")
 """Fields of a cell that its events decide."""
 

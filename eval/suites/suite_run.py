@@ -7,18 +7,17 @@ import dataclasses
 import datetime
 import gc
 import io
-import shlex
 import time
 from collections.abc import Iterator, Sequence
 
 from arena_newton import doctor
+from arena_newton.cli.flags import shell_command
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder, iso, setting
 from arena_newton.eval.plan.config import RunConfig, resolve
-from arena_newton.eval.plan.flag_checks import RAY_FLAGS
-from arena_newton.eval.plan.suite_options import MatrixOptions
-from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.plan.options import Ray, flags_of
+from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunStopped, execute
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.journal import StorageError
@@ -27,6 +26,7 @@ from arena_newton.eval.suites.matrix_cells import matrix_table, run_options
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_file import SuiteFile
 from arena_newton.eval.suites.suite_folder import SuiteFolder
+from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.eval.suites.suite_records import CellEnding, CellEvent, SuiteCell
 from arena_newton.eval.workers.slice_player import device_name
 from arena_newton.files.text import counted, plain_text
@@ -67,13 +67,13 @@ class CellPlayer:
         self, suite: SuiteFile, folder: SuiteFolder, options: MatrixOptions, factories: Factories | None, *, again: str
     ):
         self.suite, self.folder, self.options, self.again = suite, folder, options, again
-        self.keeper = EnvironmentKeeper()
+        self.env_cache = EnvCache()
         self.given = factories
-        self.factories = factories or Factories(env=self.keeper)
+        self.factories = factories or Factories(env=self.env_cache)
         self.installed = doctor.versions()
         self.configs: dict[str, RunConfig] = {}
         self.devices: dict[str, str] = {}
-        """Where the cells of this call are played."""
+        """Devices on which the cells of this call are played."""
         self.failed: list[tuple[str, str]] = []
         self.spent = self.done_ticks = 0.0
 
@@ -99,7 +99,7 @@ class CellPlayer:
         try:
             return all(self._play_cell(name, number, todo) for number, name in enumerate(todo))
         finally:
-            self.keeper.drop()
+            self.env_cache.drop()
 
     def _kept(self, chosen: Sequence[str]) -> str:
         done = sum(self.folder.plan.cell(name).status == "done" for name in chosen)
@@ -116,7 +116,7 @@ class CellPlayer:
         for name in chosen:
             cell = self.folder.plan.cell(name)
             options = run_options(self.suite, cell, self.folder.path, self.options.device)
-            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", "ray", *RAY_FLAGS)}
+            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", *flags_of(Ray))}
             try:
                 self.configs[name] = resolve(dataclasses.replace(options, **given))
             except InputError as error:
@@ -203,7 +203,7 @@ class CellPlayer:
         return names
 
     def _is_done(self, name: str) -> bool:
-        """Whether a cell is done; one whose results are gone is not."""
+        """True if a cell is done; one whose results are gone is not."""
         cell = self.folder.plan.cell(name)
         if cell.status != "done":
             return False
@@ -239,11 +239,11 @@ class CellPlayer:
             code, error = 2, caught
         wall = time.perf_counter() - began
         if code:
-            self.keeper.drop()  # what broke off in it may have left it in any state
+            self.env_cache.drop()  # what broke off in it may have left it in any state
         return self.ended(name, code, error, wall, todo[number + 1 :])
 
     def silence(self) -> contextlib.AbstractContextManager[object]:
-        """What a run prints is shown on --verbose only."""
+        """Context that hides the output of a run unless --verbose shows it."""
         return contextlib.nullcontext() if self.options.verbose else contextlib.redirect_stdout(io.StringIO())
 
     def begun(self, name: str, device: str) -> None:
@@ -307,7 +307,7 @@ class CellPlayer:
         return self.folder.plan.cell(name)
 
     def _line(self, cell: SuiteCell, wall: float, left: Sequence[str]) -> str:
-        """What is said of a cell that is done, and how long the others take."""
+        """Line about a cell that is done, with the time that the others take."""
         parts = [f"{cell.successes}/{cell.episodes} successes"]
         parts += [f"{counted(cell.errors, 'error')}"] if cell.errors else []
         parts.append(duration(wall))
@@ -330,7 +330,7 @@ class CellPlayer:
             print(f"failed: {name}: {message}")
         if errors:
             print(f"{counted(errors, 'episode')} ended with an error; run them again with: {self.again} --retry-errors")
-        print(f"tables: python -m arena_newton.eval tables {shlex.quote(str(self.folder.path))}")
+        print(f"tables: {shell_command('arena_newton.eval', 'tables', self.folder.path)}")
         return 1 if self.failed or errors else 0
 
 

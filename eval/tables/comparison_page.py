@@ -6,8 +6,6 @@ that two policies ended differently are linked with their recordings, by paths f
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
 import os
 import urllib.parse
@@ -15,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from arena_newton.eval.reports.html_report import FOLDER, page_template
-from arena_newton.eval.reports.wording import MEDIA, media_of, plain, replay_command
+from arena_newton.eval.reports.html_report import FOLDER
+from arena_newton.eval.reports.wording import MEDIA, media_of, replay_command
 from arena_newton.eval.statistics.comparison import Comparison, PairComparison, Standing
 from arena_newton.eval.statistics.rate_tests import PairedCounts
 from arena_newton.eval.tables.comparison_text import (
@@ -29,6 +27,9 @@ from arena_newton.eval.tables.comparison_text import (
     verdict,
 )
 from arena_newton.eval.tables.contenders import ContenderSet, PlayedEpisode
+from arena_newton.files.text import plain
+from arena_newton.pages.html import render
+from arena_newton.pages.tables import percent
 
 __all__ = ["beta_density", "comparison_page"]
 
@@ -65,18 +66,16 @@ def beta_density(successes: int, episodes: int, rate: float) -> float:
 
 def comparison_page(out: Path, comparison: Comparison, contenders: ContenderSet) -> str:
     """The page as text, the same for the same content and folders byte for byte; `out` is the folder it will be in."""
-    style = (FOLDER / "report.css").read_text(encoding="utf-8") + (FOLDER / "compare.css").read_text(encoding="utf-8")
-    known = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     several = len(comparison.strata) > 1
-    return page_template("compare.html").render(
-        policy=f"default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'sha256-{known}'",
-        style=style,
+    return render(
+        FOLDER / "compare.html",
+        styles=["report.css", "compare.css"],
         facts=[("policies", len(comparison.names)), ("tasks", _task_count(comparison)), *contenders.alike],
         notes=remarks(comparison, contenders),
         ticks=TICKS,
         size=VIOLIN,
-        policies=[(name, dict(facts)) for name, facts in zip(comparison.names, contenders.facts, strict=True)],
-        reports=[_report(out, folder) for folder in contenders.folders],
+        policies=[(one.name, dict(one.facts)) for one in contenders.compared],
+        reports=[_report(out, one.folder) for one in contenders.compared],
         overall=_rows(comparison, comparison.overall),
         verdicts=[verdict(comparison, pair) for pair in comparison.pairs],
         pairs=[_pair(comparison, pair) for pair in comparison.pairs],
@@ -120,16 +119,12 @@ def _rows(comparison: Comparison, standings: Sequence[Standing]) -> list[dict[st
                 "interval": interval,
                 "letters": standing.letters,
                 "path": _outline(standing),
-                "ends": [_per_cent(bound) for bound in (standing.low, standing.high)],
-                "dot": _per_cent(standing.rate),
-                "mean": _per_cent((standing.successes + 1) / (standing.episodes + 2)),
+                "ends": [percent(bound, 2) + "%" for bound in (standing.low, standing.high)],
+                "dot": percent(standing.rate, 2) + "%",
+                "mean": percent((standing.successes + 1) / (standing.episodes + 2), 2) + "%",
             }
         )
     return rows
-
-
-def _per_cent(fraction: float) -> str:
-    return f"{100 * fraction:.2f}%"
 
 
 def _outline(standing: Standing) -> str:
@@ -164,7 +159,7 @@ def _within(
     out: Path, comparison: Comparison, contenders: ContenderSet, pair: PairComparison, position: int
 ) -> dict[str, object]:
     part = pair.strata[position]
-    first, second = contenders.played[pair.first], contenders.played[pair.second]
+    first, second = (contenders.compared[n].episodes for n in (pair.first, pair.second))
     outcomes = [contenders.contenders[n].outcomes[part.stratum] for n in (pair.first, pair.second)]
     differing = [key for key in outcomes[0] if key in outcomes[1] and outcomes[0][key] != outcomes[1][key]]
     # Those of the first alone come first.

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Sequence
 
 from arena_newton.eval.records.schema import JsonObject
-from arena_newton.eval.reports.wording import escaped, markdown_table, plain
 from arena_newton.eval.statistics.comparison import LEVEL, Comparison, PairComparison, Standing, StratumPair
 from arena_newton.eval.statistics.rate_tests import LARGEST_BOSCHLOO, PairedCounts, UnpairedCounts
 from arena_newton.eval.statistics.stats import Contrast
 from arena_newton.eval.tables.contenders import ContenderSet
-from arena_newton.files.text import counted
+from arena_newton.files.text import counted, plain
+from arena_newton.pages.tables import Table, between, escaped, percent
 
 __all__ = [
     "METHOD",
@@ -64,8 +62,8 @@ def p_text(p: float) -> str:
 
 def rate_text(standing: Standing) -> tuple[str, str, str]:
     """Successes of episodes, rate and interval [%]."""
-    interval = f"{100 * standing.low:.0f} to {100 * standing.high:.0f}"
-    return f"{standing.successes}/{standing.episodes}", f"{100 * standing.rate:.1f}", interval
+    interval = between((standing.low, standing.high))
+    return f"{standing.successes}/{standing.episodes}", percent(standing.rate), interval
 
 
 def difference_text(difference: Contrast) -> str:
@@ -125,8 +123,8 @@ def _standings(comparison: Comparison, standings: Sequence[Standing], title: str
 def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
     """Rates and letters, pairs, counts per task, notes and methods."""
     lines = ["# Comparison", ""]
-    for name, facts in zip(comparison.names, contenders.facts, strict=True):
-        lines.append(f"- {escaped(name)}: " + ", ".join(f"{key} {escaped(value)}" for key, value in facts))
+    for one in contenders.compared:
+        lines.append(f"- {escaped(one.name)}: " + ", ".join(f"{key} {escaped(value)}" for key, value in one.facts))
     if contenders.alike:
         lines.append("- alike: " + ", ".join(f"{key} {escaped(value)}" for key, value in contenders.alike))
     notes = remarks(comparison, contenders)
@@ -136,12 +134,12 @@ def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
         for stratum in comparison.strata:
             rows += _standings(comparison, comparison.within[stratum], stratum_title(stratum))
     head = ["task", "policy", "successes", "rate %", "95 % interval", "letters"]
-    lines += ["## Rates", "", markdown_table(head, rows, 2), "## Pairs", ""]
+    lines += ["## Rates", "", Table(head, rows, "llr").markdown(), "## Pairs", ""]
     table = []
     for pair in comparison.pairs:
         names = [comparison.names[pair.first], comparison.names[pair.second]]
         table.append([*names, difference_text(pair.difference), p_text(pair.p), p_text(pair.p_holm)])
-    lines += [markdown_table(["first", "second", "Δ", "p", "p (Holm)"], table, 2)]
+    lines += [Table(["first", "second", "Δ", "p", "p (Holm)"], table, "llr").markdown()]
     lines += [f"- {escaped(verdict(comparison, pair))}." for pair in comparison.pairs] + [""]
     lines += ["## Within tasks", ""]
     head = ["task", "first", "second", "both", "only first", "only second", "neither", "successes"]
@@ -153,7 +151,7 @@ def as_markdown(comparison: Comparison, contenders: ContenderSet) -> str:
             names = [comparison.names[pair.first], comparison.names[pair.second]]
             figures = [difference_text(part.difference), part.test, p_text(part.p), p_text(part.p_holm)]
             table.append([stratum_title(part.stratum), *names, *_cells(part), *figures])
-    lines += [markdown_table(head, table, 3)]
+    lines += [Table(head, table, "lllr").markdown()]
     lines += [f"{paragraph}\n" for paragraph in METHOD]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -177,7 +175,7 @@ def as_json(comparison: Comparison, contenders: ContenderSet) -> JsonObject:
         within = {
             stratum_title(stratum): _standing(comparison.within[stratum][number]) for stratum in comparison.strata
         }
-        facts: JsonObject = dict(contenders.facts[number])
+        facts: JsonObject = dict(contenders.compared[number].facts)
         policies.append({"name": name} | facts | {"all": _standing(comparison.overall[number]), "tasks": within})
     pairs = []
     for pair in comparison.pairs:
@@ -203,18 +201,16 @@ def as_csv(comparison: Comparison) -> str:
     """A row per pair and task, and one over all tasks."""
     head = ["task", "first", "second", "first_successes", "first_episodes", "second_successes", "second_episodes"]
     head += [*CELLS, "left_out", "difference", "low", "high", "test", "p", "p_holm"]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
+    rows: list[list[object]] = []
     for pair in comparison.pairs:
         names = [comparison.names[pair.first], comparison.names[pair.second]]
         for part in pair.strata:
             figures = [part.unpaired, *_difference(part.difference), part.test, part.p, part.p_holm]
-            writer.writerow([stratum_title(part.stratum), *names, *_sums([part.counts]), *figures])
+            rows.append([stratum_title(part.stratum), *names, *_sums([part.counts]), *figures])
         figures = [sum(part.unpaired for part in pair.strata), *_difference(pair.difference)]
         figures += ["Cochran-Mantel-Haenszel", pair.p, pair.p_holm]
-        writer.writerow([OVER_ALL, *names, *_sums([part.counts for part in pair.strata]), *figures])
-    return out.getvalue()
+        rows.append([OVER_ALL, *names, *_sums([part.counts for part in pair.strata]), *figures])
+    return Table(head, rows).csv()
 
 
 def _sums(counts: Sequence[PairedCounts | UnpairedCounts]) -> list[object]:

@@ -1,41 +1,33 @@
-"""What is compared, read from results folders and suites: policies with their episodes, alike in what must be alike."""
+"""Policies of a comparison with their episodes, alike in what must be alike."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton.errors import InputError
-from arena_newton.eval.folders.results import (
-    RunRecord,
-    changed_conditions,
-    check_whole_plan,
-    is_complete,
-    load_run,
-    width_rule,
-)
-from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
+from arena_newton.eval.folders.results import RunRecord, changed_conditions, is_complete, width_rule
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.records.schema import Json, shown
 from arena_newton.eval.statistics.comparison import Contender
-from arena_newton.eval.suites.suite_records import SuiteCell, load_cell, read_suite
+from arena_newton.eval.suites.suite_records import SuiteCell
+from arena_newton.eval.tables.episode_table import PlayedCell, code_notes, error_note, read_folder, runs_of
 from arena_newton.files.text import counted, plain_text
-from arena_newton.rules import seeding
 
 __all__ = ["CONDITIONS", "MOST_CONTENDERS", "ContenderSet", "PlayedEpisode", "read_contenders"]
 
 CONDITIONS = ("rules", "engine", "max_steps", "variant", "fast_physics")
-"""What must be alike in everything that is compared, unless it is what is compared (`--differ`)."""
+"""Conditions that must be alike in everything that is compared, unless they are compared (`--differ`)."""
 NOTED = ("device", "drive", "labels", "replan", "ensemble", "latency_ticks")
-"""What may differ; every value is named."""
+"""Conditions that may differ; every value is named."""
 HASHED = {"rules_hash": "The rules", "scenes": "The scenes"}
-"""What is known by its content, of the tasks of a run; that it differs is named."""
+"""Contents that belong to the tasks of a run, known by their hashes; a difference is named."""
 NOT_GIVEN = "not given"
-"""How a condition is shown that a run leaves open."""
+"""Text for a condition that a run leaves open."""
 USUAL = {"labels": "v3.1"}
-"""What a run had that does not say it."""
+"""Values of a run that does not say them."""
 MOST_CONTENDERS = 12
 """Policies of one comparison: 66 pairs, whose page is of some megabytes."""
 
@@ -50,41 +42,73 @@ class PlayedEpisode:
     run: RunRecord
 
 
-@dataclass(frozen=True)
-class ContenderSet:
-    """Everything that a comparison is made of."""
-
-    contenders: tuple[Contender, ...]
-    played: tuple[Mapping[tuple[Stratum, Hashable], PlayedEpisode], ...]
-    """Of each contender its episodes, by stratum and what names the episode in it."""
-    facts: tuple[tuple[tuple[str, str], ...], ...]
-    """Of each contender what it is, by name: policy, tracker, folder."""
-    folders: tuple[Path, ...]
-    """Of each contender the folder that was named on the command line."""
-    alike: tuple[tuple[str, str], ...]
-    """Conditions that all share, by name."""
-    notes: tuple[str, ...]
-    """What a reader must know besides the figures."""
-
-
 @dataclass
-class _Gathered:
-    """A contender while its folders are read."""
+class Compared:
+    """One of what is compared: a policy with its cells."""
 
     name: str
-    where: Path
-    """Folder that was named on the command line."""
-    episodes: list[PlayedEpisode] = dataclasses.field(default_factory=list)
+    folder: Path
+    """As it was named on the command line."""
+    cells: list[PlayedCell] = dataclasses.field(default_factory=list)
+    episodes: dict[tuple[Stratum, Hashable], PlayedEpisode] = dataclasses.field(default_factory=dict)
+    """Its episodes, by stratum and what names the episode in every folder: group seed, repeat and episode seed."""
+
+    @property
+    def trackers(self) -> list[str]:
+        """Trackers that executed its actions."""
+        return list(dict.fromkeys(cell.tracker for cell in self.cells))
+
+    @property
+    def facts(self) -> tuple[tuple[str, str], ...]:
+        """Policy, tracker and folder, by name."""
+        policies = list(dict.fromkeys(plain_text(cell.records[0].shown_policy, 120) for cell in self.cells))
+        more = f" and {len(policies) - 3} more" if len(policies) > 3 else ""
+        trackers = plain_text(" ".join(self.trackers), 120)
+        return (
+            ("policy", " ".join(policies[:3]) + more),
+            ("tracker", trackers),
+            ("folder", plain_text(self.folder, 200)),
+        )
 
     def values(self, name: str) -> list[str]:
         """Values of a condition, as texts."""
         found = []
-        for run in dict.fromkeys(map(id, (one.run for one in self.episodes))):
-            first = next(one for one in self.episodes if id(one.run) == run)
-            own: Json = getattr(first.record, name, "") if name in ("rules", "engine") else None
-            value = own or first.run.config.get(name) or USUAL.get(name) or None  # absent, null and false are alike
+        for cell in self.cells:
+            own: Json = getattr(cell.records[0], name, "") if name in ("rules", "engine") else None
+            value = own or cell.run.config.get(name) or USUAL.get(name) or None  # absent, null and false are alike
             found.append(NOT_GIVEN if value is None else shown(value).strip('"'))
         return list(dict.fromkeys(found))
+
+    def stratified(self, with_tracker: bool, with_mode: bool) -> Contender:
+        """Put the episodes into strata: tasks, and trackers and modes where these vary.
+
+        Raises:
+            InputError: Two of its folders hold the same episode.
+        """
+        outcomes: dict[Stratum, dict[Hashable, bool]] = {}
+        for cell in self.cells:
+            stratum = (cell.task, *([cell.tracker] if with_tracker else []), *([cell.mode] if with_mode else []))
+            for record in cell.records:
+                key = (record.group_seed, record.repeat, record.episode_seed)
+                if (other := self.episodes.get((stratum, key))) is not None:
+                    name = f"{' '.join(stratum)} seed {record.group_seed} repeat {record.repeat} of {self.name}"
+                    raise InputError(f"{cell.folder}: episode {name} is in {other.run.folder} too")
+                self.episodes[stratum, key] = PlayedEpisode(record, cell.run)
+                outcomes.setdefault(stratum, {})[key] = record.outcome == "success"
+        return Contender(self.name, outcomes)
+
+
+@dataclass(frozen=True)
+class ContenderSet:
+    """Everything that a comparison is made of."""
+
+    compared: tuple[Compared, ...]
+    contenders: tuple[Contender, ...]
+    """Of each its outcomes."""
+    alike: tuple[tuple[str, str], ...]
+    """Conditions that all share, by name."""
+    notes: tuple[str, ...]
+    """Sentences for a reader besides the figures."""
 
 
 def read_contenders(
@@ -113,41 +137,20 @@ def read_contenders(
             raise InputError(f"--differ {plain_text(name, 60)}: choose from {' '.join(CONDITIONS)}")
     notes: list[str] = []
     titles = _titles(folders)
-    gathered: list[_Gathered] = []
+    gathered: list[Compared] = []
     for folder, title in zip(folders, titles, strict=True):
-        if (folder / SUITE_FILE).is_file():
-            gathered += _of_suite(folder, title if len(folders) > 1 else "", per_tracker, notes)
-        else:
-            gathered += _of_run(folder, title, per_tracker, notes)
+        gathered += _of_folder(folder, title, len(folders) == 1, per_tracker, notes)
     gathered = _chosen(gathered, only)
     _check_alike(gathered, differ)
-    notes += _notes(gathered, differ)
-    with_tracker = not all(len(_trackers(one)) == 1 for one in gathered)
-    modes = len({played.record.mode for one in gathered for played in one.episodes}) > 1
-
-    def stratum(record: EpisodeRecord) -> Stratum:
-        return (record.task, *([record.tracker] if with_tracker else []), *([record.mode] if modes else []))
-
-    contenders, played = [], []
-    for one in gathered:
-        found = _by_episode(one, stratum)
-        outcomes: dict[Stratum, dict[Hashable, bool]] = {}
-        for (where, key), episode in found.items():
-            outcomes.setdefault(where, {})[key] = episode.record.outcome == "success"
-        contenders.append(Contender(one.name, outcomes))
-        played.append(found)
-    alike = [(name, gathered[0].values(name)) for name in CONDITIONS]
-    shared = [(name.replace("_", " "), values[0]) for name, values in alike if _all_alike(gathered, name)]
-    shared = [(name, value) for name, value in shared if value != NOT_GIVEN]
-    if not modes:
-        shared.append(("mode", gathered[0].episodes[0].record.mode))
+    with_tracker = not all(len(one.trackers) == 1 for one in gathered)
+    modes = {cell.mode for one in gathered for cell in one.cells}
+    alike = [(name.replace("_", " "), gathered[0].values(name)[0]) for name in CONDITIONS if _all_alike(gathered, name)]
+    alike = [(name, value) for name, value in alike if value != NOT_GIVEN]
     return ContenderSet(
-        contenders=tuple(contenders),
-        played=tuple(played),
-        facts=tuple(map(_facts, gathered)),
-        folders=tuple(one.where for one in gathered),
-        alike=tuple(shared),
-        notes=tuple(notes),
+        tuple(gathered),
+        tuple(one.stratified(with_tracker, len(modes) > 1) for one in gathered),
+        (*alike, *(("mode", mode) for mode in modes if len(modes) == 1)),
+        (*notes, *_notes(gathered, differ)),
     )
 
 
@@ -161,72 +164,47 @@ def _titles(folders: Sequence[Path]) -> list[str]:
     return [plain_text(path, None) for path in paths]
 
 
-def _check_evaluation(run: RunRecord) -> None:
-    if run.config.get("seed_range", seeding.EVALUATION) != seeding.EVALUATION:
-        raise InputError(f"{run.folder}: holds recordings for training; what is compared are evaluations")
-
-
-def _of_run(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> list[_Gathered]:
-    run = load_run(folder)
-    _check_evaluation(run)
-    check_whole_plan(run)
-    played, planned = len(run.records), run.document["planned"]
-    if not played:
-        raise InputError(f"{folder}: holds no finished episode")
-    if not is_complete(run):
-        # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
+def _of_folder(folder: Path, title: str, alone: bool, per_tracker: bool, notes: list[str]) -> list[Compared]:
+    """Contenders of a results folder or a suite; in the name of a suite's the folder counts unless it is alone."""
+    suite, cells = read_folder(folder, notes)
+    if not cells:
         raise InputError(
-            f"{folder}: is unfinished ({played} of {planned} episodes), and what ends first is no fair sample; "
-            f"finish it by eval resume {folder}"
+            f"{folder}: {'holds no finished episode' if suite is None else 'no cell of the suite is finished'}"
+        )
+    if suite is None:
+        _check_sample(runs_of(cells)[0], notes)
+    alike: dict[str, list[tuple[str, ...]]] = {}
+    for planned in suite.cells if suite is not None else ():
+        alike.setdefault(planned.policy, []).append(_conditions(planned))
+    several = len({cell.records[0].shown_policy for cell in cells}) > 1
+    found: dict[tuple[str, ...], Compared] = {}
+    for cell in cells:
+        policy, words, said = cell.records[0].shown_policy if several else "", tuple[str, ...](), list[str]()
+        if cell.planned is not None:
+            policy, words = cell.planned.policy, _conditions(cell.planned)
+            said = [word for word, *others in zip(words, *alike[policy], strict=True) if len(set(others)) > 1]
+        tracker = cell.tracker if per_tracker else ""
+        name = " ".join(filter(None, ["" if alone and suite else title, policy, *said, tracker]))
+        found.setdefault((policy, *words, tracker), Compared(plain_text(name, None), folder)).cells.append(cell)
+    return list(found.values())
+
+
+def _check_sample(run: RunRecord, notes: list[str]) -> None:
+    """Refuse a run that is unfinished: successes end before timeouts, so that its first episodes are no fair sample."""
+    if not is_complete(run):
+        raise InputError(
+            f"{run.folder}: is unfinished ({len(run.records)} of {run.document['planned']} episodes), and what ends "
+            f"first is no fair sample; finish it by eval resume {run.folder}"
         )
     if (rule := width_rule(run.config)) is not None:
         notes.append(
-            f"{folder}: rows ended when their interval was at most {100 * rule.width:g} points wide, or at "
+            f"{run.folder}: rows ended when their interval was at most {100 * rule.width:g} points wide, or at "
             f"{rule.most:,} episodes; tests are of the episodes that a pair shares."
         )
-    found: dict[tuple[str, str], _Gathered] = {}
-    policies = {record.shown_policy for record in run.records}
-    for record in run.records:
-        key = (record.shown_policy if len(policies) > 1 else "", record.tracker if per_tracker else "")
-        name = " ".join([title, *(plain_text(word, None) for word in key if word)])
-        found.setdefault(key, _Gathered(name, folder)).episodes.append(PlayedEpisode(record, run))
-    return list(found.values())
-
-
-def _of_suite(folder: Path, title: str, per_tracker: bool, notes: list[str]) -> list[_Gathered]:
-    suite = read_suite(folder)
-    words = {cell.id: _conditions(cell) for cell in suite.cells}
-    found: dict[tuple[str, ...], _Gathered] = {}
-    waiting = 0
-    for cell in suite.cells:
-        if cell.status == "failed":
-            notes.append(f"{folder / cell.folder}: failed ({plain_text(cell.error or 'no reason', 200)}).")
-        # A cell that is beginning has a folder before it has a configuration.
-        run = load_cell(suite, cell) if (folder / cell.folder / CONFIG_FILE).exists() else None
-        if run is None or not run.records:
-            waiting += cell.status != "failed"
-            continue
-        _check_evaluation(run)
-        if not is_complete(run):
-            notes.append(
-                f"{run.folder} is unfinished, and left out: {len(run.records)} of {run.document['planned']} episodes."
-            )
-            continue
-        alike = [words[other.id] for other in suite.cells if other.policy == cell.policy]
-        said = [word for position, word in enumerate(words[cell.id]) if len({one[position] for one in alike}) > 1]
-        name = " ".join(filter(None, [title, cell.policy, *said, cell.tracker if per_tracker else ""]))
-        key = (cell.policy, *words[cell.id], cell.tracker if per_tracker else "")
-        one = found.setdefault(key, _Gathered(plain_text(name, None), folder))
-        one.episodes += [PlayedEpisode(record, run) for record in run.records]
-    if waiting:
-        notes.append(f"{folder}: {counted(waiting, 'cell')} of {len(suite.cells)} not played yet.")
-    if not found:
-        raise InputError(f"{folder}: no cell of the suite is finished")
-    return list(found.values())
 
 
 def _conditions(cell: SuiteCell) -> tuple[str, ...]:
-    """What tells cells of one policy of a suite apart, besides task, tracker and mode.
+    """Conditions that tell cells of one policy of a suite apart, besides task, tracker and mode.
 
     Checkpoints of one policy, each executed by the tracker of its training, are one contender.
     """
@@ -241,7 +219,7 @@ def _conditions(cell: SuiteCell) -> tuple[str, ...]:
     )
 
 
-def _chosen(gathered: Sequence[_Gathered], only: Sequence[str]) -> list[_Gathered]:
+def _chosen(gathered: Sequence[Compared], only: Sequence[str]) -> list[Compared]:
     known = [one.name for one in gathered]
     for name in known:
         if known.count(name) > 1:
@@ -264,7 +242,7 @@ def _chosen(gathered: Sequence[_Gathered], only: Sequence[str]) -> list[_Gathere
     return kept
 
 
-def _check_alike(gathered: Sequence[_Gathered], differ: Sequence[str]) -> None:
+def _check_alike(gathered: Sequence[Compared], differ: Sequence[str]) -> None:
     """Refuse what differs in a condition, and name what does not."""
     for name in CONDITIONS:
         if name in differ or _all_alike(gathered, name):
@@ -281,82 +259,42 @@ def _check_alike(gathered: Sequence[_Gathered], differ: Sequence[str]) -> None:
         )
 
 
-def _all_alike(gathered: Sequence[_Gathered], name: str) -> bool:
+def _all_alike(gathered: Sequence[Compared], name: str) -> bool:
     return len({value for one in gathered for value in one.values(name)}) == 1
 
 
-def _trackers(one: _Gathered) -> list[str]:
-    return list(dict.fromkeys(played.record.tracker for played in one.episodes))
-
-
-def _notes(gathered: Sequence[_Gathered], differ: Sequence[str]) -> list[str]:
+def _notes(gathered: Sequence[Compared], differ: Sequence[str]) -> list[str]:
     """Conditions under which runs are no results of the benchmark, needless differences, and errors."""
-    runs = {id(played.run): played.run for one in gathered for played in one.episodes}
-    found = list(dict.fromkeys(said for run in runs.values() for said in changed_conditions(run)))
+    cells = [cell for one in gathered for cell in one.cells]
+    runs = runs_of(cells)
+    found = list(dict.fromkeys(said for run in runs for said in changed_conditions(run)))
     for name in dict.fromkeys((*differ, *NOTED)):
         if not _all_alike(gathered, name):
             said = "; ".join(f"{one.name}: {' and '.join(one.values(name))}" for one in gathered)
             found.append(f"{name.replace('_', ' ').capitalize()} differs: {said}.")
-    trackers = {one.name: " ".join(_trackers(one)) for one in gathered}
+    trackers = {one.name: " ".join(one.trackers) for one in gathered}
     if len(set(trackers.values())) > 1:
         found.append(f"Trackers differ: {'; '.join(f'{name}: {words}' for name, words in trackers.items())}.")
     weights: dict[str, dict[str, None]] = {}
-    for one in gathered:
-        for played in one.episodes:
-            now = played.record.hashes.get("checkpoint")
-            if now is not None:
-                weights.setdefault(played.record.tracker, {})[now] = None
+    for record in (record for cell in cells for record in cell.records):
+        if (now := record.hashes.get("checkpoint")) is not None:
+            weights.setdefault(record.tracker, {})[now] = None
     found += [f"Weights of {tracker} differ: {' '.join(kept)}." for tracker, kept in weights.items() if len(kept) > 1]
-    codes = {run.config.get("code") for run in runs.values()}
-    found += [f"The runs were made with {len(codes)} versions of the code."] if len(codes) > 1 else []
+    found += code_notes(runs)
     found += [
         f"{what} have changed between the runs: {' '.join(sorted(versions))}, of the same tasks."
         for key, what in HASHED.items()
-        for versions in _versions(gathered, key)
+        for versions in _versions(runs, key)
     ]
-    for one in gathered:
-        errors = sum(played.record.outcome == "error" for played in one.episodes)
-        if errors:
-            found.append(
-                f"{one.name}: {counted(errors, 'episode')} of {len(one.episodes)} ended with an error; they count as "
-                "no success."
-            )
+    found += [f"{one.name}: {said}" for one in gathered if (said := error_note(one.cells))]
     return [plain_text(text) for text in found]
 
 
-def _versions(gathered: Sequence[_Gathered], key: str) -> list[set[str]]:
+def _versions(runs: Sequence[RunRecord], key: str) -> list[set[str]]:
     """Hashes of something that depends on a run's tasks, where runs of the same tasks have several."""
     by_tasks: dict[tuple[str, ...], set[str]] = {}
-    for run in {id(played.run): played.run for one in gathered for played in one.episodes}.values():
+    for run in runs:
         tasks, value = run.config.get("task"), run.config.get(key)
         if tasks is not None and isinstance(value, str):
             by_tasks.setdefault((run.config["rules"], *sorted(tasks)), set()).add(value)
     return [versions for versions in by_tasks.values() if len(versions) > 1]
-
-
-def _by_episode(
-    one: _Gathered, stratum: Callable[[EpisodeRecord], Stratum]
-) -> dict[tuple[Stratum, Hashable], PlayedEpisode]:
-    """Episodes by stratum and by what names an episode in every folder: its group seed, repeat and episode seed."""
-    found: dict[tuple[Stratum, Hashable], PlayedEpisode] = {}
-    for played in one.episodes:
-        record = played.record
-        key = (stratum(record), (record.group_seed, record.repeat, record.episode_seed))
-        if key in found:
-            where = " ".join(key[0])
-            raise InputError(
-                f"{played.run.folder}: episode {where} seed {record.group_seed} repeat {record.repeat} of {one.name} "
-                f"is in {found[key].run.folder} too"
-            )
-        found[key] = played
-    return found
-
-
-def _facts(one: _Gathered) -> tuple[tuple[str, str], ...]:
-    policies = dict.fromkeys(plain_text(played.record.shown_policy, 120) for played in one.episodes)
-    shown_policies = " ".join(list(policies)[:3]) + (f" and {len(policies) - 3} more" if len(policies) > 3 else "")
-    return (
-        ("policy", shown_policies),
-        ("tracker", plain_text(" ".join(_trackers(one)), 120)),
-        ("folder", plain_text(one.where, 200)),
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.table_entries import SuiteTable
 
 __all__ = ["cost_table"]
@@ -52,4 +52,4 @@ def cost_table(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
         "suite measured, start and compilation included."
     )
     whole = (*head, "evaluation min", "min per cell")
-    return SuiteTable("cost", "Time", caption, whole, 4, tuple(rows), (0,), ())
+    return SuiteTable(whole, rows, "llllr", "Time", caption, "cost")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from arena_newton.eval.reports.wording import escaped, markdown_table
 from arena_newton.eval.statistics.trainings import DROP_SPREAD, ENOUGH, MATCHED_SPREAD, SWAPPED_SPREAD
 from arena_newton.eval.tables.paper_claims import NEGLIGIBLE, SIGNIFICANT, ClaimResult
 from arena_newton.eval.tables.table_entries import probability
+from arena_newton.pages.tables import Table, escaped
 
 __all__ = ["findings_table", "findings_text"]
 
@@ -49,4 +49,4 @@ def findings_table(found: Sequence[ClaimResult]) -> str:
     """The findings as one Markdown table, for a page of results."""
     rows = [(one.name, one.verdict, one.paper, one.ours, probability(one.p_holm)) for one in found]
     head = ("finding", "here", "the paper", "these networks", "p (Holm)")
-    return markdown_table(head, rows, 4)
+    return Table(head, rows, "llllr").markdown()

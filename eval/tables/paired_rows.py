@@ -6,16 +6,9 @@ import dataclasses
 from collections.abc import Sequence
 
 from arena_newton.eval.statistics.stats import contrast, holm, paired_rates
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
-from arena_newton.eval.tables.table_entries import (
-    UNDEFINED,
-    TableEntry,
-    interval_text,
-    ours,
-    percent,
-    points,
-    probability,
-)
+from arena_newton.eval.tables.episode_table import EvaluatedCell
+from arena_newton.eval.tables.table_entries import UNDEFINED, TableEntry, interval_text, ours, probability
+from arena_newton.pages.tables import percent, points
 
 __all__ = ["PAIRED", "RowPair", "paired_rows"]
 

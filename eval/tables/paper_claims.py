@@ -20,10 +20,11 @@ from arena_newton.eval.statistics.trainings import (
     TrainedContrast,
     trained_contrast,
 )
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers
-from arena_newton.eval.tables.table_entries import PAPER_NAMES, SEMANTIC_STRENGTH, points, semantic_text
+from arena_newton.eval.tables.table_entries import PAPER_NAMES, SEMANTIC_STRENGTH, semantic_text
 from arena_newton.files.text import counted
+from arena_newton.pages.tables import points
 
 __all__ = ["NEGLIGIBLE", "SIGNIFICANT", "ClaimResult", "findings"]
 

@@ -1,4 +1,4 @@
-"""The numbers that the HumanoidArena paper prints, read from `eval/paper/*.csv` and checked."""
+"""The numbers that the HumanoidArena paper prints, read from `eval/tables/paper/*.csv` and checked."""
 
 from __future__ import annotations
 

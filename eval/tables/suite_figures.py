@@ -17,8 +17,9 @@ from matplotlib.colors import LinearSegmentedColormap  # noqa: E402
 from arena_newton.eval.records.journal import StorageError  # noqa: E402
 from arena_newton.eval.statistics.stats import suites  # noqa: E402
 from arena_newton.eval.tables.suite_tables import MODE_ORDER, tracker_order  # noqa: E402
-from arena_newton.eval.tables.table_entries import PAPER_NAMES, SuiteTable, TableEntry, percent  # noqa: E402
+from arena_newton.eval.tables.table_entries import PAPER_NAMES, SuiteTable, TableEntry  # noqa: E402
 from arena_newton.files.own_files import replace_atomically  # noqa: E402
+from arena_newton.pages.tables import percent  # noqa: E402
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

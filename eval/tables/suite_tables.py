@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from arena_newton import tasks
 from arena_newton.eval.statistics.stats import contrast, paired_rates, suites
 from arena_newton.eval.tables.cost_table import cost_table
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paired_rows import PAIRED, RowPair, paired_rows
 from arena_newton.eval.tables.paper_numbers import (
     FAMILIES,
@@ -29,11 +29,10 @@ from arena_newton.eval.tables.table_entries import (
     SuiteTable,
     TableEntry,
     interval_text,
+    ordered,
     ours,
     ours_average,
     paper_entry,
-    percent,
-    points,
     probability,
     published_entry,
     rate_text,
@@ -41,6 +40,7 @@ from arena_newton.eval.tables.table_entries import (
     task_title,
 )
 from arena_newton.eval.tables.trainings_table import trainings_table
+from arena_newton.pages.tables import percent, points
 
 __all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 
@@ -69,7 +69,7 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers, changed: S
         paper = PaperNumbers({}, {}, {})
     cells = [cell for cell in cells if cell.records]
     prompt = [cell for cell in cells if cell.latency == 0]
-    modes = _ordered({c.mode for c in prompt}, MODE_ORDER)
+    modes = ordered({c.mode for c in prompt}, MODE_ORDER)
     found: list[SuiteTable | None] = [_in_gmt(prompt, paper, mode) for mode in modes]
     found += [_untrained(prompt, mode) for mode in modes]
     found += [
@@ -94,11 +94,7 @@ def _with_rules(table: SuiteTable, changed: Sequence[str]) -> SuiteTable:
 
 def tracker_order(names: set[str]) -> list[str]:
     """Trackers, the paper's first."""
-    return _ordered(names, ("twist2", "sonic"))
-
-
-def _ordered(names: set[str], known: Sequence[str]) -> list[str]:
-    return [name for name in known if name in names] + sorted(names - set(known))
+    return ordered(names, ("twist2", "sonic"))
 
 
 def _policies(cells: Sequence[EvaluatedCell]) -> list[tuple[str, str]]:
@@ -109,7 +105,7 @@ def _policies(cells: Sequence[EvaluatedCell]) -> list[tuple[str, str]]:
 
 
 def _tasks(cells: Sequence[EvaluatedCell]) -> list[str]:
-    return _ordered({cell.task for cell in cells}, suites()["ALL_AVG"])
+    return ordered({cell.task for cell in cells}, suites()["ALL_AVG"])
 
 
 def _in_gmt_cells(cells: Sequence[EvaluatedCell], mode: str = "base") -> list[EvaluatedCell]:
@@ -195,7 +191,7 @@ def _in_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers, mode: str) -> S
     about = _reported(paper) if mode == "base" else _about(mode)
     caption = f"Policies executed by the tracker of their training. {INTERVALS}{about}"
     head = ("tracker", "policy", "source", "n", "AFR", *named)
-    return SuiteTable(name, title, caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
+    return SuiteTable(head, rows, "lllr", title, caption, name, groups, entries)
 
 
 def _published(paper: PaperNumbers, tracker: str, mode: str) -> list[PublishedRow]:
@@ -239,7 +235,7 @@ def _untrained(cells: Sequence[EvaluatedCell], mode: str) -> SuiteTable | None:
     title = "Policies without training" + ("" if mode == "base" else f", mode {mode}")
     head = ("tracker", "policy", "n", "AFR", *(SHORT.get(c, task_title(c)) + _change(mode, c) for c in columns))
     caption = f"Policies that were not trained, or do not say on what. {OURS}{_about(mode)}"
-    return SuiteTable(name, title, caption, head, 2, tuple(rows), tuple(groups), tuple(entries))
+    return SuiteTable(head, rows, "llr", title, caption, name, groups, entries)
 
 
 def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:
@@ -280,7 +276,7 @@ def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | N
         "the highest of several favours it, on both sides. The paper's successes are derived from its rates."
         f"{_reported(paper)}"
     )
-    return SuiteTable("best", "Best policy per task", caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
+    return SuiteTable(head, rows, "lllr", "Best policy per task", caption, "best", groups, entries)
 
 
 def _families(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
@@ -306,16 +302,8 @@ def _families(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
     rows, entries = paired_rows("families", pairs)
     rows = [(*row[:8], *row[9:-1]) for row in rows]
     head = ("tracker", "task", "first", "second", "n", "first %", "second %", "Δ", "alone", "p", "p (Holm)")
-    return SuiteTable(
-        "families",
-        "Policies against each other",
-        PAIRED + "In-GMT, mode base, of a recipe its first training. They tell networks apart, no families.",
-        head,
-        4,
-        tuple(rows),
-        tuple(groups),
-        tuple(entries),
-    )
+    caption = PAIRED + "In-GMT, mode base, of a recipe its first training. They tell networks apart, no families."
+    return SuiteTable(head, rows, "llllr", "Policies against each other", caption, "families", groups, entries)
 
 
 def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:
@@ -351,9 +339,7 @@ def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
         f"{PAIRED}Δ: matched minus swapped. Ret: swapped over matched; {UNDEFINED} where nothing succeeded when "
         "matched. AFR: falls of the swapped episodes; the paper's is of the task and direction over all its policies."
     )
-    return SuiteTable(
-        "cross_gmt", "Cross-GMT evaluation", caption, heads, 3, tuple(rows), tuple(groups), tuple(entries)
-    )
+    return SuiteTable(heads, rows, "lllr", "Cross-GMT evaluation", caption, "cross_gmt", groups, entries)
 
 
 def _paper_transfers(pairs: Sequence[RowPair], paper: PaperNumbers) -> list[TableEntry]:
@@ -385,7 +371,7 @@ def _paper_transfers(pairs: Sequence[RowPair], paper: PaperNumbers) -> list[Tabl
 def _perturbation(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:
     """Average rates per mode over the tasks that were played in every mode shown, and drops from base."""
     mine = [c for mode in MODE_ORDER for c in _in_gmt_cells(cells, mode)]
-    modes = _ordered({c.mode for c in mine}, MODE_ORDER)
+    modes = ordered({c.mode for c in mine}, MODE_ORDER)
     if len(modes) < 2 or "base" not in modes:
         return None
     rows: list[tuple[str, ...]] = []
@@ -421,9 +407,7 @@ def _perturbation(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteT
     )
     if others := sorted({c.mode for c in cells} - set(MODE_ORDER)):
         caption += f" Without {', '.join(others)}: no mode of the paper, each has a table of its own."
-    return SuiteTable(
-        "perturbation", "Perturbation profile", caption, head, 4, tuple(rows), tuple(groups), tuple(entries)
-    )
+    return SuiteTable(head, rows, "llllr", "Perturbation profile", caption, "perturbation", groups, entries)
 
 
 def _profile(
@@ -509,7 +493,7 @@ def _merge_all(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
         "Policies of merged demonstrations; those of several trackers are executed by each of them and pooled, as in "
         f"the paper. {INTERVALS}"
     )
-    return SuiteTable("merge_all", "Merged training", caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
+    return SuiteTable(head, rows, "lllr", "Merged training", caption, "merge_all", groups, entries)
 
 
 def _latency(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
@@ -553,7 +537,7 @@ def _latency(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
         "Success rate in % (95 % Wilson interval) when each chunk starts late by so much, mode base; p: exact McNemar "
         "test against no delay on the same episodes. The paper has no such table."
     )
-    return SuiteTable("latency", "Latency", caption, head, 3, tuple(rows), tuple(groups), tuple(entries))
+    return SuiteTable(head, rows, "lllr", "Latency", caption, "latency", groups, entries)
 
 
 def _labels(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
@@ -580,14 +564,8 @@ def _labels(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
     rows = [(*row[:10], *row[11:-1]) for row in rows]
     named = ("trained on", "tracker", "", "task", "v3.1 policy", "v4 policy")
     head = (*named, "n", "v3.1 %", "v4 %", "Δ", "alone", "p", "p (Holm)")
-    return SuiteTable(
-        "labels",
-        "Label protocols",
-        PAIRED + "Δ: v3.1 minus v4. They tell networks apart, no labels: trainings of one recipe differ too. The paper "
-        "has labels of v3.1 only.",
-        head,
-        6,
-        tuple(rows),
-        tuple(groups),
-        tuple(entries),
+    caption = (
+        f"{PAIRED}Δ: v3.1 minus v4. They tell networks apart, no labels: trainings of one recipe differ too. The paper "
+        "has labels of v3.1 only."
     )
+    return SuiteTable(head, rows, "llllllr", "Label protocols", caption, "labels", groups, entries)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 from arena_newton import tasks
 from arena_newton.eval.statistics.stats import Contrast, contrast, population_std, seed_rates, suites, wilson
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import PaperRate, PublishedRow
+from arena_newton.pages.tables import Table, percent
 
 __all__ = [
     "PAPER_NAMES",
@@ -20,11 +21,10 @@ __all__ = [
     "SuiteTable",
     "TableEntry",
     "interval_text",
+    "ordered",
     "ours",
     "ours_average",
     "paper_entry",
-    "percent",
-    "points",
     "published_entry",
     "probability",
     "rate_text",
@@ -99,20 +99,15 @@ class TableEntry:
 
 
 @dataclass(frozen=True)
-class SuiteTable:
-    """A table as it is shown."""
+class SuiteTable(Table):
+    """A table as it is shown, and its numbers."""
 
-    name: str
-    """Name of its files."""
-    title: str
-    caption: str
-    head: tuple[str, ...]
-    left: int
-    """Columns flush left."""
-    rows: tuple[tuple[str, ...], ...]
-    groups: tuple[int, ...]
-    """Numbers of the rows that begin a group; a rule is drawn above them."""
-    entries: tuple[TableEntry, ...]
+    entries: Sequence[TableEntry] = ()
+
+
+def ordered(names: set[str], known: Sequence[str]) -> list[str]:
+    """Names in the order of those that are known, others after them."""
+    return [name for name in known if name in names] + sorted(names - set(known))
 
 
 def task_title(task: str) -> str:
@@ -130,17 +125,6 @@ def semantic_text() -> str:
         f"Semantic mode changes looks, and nothing that moves or collides in base mode: {'; '.join(parts)}. (Under "
         "rules released what counts in VisNavi becomes a disc, too, and Football has a second ball.)"
     )
-
-
-def percent(value: float, digits: int = 1) -> str:
-    """A fraction as a percentage without sign of percent, such as `45.0`."""
-    return f"{100 * value:.{digits}f}"
-
-
-def points(value: float) -> str:
-    """A difference of fractions in percentage points, such as `−4.2`."""
-    text = f"{100 * value:+.1f}"
-    return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
 
 
 def interval_text(low: float, high: float) -> str:

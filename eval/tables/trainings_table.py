@@ -5,8 +5,9 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
-from arena_newton.eval.tables.table_entries import SuiteTable, percent, task_title
+from arena_newton.eval.tables.episode_table import EvaluatedCell
+from arena_newton.eval.tables.table_entries import SuiteTable, task_title
+from arena_newton.pages.tables import percent
 
 __all__ = ["trainings_table"]
 
@@ -32,4 +33,4 @@ def trainings_table(cells: Sequence[EvaluatedCell]) -> SuiteTable | None:
         "Several trainings of one recipe: successes of each, their mean rate, and the standard deviation between "
         "trainings, chance of episodes included."
     )
-    return SuiteTable("trainings", "Several trainings", caption, head, 5, tuple(rows), (0,), ())
+    return SuiteTable(head, rows, "lllllr", "Several trainings", caption, "trainings")

@@ -25,7 +25,7 @@ __all__ = ["EpisodeActor"]
 
 
 class EpisodeActor:
-    """What Ray makes a process of. All is played in one thread, so that episodes are told of while others run."""
+    """Process of Ray that plays episodes, all in one thread, so that episodes are reported while others run."""
 
     def __init__(self, gpu: bool):
         """Hide the GPUs from a process that was given none: Warp would make a context on each."""
@@ -38,7 +38,7 @@ class EpisodeActor:
         self._folder: Path
 
     def node(self) -> Node:
-        """Where this process is."""
+        """Machine, process and GPUs of this process."""
         import ray
 
         gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")

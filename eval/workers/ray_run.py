@@ -11,7 +11,7 @@ import dataclasses
 import shlex
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,7 @@ from ray.exceptions import RayError
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.run_folder import BREAK_FILE, ResultsFolder, iso
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.play.whole_run import (
+from arena_newton.eval.play.run_flow import (
     Group,
     RunStopped,
     begun,
@@ -34,15 +34,15 @@ from arena_newton.eval.play.whole_run import (
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.workers.ray_crew import Crew, Done, Job, Lease, Lost, Member, in_cluster
 from arena_newton.eval.workers.slice_events import Built, Ended, Event, Opened, Ticks
+from arena_newton.eval.workers.worker_pool import Assignment, Done, Job, Lost, Worker, WorkerPool, in_cluster
 from arena_newton.files.text import counted, plain_text
 from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
 
-__all__ = ["DealtRun", "execute", "round_seconds"]
+__all__ = ["DealtRun", "execute"]
 
 BATCHES = 2
 """Most episodes of a slice, in batches of --worlds."""
@@ -76,77 +76,54 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
 
 def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
-    crew = Crew(folder.config, len(folder.config.episodes), factories)
+    pool = WorkerPool(folder.config, len(folder.config.episodes), factories)
     try:
-        return _played_by(crew, folder)
+        return _played_by(pool, folder)
     finally:
-        crew.dismiss()
+        pool.dismiss()
 
 
-def round_seconds(folders: Sequence[ResultsFolder], number: int, factories: Factories | None) -> list[float] | None:
-    """Time of each of several runs that so many processes play one after the other, each run as a whole [s].
-
-    Returns:
-        None where the cluster has no room for as many processes.
-    """
-    config = folders[0].config
-    found = []
-    with in_cluster(config.flags.ray or ()):
-        crew = Crew(config, number, factories)
-        try:
-            if crew.room() < number:
-                return None
-            for folder in folders:
-                began = time.perf_counter()
-                if not _played_by(crew, folder):
-                    raise KeyboardInterrupt
-                found.append(time.perf_counter() - began)
-        finally:
-            crew.dismiss()
-    return found
-
-
-def _played_by(crew: Crew, folder: ResultsFolder) -> bool:
-    """Play what is missing in a folder by a crew; False when it was interrupted."""
+def _played_by(pool: WorkerPool, folder: ResultsFolder) -> bool:
+    """Play what is missing in a folder by a pool; False when it was interrupted."""
     job = Job(folder)
     resume = f"{command(folder, 'resume')} {shlex.join(['--ray', *(folder.config.flags.ray or ())])}"
     with contextlib.ExitStack() as ended:
-        config = crew.opened(job)
+        config = pool.opened(job)
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
         folder.settle(config, journal.records)
         folder.sweep()
-        ended.callback(_swept, crew, folder)
+        ended.callback(_swept, pool, folder)
         try:
             with told_how_to_go_on(resume, lambda: kept(config, journal.records)):
                 done, waiting = begun(config, folder, journal)
                 if waiting:
-                    _play(DealtRun(job, journal, crew, done, waiting, progress_of(config, done, waiting)))
+                    _play(DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
         except KeyboardInterrupt:
             print(f"\ninterrupted: {kept(config, journal.records)}; continue with: {resume}")
             return False
     return True
 
 
-def _swept(crew: Crew, folder: ResultsFolder) -> None:
+def _swept(pool: WorkerPool, folder: ResultsFolder) -> None:
     """Remove what unfinished recordings left, once who writes them has ended."""
-    if any(member.lease is not None for member in crew.members):
-        crew.dismiss()
+    if any(worker.assignment is not None for worker in pool.workers):
+        pool.dismiss()
     folder.sweep()
 
 
 def _play(run: DealtRun) -> None:
     """Play a run until nothing is left."""
-    crew = run.crew
+    pool = run.pool
     try:
         with run.folder.running():
-            run.shown.group(counted(len(crew.members), "Ray actor"))
+            run.shown.group(counted(len(pool.workers), "Ray actor"))
             while _dealt(run):
-                for _, lease, said in crew.heard():
-                    if lease is not None and not isinstance(said, Opened):
-                        run.take(lease, said)
-                    elif isinstance(said, ArenaError):
-                        raise said
+                for _, assignment, message in pool.messages():
+                    if assignment is not None and not isinstance(message, Opened):
+                        run.take(assignment, message)
+                    elif isinstance(message, ArenaError):
+                        raise message
     except RayError as error:
         raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
     finally:
@@ -155,22 +132,22 @@ def _play(run: DealtRun) -> None:
 
 def _dealt(run: DealtRun) -> bool:
     """Give a slice to each process that waits for one; False when all is played."""
-    for member in run.crew.idle():
-        if member.job is not run.job:
-            run.crew.prepare(member, run.job)
-        elif (lease := run.next(member)) is not None:
-            run.crew.lend(member, lease)
+    for worker in run.pool.idle():
+        if worker.job is not run.job:
+            run.pool.prepare(worker, run.job)
+        elif (assignment := run.next(worker)) is not None:
+            run.pool.assign(worker, assignment)
     return not run.finished
 
 
 class DealtRun:
-    """A run whose episodes are dealt out to a crew: its slices, and the journal of what comes back."""
+    """A run whose episodes are dealt out to a pool: its slices, and the journal of what comes back."""
 
     def __init__(
         self,
         job: Job,
         journal: Journal,
-        crew: Crew,
+        pool: WorkerPool,
         ended: dict[int, EpisodeRecord],
         waiting: dict[Group, list[Episode]],
         shown: Progress,
@@ -181,15 +158,15 @@ class DealtRun:
         Args:
             job: The run.
             journal: Its journal.
-            crew: Who plays.
+            pool: Who plays.
             ended: Finished episodes by number.
             waiting: Those to play by task, tracker and mode.
             shown: What shows how far all is.
             besides: Episodes of other runs that nobody plays yet.
         """
-        self.job, self.folder, self.config, self.journal, self.crew = job, job.folder, job.folder.config, journal, crew
+        self.job, self.folder, self.config, self.journal, self.pool = job, job.folder, job.folder.config, journal, pool
         self.ended, self._besides = ended, besides
-        self.shown = crew.shown = shown
+        self.shown = pool.shown = shown
         self._queues: dict[tuple[Group, int], deque[Episode]] = {}
         """Episodes to play, by group and by how often they were lost."""
         for group, episodes in waiting.items():
@@ -211,24 +188,24 @@ class DealtRun:
         return ceil(self.waiting / self._batch)
 
     @property
-    def leased(self) -> bool:
-        """Whether a process plays a slice."""
-        return any(one.lease is not None and one.lease.job is self.job for one in self.crew.members)
+    def assigned(self) -> bool:
+        """True if a process plays a slice."""
+        return any(one.assignment is not None and one.assignment.job is self.job for one in self.pool.workers)
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to play."""
-        return not self.waiting and not self.leased
+        """True if nothing is left to play."""
+        return not self.waiting and not self.assigned
 
     def _fair(self) -> int:
         """Episodes for each process, if what nobody plays were divided now."""
-        return ceil((self.waiting + self._besides()) / len(self.crew.members))
+        return ceil((self.waiting + self._besides()) / len(self.pool.workers))
 
-    def next(self, member: Member) -> Lease | None:
+    def next(self, worker: Worker) -> Assignment | None:
         """The next slice for a process: of its environment if possible, else of the group that has the most to do."""
-        taken = Counter(one.lease.group for one in self.crew.members if one.lease is not None)
+        taken = Counter(one.assignment.group for one in self.pool.workers if one.assignment is not None)
         work = {
-            key: (key == (member.last, 0), sum(e.max_steps for e in queue) / (1 + taken[key[0]]))
+            key: (key == (worker.last, 0), sum(e.max_steps for e in queue) / (1 + taken[key[0]]))
             for key, queue in self._queues.items()
             if queue
         }
@@ -239,31 +216,31 @@ class DealtRun:
         size = min(BATCHES * worlds, max(self._batch, self._fair())) if not level else max(1, worlds // SMALLER)
         size = 1 if level == ALONE else min(size, len(queue))
         episodes = [queue.popleft() for _ in range(size)]
-        return Lease(self.job, group, {e.index: e for e in episodes}, self._batch if not level else size, level)
+        return Assignment(self.job, group, {e.index: e for e in episodes}, self._batch if not level else size, level)
 
-    def take(self, lease: Lease, said: Event | Done | Lost | ArenaError) -> None:
+    def take(self, assignment: Assignment, message: Event | Done | Lost | ArenaError) -> None:
         """Take what a process tells of its slice.
 
         Raises:
             ArenaError: The run cannot go on.
         """
-        if isinstance(said, Built):
-            self.folder.register(" ".join(lease.group), said.facts)
-            lease.built = True
-        elif isinstance(said, Ticks):
-            self.shown.tick(said.count)
-        elif isinstance(said, Ended):
-            self._keep(lease, EpisodeRecord.from_json("a process of --ray", said.line))
-        elif isinstance(said, Lost):
-            self._again(lease, said)
-        elif isinstance(said, Done) and lease.left:  # told of as ended without a line: no process does that
-            self._again(lease, Lost("episodes were left out"))
-        elif isinstance(said, ArenaError):
-            raise said
+        if isinstance(message, Built):
+            self.folder.register(" ".join(assignment.group), message.facts)
+            assignment.built = True
+        elif isinstance(message, Ticks):
+            self.shown.tick(message.count)
+        elif isinstance(message, Ended):
+            self._keep(assignment, EpisodeRecord.from_json("a process of --ray", message.line))
+        elif isinstance(message, Lost):
+            self._again(assignment, message)
+        elif isinstance(message, Done) and assignment.left:  # told of as ended without a line: no process does that
+            self._again(assignment, Lost("episodes were left out"))
+        elif isinstance(message, ArenaError):
+            raise message
 
-    def _keep(self, lease: Lease, record: EpisodeRecord) -> None:
+    def _keep(self, assignment: Assignment, record: EpisodeRecord) -> None:
         """Append an episode to the journal, once."""
-        episode = lease.left.pop(record.index, None)
+        episode = assignment.left.pop(record.index, None)
         if episode is None:
             return
         check_again(self.config, self.folder.path, self.journal.records, record, episode, (record.media or {}).values())
@@ -278,8 +255,10 @@ class DealtRun:
 
     def _next_round(self, group: Group) -> None:
         """More attempts where successes are missing, when all of a round have ended."""
-        mine = [one.lease for one in self.crew.members if one.lease is not None and one.lease.job is self.job]
-        if any(lease.left for lease in mine if lease.group == group):
+        mine = [
+            one.assignment for one in self.pool.workers if one.assignment is not None and one.assignment.job is self.job
+        ]
+        if any(assignment.left for assignment in mine if assignment.group == group):
             return
         if any(queue for (name, _), queue in self._queues.items() if name == group):
             return
@@ -287,26 +266,29 @@ class DealtRun:
         self._queues[group, 0] = deque(more)
         self.shown.more([episode.max_steps for episode in more])
 
-    def _again(self, lease: Lease, lost: Lost) -> None:
+    def _again(self, assignment: Assignment, lost: Lost) -> None:
         """Deal out again what a lost process had not finished; who was running then comes into a smaller slice."""
         if lost.trace:
             with contextlib.suppress(ArenaError):
                 write_atomic(self.folder.path / BREAK_FILE, lost.trace)
-        left, suspects = list(lease.left.values()), set() if lost.with_node else {e.index for e in lease.running()}
-        lease.left.clear()
+        left, suspects = (
+            list(assignment.left.values()),
+            set() if lost.with_node else {e.index for e in assignment.running()},
+        )
+        assignment.left.clear()
         for episode in reversed(left):
             suspected = episode.index in suspects
-            if suspected and lease.size == 1:
+            if suspected and assignment.size == 1:
                 self._losses[episode.index] += 1
                 if self._losses[episode.index] >= self.config.flags.ray_attempts:
-                    self._give_up(lease, episode, lost.cause)
+                    self._give_up(assignment, episode, lost.cause)
                     continue
-            level = min(ALONE, lease.level + 1) if suspected else lease.level
-            self._queues.setdefault((lease.group, level), deque()).appendleft(episode)
+            level = min(ALONE, assignment.level + 1) if suspected else assignment.level
+            self._queues.setdefault((assignment.group, level), deque()).appendleft(episode)
 
-    def _give_up(self, lease: Lease, episode: Episode, cause: str) -> None:
+    def _give_up(self, assignment: Assignment, episode: Episode, cause: str) -> None:
         """End an episode as an error: it takes its process with it."""
-        facts, now = self.folder.document["environments"][" ".join(lease.group)], iso(time.time())
+        facts, now = self.folder.document["environments"][" ".join(assignment.group)], iso(time.time())
         attempts = f"played alone {self._losses[episode.index]} times, each time its process was lost"
         planned = dataclasses.asdict(episode)
         del planned["rank"]
@@ -328,9 +310,12 @@ class DealtRun:
         self.shown.say(f"  {episode.key} ends as an error: {record.error}")
         self._append(episode, record)
         self.shown.episode(episode.max_steps, 0)
-        self._given_up[lease.group] += 1
+        self._given_up[assignment.group] += 1
         played = any(
-            (one.task, one.tracker, one.mode) == lease.group and one.outcome != "error" for one in self.ended.values()
+            (one.task, one.tracker, one.mode) == assignment.group and one.outcome != "error"
+            for one in self.ended.values()
         )
-        if self._given_up[lease.group] >= GIVEN_UP and not played:
-            raise RunStopped(f"{' '.join(lease.group)}: {GIVEN_UP} episodes and no other: {cause}; see {BREAK_FILE}")
+        if self._given_up[assignment.group] >= GIVEN_UP and not played:
+            raise RunStopped(
+                f"{' '.join(assignment.group)}: {GIVEN_UP} episodes and no other: {cause}; see {BREAK_FILE}"
+            )

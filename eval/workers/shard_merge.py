@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import re
-import shlex
 import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from arena_newton.cli.flags import flag_name
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import Results, RunRecord, due_episodes, is_complete, load_run
 from arena_newton.eval.folders.run_folder import RECORDING_FLAGS, comparable, setting
-from arena_newton.eval.plan.options import RunMergeOptions, RunOptions
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
@@ -25,9 +25,9 @@ from arena_newton.eval.records.schema import Json, JsonObject, shown
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
 from arena_newton.eval.reports import report
 from arena_newton.files.own_files import PARTIAL, file_label, replace_atomically
-from arena_newton.files.text import counted, plain_text, unprintable
+from arena_newton.files.text import counted, plain_text
 
-__all__ = ["MergedRun", "merge", "run"]
+__all__ = ["MergedRun", "merge"]
 
 TIMES = ("started_at", "finished_at")
 """Keys of a journal line that differ when an episode is played again, as `durations.wall_s` does."""
@@ -42,12 +42,12 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class MergedRun:
-    """What a merge wrote."""
+    """Result of a merge."""
 
     run: RunRecord
     results: Results
     notes: tuple[str, ...]
-    """What a reader must know besides the table."""
+    """Notes for a reader besides the table."""
 
 
 @dataclass(frozen=True)
@@ -56,36 +56,9 @@ class _Kept:
 
     record: EpisodeRecord
     folder: Path
-    """Where it is from."""
+    """Folder that it is from."""
     others: tuple[Path, ...] = ()
     """Folders where the same came of it."""
-
-
-def run(folders: Sequence[Path], options: RunMergeOptions) -> int:
-    """Merge as the command line asks for, and print the table.
-
-    Returns:
-        0: every planned episode is there, with another outcome than error. 1: some are missing or ended so.
-
-    Raises:
-        InputError: The folders cannot be joined, or --out cannot be written to.
-        StorageError: The disk is full.
-    """
-    if options.out is None or not options.out.strip():
-        raise InputError("merge: name a new folder with --out")
-    if (reason := unprintable(options.out)) is not None:
-        raise InputError(f"--out {plain_text(options.out)}: {reason}")
-    out = Path(options.out).expanduser()
-    merged = merge(folders, out, partial=options.partial, accept_versions=options.accept_versions)
-    print(report.table(merged.results))
-    for note in (*report.notes(merged.run, merged.results), *merged.notes):
-        print(note)
-    whole = merged.results["complete"]
-    if not whole:
-        print(f"The rest: python -m arena_newton.eval resume {shlex.quote(str(out))}")
-    print(f"{counted(merged.results['finished'], 'episode')} of {counted(len(folders), 'folder')} -> {out}")
-    print(f"report: {out / 'report.html'}")
-    return 0 if whole and not any(record.outcome == "error" for record in merged.run.records) else 1
 
 
 def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_versions: bool = False) -> MergedRun:
@@ -191,7 +164,7 @@ def _check_alike(first: RunRecord, other: RunRecord, accept_versions: bool) -> N
     for name in RECORDING_FLAGS:
         values = [_plain(run.document["options"].get(name, getattr(RunOptions, name))) for run in (first, other)]
         if values[0] != values[1]:
-            raise refuse(f"--{name.replace('_', '-')}", *values)
+            raise refuse(flag_name(name), *values)
     versions = [moving_versions(run.document.get("versions", {})) for run in (first, other)]
     difference = differing_key(*versions)
     if difference is not None and not accept_versions:
@@ -249,7 +222,7 @@ def _joined(runs: Sequence[RunRecord]) -> tuple[list[_Kept], list[str]]:
 
 
 def _whole(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> bool:
-    """Whether the plan is played: every episode, or as many successes as were to be kept."""
+    """True if the plan is played: every episode, or as many successes as were to be kept."""
     document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
     document.pop("shard", None)
     return is_complete(RunRecord(runs[0].folder, document, [part.record for part in kept]))
@@ -269,7 +242,7 @@ def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
 
 
 def _outcome(record: EpisodeRecord) -> JsonObject:
-    """What came of an episode, without times of day, recordings and the libraries' versions."""
+    """Outcome of an episode, without times of day, recordings and the libraries' versions."""
     line = record.to_json()
     for key in (*TIMES, *PICTURES):
         del line[key]
@@ -279,7 +252,7 @@ def _outcome(record: EpisodeRecord) -> JsonObject:
 
 
 def _missing(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> str:
-    """Which shards are unfinished, and which are missing, in words."""
+    """Unfinished and missing shards, in words."""
     known = {part.record.index for part in kept}
     count = max((shard.count for shard in map(_shard, runs) if shard), default=0)
     keys = list(plan_numbers(runs[0].folder / CONFIG_FILE, runs[0].config)) if count else []

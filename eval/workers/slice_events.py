@@ -1,4 +1,4 @@
-"""What the processes of a cluster and the run that they play for tell each other: small values, never pictures."""
+"""Messages between the processes of a cluster and the run that they play for: small values, never pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Broke", "Built", "Ended", "Event", "Node", "Opened", "Slice", "Ticks
 
 @dataclass(frozen=True)
 class Node:
-    """Where a process is."""
+    """Location of a process in the cluster."""
 
     name: str
     """Ray's name of the node."""
@@ -29,7 +29,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Opened:
-    """What the parts of a run say of themselves in a process."""
+    """Descriptions of a run's parts in a process."""
 
     identity: Identity
     labels: str
@@ -59,7 +59,7 @@ class Built:
     """The environment of a slice is built."""
 
     facts: JsonObject
-    """What it says of itself."""
+    """The policy's or tracker's own description."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ Event = Built | Ticks | Ended | Broke
 
 
 def broke(error: BaseException) -> Broke:
-    """What is told of an exception that is being handled."""
+    """Message about an exception that is being handled."""
     trace = traceback.format_exc()
     if isinstance(error, InputError):
         return Broke("input", str(error), trace)

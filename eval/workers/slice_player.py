@@ -20,7 +20,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig, plain_facts, resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.play.lasting_env import EnvironmentKeeper
+from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_parts
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
@@ -47,7 +47,7 @@ def parts(options: RunOptions, factories: Factories | None) -> tuple[RunConfig, 
         factories: The real parts by default, with environments that last from one slice to the next.
     """
     quiet_warp()
-    made_of = factories or Factories(env=EnvironmentKeeper())
+    made_of = factories or Factories(env=EnvCache())
     return *check_parts(resolve(options), made_of), made_of
 
 
@@ -111,7 +111,7 @@ def _check_shared(path: Path) -> None:
 
 @contextlib.contextmanager
 def _alone_while_compiling(engine: str, device: str) -> Iterator[None]:
-    """Where kernels must be compiled, one process of a machine does it, and the others wait for its cache."""
+    """Let one process of a machine compile missing kernels while the others wait for its cache."""
     cache = Path(wp.config.kernel_cache_dir or ".")  # named once Warp has begun
     if not wp.config.kernel_cache_dir or not kernels_to_compile(cache, engine, device):
         yield

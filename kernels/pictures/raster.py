@@ -10,7 +10,7 @@ from arena_newton.kernels.launching import launch
 __all__ = ["Soup", "launch_rasterize"]
 
 NEAR = wp.constant(wp.float32(0.002))
-"""What is closer to the camera's plane than this is not drawn [m]."""
+"""Smallest distance from the camera's plane at which a surface is drawn [m]."""
 EDGE = wp.constant(wp.float32(1.0e-3))
 """Overlap of neighbouring triangles, against cracks by rounding [px]."""
 

@@ -18,7 +18,8 @@ from arena_newton.kernels.pictures.raster import EDGE, Soup, corner, soup_entry,
 __all__ = ["MAPPED", "Occluders", "ShadowMaps", "launch_shadow_maps", "traced"]
 
 RANGE = wp.constant(wp.float32(16.0))
-"""How far from the camera a surface gets shadows [m]; the rooms of the benchmark are hardly longer."""
+"""Largest distance from the camera at which a surface gets shadows [m]; the rooms of the benchmark are hardly
+longer."""
 SPLIT = wp.constant(wp.float32(2.5))
 """Distance from the camera at which the coarser map takes over [m]."""
 PROBES = (112, 32)
@@ -28,7 +29,7 @@ MARGIN = wp.constant(wp.float32(0.02))
 DEPTH_ORIGIN = wp.constant(wp.float32(256.0))
 """Added to a depth, which makes it positive: a caster counts up to this far behind the camera [m]."""
 BIAS = wp.constant(wp.float32(3.0e-3))
-"""What a caster must stand out of the receiver's tangent plane, in addition to a fraction of a texel [m]."""
+"""Least height of a caster above the receiver's tangent plane, in addition to a fraction of a texel [m]."""
 TEXEL_BIAS = wp.constant(wp.float32(0.35))
 """That fraction: smooth normals tilt the tangent planes of facets."""
 STEEPEST = wp.constant(wp.float32(10.0))
@@ -336,7 +337,7 @@ MAPPED = (ShadowMaps, _unshadowed)
 
 @wp.struct
 class Occluders:
-    """What a shadow ray can hit: the shapes of the model and their BVH, grouped by world."""
+    """Surfaces that a shadow ray can hit: the shapes of the model and their BVH, grouped by world."""
 
     bvh: wp.uint64
     group_roots: wp.array[wp.int32]

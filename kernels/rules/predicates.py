@@ -141,7 +141,7 @@ def launch_predicates(
     boxes: Boxes,
     predicates: wp.array,
 ) -> None:
-    """Which predicates hold at this tick; launch after the task's success kernel.
+    """Predicates that hold at this tick; launch after the task's success kernel.
 
     Arguments that `success` describes are not repeated.
 

@@ -1,4 +1,4 @@
-"""What the scripted experts share: a privileged view of the world, and the generator that makes their actions.
+"""Base of the scripted experts: a privileged view of the world, and the generator that makes their actions.
 
 An expert decides commands for the reference generator (velocity, height, hand points) from the true state of the world;
 the generator turns them into canonical actions. The expert does not know which tracker executes those.
@@ -132,7 +132,7 @@ class Sight:
 
 
 class Expert:
-    """How one task is solved; a subclass writes `begin` and `command`."""
+    """Scripted solution of one task; a subclass writes `begin` and `command`."""
 
     task: str = ""
     """Name of the task that it solves."""

@@ -178,7 +178,7 @@ CLOSER = 0.10
 OVER_LEAN = 0.40
 """Waist pitch above the crate [rad]."""
 OVER_LEAN_MORE = 0.10
-"""How it grows while the hammer is held there [rad/s], so that the arm comes farther ..."""
+"""Growth of that while the hammer is held there [rad/s], so that the arm reaches farther ."""
 MOST_LEAN = 0.7
 """... to this limit [rad]. The hand opens with the pitch at which it came to rest."""
 
@@ -277,7 +277,7 @@ class DoubleDeskExpert(Expert):
     # What it sees.
 
     def _aim(self, mask: Tensor) -> None:
-        """Where to grasp the hammer, and the heading of the hand, in the worlds of `mask`."""
+        """Grasp point on the hammer and heading of the hand, in the worlds of `mask`."""
         origin = self._origin()
         handle = torch.nn.functional.normalize((self._mass() - origin)[:, :2], dim=1)
         grasp = torch.cat([origin[:, :2] + ALONG_HANDLE * handle, origin[:, 2:]], dim=1)
@@ -288,13 +288,13 @@ class DoubleDeskExpert(Expert):
         self._hand_yaw = select(mask, LOOK_RIGHT + off, self._hand_yaw)
 
     def _held(self) -> Tensor:
-        """Whether the hammer is in the left hand, bool, [worlds]."""
+        """True if the hammer is in the left hand, bool, [worlds]."""
         origin = self._origin()
         point = origin + ALONG_HANDLE * torch.nn.functional.normalize(self._mass() - origin, dim=1)
         return torch.linalg.vector_norm(self.palms.measured()[:, 0] - point, dim=1) < HELD
 
     def _in_view(self, point: Tensor) -> Tensor:
-        """Whether the head camera shows a point that is ahead, bool, [worlds]."""
+        """True if the head camera shows a point that is ahead, bool, [worlds]."""
         pose = self.sight.pose
         offset = point[:, :2] - pose[:, :2]
         return wrap_angle(atan2(offset[:, 1], offset[:, 0]) - pose[:, 2]).abs() < IN_VIEW
@@ -311,7 +311,7 @@ class DoubleDeskExpert(Expert):
         return self._middle()[:, 0] + BESIDE
 
     def _past_sill(self) -> Tensor:
-        """Whether both ankles are beyond the sill, bool, [worlds]."""
+        """True if both ankles are beyond the sill, bool, [worlds]."""
         y = torch.stack([self.sight.body(ankle)[0][:, 1] for ankle in self._ankles], dim=1)
         return y.amin(dim=1) > self._sill + PAST_SILL
 
@@ -327,7 +327,7 @@ class DoubleDeskExpert(Expert):
         return torch.gather(speeds, 1, soon)[:, 0], torch.gather(times, 1, soon)[:, 0]
 
     def _over(self) -> tuple[Tensor, Tensor]:
-        """Where the centre of mass must go above the crate [m], [worlds, 3]; whether it may be let go, [worlds]."""
+        """Target of the centre of mass above the crate [m], [worlds, 3]; whether to release it, [worlds]."""
         mass, middle = self._mass(), self._middle()
         yaw = heading(self.sight.body(self._crate)[1])
         local = rotate_xy(-yaw, mass[:, :2] - middle[:, :2])

@@ -1,4 +1,4 @@
-"""What the head camera could see: points in its view and not hidden behind upright cylinders.
+"""View of the head camera: points within its borders and not hidden behind upright cylinders.
 
 An expert that decides from this shows a learner nothing that the picture does not: it looks before it acts. A few
 torch operations stand in for a picture; `tests/policies/test_expert_boxing.py` compares them with rendered ones.
@@ -53,7 +53,7 @@ class Eyes:
         return self.sight.point(self._body, self._offset)
 
     def in_view(self, points: Tensor) -> Tensor:
-        """Whether points are within the picture's borders.
+        """True for points within the picture's borders.
 
         Args:
             points: x, y, z [m], shape [worlds, points, 3].
@@ -69,7 +69,7 @@ class Eyes:
         return (z < 0.0) & (x.abs() < -wide * z) & (y.abs() < -high * z)
 
     def sees(self, points: Tensor, cylinders: Tensor) -> Tensor:
-        """Whether points are in view and nothing stands before them.
+        """True for points in view that nothing hides.
 
         Args:
             points: x, y, z [m], shape [worlds, points, 3].
@@ -83,7 +83,7 @@ class Eyes:
 
 
 def hidden(eye: Tensor, points: Tensor, cylinders: Tensor) -> Tensor:
-    """Whether the line from an eye to a point cuts a cylinder, seen from above.
+    """True if the line from an eye to a point cuts a cylinder, seen from above.
 
     Args:
         eye: x, y [m], shape [worlds, 2].

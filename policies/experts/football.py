@@ -52,7 +52,7 @@ FROM_POST = 0.5
 AIMS = 25
 """Number of aims that are compared."""
 COLLISION = 30.0
-"""What a lack of that distance costs against a shift of the aim [m per m]."""
+"""Cost of a lack of that distance against a shift of the aim [m per m]."""
 ON_LINE = (0.09, 0.12)
 """Errors behind the ball with which the kick begins [m, rad]; the walk along the line takes what is left."""
 SLOW_DOWN = (6.0, 0.15)

@@ -39,7 +39,7 @@ class Palms:
         """Left and right wrist yaw link."""
         self._ahead = torch.tensor([HAND_POINT, 0.0, 0.0], device=sight.device)
         self.correction = torch.zeros(sight.worlds, 2, 3, device=sight.device)
-        """What is added to the command of left and right palm [m], pelvis' heading frame, shape [worlds, 2, 3]."""
+        """Correction added to the command of left and right palm [m], pelvis' heading frame, shape [worlds, 2, 3]."""
 
     def reset(self, mask: Tensor) -> None:
         """Forget the corrections in the worlds of `mask`, bool, shape [worlds]."""
@@ -109,7 +109,7 @@ class Wrists:
         self._joints = torch.tensor([[MUJOCO_JOINTS.index(n) for n in row] for row in names], device=sight.device)
         assert (self._joints.cpu() == WRISTS + ARMS[0]).all()
         self.correction = torch.zeros(sight.worlds, 2, 3, device=sight.device)
-        """What is added to the angles of left and right wrist [rad], shape [worlds, 2, 3]."""
+        """Correction added to the angles of left and right wrist [rad], shape [worlds, 2, 3]."""
 
     def reset(self, mask: Tensor) -> None:
         """Forget the corrections in the worlds of `mask`, bool, shape [worlds]."""

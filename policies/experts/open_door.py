@@ -193,7 +193,7 @@ class OpenDoorExpert(Expert):
         states.enter("through", passed)
 
     def _arrive(self, mask: Tensor) -> None:
-        """What follows a walk."""
+        """Enter the state that follows a walk."""
         states = self.states
         near, before = mask & states.at("step in"), mask & states.at("approach", "retreat")
         states.enter("lower", near)

@@ -79,7 +79,7 @@ def signed_distance(points: Tensor, boxes: Tensor) -> Tensor:
 
 
 def _blocked(points: Tensor, boxes: Tensor, grow: Tensor) -> Tensor:
-    """Whether the straight line between two points cuts a grown box; [W, N, 2] to bool [W, N, N]."""
+    """True if the straight line between two points cuts a grown box; [W, N, 2] to bool [W, N, N]."""
     local = _local(points, boxes)
     start, step = local[:, :, None], local[:, None] - local[:, :, None]  # [W, N, N, B, 2]
     half = (boxes[:, None, None, :, 3:] + grow[:, None, None, None, None]).clamp_min(1e-6)

@@ -72,10 +72,10 @@ WAITING = 0.2
 CLOSING = 0.15
 """Speed of each hand when closing [m/s]; twice as fast where it presses too little."""
 OVERLAP = 0.115
-"""How much deeper than it gets each palm is commanded into the box [m]: about 100 N/m times this, 10-12 N a side.
-Below 8 N weak arms drop the box in the carry."""
+"""Depth of each palm's commanded position inside the box, beyond the one it reaches [m]: about 100 N/m times this,
+10-12 N a side. Below 8 N weak arms drop the box in the carry."""
 TURNED = 0.08
-"""How much deeper into a box that stands turned between the fists [m/rad]: they slide on its faces, and press less."""
+"""Additional depth in a box that is turned between the fists [m/rad]: they slide on its faces, and press less."""
 SERVO = 5.0
 """Gain of the squeeze [1/s]: speed of a hand for what the overlap lacks. It ends with the lift, since a turned box
 comes to lie flat between the fists only when they press, and is then narrower."""
@@ -103,7 +103,7 @@ DRAWING = 0.10
 CLEAR = 0.08
 """Height of the box's underside above the deck while it is carried there [m]."""
 RAISED = 0.115
-"""How much higher than to the wanted height the hands are commanded [m]: arms sink by that under the box."""
+"""Height of the hands' command above the wanted height [m]: arms sink by that under the box."""
 HEIGHT_GAIN = 1.5
 """More of it for what the box's height lacks. No integral: whoever learns from demonstrations does not know it."""
 MOST_RAISED = 0.20
@@ -124,7 +124,7 @@ CLEARANCE = 0.60
 STRETCHING = (0.50, 0.25)
 """Distances of pelvis and front edge between which the arms stretch to the box's place on the deck [m]."""
 AHEAD = 0.02
-"""How much farther than the palms are commanded the box gets [m]."""
+"""Distance of the box ahead of the palms' command [m]."""
 SIDE = 0.55
 """Largest distance of the spot from the deck's middle [m]: the opening hands clear the uprights."""
 INSIDE = 0.21
@@ -142,9 +142,9 @@ SINKING = 0.05
 LOWERING = 0.08
 """Speed of the box on its way down [m/s]."""
 SUNK = 0.06
-"""How much farther than to the deck the hands are commanded down before they open [m]: a posture that can be seen."""
+"""Depth of the hands' command below the deck before they open [m]: a posture that can be seen."""
 DOWN = (0.006, 0.02)
-"""How much less that is; one is drawn an episode [m]."""
+"""Reduction of that depth; one value is drawn per episode [m]."""
 RESTS = 0.03
 """Height of the box's lowest corner above the deck below which it counts as put down [m]. A box that is tilted between
 the fists comes to lie flat when they open; to wait for that is to wait for nothing that can be seen."""
@@ -303,7 +303,7 @@ class PPBoxExpert(Expert):
         return torch.stack([local[:, 0], local[:, 1] + self._deck_half[1]], dim=1)
 
     def _beside(self) -> Tensor:
-        """How far aside of all places on the deck the robot is, 0 to 1, shape [worlds]."""
+        """Fraction of the way to the side of all positions on the deck, 0 to 1, shape [worlds]."""
         aside = self._depth(self.sight.pose[:, :2])[:, 0].abs() - SIDE
         return ((aside - BESIDE[0]) / (BESIDE[1] - BESIDE[0])).clamp(0.0, 1.0)
 
@@ -390,7 +390,7 @@ class PPBoxExpert(Expert):
         self.state.enter("open", dropped & ~lost & ~early)
 
     def _overlap(self) -> Tensor:
-        """How much farther apart the palms are than commanded [m], shape [worlds]."""
+        """Distance of each palm outside its commanded position [m], shape [worlds]."""
         y = self.palms.local(self.palms.measured())[:, :, 1]
         return 0.5 * (y[:, 0] - y[:, 1]) - self.half
 
@@ -404,7 +404,7 @@ class PPBoxExpert(Expert):
         return torch.stack([x.clamp(max=REACH), y, z], dim=1)
 
     def _wanted(self) -> Tensor:
-        """Where the palms must be to close on the box [m], world, shape [worlds, 2, 3]."""
+        """Positions of the palms from which they close on the box [m], world, shape [worlds, 2, 3]."""
         yaw = self.sight.pose[:, 2:3].expand(-1, 2)
         side = self.half[:, None, None] * self._sides
         side = torch.cat([rotate_xy(yaw, side[..., :2]), side[..., 2:]], dim=2)

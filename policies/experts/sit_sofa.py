@@ -36,10 +36,11 @@ SHOULDER_PITCHES, ELBOWS = [0, 7], [3, 10]
 LIMITS = NavigationLimits(forward=0.58, turn=0.9, sideways=0.28)
 """Of the walk to the gate: faster than the navigator's own, for the step budget of `paper` is short."""
 GATE_ASIDE = (0.26, 0.34, 0.42, 0.50, 0.60, 0.70)
-"""How far beyond the end of the seat the robot may turn its back to the sofa [m]. The armrest ends 0.10 m beyond it."""
+"""Distances beyond the end of the seat at which the robot may turn its back to the sofa [m]. The armrest ends 0.10 m
+beyond it."""
 GATE_AHEAD = (0.36, 0.26, 0.16, 0.06, -0.04, -0.14, -0.24)
-"""How far in front of the seat's edge it may do so [m], negative next to the armrest. The best gate is the first one
-of both lists; a carton in front of the gap moves it."""
+"""Distances in front of the seat's edge at which it may do so [m], negative next to the armrest. The best gate is the
+first one of both lists; a carton in front of the gap moves it."""
 GATE_CLEARANCE = CLEARANCES[-1] + 0.01
 """Distance of a gate from all obstacles [m]: with less no path leads to it."""
 GATE_WITHIN = (0.12, 0.20)
@@ -121,7 +122,7 @@ class SitSofaExpert(Expert):
         self._cartons = [sight.box(carton) for carton in CARTONS]
         self.walk = Walk(sight, LIMITS)
         self.phase = Phases(LONGEST, worlds, device)
-        """Where each world is in the task."""
+        """Phase of each world in the task."""
         self._named = self.phase.names()
         self._most = torch.tensor([BACKWARD, SIDEWAYS], device=device)
         self._seen = torch.zeros(worlds, len(CARTONS), 5, device=device)

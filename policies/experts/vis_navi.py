@@ -142,7 +142,7 @@ class VisNaviExpert(Expert):
         return command
 
     def _legs(self) -> Tensor:
-        """Which pieces of the path have a length, bool, [worlds, points − 1]."""
+        """True for pieces of the path that have a length, bool, [worlds, points − 1]."""
         return torch.linalg.vector_norm(self._route[:, 1:] - self._route[:, :-1], dim=2) > CORNER
 
     def _nearest_leg(self, here: Tensor) -> Tensor:

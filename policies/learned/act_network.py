@@ -34,7 +34,7 @@ POSITION_EPS = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class ActSizes:
-    """What decides the shapes of the network; names are those of LeRobot's configuration."""
+    """Sizes that decide the network's shapes; names are those of LeRobot's configuration."""
 
     state: int
     """Numbers of the state."""

@@ -1,4 +1,4 @@
-"""What the card of a packed policy says, compared with the files next to it."""
+"""Check of a packed policy: its card against the files next to it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import FACTS_FILE, Checkpoin
 __all__ = ["check_facts", "check_weights", "training_entries"]
 
 REMEDY = "take all files of one policy, or pack the checkpoint again"
-"""What is to be done where they differ."""
+"""Advice where they differ."""
 
 
 def training_entries(facts: CheckpointFacts) -> dict[str, object]:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
+from arena_newton.pages.tables import Table, between, percent
 
 __all__ = ["CARD_FILE", "CARD_PAGE", "NOT_SHIPPED", "SHIPPED", "CellResult", "PolicyCard", "read_card", "shipped_card"]
 
@@ -23,7 +24,7 @@ NOT_SHIPPED = (
     "--policy learned: no policy comes with this build; learned:<folder> takes one that `python -m arena_newton.eval "
     "pack` made, lerobot:<checkpoint> a checkpoint"
 )
-"""What is said where there is none."""
+"""Error where no policy is shipped."""
 FORMAT = 1
 """Version of the card."""
 MOST_CARD = 1 << 20
@@ -34,7 +35,7 @@ MOST_EPISODES = 10_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class CellResult:
-    """What a policy reached on one task, through one tracker, in one mode."""
+    """Result of a policy on one task, through one tracker, in one mode."""
 
     task: str
     tracker: str
@@ -62,7 +63,7 @@ class CellResult:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyCard:
-    """What a packed policy says of itself."""
+    """Card of a packed policy, which describes it."""
 
     tasks: tuple[str, ...]
     """Tasks that it is offered for; the default run shows the first."""
@@ -76,7 +77,7 @@ class PolicyCard:
     gpu_minutes: float = 0.0
     """Time of the training [min]."""
     device: str = ""
-    """Where it was trained."""
+    """Device of the training."""
     datasets: tuple[Mapping[str, object], ...] = ()
     """Of each dataset of its training: name, hash, episodes, frames."""
     command: str = ""
@@ -122,11 +123,11 @@ class PolicyCard:
             "size": f"{self.bytes / 1e6:.1f} MB, matrices in {self.precision}, computed in float32",
             "weights": self.weights,
         }
-        lines = ["# The learned policy", "", *([self.note, ""] if self.note else []), "| | |", "|---|---|"]
-        lines += [f"| {name} | {_cell(text)} |" for name, text in rows.items() if text]
+        about = Table(("", ""), [(name, _cell(text)) for name, text in rows.items() if text])
+        lines = ["# The learned policy", "", *([self.note, ""] if self.note else []), *about.compact()]
         if self.results:
-            lines += ["", "## Results", "", "| task | tracker | mode | successes | SR % | 95 % CI | falls |"]
-            lines += ["|---|---|---|--:|--:|--:|--:|", *map(_result, self.results)]
+            head = ("task", "tracker", "mode", "successes", "SR %", "95 % CI", "falls")
+            lines += ["", "## Results", "", *Table(head, [_result(one) for one in self.results], "lllr").compact()]
         return "\n".join(lines) + "\n"
 
 
@@ -139,10 +140,9 @@ def _dataset(facts: Mapping[str, object]) -> str:
     return f"{facts.get('name', '?')} ({', '.join(filter(None, (counts, str(facts.get('hash', '')))))})"
 
 
-def _result(one: CellResult) -> str:
-    low, high = wilson(one.successes, one.episodes)
-    shown = f"{one.successes}/{one.episodes} | {100 * one.rate:.0f} | {100 * low:.0f}–{100 * high:.0f} | {one.falls}"
-    return f"| {one.task} | {one.tracker} | {one.mode} | {shown} |"
+def _result(one: CellResult) -> tuple[object, ...]:
+    rates = (percent(one.rate, 0), between(wilson(one.successes, one.episodes)).replace(" to ", "–"))
+    return (one.task, one.tracker, one.mode, f"{one.successes}/{one.episodes}", *rates, one.falls)
 
 
 def read_card(folder: Path) -> PolicyCard:

@@ -173,7 +173,7 @@ Looks = Callable[[Callable[[list[int]], torch.Tensor], list[list[int]]], Iterabl
 
 @contextlib.contextmanager
 def _looking(device: torch.device, count: int) -> Iterator[Looks]:
-    """How looks are computed: on the CPU each on one core, as many at once as torch may have threads.
+    """Runs queries: on the CPU each on one core, as many at once as torch may have threads.
 
     A look is too small for two cores: where the machine is busy they lose more by waiting for each other. And an
     answer then has the same bits on machines with another number of cores.

@@ -15,7 +15,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import check_size, file_digest, read_bytes
+from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
 from arena_newton.policies.lerobot.checkpoint_tensors import check_spread
@@ -80,7 +80,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class ActCheckpoint:
-    """What a checkpoint of ACT says, checked; without its weights."""
+    """Contents of an ACT checkpoint, checked; without its weights."""
 
     folder: Path
     sizes: ActSizes
@@ -94,7 +94,7 @@ class ActCheckpoint:
     files: tuple[str, ...]
     """Names of its files, the weights' first."""
     trains_latent: bool
-    """Whether the file has weights of the latent's encoder, which only training uses."""
+    """True if the file has weights of the latent's encoder, which only training uses."""
 
     def network(self) -> ActNetwork:
         """The network with its weights, on the CPU, in float32.
@@ -229,7 +229,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
 
 
 def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str]]:
-    """How features are normalised, and the files that say so."""
+    """Normalisation of the features, and the files that give it."""
     found: dict[str, Spread] = {}
     files = []
     for name in PROCESSOR_FILES:

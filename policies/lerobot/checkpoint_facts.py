@@ -1,4 +1,4 @@
-"""What a checkpoint says beside what LeRobot's own files say: how its actions are read and what it was trained on.
+"""Facts of a checkpoint that LeRobot's own files lack: the meaning of its actions and its training.
 
 A checkpoint is a folder as LeRobot writes it (`config.json`, `model.safetensors`, the processors' files), which a stock
 LeRobot loads, with one more file, `arena_policy.json`. One without it is somebody else's: its actions are v3.1.
@@ -31,12 +31,12 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 FORMAT = 1
 """Version of the file."""
 INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model", "last/pretrained_model")
-"""Where a checkpoint lies in the folder of a training, in the order in which it is looked for."""
+"""Folders of a training that may hold a checkpoint, in the order of the search."""
 
 
 @dataclass(frozen=True)
 class CheckpointFacts:
-    """How a policy's pictures and actions are meant, and where it comes from."""
+    """Meaning of a policy's pictures and actions, and its origin."""
 
     labels: str = "v3.1"
     """Protocol of its actions (`data.readers.label_protocols`)."""
@@ -65,7 +65,7 @@ class CheckpointFacts:
     minutes: float = 0.0
     """Time of the training [min]."""
     device: str = ""
-    """Where it was trained, such as `NVIDIA H200`."""
+    """Device of the training, such as `NVIDIA H200`."""
     datasets: tuple[Mapping[str, object], ...] = ()
     """Of each dataset: `name`, `hash` of its content, `episodes`, `frames`."""
     options: Mapping[str, object] = field(default_factory=dict)

@@ -106,7 +106,7 @@ class PolicyNetwork:
         return done.to(self.device, torch.float32).clone()  # outside of inference mode it may be written to
 
     def _chunk(self, batch: dict[str, torch.Tensor], draws: Sequence[Draw]) -> torch.Tensor:
-        """What the network answers to a normalised batch, normalised."""
+        """Chunk that the network predicts from a normalised batch, normalised."""
         policy, config = self.policy, self.checkpoint.config
         match self.checkpoint.type:
             case "act":

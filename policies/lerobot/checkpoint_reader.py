@@ -21,7 +21,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import check_size, file_digest, read_bytes
+from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
@@ -87,18 +87,18 @@ NATIVE = (640, 480)
 
 @dataclass(frozen=True)
 class PolicyCheckpoint:
-    """What a checkpoint says, checked."""
+    """Contents of a checkpoint, checked."""
 
     folder: Path
     """With `config.json`."""
     config: PreTrainedConfig
     """LeRobot's configuration of the policy; nothing in it makes LeRobot download or compile."""
     facts: CheckpointFacts
-    """What it says of itself; of a foreign one actions of v3.1."""
+    """Facts that it gives; a foreign one gets actions of v3.1."""
     camera: CameraConfig | None
     """The picture that is rendered; None for a policy without pictures."""
     preparation: PicturePreparation | None
-    """What happens to the picture before LeRobot's processors, in checkpoints of the original."""
+    """Preparation of the picture before LeRobot's processors, in checkpoints of the original."""
     digest: str
     """First 12 hex digits of the SHA-256 of the weights."""
     ignored: tuple[str, ...] = ()
@@ -216,7 +216,7 @@ def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tupl
 
 
 def _reason(error: BaseException) -> str:
-    """What an error says, and the one behind it, which draccus leaves out."""
+    """Message of an error and of its cause, which draccus leaves out."""
     said = " ".join(str(error).split())[:300]
     behind = " ".join(str(error.__cause__ or error.__context__ or "").split())[:200]
     return said if not behind or behind in said else f"{said} ({behind})"
@@ -274,7 +274,7 @@ def _check_normaliser(where: str, options: Mapping[str, object], state: object, 
 
 
 def _modes(registered: str, config: PreTrainedConfig) -> dict[str, str]:
-    """What a normalising step is used on: feature → LeRobot's mode of its kind."""
+    """Features that a normalising step is used on: feature → LeRobot's mode of its kind."""
     features = (config.input_features if registered == NORMALISES[0] else config.output_features) or {}
     modes = {str(kind): mode.value for kind, mode in config.normalization_mapping.items()}
     return {name: modes.get(feature.type.value, "IDENTITY") for name, feature in features.items()}
@@ -321,7 +321,7 @@ def _shape(feature: PolicyFeature | None) -> str:
 
 
 def _foreign_camera(picture: tuple[int, int], preparation: PicturePreparation | None) -> CameraConfig:
-    """What somebody else's policy is shown: what the original's server is sent, or the size that it was trained on."""
+    """Camera for somebody else's policy: the picture for the original's server, or the size that it was trained on."""
     if preparation is not None:
         return CameraConfig(width=NATIVE[0], height=NATIVE[1], fit="native")
     height, width = picture

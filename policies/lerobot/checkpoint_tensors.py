@@ -24,7 +24,7 @@ __all__ = ["check_family", "check_layers", "check_spread", "check_statistics", "
 
 @dataclass(frozen=True)
 class _Names:
-    """How the names of a family's tensors begin, as LeRobot 0.6 saves them."""
+    """Prefixes of a family's tensor names, as LeRobot 0.6 saves them."""
 
     always: tuple[str, ...]
     """Each begins a name of every checkpoint of the family."""

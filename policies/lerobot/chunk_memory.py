@@ -1,4 +1,4 @@
-"""What a policy remembers of each world between two answers: earlier glimpses, actions not yet given, and a mean.
+"""Memory of a policy per world between two chunks: earlier glimpses, actions not yet given, and a mean.
 
 A policy that looks at several ticks gives the last actions of a chunk one by one, so that it is asked at each of the
 ticks that it will look at: the world has no other hook for it.
@@ -53,7 +53,7 @@ class ChunkMemory:
             self._sum[world], self._count[world] = 0.0, 0.0
 
     def waits(self, world: int) -> bool:
-        """Whether actions of an earlier look have not been given yet."""
+        """True if actions of an earlier query have not been given yet."""
         return bool(self._waiting[world])
 
     def glimpse(self, world: int, seen: Glimpse) -> None:

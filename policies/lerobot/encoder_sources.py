@@ -1,4 +1,4 @@
-"""Where LeRobot's policies take their encoders of pictures and text from: a folder, new weights, or a checkpoint.
+"""Sources of the encoders of LeRobot's policies: a folder, new weights, or a checkpoint.
 
 LeRobot fetches CLIP, tokenizers and the sizes of Gemma by fixed names while it builds a policy or its processors. Here
 those names are replaced for the time of a `with` block. A checkpoint of flow matching or pi0.5 holds the architecture
@@ -91,7 +91,7 @@ class _Made:
         self._make = make
 
     def from_pretrained(self, *_: object, **__: object) -> object:
-        """What was made, whatever the name."""
+        """Object that was made, whatever the name."""
         return self._make()
 
 

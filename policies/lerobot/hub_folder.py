@@ -11,9 +11,9 @@ from arena_newton.errors import InputError
 __all__ = ["fetched"]
 
 FILES = ("*.json", "*.safetensors")
-"""What is fetched: no pickles, no code."""
+"""Files that are fetched: no pickles, no code."""
 PATIENCE = 5.0
-"""How long the hub may take to answer the first time [s]."""
+"""Longest wait for the hub's first answer [s]."""
 
 
 def fetched(name: str) -> Path:

@@ -15,12 +15,12 @@ import torch
 __all__ = ["NOISE_RULE", "Draw", "generators", "normal"]
 
 NOISE_RULE = "sha256(policy seed|look)"
-"""How the seed of a look's generator is made; results record it."""
+"""Rule for the seed of a query's generator; results record it."""
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Whose noise it is."""
+    """Seed and query of one world, from which its noise is drawn."""
 
     seed: int
     """Seed that the policy was given of the episode."""

@@ -1,4 +1,4 @@
-"""How the original's policy server prepares a picture: resized and padded as the checkpoint's training did it.
+"""Picture preparation of the original's policy server: resized and padded as the checkpoint's training did it.
 
 The original trains on 640x480 pictures and lists what happens to them as image transforms of LeRobot's training
 configuration, `train_config.json`. Its server applies those that are deterministic, `Resize` and `Pad`, in their order,
@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
 
 __all__ = ["MOST_JSON", "TRAIN_CONFIG", "PicturePreparation"]
 
@@ -75,7 +75,7 @@ class PicturePreparation:
 
     @classmethod
     def read(cls, folder: Path) -> PicturePreparation | None:
-        """What a checkpoint's `train_config.json` says; None where it has no such file, or names no such step.
+        """Read a checkpoint's `train_config.json`; None where it has no such file, or names no such step.
 
         Raises:
             InputError: The file is damaged, or names steps that the original's server refuses too.

@@ -76,7 +76,7 @@ def pack_begin(begin: Begin) -> bytes:
 
 
 def unpack_begin(body: bytes | bytearray) -> Begin:
-    """What the body of `/reset` says; an empty one begins an episode, too.
+    """Read the body of `/reset`; an empty one begins an episode, too.
 
     Raises:
         WireError: It is unfit.
@@ -96,7 +96,7 @@ def pack_begun(facts: ServedFacts) -> bytes:
 
 
 def unpack_begun(body: bytes, where: str) -> tuple[bool, str]:
-    """Whether a server honours seeds, and the name of its policy.
+    """True if a server honours seeds, and the name of its policy.
 
     Raises:
         WireError: The reply is none to `/reset`.
@@ -119,7 +119,7 @@ def pack_look(look: Look) -> bytes:
 
 
 def unpack_look(body: bytes | bytearray) -> tuple[Look, bool]:
-    """What the body of `/infer` shows, and whether a whole chunk is wanted.
+    """Observation in the body of `/infer`, and whether a whole chunk is wanted.
 
     Raises:
         WireError: It is unfit.
@@ -182,7 +182,7 @@ def pack_config(facts: ServedFacts, more: dict[str, object] | None = None) -> by
 
 
 def unpack_config(body: bytes, where: str) -> ServedFacts:
-    """What a reply to `GET /config` declares; that of another server declares nothing.
+    """Facts declared by a reply to `GET /config`; that of another server declares nothing.
 
     Raises:
         WireError: It is no JSON object, or damaged.

@@ -1,4 +1,4 @@
-"""What a policy server declares of its policy, compared with what the robot takes before the first episode.
+"""Handshake: facts that a policy server declares, compared with the robot's requirements before the first episode.
 
 The record is JSON: openpi's metadata frame holds it, vla-eval's HELLO under `arena`, and `GET /config` answers it in
 every protocol. What a server does not declare is None here: nobody can compare it, and the robot says so.
@@ -10,8 +10,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from arena_newton.data.datasets.layouts import state_names
 from arena_newton.data.readers.label_protocols import LABELS, action_names
+from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import InputError
 from arena_newton.files.text import plain_text
 from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, PICTURE_SIDES
@@ -42,10 +42,10 @@ class ServedPicture:
 
 @dataclass(frozen=True)
 class ServedFacts:
-    """What a server declares; None: nothing."""
+    """Facts that a server declares; None: not declared."""
 
     policy: str = ""
-    """What results are known by: the policy's name and a hash of its description."""
+    """Identity in results: the policy's name and a hash of its description."""
     labels: str | None = None
     """Protocol of its actions (`data.readers.label_protocols`)."""
     realign: float | None = None
@@ -60,15 +60,15 @@ class ServedFacts:
     rate_hz: float | None = None
     """Actions per second [Hz]."""
     needs_picture: bool | None = None
-    """Whether the policy looks at pictures."""
+    """True if the policy observes pictures."""
     picture: ServedPicture | None = None
     """The picture that it looks at; pictures of other sizes are resized by the server."""
     batched: bool = False
-    """Whether one request may hold several robots, along a leading axis."""
+    """True if one request may hold several robots, along a leading axis."""
     seeded: bool = False
-    """Whether an episode follows from its seed and what is seen, whoever else asks."""
+    """True if an episode follows from its seed and its observations, whoever else asks."""
     facts: Mapping[str, object] = field(default_factory=dict)
-    """What the policy says of itself, `Policy.describe`."""
+    """The policy's own description, `Policy.describe`."""
 
     def to_json(self) -> dict[str, object]:
         """The record as JSON; what is not declared is left out."""
@@ -104,7 +104,7 @@ class ServedFacts:
 
 
 def expected_facts(labels: str = "v3.1") -> ServedFacts:
-    """What this robot takes, with actions of a label protocol."""
+    """Requirements of this robot, with actions of a label protocol."""
     return ServedFacts(
         labels=labels, action_names=tuple(action_names(labels)), state_names=tuple(state_names()), rate_hz=RATE
     )

@@ -53,7 +53,7 @@ PROMPT_KEY = "prompt"
 RESET_ANSWER = "reset successful"
 """Text frame with which RoboArena's server answers `reset`."""
 WHERE = "request"
-"""How errors name a request."""
+"""Name of a request in errors."""
 
 
 def pack_metadata(facts: ServedFacts, *, roboarena: bool = False) -> bytes:
@@ -76,7 +76,7 @@ def pack_metadata(facts: ServedFacts, *, roboarena: bool = False) -> bytes:
 
 
 def unpack_metadata(data: bytes | str, where: str) -> tuple[ServedFacts, Mapping[str, Value]]:
-    """What the first frame of a server declares, and the whole frame.
+    """Facts that the first frame of a server declares, and the whole frame.
 
     Raises:
         WireError: It is a text frame (an error of the server), or no map.

@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 type Value = None | bool | int | float | str | bytes | np.ndarray | list[Value] | dict[str, Value]
-"""What a message holds."""
+"""Values that a message may hold."""
 
 MAX_LENGTH = 8192
 """Most entries of one map or list."""
@@ -44,7 +44,7 @@ MAX_DEPTH = 16
 
 
 class ArrayKeys:
-    """How a protocol writes the map that stands for an array."""
+    """Keys of the map that stands for an array in a protocol."""
 
     def __init__(self, *, as_bytes: bool, scalars: bool):
         """Name the keys.
@@ -112,7 +112,7 @@ def unpack(
     where: str,
     special: Callable[[Mapping[str, object], str], object] | None = None,
 ) -> Value:
-    """What a message holds; arrays own their memory.
+    """Content of a message; arrays own their memory.
 
     Args:
         data: MessagePack.

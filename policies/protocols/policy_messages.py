@@ -1,4 +1,4 @@
-"""What a robot and a policy server say to each other, whatever the bytes are: the codecs translate these records."""
+"""Messages between a robot and a policy server, whatever the bytes are: the codecs translate these records."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ class End:
     session: str = ""
     """As in `Begin`."""
     result: Mapping[str, object] = field(default_factory=dict)
-    """What the robot says of it."""
+    """The robot's report of it."""
 
 
 type Request = Begin | Look | End
-"""What a robot sends."""
+"""Message of a robot."""
 
 
 def read_state(value: object, where: str) -> np.ndarray:

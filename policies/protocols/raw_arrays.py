@@ -55,5 +55,5 @@ def checked_array(data: object, dtype: object, shape: object, where: str) -> np.
 
 
 def is_number_type(dtype: str) -> bool:
-    """Whether a type is bool, an integer or a float of a known size, as `numpy.dtype.str` or by its name."""
+    """True if a type is bool, an integer or a float of a known size, as `numpy.dtype.str` or by its name."""
     return _DTYPE.fullmatch(dtype) is not None or dtype in _NAMED

@@ -61,11 +61,11 @@ CHUNKS = "chunks"
 CAMERA = "front"
 """Name of the head camera among the pictures."""
 WHERE = "message"
-"""How errors name a request."""
+"""Name of a message in errors."""
 LARGEST_SEQ = 2**63 - 1
 
 type ImageFormat = Literal["png", "jpeg", "raw"]
-"""How pictures are written; `jpeg` changes them."""
+"""Encodings of pictures; `jpeg` changes them."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class VlaEvalMessage:
     seq: int = 0
     """Number of the request, which its answer repeats."""
     timestamp: float = 0.0
-    """When it was sent [s since 1970]."""
+    """Time of sending [s since 1970]."""
 
 
 def pack_message(
@@ -129,7 +129,7 @@ def pack_hello(facts: ServedFacts | None, seq: int, timestamp: float) -> bytes:
 
 
 def unpack_hello(message: VlaEvalMessage, where: str) -> tuple[ServedFacts, bool]:
-    """What a greeting declares, and whether its sender knows chunks.
+    """Facts that a greeting declares, and whether its sender knows chunks.
 
     Raises:
         WireError: It is none, or of another version of the protocol.
@@ -164,7 +164,7 @@ def pack_request(request: Request, seq: int, timestamp: float, images: ImageForm
 
 
 def unpack_request(message: VlaEvalMessage) -> Request:
-    """What a robot asks for.
+    """Request of a robot.
 
     Raises:
         WireError: The message is no request, or a number or picture in it unfit.

@@ -1,1 +1,1 @@
-"""How policies are trained: the paper's settings and faster ones, a file each."""
+"""Training recipes of policies: the paper's settings and faster ones, a file each."""

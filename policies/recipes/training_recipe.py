@@ -1,4 +1,4 @@
-"""How a policy is trained: one record, by family and name.
+"""Training recipe of a policy: one record, by family and name.
 
 `paper` is read from the file of the family, a configuration of LeRobot's own trainer, so that both trainers have the
 same numbers. The other recipes say only what they change (docs/training.md gives the reasons).
@@ -265,7 +265,7 @@ _FAST: dict[str, object] = {
     "colour": 0.1,
     "image_transforms": False,
 }
-"""What was measured for ACT (60 of 60 episodes of VisNavi after three GPU minutes)."""
+"""Settings measured for ACT (60 of 60 episodes of VisNavi after three GPU minutes)."""
 _BY_DEVIATION = {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
 """Every number by its standard deviation. By its range, as the paper has it, the turning of labels v4 is a seventh of
 the range and a fiftieth of the squared error that walking legs have: policies walked and did not steer."""
@@ -378,4 +378,4 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
         },
     },
 }
-"""What a recipe changes in the paper's: of all families, then of one."""
+"""Changes of a recipe to the paper's: of all families, then of one."""

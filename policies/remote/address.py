@@ -1,4 +1,4 @@
-"""Where a policy server is: addresses and tokens of `--policy remote:<url>`, and what may be printed of a server."""
+"""Addresses and tokens of policy servers in `--policy remote:<url>`, and text of a server that is safe to print."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ DOORS: dict[str, tuple[str, str, int]] = {
     "gr00t": ("gr00t", "tcp", 5555),
     "gr00t+tcp": ("gr00t", "tcp", 5555),
 }
-"""What stands in front of `://` → protocol, transport and usual port. A web address has its scheme's, the
-others have the default of the servers themselves (openpi, RoboArena and vla-eval 8000, SIMPLE 22085, GR00T 5555)."""
+"""Prefix before `://` → protocol, transport and usual port. A web address has its scheme's, the others have the default
+of the servers themselves (openpi, RoboArena and vla-eval 8000, SIMPLE 22085, GR00T 5555)."""
 _ESCAPES = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|.)?", re.DOTALL)
-"""What a terminal interprets as a command (ECMA-48: CSI and OSC sequences, and ESC with one more)."""
+"""Commands to a terminal (ECMA-48: CSI and OSC sequences, and ESC with one more)."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ServerAddress:
 
     @property
     def secure(self) -> bool:
-        """Whether the connection is encrypted."""
+        """True if the connection is encrypted."""
         return self.transport in ("https", "wss")
 
     @property

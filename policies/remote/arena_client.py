@@ -76,7 +76,7 @@ class _Connection(ServerLink[bytes, _Reply]):
         return f"it answers with status {reply[0]}" if reply[0] in _RETRY_STATUS else ""
 
     def alive(self, timeout: float) -> bool:
-        """Whether the server answers a request that changes nothing; any answer counts but a gateway's."""
+        """True if the server answers a request that changes nothing; any answer counts but a gateway's."""
         try:
             status, _ = self.get("/health", timeout)
         except (OSError, http.client.HTTPException, ValueError):
@@ -125,7 +125,7 @@ class _Connection(ServerLink[bytes, _Reply]):
         return reply.status, bytes(data)
 
     def _dropped(self) -> bool:
-        """Whether the server has closed the kept connection, or sent data without a request."""
+        """True if the server has closed the kept connection, or sent data without a request."""
         if self._http is None or self._http.sock is None:
             return True
         poll = select.poll()
@@ -193,7 +193,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         self._served = self.one_line(served) if isinstance(served, str) else ""
 
     def _declared(self) -> ServedFacts:
-        """What `GET /config` answers; the original's server does not know it, and its protocol says all but the policy.
+        """Facts in the reply to `GET /config`. The original's server does not know it, and its protocol fixes the rest.
 
         Raises:
             InputError: The record is damaged, or of a later version.

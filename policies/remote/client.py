@@ -1,4 +1,4 @@
-"""What every client of a policy server does: one link per world, deadlines, repeated attempts, and when a run stops.
+"""Base of the clients of a policy server: one link per world, deadlines, repeated attempts, and when a run stops.
 
 A world whose request fails ends as `error`; the others go on. A server that is gone, that gives no usable answer to any
 world, or that lost what it remembered of a running episode, stops the run: its unfinished episodes stay unplayed.
@@ -57,11 +57,11 @@ class RemoteClient[Q, R](Policy):
     name = "remote"
     needs_image = True
     reset_kind: ClassVar[str] = " (reset)"
-    """What the beginning of an episode is called in errors."""
+    """Name of an episode's beginning in errors."""
     infer_kind: ClassVar[str] = " (infer)"
-    """What a request for actions is called in errors."""
+    """Name of a request for actions in errors."""
     said: ClassVar[str] = "a policy server"
-    """What is expected at the address."""
+    """Name of the expected server in errors."""
 
     def __init__(
         self,
@@ -119,12 +119,12 @@ class RemoteClient[Q, R](Policy):
 
     @property
     def headers(self) -> dict[str, str]:
-        """What every request says of who asks."""
+        """Headers of every request, which authorise the client."""
         return {"Authorization": f"Bearer {self.token}"} if self.token else {}
 
     @property
     def depends_on_worlds(self) -> bool:  # type: ignore[override]
-        """Whether an episode may depend on the others that run: the server did not declare that it honours seeds."""
+        """True if an episode may depend on the others that run: the server did not declare that it honours seeds."""
         return not self._seeded
 
     # What a protocol defines.
@@ -190,7 +190,7 @@ class RemoteClient[Q, R](Policy):
         raise InputError(f"--policy remote:{self.url}: no server answers there ({reason})")
 
     def refusal(self, error: RemoteError) -> InputError:
-        """What `check` says of an address where the first request failed."""
+        """Error of `check` for an address where the first request failed."""
         message = str(error)
         if "CERTIFICATE_VERIFY_FAILED" in message:
             message += "; --remote-insecure does without the check"
@@ -450,7 +450,7 @@ class RemoteClient[Q, R](Policy):
             )
 
     def _alive(self) -> bool:
-        """Whether the server answers at all, asked over a new connection."""
+        """True if the server answers at all, asked over a new connection."""
         if self._closing:  # nobody waits for the answer any more
             return True
         connection = self._connect()
@@ -521,7 +521,7 @@ class RemoteClient[Q, R](Policy):
             raise RemoteError(text if text.startswith(self.url) else f"{self.url}{kind}: {text}") from error
 
     def one_line(self, said: object) -> str:
-        """What a server said, on one line and without the token."""
+        """Message of a server, on one line and without the token."""
         return one_line(self.masked(str(said)))
 
     def without_token(self, value: object) -> object:

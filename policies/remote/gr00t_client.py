@@ -37,7 +37,7 @@ ARRAY_KEY = "__ndarray_class__"
 LONGEST_HEADER = 1024
 """Longest head of an array in NumPy's format that is read [bytes]."""
 SLICE = 0.05
-"""How often a waiting exchange looks whether it was broken off [s]."""
+"""Interval at which a waiting exchange checks whether it was interrupted [s]."""
 _BROKEN = (
     zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
@@ -67,7 +67,7 @@ def pack_gr00t(content: object) -> bytes:
 
 
 def unpack_gr00t(data: bytes, where: str) -> object:
-    """What a message of GR00T's protocol holds; nothing is ever unpickled.
+    """Values of a message in GR00T's protocol; nothing is ever unpickled.
 
     Raises:
         WireError: It is none, or larger than a robot needs.
@@ -100,7 +100,7 @@ def _array(content: Mapping[str, object], where: str) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class ModalityNames:
-    """How a server calls what it is shown and what it answers."""
+    """Names of observations and actions on a server."""
 
     video: str | None = "front"
     """The head camera; None: it looks at no picture."""
@@ -183,7 +183,7 @@ def _keys(config: object, name: str, where: str) -> tuple[tuple[str, ...], tuple
 def _slices(
     names: Sequence[str], known: Mapping[str, Mapping[str, slice]], width: int, where: str
 ) -> tuple[str, dict[str, slice]]:
-    """Which numbers each name stands for: one name for all, or the names of the slices."""
+    """Numbers of each name: one name for all, or the names of the slices."""
     plain = {name: name.removeprefix("state.").removeprefix("action.") for name in names}
     for title, slices in known.items():
         if set(plain.values()) == set(slices) and len(names) == len(slices):
@@ -326,7 +326,7 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
         self.probe()
 
     def _completed(self, facts: ServedFacts) -> ServedFacts:
-        """What the server declares, with what the names of its modalities say."""
+        """Facts that the server declares, completed by the names of its modalities."""
         if facts != ServedFacts():
             return facts
         return ServedFacts(

@@ -13,7 +13,7 @@ from arena_newton.policies.remote.address import cause
 __all__ = ["AskAgain", "RemoteError", "ServerLink", "episode_lost"]
 
 NOT_KNOWN = ("episode that the server does not know", "unknown episode", "the server is closing")
-"""What our servers say where they cannot go on with a running episode, which is no fault of the episode."""
+"""Messages of our servers that cannot continue a running episode, which is no fault of the episode."""
 
 
 class RemoteError(ArenaError):
@@ -40,11 +40,11 @@ class ServerLink[Q, R]:
     """One connection to a server, of one world; `abort` may be called from another thread."""
 
     transient: ClassVar[tuple[type[Exception], ...]] = (AskAgain, ConnectionError, socket.gaierror)
-    """What a repeated attempt may cure."""
+    """Errors that a repeated attempt may cure."""
     final: ClassVar[tuple[type[Exception], ...]] = (OSError, ValueError)
-    """What it does not."""
+    """Errors that it does not cure."""
     gone: ClassVar[tuple[type[Exception], ...]] = (OSError, AskAgain)
-    """What says that nobody is there."""
+    """Errors of an absent server."""
 
     def __init__(self, url: str):
         """Name the server; nothing is sent yet."""
@@ -110,7 +110,7 @@ class ServerLink[Q, R]:
         raise TypeError(f"{type(self).__name__} defines no probe()")
 
     def alive(self, timeout: float) -> bool:
-        """Whether the server answers a request that changes nothing; one that answers something else is there, too."""
+        """True if the server answers a request that changes nothing; one that answers something else is there, too."""
         try:
             self.probe(time.monotonic() + timeout)
         except self.gone:
@@ -131,5 +131,5 @@ class ServerLink[Q, R]:
 
 
 def episode_lost(said: str) -> bool:
-    """Whether a server says that it no longer knows the episode that is running, or is about to forget it."""
+    """True if a server reports that it no longer knows the episode that is running, or is about to forget it."""
     return any(text in said for text in NOT_KNOWN)

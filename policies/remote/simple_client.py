@@ -29,7 +29,7 @@ __all__ = ["PICTURE_KEY", "SimplePolicy", "make", "pack_array", "unpack_array"]
 PICTURE_KEY = "rgb_head_stereo_left"
 """Name of the head camera's picture."""
 DATASET_NAME = "simple"
-"""What SIMPLE's client says of where the observation is from."""
+"""Name of the data set that SIMPLE's client gives as the observation's origin."""
 
 
 def pack_array(array: np.ndarray) -> Json:

@@ -62,7 +62,7 @@ class VlaEvalLink(SocketLink):
         return answer, seq
 
     def unasked(self, frame: bytes | str) -> object:
-        """What went wrong at the beginning of the episode is the answer to its first look."""
+        """Fault at the beginning of the episode, which arrives as the answer to its first query."""
         message = vla_eval_codec.unpack_message(frame)
         return (message, message.seq) if message.type == "error" else None
 

@@ -33,7 +33,7 @@ __all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "htt
 GATEWAY_STATUS = (502, 503, 504)
 """Status of a gateway whose server is not there."""
 CLOSING = 0.5
-"""How long the closing handshake may take [s]."""
+"""Longest closing handshake [s]."""
 MOST_PAGE = 2**20
 """Longest page that is read [bytes]."""
 _SILENT = logging.Logger("arena_newton.websockets")
@@ -42,7 +42,7 @@ _SILENT.addHandler(logging.NullHandler())
 
 @dataclass(frozen=True)
 class SocketRequest:
-    """What a world asks; links make it the bytes of their protocol."""
+    """Request of a world; links make it the bytes of their protocol."""
 
     message: Begin | Look | None
     """None: `batch` says it."""
@@ -59,7 +59,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
 
     final = (OSError, ValueError, InvalidURI)
     sessions = False
-    """Whether the server keeps an episode with its connection."""
+    """True if the server keeps an episode with its connection."""
 
     def __init__(self, owner: SocketClient):
         """Take the policy whose server it is."""
@@ -221,7 +221,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
         return self._socket
 
     def _waiting(self) -> tuple[bool, bytes | str | None]:
-        """Whether the connection is open without a frame that nobody asked for, which would answer what comes next.
+        """True if the connection is open without a frame that nobody asked for, which would answer the next request.
 
         Returns:
             That, and the frame.
@@ -245,7 +245,7 @@ class SocketClient(RemoteClient[SocketRequest, object]):
 
     _checked = False
     greeting = ServedFacts()
-    """What the server declared when it was checked."""
+    """Facts that the server declared when it was checked."""
 
     def _connect(self) -> SocketLink:
         """A link that is not connected yet."""

@@ -1,4 +1,4 @@
-"""Who may come in, for all protocols: the token, no browsers, and how many connections there may be."""
+"""Connection guard of all protocols: the token, no browsers, and how many connections there may be."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class DoorGuard:
 
     @property
     def wants_token(self) -> bool:
-        """Whether clients must send one."""
+        """True if clients must send one."""
         return bool(self._token)
 
     def refusal(
@@ -78,7 +78,7 @@ class DoorGuard:
 
     @property
     def full(self) -> bool:
-        """Whether there are as many connections as there may be."""
+        """True if no further connection is allowed."""
         return self._inside >= self.connections
 
     def arrives(self) -> bool:

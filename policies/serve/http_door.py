@@ -56,7 +56,7 @@ _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "cl
 
 
 type _Taken = socket.socket | tuple[bytes, socket.socket]
-"""What the base class calls a request: of TCP the connection."""
+"""Request of the base class: for TCP the connection."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -127,7 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
         return refusal is not None
 
     def _let_in(self) -> bool:
-        """Whether there is room for this connection, which counts from its first request that may come in."""
+        """True if there is room for this connection, which counts from its first authorised request."""
         if not self.room and self.visit.enter_context(self.server.guard.inside()):
             self.room = True
             self.server.known(self.connection)
@@ -188,14 +188,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.flush()
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What http.server itself refuses, as JSON."""
+        """Send errors of http.server itself as JSON."""
         self.close_connection = True
         if not hasattr(self, "request_version") or self.request_version == "HTTP/0.9":
             self.request_version = "HTTP/1.1"
         self._send(code, pack_failure(plain_text(message or HTTPStatus(code).phrase, 200)))
 
     def log_message(self, format: str, *args: object) -> None:
-        """What strangers send is no news."""
+        """Log nothing: what strangers send is no news."""
 
 
 class _Listener(ThreadingHTTPServer):
@@ -260,7 +260,7 @@ class _Listener(ThreadingHTTPServer):
                 connection.shutdown(socket.SHUT_RDWR)
 
     def verify_request(self, request: object, client_address: object) -> bool:
-        """Whether a connection is read at all."""
+        """True if a connection is read at all."""
         return self.guard.arrives()
 
     def process_request(self, request: _Taken, client_address: object) -> None:

@@ -1,4 +1,4 @@
-"""Which robot a request of the original's HTTP protocol is of, although the protocol does not say.
+"""Robots behind the requests of the original's HTTP protocol, which does not name them.
 
 A client names itself by the header `X-Arena-Client`: its robots are those of its worlds and seeds, over any connection.
 The original's client names neither itself nor a world. Then a robot belongs to the connection on which its episode
@@ -139,7 +139,7 @@ class HttpRobots:
 
 
 def _left(robot: HttpRobot) -> bool:
-    """Whether the connection of a robot has closed, also where its thread has not noticed yet."""
+    """True if the connection of a robot has closed, also where its thread has not noticed yet."""
     if robot.connection is None:
         return True
     try:

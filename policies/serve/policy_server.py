@@ -25,8 +25,8 @@ import numpy as np
 import torch
 
 from arena_newton import tasks
-from arena_newton.data.datasets.layouts import state_names
 from arena_newton.data.readers.label_protocols import action_names, protocol
+from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.text import plain_text
 from arena_newton.interfaces import Observation
@@ -69,7 +69,7 @@ class Refused(ArenaError):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a session is answered."""
+    """Answer to a session."""
 
     actions: np.ndarray
     """The chunk, float32, shape [n, 40]."""
@@ -79,7 +79,7 @@ class Answer:
 
 @dataclass
 class ServerCounts:
-    """What a server has done so far."""
+    """Counts of a server's work so far."""
 
     episodes: int = 0
     looks: int = 0
@@ -113,7 +113,7 @@ class ServerCounts:
 
 @dataclass(frozen=True)
 class _Task:
-    """What the policy is told of a session's task."""
+    """Task of a session as the policy receives it."""
 
     name: str
     gym_id: str
@@ -126,17 +126,17 @@ class _Session:
     seed: int
     task: _Task
     held: bool
-    """Whether a connection holds it, so that it leaves with the connection."""
+    """True if a connection holds it, so that it leaves with the connection."""
     used: float
     abandoned: bool = False
-    """Whether its last connection has closed."""
+    """True if its last connection has closed."""
     last: tuple[int | None, int] | None = None
     """Step and content of the last look."""
     answer: np.ndarray | None = None
     """To the last look."""
 
     def follows(self, step: int) -> bool:
-        """Whether a look may come so many actions into the episode: at most the last chunk behind the last look."""
+        """True if a query may come so many actions into the episode: at most the last chunk after the last query."""
         if self.last is None:
             return False
         before = self.last[0]
@@ -205,7 +205,7 @@ class PolicyServer:
 
     @property
     def facts(self) -> ServedFacts:
-        """What the server declares; complete after `start`."""
+        """Facts that the server declares; complete after `start`."""
         if self._facts is None:
             raise RuntimeError("the server has not begun")
         return self._facts
@@ -556,7 +556,7 @@ class PolicyServer:
             raise InputError(f"policy {self.policy.name}: a chunk of shape {list(shape)}, expected {wanted}")
 
     def _refusal(self, error: Exception, reason: Reason = "unfit") -> Refused:
-        """What the client is told of an error; the console is told all of it where it is not a client's fault."""
+        """Error for the client; the console prints all of it where it is not the client's fault."""
         self.counts.refused += 1
         match error:
             case Refused():

@@ -159,7 +159,7 @@ def _tls(options: ServeOptions) -> ssl.SSLContext | None:
 
 
 def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, port: int) -> list[str]:
-    """What is served where, for whom reads the console."""
+    """Lines for the console: the policy, its address and who may connect."""
     facts = server.facts
     kind = "http" if options.protocol == "arena" else "ws"
     scheme = kind + ("s" if options.tls_cert else "")

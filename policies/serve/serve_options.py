@@ -10,19 +10,19 @@ from arena_newton.errors import InputError
 __all__ = ["PROTOCOLS", "ServeOptions"]
 
 PROTOCOLS = ("openpi", "roboarena", "vla-eval", "arena")
-"""What `--protocol` takes."""
+"""Values of `--protocol`."""
 MOST_SESSIONS = 4096
 """Most rows of a policy."""
 
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """What is served, where, and to how many."""
+    """Options of a policy server."""
 
     policy: str = ""
     """Policy: stand, learned, lerobot:<checkpoint>, replay:<file>, another package's, or remote:<url> to pass on."""
     protocol: str = "openpi"
-    """What clients speak: openpi roboarena vla-eval arena (the original's HTTP)."""
+    """Protocol of the clients: openpi roboarena vla-eval arena (the original's HTTP)."""
     host: str = "127.0.0.1"
     """Address of this machine that is served; 0.0.0.0 lets others in, who then need ARENA_POLICY_TOKEN."""
     port: int = 8000
@@ -30,7 +30,7 @@ class ServeOptions:
     max_batch_size: int = 16
     """Most looks in one call of the policy."""
     max_wait: float = 0.02
-    """How long the first look of a batch waits for others [s]."""
+    """Longest wait of a batch's first query for others [s]."""
     max_sessions: int = 64
     """Most episodes at once: rows of the policy. Eight connections more are taken."""
     device: str | None = None

@@ -32,12 +32,12 @@ from arena_newton.policies.protocols.policy_messages import Begin, End, Look
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
 from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.websocket_listener import WebsocketListener
+from arena_newton.policies.serve.websocket_listener import WebsocketListener, dismiss
 
 __all__ = ["WebsocketDoor", "WebsocketProtocol"]
 
 type WebsocketProtocol = Literal["openpi", "roboarena", "vla-eval"]
-"""What is spoken; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
+"""Protocol on the connection; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
 
 PONG_SECONDS = 300.0
 """Time that a client has to answer a ping: compiling kernels holds up a robot [s]."""
@@ -107,7 +107,7 @@ class WebsocketDoor:
         try:
             with self._guard.inside() as room:
                 if not room:
-                    connection.close(FULL, "too many connections")
+                    dismiss(connection, FULL, "too many connections")
                 elif self._protocol == "vla-eval":
                     self._serve_vla_eval(connection, owner)
                 else:
@@ -116,7 +116,7 @@ class WebsocketDoor:
             pass  # the robot has left
         except Exception:
             print(traceback.format_exc(), file=sys.stderr, flush=True)
-            connection.close(INTERNAL_ERROR, "the server failed; its console says more")
+            dismiss(connection, INTERNAL_ERROR, "the server failed; its console says more")
         finally:
             self._policy.leave(owner)
 
@@ -136,7 +136,7 @@ class WebsocketDoor:
                 frame = openpi_codec.pack_answer(answer.actions, answer.infer_ms, total, roboarena=roboarena)
             except ArenaError as error:  # openpi's server says so in a text frame, too, and closes
                 connection.send(plain_text(error, 300))
-                connection.close(INTERNAL_ERROR, "the request failed, as the last frame says")
+                dismiss(connection, INTERNAL_ERROR, "the request failed, as the last frame says")
                 return
             connection.send(frame)
             total = 1000 * (time.monotonic() - began)

@@ -18,7 +18,7 @@ from websockets.typing import Origin
 
 from arena_newton.policies.serve.door_guard import STRANGER_SECONDS, DoorGuard
 
-__all__ = ["WebsocketListener", "part"]
+__all__ = ["WebsocketListener", "dismiss", "part"]
 
 PING_SECONDS = 20.0
 """Time between two pings [s]."""
@@ -143,6 +143,16 @@ def part(connections: Iterable[ServerConnection], code: int, reason: str) -> Non
     for connection in connections:
         with suppress(OSError):
             connection.socket.shutdown(socket.SHUT_RDWR)
+
+
+def dismiss(connection: ServerConnection, code: int, reason: str) -> None:
+    """Close a connection; frames that its client still sends are dropped, for its own farewell comes after them."""
+    farewell = threading.Thread(target=_say_goodbye, args=[connection, code, reason], daemon=True)
+    farewell.start()
+    with suppress(ConnectionClosed):
+        for _ in connection:
+            pass
+    farewell.join()
 
 
 def _say_goodbye(connection: ServerConnection, code: int, reason: str) -> None:

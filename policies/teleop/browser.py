@@ -57,7 +57,7 @@ class BrowserSource:
         return Wish(self.driver.action(held, view), control)
 
     def _held(self) -> Held | None:
-        """What is held now; None where nobody drives."""
+        """Controls held now; None where nobody drives."""
         held, age = self.server.held()
         return held if age <= DEAD_MAN else None
 

@@ -1,4 +1,4 @@
-"""What a person holds on the page, and the canonical actions that a reference generator makes of it.
+"""Controls that a person holds on the page, and the canonical actions that a reference generator makes of them.
 
 The page sends all that is held 25 times a second; the generator limits every rate, so that nothing that is typed,
 dragged or lost makes the action jump.
@@ -49,7 +49,7 @@ RANGES: dict[str, tuple[float, float]] = {
 """Numbers of a message and their ranges: deflections of the stick, height of the pelvis [m], turn of the waist [rad],
 where a reaching palm is ahead of, outward of and above the pelvis [m], and frames of the page per second."""
 CAMERAS = ("follow", "room", "free")
-"""Where the page sees the world from: behind the robot, the scene's own camera, wherever a mouse takes it."""
+"""Views of the page: behind the robot, the scene's own camera, wherever a mouse takes it."""
 SWITCHES = ("reach_left", "reach_right", "close_left", "close_right", "high_steps", "sit")
 """Switches of a message."""
 HIGH_STEPS = {"swing_height": 0.18, "step_time": 0.52, "height": 0.74}
@@ -63,7 +63,7 @@ KICKS = {"kick_left": 1, "kick_right": 2}
 DOWN = 3.2
 """Time of sitting down [s], as in `primitives.sit`; a robot rises after it."""
 EVENTS = (*KICKS, *(control for control in get_args(Control) if control != "none"))
-"""What a message may ask for once."""
+"""Events that a message may request."""
 MOST_EVENTS = 8
 """Events in one message."""
 
@@ -149,7 +149,7 @@ class Driver:
         self._kick_ticks = 0
         self._kicking = False
         self._seat: Program | None = None
-        """What a robot that sits or rises follows."""
+        """Program that a robot follows while it sits or rises."""
         self._seat_ticks = 0
         self._sits = False
 

@@ -1,4 +1,4 @@
-"""What the commands of teleoperation do: make the world, begin the session, say how it went."""
+"""Commands of teleoperation: make the world, begin the session, report it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def drive(
 
 
 def session_facts(env: ArenaEnv, options: SessionOptions) -> dict[str, object]:
-    """What the motion of a session's episodes depends on, as `eval record --from` compares it with what it has.
+    """Facts on which the motion of a session's episodes depends, as `eval record --from` compares them with its own.
 
     Args:
         env: The world.

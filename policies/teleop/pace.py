@@ -23,7 +23,7 @@ STARVED = 1.0
 
 
 class Pace:
-    """When each tick begins, and what became of it."""
+    """Timing of the ticks: their begin, delays and cost."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep):
         """Begin now.
@@ -94,7 +94,7 @@ class TimedPicture:
         self.shed = 0
         """Those that came later than they were due, for lack of time."""
         self.cost = 0.0
-        """What one costs [s], of the last ones."""
+        """Cost of a picture [s], of the last ones."""
         self._next = 0.0
         self._waits = False
 

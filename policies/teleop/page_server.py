@@ -111,17 +111,17 @@ class PageServer:
 
     @property
     def connected(self) -> bool:
-        """Whether a page drives."""
+        """True if a page drives."""
         with self._lock:
             return self._driver is not None
 
     def held(self) -> tuple[Held, float]:
-        """What is held, and the age of the message that said so [s]; infinite without a page."""
+        """Controls held now, and the age of the message with them [s]; infinite without a page."""
         with self._lock:
             return self._held, time.monotonic() - self._held_at
 
     def events(self) -> list[str]:
-        """What was asked for since the last call."""
+        """Events requested since the last call."""
         with self._lock:
             events, self._events = self._events, []
         return events

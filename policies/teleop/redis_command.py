@@ -1,4 +1,4 @@
-"""What `python -m arena_newton.policies.teleop redis` does."""
+"""Command `python -m arena_newton.policies.teleop redis`."""
 
 from __future__ import annotations
 

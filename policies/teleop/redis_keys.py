@@ -68,7 +68,7 @@ PRESSED = 0.5
 RECORDING_CONTROL = f"recording_control{SUFFIX}"
 """`active`, `command`, `sequence`, `timestamp_ms`, `source`; a command counts when its sequence changes."""
 T_ACTION = "t_action"
-"""When the sender wrote, on its clock [ms]."""
+"""Time at which the sender wrote, on its clock [ms]."""
 GMR_JOINT_POS = f"gmr_joint_pos{SUFFIX}"
 """29 numbers: reference joint positions [rad], canonical order."""
 GMR_BODY_POS = f"gmr_body_pos{SUFFIX}"
@@ -90,7 +90,7 @@ STATE_HANDS = (f"state_hand_left{SUFFIX}", f"state_hand_right{SUFFIX}")
 STATE_NECK = f"state_neck{SUFFIX}"
 """2 numbers."""
 T_STATE = "t_state"
-"""When the state was written, on our clock [ms]."""
+"""Time at which the state was written, on our clock [ms]."""
 CAMERA = f"arena_camera_front{SUFFIX}"
 """The head camera's newest picture, JPEG bytes."""
 STATUS = f"arena_status{SUFFIX}"
@@ -103,7 +103,7 @@ _GMR = (GMR_JOINT_POS, f"gmr_joint_vel{SUFFIX}", GMR_BODY_POS, GMR_BODY_QUAT, f"
 
 @dataclass(frozen=True)
 class Backend:
-    """What a sender sends for one kind of tracker."""
+    """Messages that a sender sends for one kind of tracker."""
 
     name: str
     stream: tuple[str, ...]
@@ -175,7 +175,7 @@ def stamp(key: str, raw: bytes) -> float | None:
 
 
 def closed_hands(controllers: bytes, hands: tuple[bytes, bytes]) -> np.ndarray | None:
-    """Which hands are to close, left and right: 0 or 1, float32, shape [2].
+    """Hands to close, left and right: 0 or 1, float32, shape [2].
 
     Args:
         controllers: Value of `CONTROLLERS`. Of each hand its `grip_binary` decides, as in the original's labels;
@@ -202,7 +202,7 @@ def closed_hands(controllers: bytes, hands: tuple[bytes, bytes]) -> np.ndarray |
 
 
 def _controlled(controller: object) -> bool | None:
-    """Whether a controller closes its hand; None where it says nothing."""
+    """True if a controller closes its hand; None where it has no value for it."""
     if not isinstance(controller, dict):
         return None
     binary = controller.get("grip_binary")
@@ -224,7 +224,7 @@ class RecordingCommand:
 
 
 def recording_command(raw: bytes) -> RecordingCommand | None:
-    """What `RECORDING_CONTROL` says; None where it is absent.
+    """Command in `RECORDING_CONTROL`; None where it is absent.
 
     Raises:
         InputError: It is something else.

@@ -34,7 +34,7 @@ _CANONICAL = np.array(CANONICAL_TO_MUJOCO)
 
 
 class Limits:
-    """How far a reference may go in one tick; a sender that jumps is then followed at these rates."""
+    """Largest change of a reference in one tick; a sender that jumps is then followed at these rates."""
 
     TURN = math.radians(26.0)
     """Turn of the root: what the original's SONIC scripts allow (its TWIST2 scripts allow any) [rad]."""
@@ -66,7 +66,7 @@ class Reference(ABC):
         self._action: np.ndarray | None = None
         self._quat = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
         self.limited = ""
-        """What of the last frame went beyond `Limits`; empty: nothing."""
+        """Parts of the last frame beyond `Limits`; empty: none."""
 
     @abstractmethod
     def read(self, values: list[bytes]) -> np.ndarray:

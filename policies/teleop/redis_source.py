@@ -43,7 +43,7 @@ COMMANDS: dict[str, Control] = {name: name for name in get_args(Control) if name
 MOST_LINES = 50
 """Kinds of unfit input that are told."""
 RESET: Control = "discard_and_reset"
-"""What a reset from outside does: an episode that was reset is no demonstration."""
+"""Control for a reset from outside: an episode that was reset is no demonstration."""
 
 
 def connect(host: str, port: int, db: int) -> redis.Redis:

@@ -1,4 +1,4 @@
-"""What passes between a teleoperation session and the source of a person's actions: records and a Protocol."""
+"""Interface between a teleoperation session and the source of a person's actions: records and a Protocol."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 __all__ = ["Control", "Recording", "Source", "Telemetry", "Wish"]
 
 Recording = Literal["idle", "recording", "saved", "discarded"]
-"""What becomes of the running episode: not recorded, recorded, just saved, just discarded."""
+"""State of the running episode's recording: not recorded, recorded, just saved, just discarded."""
 
 Control = Literal["none", "start", "save", "cancel", "save_and_reset", "discard_and_reset", "quit"]
-"""What a person wants of the recording: `start` begins one, in an episode that begins with it; `save` and `cancel` end
+"""Control of the recording by a person: `start` begins one, in an episode that begins with it; `save` and `cancel` end
 it; the `_and_reset` forms also begin the next episode; `quit` ends the session. A control is an event: a source gives
 each once."""
 
@@ -42,7 +42,7 @@ class Telemetry:
     recording: Recording
     """State of the recording."""
     outcome: str | None = None
-    """How the episode ended: `success`, `fall`, or the task's own event, such as `ball_out`; None while it goes on."""
+    """Ending of the episode: `success`, `fall`, or the task's own event, such as `ball_out`; None while it goes on."""
     note: str = ""
     """One line for the person, such as the file that was saved."""
     factor: float = 1.0
@@ -51,13 +51,13 @@ class Telemetry:
 
 @dataclass(frozen=True)
 class Wish:
-    """What a source wants at one tick."""
+    """Wanted action and control of a source at one tick."""
 
     action: np.ndarray | None
     """Canonical action of this tick, float32, shape [40]; None: the source has nothing of now, and the robot comes to a
     stand."""
     control: Control = "none"
-    """What to do with the recording."""
+    """Control of the recording."""
 
 
 class Source(Protocol):

@@ -1,4 +1,4 @@
-"""How a robot comes to a stand when the source of its actions has nothing of now, and how it takes up actions again."""
+"""Standing: a robot comes to a stand when the source of its actions has nothing of now, and takes up actions again."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Stander:
         """Fraction of the way from `_from`."""
         self._silent = False
         self.standing = False
-        """Whether the last action was one of standing still."""
+        """True if the last action was one of standing still."""
 
     def action(self, given: np.ndarray | None) -> np.ndarray:
         """The action of this tick.

@@ -63,7 +63,7 @@ class PersonEpisode:
 
 @dataclass(frozen=True)
 class SessionReport:
-    """What a session did."""
+    """Report of a session."""
 
     ticks: int
     """Ticks of 20 ms, start-ups included."""
@@ -215,7 +215,7 @@ class TeleopSession:
         return self.report()
 
     def report(self) -> SessionReport:
-        """What the session did so far."""
+        """Report of the session so far."""
         pace, pictures = self.pace, self._pictures
         drawn, shed = sum(p.drawn for p in pictures), sum(p.shed for p in pictures)
         return SessionReport(pace.ticks, pace.late, pace.factor, drawn, shed, tuple(self.saved))
@@ -272,7 +272,7 @@ class TeleopSession:
         self.source.show(self._view(env.observe()))
 
     def _judge(self, code: int) -> None:
-        """Whether this tick ended the episode."""
+        """End the episode if this tick ended it."""
         tick, event = int(self.env.tick[0]), None
         if code == codes.SUCCESS:
             event = "success"

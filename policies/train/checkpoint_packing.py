@@ -11,16 +11,16 @@ import dataclasses
 import hashlib
 import json
 import os
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors.torch import save
 
+from arena_newton.cli.flags import shell_command, typed
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import create
 from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.untrusted_files import create
 from arena_newton.policies.learned.card_check import training_entries
 from arena_newton.policies.learned.learned_card import CARD_FILE, CARD_PAGE, PolicyCard, read_card
 from arena_newton.policies.learned.packed_checkpoint import (
@@ -41,7 +41,7 @@ MOST_BYTES = 32_000_000
 MIN_HALF_DIMS = 2
 """Tensors with fewer dimensions stay in float32: all together they are less than a hundredth of a network."""
 LATENT = "model.vae_encoder"
-"""How names begin of weights that only training uses."""
+"""Name prefix of weights that only training uses."""
 PRIVATE = {"device": "cpu", "repo_id": None, "pretrained_path": None, "use_vae": False}
 """Fields of `config.json` that say where it was trained, and of what is left out of the file."""
 UNTOLD = ("out", "resume", "device", "log_every", "save_every", "num_workers")
@@ -213,19 +213,13 @@ def training_command(options: Mapping[str, object]) -> str:
     flags = options.get("flags")
     if not isinstance(flags, dict):
         return ""
-    words = ["python", "-m", "arena_newton.policies.train"]
+    words: list[str] = []
     for one in dataclasses.fields(PolicyTrainOptions):
         value = flags.get(one.name)
         default = list(one.default) if isinstance(one.default, tuple) else one.default
         if one.name in UNTOLD or value is None or (value == default and one.name not in ("policy", "recipe")):
             continue
-        name = one.name.replace("_", "-")
-        values: Sequence[object] = value if isinstance(value, list) else [value]
-        if isinstance(value, bool):
-            words.append(f"--{name}" if value else f"--no-{name}")
-        else:
-            words += [
-                f"--{name}",
-                *(Path(str(v)).name if one.name in ("dataset", "weights") else str(v) for v in values),
-            ]
-    return " ".join(map(shlex.quote, words))
+        if one.name in ("dataset", "weights"):
+            value = [Path(str(path)).name for path in (value if isinstance(value, list) else [value])]
+        words += typed(one.name, value)
+    return shell_command("arena_newton.policies.train", *words)

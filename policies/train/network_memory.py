@@ -1,4 +1,4 @@
-"""What the parameters of a network take: memory of a GPU in training, and the disk for a checkpoint."""
+"""Size of a network's parameters: memory of a GPU in training, and the disk for a checkpoint."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONTEXT_BYTES = 2 * 2**30
 
 @dataclass(frozen=True)
 class NetworkSize:
-    """What a family's largest network takes while it is trained."""
+    """Memory of a family's largest network during training."""
 
     parameters: int
     parameter_bytes: int

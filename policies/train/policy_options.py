@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
-__all__ = ["PolicyTrainOptions", "TeachableOptions", "TrainingBenchOptions", "check_numbers", "check_teachable"]
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
-MOST_TRAININGS = 16
-"""Most trainings that are measured side by side."""
-
+__all__ = [
+    "PolicyTrainOptions",
+    "TeachableOptions",
+    "bounds",
+    "check_choices",
+    "check_numbers",
+    "check_ranges",
+    "check_teachable",
+]
 
 UNCOMPILED = ("pi05",)
 """Families that --compile refuses."""
@@ -85,38 +94,6 @@ class PolicyTrainOptions:
 
 
 @dataclass(frozen=True)
-class TrainingBenchOptions:
-    """Measure steps/s of trainings: alone, and several at once on one device."""
-
-    policy: str = "act"
-    """Family: act, diffusion, flow or pi05."""
-    recipe: str = "fast"
-    """Settings, as of a training."""
-    dataset: Several[Path] = ()
-    """Datasets; without them pictures are made up."""
-    frames: int = field(default=20_000, metadata=bounds(100, 10_000_000))
-    """Pictures that are made up."""
-    trainings: tuple[int, ...] = (1, 2, 4)
-    """Numbers of trainings at once."""
-    seconds: float = field(default=20.0, metadata=bounds(0.1, 3600.0))
-    """Time of each measurement [s], after the warm-up."""
-    batch_size: int = field(default=0, metadata=bounds(0, 65536))
-    """Samples of a step; 0: the recipe's."""
-    device: str = "auto"
-    """cpu, cuda, cuda:N or auto."""
-    weights: str = ""
-    """Pretrained weights, as of a training."""
-    graph: bool = True
-    """On CUDA: capture batch and step in one CUDA graph."""
-    compile: bool = False
-    """Compile the network with torch.compile; not for pi05."""
-    against_lerobot: bool = False
-    """Measure LeRobot's own loop too, its data loader on the dataset; needs --dataset."""
-    workers: int = field(default=4, metadata=bounds(0, 256))
-    """Processes of LeRobot's data loader."""
-
-
-@dataclass(frozen=True)
 class TeachableOptions:
     """Say in minutes, without pictures and without a GPU, whether a policy without memory can learn demonstrations.
 
@@ -158,52 +135,59 @@ def check_teachable(options: TeachableOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    _check_ranges(options)
+    check_ranges(options)
     if options.recording == Path() or not options.recording.is_dir():
         raise InputError(f"--recording {options.recording}: name a folder that eval record wrote")
     if not options.task:
         raise InputError("--task: name the task of the demonstrations")
 
 
-def _check_ranges(options: PolicyTrainOptions | TrainingBenchOptions | TeachableOptions) -> None:
-    """Refuse numbers that are out of the ranges of their fields."""
+def check_ranges(options: DataclassInstance) -> None:
+    """Refuse numbers that are out of the ranges of their fields.
+
+    Raises:
+        InputError: One is.
+    """
     for one in dataclasses.fields(options):
         if "range" in one.metadata:
             low, high = one.metadata["range"]
             value = getattr(options, one.name)
             if value is not None and not (low <= value <= high and math.isfinite(value)):
-                flag = "--" + one.name.replace("_", "-")
+                flag = flag_name(one.name)
                 until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise InputError(f"{flag} {value}: expected a number {until}")
 
 
-def check_numbers(options: PolicyTrainOptions | TrainingBenchOptions) -> None:
+def check_choices(policy: str, recipe: str, datasets: Sequence[Path], *, compiled: bool) -> None:
+    """Refuse a family, recipe or datasets that no training can use, before anything is loaded.
+
+    Raises:
+        InputError: One is unfit.
+    """
+    for flag, value, known in (("--policy", policy, FAMILIES), ("--recipe", recipe, RECIPES)):
+        if value not in known:
+            raise InputError(f"{flag} {value}: unknown, choose from {', '.join(known)}")
+    if compiled and policy in UNCOMPILED:
+        raise InputError(
+            f"--compile: {policy} cannot be compiled: LeRobot makes its masks on the host in every forward pass"
+        )
+    for folder in datasets:
+        if not folder.is_dir():
+            raise InputError(f"--dataset {folder}: no such folder")
+    resolved = [folder.resolve() for folder in datasets]
+    for number, folder in enumerate(resolved):
+        if folder in resolved[:number]:
+            raise InputError(f"--dataset {datasets[number]}: is named twice")
+
+
+def check_numbers(options: PolicyTrainOptions) -> None:
     """Refuse flags that no training can use, before anything is loaded.
 
     Raises:
         InputError: A flag's value is unfit.
     """
-    _check_ranges(options)
-    for flag, value, known in (("--policy", options.policy, FAMILIES), ("--recipe", options.recipe, RECIPES)):
-        if value not in known:
-            raise InputError(f"{flag} {value}: unknown, choose from {', '.join(known)}")
-    if options.compile and options.policy in UNCOMPILED:
-        raise InputError(
-            f"--compile: {options.policy} cannot be compiled: LeRobot makes its masks on the host in every forward pass"
-        )
-    for folder in options.dataset:
-        if not folder.is_dir():
-            raise InputError(f"--dataset {folder}: no such folder")
-    resolved = [folder.resolve() for folder in options.dataset]
-    for number, folder in enumerate(resolved):
-        if folder in resolved[:number]:
-            raise InputError(f"--dataset {options.dataset[number]}: is named twice")
-    if isinstance(options, TrainingBenchOptions):
-        if not options.trainings or not all(1 <= n <= MOST_TRAININGS for n in options.trainings):
-            raise InputError(f"--trainings: expected numbers from 1 to {MOST_TRAININGS}")
-        if options.against_lerobot and not options.dataset:
-            raise InputError("--against-lerobot: LeRobot's loop reads a dataset; name one with --dataset")
-        return
+    check_ranges(options)
+    check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if options.steps and options.minutes:
         raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.labels not in ("", "v3.1", "v4"):

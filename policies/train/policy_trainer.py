@@ -67,7 +67,7 @@ class PolicyTrainer:
         self.step = 0
         """Steps that are done."""
         self.graphed = graph and self.device.type == "cuda" and model.capturable
-        """Whether steps are graphs."""
+        """True if steps are graphs."""
         drop, store = model.drop_last, batches.store
         self.samples = store.samples(drop_last=drop)
         """Rows at which a sample may begin."""

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from arena_newton.cli.flags import flag_name
 from arena_newton.errors import InputError
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 
@@ -42,7 +43,7 @@ def resumed(
         if one.name in changes or (given == getattr(empty, one.name) and one.name not in chosen):
             continue
         if one.name not in FREE_ON_RESUME and given != getattr(stored, one.name):
-            flag = "--" + one.name.replace("_", "-")
+            flag = flag_name(one.name)
             raise InputError(f"{flag} {given}: the training in {options.resume} has {getattr(stored, one.name)}")
         changes[one.name] = given
     for given_flag, other in (("steps", "minutes"), ("minutes", "steps")):  # either says how long a training is

@@ -50,7 +50,7 @@ class Demonstrations:
 
 
 def pose_features(state: Tensor, position: Tensor, quat: Tensor, objects: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """What the network is given.
+    """Inputs of the network.
 
     Args:
         state: Canonical state, shape [rows, 64].

@@ -1,4 +1,4 @@
-"""What a training needs besides its data, checked before anything that takes time: `check_training`."""
+"""Requirements of a training besides its data, checked before anything that takes time: `check_training`."""
 
 from __future__ import annotations
 

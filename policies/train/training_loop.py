@@ -54,7 +54,7 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether it writes files and speaks."""
+        """True if it writes files and speaks."""
         return self.rank == 0
 
 
@@ -155,7 +155,7 @@ class TrainingLoop:
         self._stopped = True
 
     def _asked_to_stop(self) -> bool:
-        """Whether a signal came, to any of the processes."""
+        """True if a signal came, to any of the processes."""
         if self._processes.count == 1:
             return self._stopped
         if self._trainer.step % STOP_STEPS:

@@ -59,7 +59,7 @@ BATCH_COUNTER = "num_batches_tracked"
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Where a training is, and what it is of."""
+    """Progress of a training, and its identity."""
 
     step: int
     """Steps that are done."""

@@ -170,15 +170,6 @@ BROKEN = {
 }
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Two threads that wait for each other on a busy machine make small networks a hundred times slower."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture
 def falcon_module(monkeypatch):
     """A stranger's package, importable as when it is installed."""

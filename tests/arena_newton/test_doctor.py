@@ -9,7 +9,7 @@ import pytest
 from arena_newton import doctor, policies, trackers
 from arena_newton.__main__ import main
 from arena_newton.cli import extras
-from arena_newton.files import probe
+from arena_newton.files import sandboxed_load
 from arena_newton.robot.canonical import STAND_ACTION
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,8 +27,8 @@ def test_modules_are_tried_in_another_process(tmp_path, monkeypatch):
     (tmp_path / "never_ends.py").write_text("import time\ntime.sleep(100)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     names = ["json", "no_such_module", "dies_at_once", "never_ends"]
-    answers = probe.faults("module", names, memory=1 << 30, seconds=2.0)
-    assert answers == [None, "No module named 'no_such_module'", probe.CRASHED, probe.TOO_LONG]
+    answers = sandboxed_load.faults("module", names, memory=1 << 30, seconds=2.0)
+    assert answers == [None, "No module named 'no_such_module'", sandboxed_load.CRASHED, sandboxed_load.TOO_LONG]
 
 
 def test_every_extra_is_reported(monkeypatch):

@@ -67,7 +67,7 @@ def test_wheel_holds_one_top_level_package(tmp_path):
     assert "arena_newton/usd_scenes/football/scene.usda" in names
     assert "arena_newton/py.typed" in names
     assert {f"arena_newton/eval/suites/{name}.toml" for name in ("paper", "tiny")} <= set(names)
-    assert {f"arena_newton/eval/page/report.{ending}" for ending in ("html", "css", "js")} <= set(names)
+    assert {f"arena_newton/eval/reports/page/report.{ending}" for ending in ("html", "css", "js")} <= set(names)
 
 
 def test_dependencies_have_both_ends_and_a_tested_version():
@@ -95,10 +95,10 @@ def test_what_is_imported_is_a_dependency():
     names |= {"zmq": "pyzmq", "sklearn": "scikit-learn", "huggingface_hub": "huggingface-hub"}
     names |= {"mujoco_warp": "mujoco-warp", "rsl_rl": "rsl-rl-lib"}
     # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
-    known = {*sys.stdlib_module_names, "arena_newton", "tensordict"}
+    known = {*sys.stdlib_module_names, "arena_newton", "benchmarks", "tensordict"}
     # Run by the interpreter of that other program, never imported.
-    theirs = {"eval/bench/mjlab_training.py": {"mjlab"}}
-    for folder in ("arena_newton", *FLOORS):
+    theirs = {"benchmarks/mjlab_training.py": {"mjlab"}}
+    for folder in ("arena_newton", *FLOORS, "benchmarks"):
         for path in (ROOT / folder).rglob("*.py"):
             allowed = known | theirs.get(path.resolve().relative_to(ROOT).as_posix(), set())
             for node in ast.walk(ast.parse(path.read_text())):

@@ -2,11 +2,23 @@
 
 import os
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def installed():
+    """Versions of the installed packages are read once, not by every command."""
+    from arena_newton import doctor
+
+    found = doctor.versions()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(doctor, "versions", lambda: dict(found))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +29,55 @@ def made_suite(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda file: None)  # thousands of journal lines
         return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
+
+
+class Keepers(defaultdict):
+    """Builder of environments (`Factories.env`) that hands out again what was closed: one keeper for each kind."""
+
+    def __call__(self, task, **options):
+        """The environment of a run; what is not said is the default."""
+        said = {name: value for name, value in options.items() if value is not None and value is not False}
+        said = {"rules": "paper", "mode": "base"} | said
+        kind = {name: str(value) for name, value in sorted(said.items()) if name != "tracker"}
+        return self[task, said["tracker"].name, str(kind)](task, **said)
+
+    def drop(self):
+        """Release all."""
+        for keeper in self.values():
+            keeper.drop()
+
+
+@pytest.fixture(scope="session")
+def kept_worlds():
+    """Environments that all files share."""
+    from arena_newton.eval.play.env_cache import EnvCache
+
+    keepers = Keepers(EnvCache)
+    yield keepers
+    keepers.drop()
+
+
+@pytest.fixture(scope="session")
+def watched_worlds():
+    """Environments that all files share and that keep a hash of every tick."""
+    from watched import LastingWatchedEnv
+
+    from arena_newton.eval.play import env_cache
+
+    def keeper():
+        return env_cache.EnvCache(LastingWatchedEnv)
+
+    keepers = Keepers(keeper)
+    yield keepers
+    keepers.drop()
+
+
+@pytest.fixture(scope="session")
+def boxed(watched_worlds):
+    """An expert's first two episodes of boxing: a `Table` of its actions, hashes of the ticks, results."""
+    from watched import Table, watched_rollout
+
+    from arena_newton import policies
+
+    table = Table()
+    return table, *watched_rollout(watched_worlds, "boxing", 2, 2, policies.get("expert"), recorder=table)

@@ -143,7 +143,12 @@ def factories(**changes):
     return Factories(**(parts | changes))
 
 
-if __name__ == "__main__":
-    from arena_newton.eval.__main__ import main
+def main(arguments):
+    """The command line with these stand-ins."""
+    from arena_newton.eval import __main__ as command_line
 
-    sys.exit(main(sys.argv[1:], factories()))
+    return command_line.main(arguments, factories())
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -33,7 +33,7 @@ def full(row):
         "video": "",
     }
     rest |= {"durations": {"wall_s": 1.0, "sim_s": 2.0}, "started_at": "a", "finished_at": "b"}
-    rest |= {"phases": [["walk", 0], ["reach", 40]], "progress": 0.5}
+    rest |= {"phases": [["walk", 0], ["reach", 40]], "progress": 1.0 if ended[0] == "success" else 0.5}
     rest |= {"predicates": {"approach": 30, "contact": ended[1] if ended[0] == "success" else None}}
     fell = [{"kind": "fall", "tick": ended[1], "detail": "tilt"}] * (ended[0] == "fall")
     rest |= {"events": [{"kind": "contact", "tick": 61, "detail": "hand"}, *fell]}

@@ -10,19 +10,19 @@ from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification import certificate, claims
+from arena_newton.eval.certification import certificate, certify, claims
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import legs, solvable, swap
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.certification.stand_ins.bodies import Body
-from arena_newton.eval.commands import certify
 from arena_newton.eval.plan import options as flags
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.play import run as runs
 from arena_newton.eval.records.journal import ContradictionError
 from arena_newton.eval.statistics.stats import mcnemar
 from arena_newton.interfaces import Verdict
 from arena_newton.kernels import tick as codes
+from arena_newton.pages.tables import Table
 
 
 class SolvedEnv(FakeEnv):
@@ -274,7 +274,7 @@ def test_the_page_needs_no_other_file(tmp_path):
     found = CheckFinding(
         "note",
         "three of four",
-        (Sheet("A table", ("task",), (("<script>alert(1)</script>",),)),),
+        (Table(("task",), (("<script>alert(1)</script>",),), title="A table"),),
         ("a | note",),
         (Picture('a "picture"', picture),),
     )

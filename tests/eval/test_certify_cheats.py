@@ -11,10 +11,10 @@ import pytest
 import warp as wp
 
 from arena_newton.env import ArenaEnv
+from arena_newton.eval.certification import certify
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import solvable
-from arena_newton.eval.commands import certify
 from arena_newton.eval.folders.recordings import ActionRecorder
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.policies.experts.base import ExpertPolicy
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding

@@ -8,15 +8,16 @@ import pytest
 import torch
 
 from arena_newton import rule_sets, tasks, trackers
+from arena_newton.eval.certification import certify
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import agreement, axes, visible
 from arena_newton.eval.certification.checks.swap import retention
 from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell
-from arena_newton.eval.certification.finding import Score, Sheet, discordant
+from arena_newton.eval.certification.finding import Score, discordant
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
-from arena_newton.eval.commands import certify
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.play.run import Factories
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
@@ -225,7 +226,7 @@ class Played:
 def test_engines_and_weights_are_compared_episode_by_episode(monkeypatch):
     """Equal rates of other episodes are no difference, and eleven episodes that one alone solves are one."""
     monkeypatch.setattr(agreement, "recorded", lambda context, task, tracker: CertifyCell(task, tracker))
-    monkeypatch.setattr(agreement, "_same_start", lambda *given: ("both alike", Sheet("", (), ()), []))
+    monkeypatch.setattr(agreement, "_same_start", lambda *given: ("both alike", Table((), ()), []))
     exact = 2 * 0.5**11
     found = agreement.official(Played(own="s" * 12, other="s" + "t" * 11))
     assert (found.verdict, found.sheets[0].rows[0][-1]) == (

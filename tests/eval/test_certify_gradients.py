@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from arena_newton.differentiable import RollingBall
+from arena_newton.eval.certification import certify
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import gradients
 from arena_newton.eval.certification.checks.gradients import Agreement, Slopes, agreement_of, flight_slopes
-from arena_newton.eval.commands import certify
-from arena_newton.eval.plan.options import CertifyOptions
 
 ESTIMATES = torch.tensor([1.0, -2.0, 0.001, 0.5, 1.5])
 

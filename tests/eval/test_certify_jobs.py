@@ -8,7 +8,7 @@ import pytest
 import tyro
 
 from arena_newton.eval.certification import jobs
-from arena_newton.eval.plan.options import CertifyOptions
+from arena_newton.eval.certification.certify_options import CertifyOptions
 
 
 def stand_in(tmp_path, monkeypatch, code=0):

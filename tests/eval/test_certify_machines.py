@@ -12,10 +12,10 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton.errors import InputError
+from arena_newton.eval.certification import certify
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import machines
 from arena_newton.eval.certification.checks.same_files import contents
-from arena_newton.eval.commands import certify
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.eval.workers.shard_merge import merge
 
 FAKES = Path(__file__).with_name("fakes_by_name.py")

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from arena_newton.eval.certification import certify
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import closed_forms
-from arena_newton.eval.commands import certify
-from arena_newton.eval.plan.options import CertifyOptions
 from arena_newton.kernels.rules import success
 from arena_newton.physics import batch, scene
 from arena_newton.pictures.camera import Camera

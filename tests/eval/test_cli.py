@@ -14,11 +14,15 @@ from eval_fakes import factories
 
 from arena_newton import rule_sets, tasks
 from arena_newton.cli.command_line import exit_code
+from arena_newton.cli.command_table import CommandRow
+from arena_newton.cli.flags import parse_flags, words
 from arena_newton.errors import InputError
-from arena_newton.eval.__main__ import main
+from arena_newton.eval import commands
+from arena_newton.eval.__main__ import COMMANDS, main
 from arena_newton.eval.plan.config import resolve
-from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play import run
+from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.policies.learned import learned_card
 from arena_newton.tasks import football
 
@@ -154,7 +158,7 @@ def test_files_of_several_trackers_have_names_of_their_own(tmp_path):
         (["--max-steps", "0"], "--max-steps 0"),
         (["--drive", "stiff"], "--drive stiff: .*humanoidarena"),
         (["--strip", "--video-size", "big"], "--video-size big"),
-        (["bench", "--what", "all", "nosuch"], "--what nosuch: known are help"),
+        (["bench", "--what", "all", "nosuch"], "--what nosuch: known are tick throughput learned start all"),
         (["--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--seeds", "-1"], "seeds"),
         (["--task", "football", "--seeds", "99999999999999999999999"], "--seeds 99999999999999999999999: expected at"),
@@ -250,19 +254,64 @@ def test_report_from_journal(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["complete"]
 
 
-@pytest.mark.parametrize("command", [[], ["resume"], ["report"], ["list"], ["bench"]])
-def test_help_is_quick_and_imports_nothing_heavy(command):
-    """--help answers without the heavy packages: Warp, torch, USD and MuJoCo stay unloaded."""
+def test_help_is_quick_and_imports_nothing_heavy():
+    """--help of each command answers without the heavy packages: Warp, torch, USD and MuJoCo stay unloaded."""
     code = (
-        "import sys; from arena_newton.eval.__main__ import main\n"
-        "try: main(sys.argv[1:])\n"
-        "except SystemExit as stop: assert not stop.code\n"
-        "heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'numpy', 'cv2'} & set(sys.modules)\n"
-        "assert not heavy, heavy"
+        "import sys; from arena_newton.eval.__main__ import COMMANDS, main\n"
+        "for command in ([], *([name] for name in COMMANDS)):\n"
+        "    try: main([*command, '--help'])\n"
+        "    except SystemExit as stop: assert not stop.code\n"
+        "    heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'numpy', 'cv2'} & set(sys.modules)\n"
+        "    assert not heavy, (command, heavy)"
     )
-    done = subprocess.run([sys.executable, "-c", code, *command, "--help"], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "usage" in done.stdout
+    assert done.stdout.count("usage: ") == len(COMMANDS) + 1
+
+
+def test_a_new_command_is_its_file_and_its_row(tmp_path, monkeypatch, capsys):
+    """A file in `eval/commands` and a row of the table give help, folders, flags, extras and the exit code."""
+    (tmp_path / "greet.py").write_text(
+        "from dataclasses import dataclass\n"
+        "@dataclass(frozen=True)\n"
+        "class GreetOptions:\n"
+        '    """Greet folders."""\n'
+        "    times: int = 1\n"
+        '    """How often."""\n'
+        "def run(folders, options: 'GreetOptions'):\n"
+        "    print([folder.name for folder in folders] * options.times)\n"
+        "    return 7\n"
+    )
+    monkeypatch.setattr(commands, "__path__", [*commands.__path__, str(tmp_path)])
+    monkeypatch.setitem(COMMANDS, "greet", CommandRow("say hello", "<out> [<out> ...]", "the results folder"))
+    assert main(["greet", "a", "b", "--times", "2"]) == 7
+    assert capsys.readouterr().out == "['a', 'b', 'a', 'b']\n"
+    assert main(["greet", "--times", "2"]) == main(["greet", "a", "a"]) == main(["greet", "a", "--time", "x"]) == 2
+    assert "greet: name the results folder: " in capsys.readouterr().err
+    for typed, shown in ((["greet", "--help"], "How often. (default: 1)"), (["--help"], "say hello")):
+        with pytest.raises(SystemExit):
+            main(typed)
+        assert shown in capsys.readouterr().out
+    monkeypatch.setitem(COMMANDS, "greet", CommandRow("say hello", "<out>", extras={"data": ("nosuch",)}))
+    assert main(["greet", "a"]) == 2
+    assert "eval greet: needs the extra [data] (nosuch" in capsys.readouterr().err
+
+
+def test_every_command_has_its_file():
+    """The table and the files of `eval/commands` name the same commands."""
+    files = {path.stem for path in Path(commands.__file__).parent.glob("*.py")} - {"__init__"}
+    assert files == set(COMMANDS)
+
+
+def test_options_are_written_as_they_are_typed():
+    """What a command prints of its options gives the same options again."""
+    for options in (
+        RunOptions(task=("boxing", "vis_navi"), ray=(), follow=True, remote_timeout=2.5, until_width=0.1),
+        MatrixOptions(only="policy=act task=boxing", shard="1/4", ray=("auto",), ray_gpus=0.5, keep_going=True),
+        RecordOptions(disturb=False, cameras=(), episodes=3),
+    ):
+        assert parse_flags(type(options), words(options), "eval") == options
+    assert words(RunOptions()) == []
 
 
 @pytest.mark.parametrize(

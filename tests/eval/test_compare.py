@@ -174,7 +174,7 @@ def test_a_suite_holds_its_policies(tmp_path):
     strata = [["football", "twist2"], ["boxing", "twist2"], ["football", "sonic"], ["boxing", "sonic"]]
     assert [[task["stratum"] for task in pair["tasks"]] for pair in found["pairs"]] == [strata] * 3
     assert any("Left out, because not all have it: vis_navi" in note for note in found["notes"])
-    assert sum("is unfinished, and left out: 30 of 60" in note for note in found["notes"]) == 3
+    assert sum("is incomplete, and left out: 30 of 60" in note for note in found["notes"]) == 3
     beginning = cell_of("act", "act", "twist2", "sit_sofa")
     broken = cell_of("act", "act", "sonic", "sit_sofa")
     suite = write_suite(tmp_path / "more", [*cells, (beginning, None), (broken, None)])

@@ -19,7 +19,6 @@ from arena_newton.eval.adapters.door_comparison import DoorEpisode, DoorPlay, co
 from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
 from arena_newton.eval.adapters.lerobot_env import ArenaNewtonEnv
 from arena_newton.eval.adapters.lerobot_env.labelled_worlds import V4VectorEnv
-from arena_newton.eval.adapters.picture_differences import picture_rows, picture_table
 from arena_newton.policies.replay import ReplayEpisodes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies" / "checkpoints"))
@@ -209,24 +208,6 @@ def test_the_vector_names_the_task():
     batch.close()
 
 
-def test_other_pictures_change_the_answer(checkpoint):
-    """What is packed without loss decides the same bits; JPEG, the other lens and blackness something else each."""
-    options = DoorOptions(task="boxing", episodes=2)
-    rows = picture_rows(options, checkpoint)
-    assert [row.name for row in rows] == [
-        f"{SIDE}x{SIDE} native, as rendered",
-        "the same as PNG",
-        "the same as JPEG, quality 95",
-        "the same as JPEG, quality 75",
-        f"{SIDE}x{SIDE} pad",
-        "black",
-    ]
-    assert [row.largest for row in rows[:2]] == [row.brightness for row in rows[:2]] == [0.0, 0.0]
-    assert all(row.largest >= row.mean > 0.0 and row.brightness > 0.0 for row in rows[2:])
-    assert rows[2].brightness < rows[3].brightness < rows[5].brightness
-    assert picture_table(rows).count("\n") == 2 + len(rows)
-
-
 @pytest.mark.slow
 def test_every_door_gives_the_same_episodes(checkpoint, tmp_path, capsys):
     """The command itself, each door a program: equal bits, exit code 0, and a table with every command."""
@@ -242,6 +223,7 @@ def test_every_door_gives_the_same_episodes(checkpoint, tmp_path, capsys):
     assert "lerobot.scripts.lerobot_eval" in text and text.count("policies.serve") == 4
 
 
+@pytest.mark.release
 def test_our_runner_as_a_door(checkpoint, tmp_path):
     """One door alone: its program runs, and what it did is read from its files."""
     flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "1", "--max-steps", str(TICKS)]

@@ -13,10 +13,10 @@ from rows import episodes, full, record
 from test_report import document_of, folder_with
 
 from arena_newton import tasks, trackers
-from arena_newton.cli.flags import parse_flags
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.failures import HELD_OUT, LEAST, TUNED, confusion, failures
 from arena_newton.eval.certification.checks.labelled_failures import (
     LABELLED,
@@ -40,7 +40,7 @@ from arena_newton.eval.folders.failure_rules import BARS, near_bars, sees_at_sta
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.folders.results import OWN_FOLDER, load_run
 from arena_newton.eval.plan.interaction import INTERACTIONS
-from arena_newton.eval.plan.options import CertifyOptions, RunOptions
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.interaction_view import InteractionView
 from arena_newton.eval.play.own_tracker import own_options
 from arena_newton.eval.play.run import Factories
@@ -255,9 +255,9 @@ def test_a_swapped_run_says_what_its_swap_made(tmp_path, capsys):
 
 def test_the_own_tracker_plays_the_same_episodes(tmp_path, capsys):
     """The replay has the run's tasks, modes, seeds and physics; a run that has no actions is refused in a line."""
-    given = ["--tracker", "sonic", "--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco"]
+    given = {"task": ("boxing",), "tracker": ("sonic",), "seeds": (3,), "repeats": 2, "engine": "mujoco"}
     (tmp_path / "a" / "actions").mkdir(parents=True)
-    options = parse_flags(RunOptions, [*given, "--failures", "--actions"], "run")
+    options = RunOptions(**given, failures=True, actions=True)
     document = document_of(2) | {"options": dataclasses.asdict(options)}
     (tmp_path / "a" / "config.json").write_text(json.dumps(document))
     found = own_options(tmp_path / "a", "twist2")

@@ -13,7 +13,7 @@ from made_suites import HOI, HSI, cell_of, outcomes, write_suite
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.commands.tables_command import BEGIN, END
+from arena_newton.eval.commands.tables import BEGIN, END
 from arena_newton.eval.statistics.stats import contrast, holm, paired_rates, suites, wilson
 from arena_newton.eval.statistics.trainings import DROP_SPREAD, MATCHED_SPREAD, SWAPPED_SPREAD
 from arena_newton.eval.tables import findings_text, paper_claims

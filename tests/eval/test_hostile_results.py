@@ -215,6 +215,7 @@ def test_a_line_of_another_run_is_refused(base, capsys, field, value):
     ("ended", "changes", "said"),
     [
         ("success", {"margin": -0.5}, "a success with a margin of -0.5"),
+        ("success", {"progress": 0.1}, "a success with a progress of 0.1"),
         ("success", {"predicates": {"goal": None}}, "whose last predicate held first at None"),
         ("success", {"outcome": "timeout", "reason": "timeout"}, "a timeout after"),
         ("success", {"outcome": "fall", "reason": "fall"}, "a fall without the event fall"),

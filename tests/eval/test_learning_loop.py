@@ -20,8 +20,8 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.loop import learning_loop
 from arena_newton.eval.loop.learning_loop import LOOP_FILE, is_begun, resolved
+from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import worked_seconds
-from arena_newton.eval.plan.options import LoopOptions
 from arena_newton.files.new_folder import held_folder
 from arena_newton.files.text import is_printable
 from tests.fuzz.mutants import damaged

@@ -5,9 +5,7 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
@@ -17,6 +15,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.suites.matrix_cells import dealt, expand_cells, parse_only, run_options, selected
 from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file
 from arena_newton.eval.suites.suite_records import load_cell, read_events, read_suite
+from tests.children import Child
 
 SUITE = """
 name = "small"
@@ -126,10 +125,7 @@ def test_a_finished_suite_plays_nothing(played, suite, capsys):
 
 def start(suite, out, *flags, pause="0.02"):
     """The command line in a process of its own."""
-    script = Path(__file__).parent / "eval_fakes.py"
-    command = [sys.executable, str(script), "matrix", str(suite), "--out", str(out), *flags]
-    environment = os.environ | {"FAKE_TICK_S": pause}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Child("eval_fakes", ["matrix", str(suite), "--out", str(out), *flags], FAKE_TICK_S=pause)
 
 
 def wait_for(process, out, text):

@@ -32,7 +32,7 @@ from arena_newton.eval.statistics.rate_tests import (
 from arena_newton.eval.statistics.stats import contrast, mcnemar, suites
 from arena_newton.eval.statistics.trainings import RateTerm, trained_contrast
 from arena_newton.eval.tables.comparison_page import beta_density
-from arena_newton.eval.tables.evaluated_cells import EvaluatedCell
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import paper_numbers
 from arena_newton.eval.tables.suite_tables import suite_tables
 

@@ -6,9 +6,9 @@ import sys
 import pytest
 from test_shard_merge import configuration, contents
 
-from arena_newton.eval.bench.bench_policy import random_checkpoint
 from arena_newton.eval.suites.suite_records import read_suite
 from arena_newton.eval.workers.shard_merge import merge
+from benchmarks.policy_bench import random_checkpoint
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 

@@ -63,6 +63,7 @@ def lines(folder):
     return path.read_text().splitlines() if path.exists() else []
 
 
+@pytest.mark.release
 def test_kill_9_in_a_job_of_two_machines(alone, tmp_path):
     """The batch file makes a cluster; a process and a machine are killed, and all files are those of one process.
 

@@ -10,7 +10,7 @@ from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import RunStopped, check_parts
-from arena_newton.eval.play.whole_run import begun, progress_of
+from arena_newton.eval.play.run_flow import begun, progress_of
 from arena_newton.eval.records.journal import Journal, read_journal
 from arena_newton.eval.workers.slice_events import Ended, Slice
 from arena_newton.eval.workers.slice_player import play
@@ -18,59 +18,64 @@ from arena_newton.physics import devices
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from arena_newton.eval.workers import ray_run  # noqa: E402
-from arena_newton.eval.workers.ray_crew import Done, Job, Lost, Member  # noqa: E402
+from arena_newton.eval.workers.worker_pool import Done, Job, Lost, Worker  # noqa: E402
 
 PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine": "mujoco", "worlds": 4, "ray": ()}
 
 
-class StubCrew:
+class StubPool:
     """Processes that play in this one, and are lost where a test says so."""
 
-    def __init__(self, job, size, lost=lambda lease, told: None, made_of=None):
-        self.folder, self.members, self.lost = job.folder, [Member(job=job) for _ in range(size)], lost
+    def __init__(self, job, size, lost=lambda assignment, told: None, made_of=None):
+        self.folder, self.workers, self.lost = job.folder, [Worker(job=job) for _ in range(size)], lost
         self.made_of, self.shown = made_of or factories(), None
         self.policy = FakePolicy("expert")
         self.sizes = []
 
     def idle(self):
-        return [member for member in self.members if member.lease is None]
+        return [worker for worker in self.workers if worker.assignment is None]
 
-    def lend(self, member, lease):
-        member.lease, member.last = lease, lease.group
-        self.sizes.append((lease.size, lease.worlds, tuple(lease.left)))
+    def assign(self, worker, assignment):
+        worker.assignment, worker.last = assignment, assignment.group
+        self.sizes.append((assignment.size, assignment.worlds, tuple(assignment.left)))
 
-    def heard(self):
-        for member in self.members:
-            lease = member.lease
-            if lease is None:
+    def messages(self):
+        for worker in self.workers:
+            assignment = worker.assignment
+            if assignment is None:
                 continue
             told = []
-            part = Slice(" ".join(lease.group), tuple(lease.left), lease.worlds, self.folder.document["config_hash"])
+            part = Slice(
+                " ".join(assignment.group),
+                tuple(assignment.left),
+                assignment.worlds,
+                self.folder.document["config_hash"],
+            )
             play(part, self.folder.config, self.folder.path, self.made_of, self.policy, told.append)
-            loss = self.lost(lease, told)
+            loss = self.lost(assignment, told)
             for event in told if loss is None else told[: loss[0]]:
-                yield lease.job, lease, event
-            member.lease = None
-            yield lease.job, lease, Done() if loss is None else loss[1]
+                yield assignment.job, assignment, event
+            worker.assignment = None
+            yield assignment.job, assignment, Done() if loss is None else loss[1]
 
 
 @pytest.fixture
 def driven(tmp_path):
-    """Plays a plan with a stub crew; gives the records, the crew and the folder."""
+    """Plays a plan with a stub pool; gives the records, the pool and the folder."""
 
-    def drive(lost=lambda lease, told: None, size=2, made_of=None, out="r", **changes):
+    def drive(lost=lambda assignment, told: None, size=2, made_of=None, out="r", **changes):
         options = RunOptions(**(PLAN | {"out": str(tmp_path / out)} | changes))
         config, _ = check_parts(resolve(options), factories())
         folder = ResultsFolder(tmp_path / out, config, doctor.versions())
         folder.check()
         folder.make()
         job = Job(folder)
-        crew = StubCrew(job, size, lost, made_of)
+        pool = StubPool(job, size, lost, made_of)
         with Journal(folder.journal) as journal:
             folder.settle(config, journal.records)
             done, waiting = begun(config, folder, journal)
-            ray_run._play(ray_run.DealtRun(job, journal, crew, done, waiting, progress_of(config, done, waiting)))
-        return read_journal(folder.journal)[0], crew, folder
+            ray_run._play(ray_run.DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
+        return read_journal(folder.journal)[0], pool, folder
 
     return drive
 
@@ -83,12 +88,12 @@ def outcomes(records):
 
 def test_slices_cover_the_plan_once(driven, tmp_path):
     """All episodes are played once in slices of at most two batches, with a run's outcomes."""
-    records, crew, _ = driven()
+    records, pool, _ = driven()
     assert main(["run", "--task", "football", "boxing", "--seeds", "0", "1", "--repeats", "4", "--engine", "mujoco",
                  "--out", str(tmp_path / "one")], factories()) == 0  # fmt: skip
     assert outcomes(records) == outcomes(read_journal(tmp_path / "one" / "episodes.jsonl")[0])
-    played = [index for _, _, indices in crew.sizes for index in indices]
-    assert sorted(played) == list(range(16)) and max(size for size, _, _ in crew.sizes) <= 8
+    played = [index for _, _, indices in pool.sizes for index in indices]
+    assert sorted(played) == list(range(16)) and max(size for size, _, _ in pool.sizes) <= 8
 
 
 def test_losses_lose_nothing(driven):
@@ -96,21 +101,21 @@ def test_losses_lose_nothing(driven):
     undisturbed, _, _ = driven(out="u")
     count = iter(range(100))
 
-    def lost(lease, told):
+    def lost(assignment, told):
         number = next(count)
         return (number % (len(told) + 1), Lost("killed", with_node=number % 2 == 0)) if number < 9 else None
 
-    records, crew, _ = driven(lost)
+    records, pool, _ = driven(lost)
     assert outcomes(records) == outcomes(undisturbed)
-    assert len(crew.sizes) > 9
+    assert len(pool.sizes) > 9
 
 
 def test_what_ended_before_a_loss_is_not_played_again(driven):
     """An episode that was told of is in the journal, and in no later slice."""
     known = set()
 
-    def lost(lease, told):
-        assert not known & set(lease.left)
+    def lost(assignment, told):
+        assert not known & set(assignment.left)
         after = next(i for i, event in enumerate(told) if isinstance(event, Ended)) + 1
         known.add(told[after - 1].line["index"])
         return (after, Lost("killed", with_node=True)) if len(known) < 5 else None
@@ -123,39 +128,43 @@ def test_a_poison_episode_ends_as_an_error_and_the_rest_goes_on(driven):
     """Who is running at a loss comes into a smaller slice, then alone; after the attempts alone it is an error."""
     undisturbed, _, _ = driven(out="u")
 
-    def lost(lease, told):
-        return (1, Lost("it died")) if 5 in lease.left else None
+    def lost(assignment, told):
+        return (1, Lost("it died")) if 5 in assignment.left else None
 
-    records, crew, _ = driven(lost, worlds=16)
+    records, pool, _ = driven(lost, worlds=16)
     expected = {index: ending for index, ending in outcomes(undisturbed).items() if index != 5}
     assert {index: ending for index, ending in outcomes(records).items() if index != 5} == expected
     error = next(record for record in records if record.index == 5)
     assert (error.outcome, error.reason) == ("error", "environment")
     assert error.error == "played alone 3 times, each time its process was lost: it died"
     assert error.hashes == records[0].hashes
-    with_it = [size for size, _, indices in crew.sizes if 5 in indices]
+    with_it = [size for size, _, indices in pool.sizes if 5 in indices]
     assert with_it[-3:] == [1, 1, 1] and with_it[0] > with_it[1] > 1 and len(with_it) == 5
 
 
 def test_where_every_episode_breaks_the_run_stops(driven):
     """A bug of policy or simulator does not end the whole plan as errors."""
     with pytest.raises(RunStopped, match="boxing twist2 base: 5 episodes and no other: device lost"):
-        driven(lambda lease, told: (1, Lost("device lost", "a trace")), worlds=1, ray_attempts=1, task=("boxing",))
+        driven(lambda assignment, told: (1, Lost("device lost", "a trace")), worlds=1, ray_attempts=1, task=("boxing",))
 
 
 def test_a_loss_before_the_environment_is_built_blames_no_episode(driven):
     """A process that dies while it builds costs no episode an attempt, and slices stay as large."""
     count = iter(range(100))
-    records, crew, _ = driven(lambda lease, told: (0, Lost("it died")) if next(count) < 6 else None, ray_attempts=1)
+    records, pool, _ = driven(
+        lambda assignment, told: (0, Lost("it died")) if next(count) < 6 else None, ray_attempts=1
+    )
     assert len(outcomes(records)) == 16 and all(record.outcome != "error" for record in records)
-    assert crew.sizes[0][0] == crew.sizes[6][0]
+    assert pool.sizes[0][0] == pool.sizes[6][0]
 
 
 def test_a_lost_machine_blames_no_episode(driven):
     """When a machine leaves the cluster, what ran there is not suspected."""
     count = iter(range(100))
-    records, crew, _ = driven(
-        lambda lease, told: (1, Lost("gone", with_node=True)) if next(count) < 12 else None, worlds=1, ray_attempts=1
+    records, pool, _ = driven(
+        lambda assignment, told: (1, Lost("gone", with_node=True)) if next(count) < 12 else None,
+        worlds=1,
+        ray_attempts=1,
     )
     assert all(record.outcome != "error" for record in records)
 
@@ -164,7 +173,7 @@ def test_only_so_many_successes_are_played(driven):
     """With --only-success the rounds are those of one process, whatever is lost."""
     count = iter(range(100))
 
-    def lost(lease, told):
+    def lost(assignment, told):
         return (len(told) // 2, Lost("killed", with_node=True)) if next(count) % 3 == 0 else None
 
     plain, _, _ = driven(out="a", keep=2, worlds=20, size=1)

@@ -48,14 +48,14 @@ CREW = """
 import sys
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.workers.ray_crew import Crew, in_cluster
+from arena_newton.eval.workers.worker_pool import WorkerPool, in_cluster
 address, gpus, number = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 with in_cluster((address,)):
-    crew = Crew(resolve(RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)), 8, None)
-    while len(crew.idle()) < number:
-        list(crew.heard())
-    print(len(crew.members), *sorted(member.node.gpus for member in crew.members))
-    crew.dismiss()
+    pool = WorkerPool(resolve(RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)), 8, None)
+    while len(pool.idle()) < number:
+        list(pool.messages())
+    print(len(pool.workers), *sorted(worker.node.gpus for worker in pool.workers))
+    pool.dismiss()
 """
 """A program that asks for processes and says which GPUs they see."""
 

@@ -1,4 +1,4 @@
-"""`eval matrix --ray`: one crew plays the cells of a suite, several at once; what is lost is played again.
+"""`eval matrix --ray`: one pool plays the cells of a suite, several at once; what is lost is played again.
 
 Processes are objects of this process, which answer in turn; a test says when one dies.
 """
@@ -9,7 +9,6 @@ import json
 import re
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
 from test_matrix import SUITE, journals
@@ -24,7 +23,7 @@ ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
 from arena_newton.eval.suites import ray_suite  # noqa: E402
-from arena_newton.eval.workers import ray_crew, ray_run  # noqa: E402
+from arena_newton.eval.workers import ray_run, worker_pool  # noqa: E402
 from arena_newton.eval.workers.ray_actor import EpisodeActor  # noqa: E402
 from arena_newton.eval.workers.slice_events import Node  # noqa: E402
 
@@ -37,7 +36,7 @@ class Answer:
 
 
 class InlineRay:
-    """What the crew uses of Ray; `dies` is asked before each answer."""
+    """What the pool uses of Ray; `dies` is asked before each answer."""
 
     def __init__(self, dies=lambda: False, cores=2.0):
         self.dies, self.opened, self.actors, self.killed = dies, [], 0, 0
@@ -82,8 +81,8 @@ def inline(monkeypatch):
 
     def make(dies=lambda: False, cores=2.0):
         found = InlineRay(dies, cores)
-        monkeypatch.setattr(ray_crew, "ray", found)
-        monkeypatch.setattr(ray_crew, "FIRST_PAUSE", 0.0)
+        monkeypatch.setattr(worker_pool, "ray", found)
+        monkeypatch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
         for module in (ray_run, ray_suite):
             monkeypatch.setattr(module, "in_cluster", lambda address: contextlib.nullcontext())
         return found
@@ -211,14 +210,6 @@ def test_a_failing_cell_stops_or_is_passed(inline, suite, alone, tmp_path, capsy
     assert call(suite, out) == 0
 
 
-class Plodding(FakeEnv):
-    """A world in which nothing happens."""
-
-    def step(self, action, worlds=None):
-        self.tick[self.active] += 1
-        return np.zeros(self.worlds, np.int32)
-
-
 class Hasty(FakeEnv):
     """A world that breaks in every process."""
 
@@ -230,7 +221,7 @@ class Hasty(FakeEnv):
 
 def test_a_cell_that_ends_every_process_is_passed(inline, suite, tmp_path, capsys, monkeypatch):
     """Five processes one after the other that break on a cell fail this cell alone."""
-    monkeypatch.setattr(ray_crew, "LONGEST_PAUSE", 0.0)
+    monkeypatch.setattr(worker_pool, "LONGEST_PAUSE", 0.0)
     inline(cores=1.0)
     out = tmp_path / "out"
     assert call(suite, out, "--keep-going", env=Hasty) == 1
@@ -238,18 +229,6 @@ def test_a_cell_that_ends_every_process_is_passed(inline, suite, tmp_path, capsy
     assert {name.split("/")[2] for name in failed} == {"boxing"} and len(failed) == 3
     assert all("5 processes on host ended one after the other: RuntimeError: no room" in e for e in failed.values())
     assert {c.status for c in read_suite(out).cells if c.task == "football"} == {"done"}
-
-
-def test_an_estimate_measures_two_processes(inline, suite, tmp_path, capsys):
-    """With --ray one process and then two play rounds of the same work; without room for two something is assumed."""
-    suite.write_text(SUITE.replace('["boxing", "football"]', '"boxing"'))
-    for cores, said in ((2.0, "measured cells, two at once measured"), (1.0, "assumes that processes do not slow")):
-        fake = inline(cores=cores)
-        assert call(suite, tmp_path / "out", "--only", "policy=still", "--estimate", "2", env=Plodding) == 0
-        output = capsys.readouterr().out
-        assert said in output and ("two processes at once take" in output) == (cores == 2.0)
-        assert len({folder for _, folder in fake.opened}) == (8 if cores == 2.0 else 0)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -28,13 +28,24 @@ from arena_newton.pictures.settings import CameraConfig
 
 SMALL = ["--task", "boxing", "--size", "64x64", "--engine", "mujoco", "--device", "cpu"]
 COUNT = 3
+BRIEF = [*SMALL, "--episodes", str(COUNT), "--max-steps", "40"]
+"""Episodes that are cut off, where what counts is what happens to their files."""
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def recorded(tmp_path_factory, kept_worlds):
     """Three disturbed episodes of boxing, recorded in three worlds without interruption."""
     folder = tmp_path_factory.mktemp("recorded") / "whole"
-    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]) == 0
+    command = ["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]
+    assert main(command, Factories(env=kept_worlds)) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory, kept_worlds):
+    """Three episodes that are cut off, recorded in three worlds without interruption."""
+    folder = tmp_path_factory.mktemp("brief") / "whole"
+    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], Factories(env=kept_worlds)) == 0
     return folder
 
 
@@ -93,22 +104,22 @@ def test_the_journal_names_the_files(recorded):
         assert all((recorded / path).is_file() for path in record.media.values())
 
 
-def test_bytes_do_not_depend_on_worlds(recorded, tmp_path):
+def test_bytes_do_not_depend_on_worlds(brief, tmp_path, kept_worlds):
     """One world after the other writes the same bytes as three at once."""
     other = tmp_path / "one"
-    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "1", "--out", str(other)]) == 0
-    same(recorded, other)
+    assert main(["record", *BRIEF, "--worlds", "1", "--out", str(other)], Factories(env=kept_worlds)) == 0
+    same(brief, other)
 
 
-def test_bytes_do_not_depend_on_who_encodes(recorded, tmp_path, monkeypatch):
+def test_bytes_do_not_depend_on_who_encodes(brief, tmp_path, kept_worlds, monkeypatch):
     """Processes write the same bytes as threads."""
     monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
     other = tmp_path / "processes"
-    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "2", "--out", str(other)]) == 0
-    same(recorded, other)
+    assert main(["record", *BRIEF, "--worlds", "2", "--out", str(other)], Factories(env=kept_worlds)) == 0
+    same(brief, other)
 
 
-def test_a_killed_encoder_stops_the_run(recorded, tmp_path, monkeypatch, capsys):
+def test_a_killed_encoder_stops_the_run(brief, tmp_path, kept_worlds, monkeypatch, capsys):
     """Kill -9 of a process that encodes is one error, exit code not 0, without partial files; resumed, all is there."""
     folder, started, frames = tmp_path / "killed", [], []
     popen, add = subprocess.Popen, film_pool.FilmPool.add
@@ -126,15 +137,16 @@ def test_a_killed_encoder_stops_the_run(recorded, tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
     monkeypatch.setattr(film_pool.subprocess, "Popen", start)
     monkeypatch.setattr(film_pool.FilmPool, "add", kill)
-    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]) != 0
+    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], Factories(env=kept_worlds)) != 0
     said = capsys.readouterr().err
     assert "a process that encodes pictures ended (SIGKILL; out of memory?)" in said and "Traceback" not in said
     assert len(started) == 2 and not list(folder.rglob("*.part"))
     monkeypatch.undo()
-    assert main(["resume", str(folder)]) == 0
-    same(recorded, folder)
+    assert main(["resume", str(folder)], Factories(env=kept_worlds)) == 0
+    same(brief, folder)
 
 
+@pytest.mark.release
 def test_kills_lose_at_most_what_was_running(recorded, tmp_path):
     """Killed twice at random moments and resumed, with other hash seeds, a recording has the bytes of a whole one."""
     folder, draw = tmp_path / "killed", random.Random(5)
@@ -164,35 +176,37 @@ def test_kills_lose_at_most_what_was_running(recorded, tmp_path):
 
 
 @pytest.mark.parametrize("processes", [0, 2])
-def test_ctrl_c_leaves_nothing_behind(recorded, tmp_path, processes):
+def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, kept_worlds, monkeypatch, capsys, processes):
     """Ctrl-C while pictures are encoded: code 130, no process or partial file stays; resumed, the bytes are equal."""
-    folder = tmp_path / "interrupted"
-    program = (
-        "import sys\n"
-        "from arena_newton.eval.play import recording\n"
-        "from arena_newton.eval.__main__ import main\n"
-        f"recording.encoding_processes = lambda: {processes}\n"
-        "sys.exit(main(sys.argv[1:]))\n"
-    )
-    command = [sys.executable, "-c", program, "record", *SMALL, "--episodes", str(COUNT), "--worlds", "2"]
-    run = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    began = time.monotonic()
-    while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 120 and run.poll() is None:
-        time.sleep(0.05)
-    time.sleep(0.5)
-    children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
-    run.send_signal(signal.SIGINT)
-    output, complaint = run.communicate(timeout=60)
-    assert run.returncode == 130, complaint
-    assert "resume" in output + complaint and "Traceback" not in complaint
-    assert len(children) == processes and not any(Path(f"/proc/{child}").exists() for child in children)
+    folder, started, rendered = tmp_path / "interrupted", [], []
+    popen, render = subprocess.Popen, Camera.render
+
+    def start(*command, **options):
+        started.append(popen(*command, **options))
+        return started[-1]
+
+    def interrupt(self, *pictures):
+        rendered.append(1)
+        if len(rendered) == 60:
+            assert list(folder.glob("episodes/**/*.part"))
+            signal.raise_signal(signal.SIGINT)
+        return render(self, *pictures)
+
+    monkeypatch.setattr(recording, "encoding_processes", lambda: processes)
+    monkeypatch.setattr(film_pool.subprocess, "Popen", start)
+    monkeypatch.setattr(Camera, "render", interrupt)
+    assert main(["record", *BRIEF, "--worlds", "2", "--out", str(folder)], Factories(env=kept_worlds)) == 130
+    said = capsys.readouterr()
+    assert "resume" in said.out + said.err and "Traceback" not in said.err
+    assert len(started) == processes and not any(Path(f"/proc/{child.pid}").exists() for child in started)
     assert not list(folder.rglob("*.part"))
     assert len(read_journal(folder / "episodes.jsonl")[0]) < COUNT
-    assert main(["resume", str(folder)]) == 0
-    same(recorded, folder)
+    monkeypatch.undo()
+    assert main(["resume", str(folder)], Factories(env=kept_worlds)) == 0
+    same(brief, folder)
 
 
-def test_missing_and_torn_files_are_recorded_again(recorded, copied, capsys):
+def test_missing_and_torn_files_are_recorded_again(recorded, copied, kept_worlds, capsys):
     """A removed video, a cut NPZ and another video: those episodes are played again, with the same bytes."""
     files = episode_files([copied])
     files[0].write_bytes(files[0].read_bytes()[:-100])
@@ -200,14 +214,14 @@ def test_missing_and_torn_files_are_recorded_again(recorded, copied, capsys):
     other = EpisodeFile(episode_files([recorded])[0]).video("front")
     shutil.copyfile(other, EpisodeFile(files[2]).video("front"))
     lines = (copied / "episodes.jsonl").read_bytes()
-    assert main(["resume", str(copied)]) == 0
+    assert main(["resume", str(copied)], Factories(env=kept_worlds)) == 0
     assert "of 3 episodes the recording is missing" in capsys.readouterr().err
     same(recorded, copied)
     assert (copied / "episodes.jsonl").read_bytes().startswith(lines)  # the journal only grows
     assert len(load_run(copied).records) == COUNT
 
 
-def test_a_full_disk_loses_no_finished_episode(recorded, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_loses_no_finished_episode(brief, tmp_path, kept_worlds, monkeypatch, capsys):
     """A file that cannot be written stops the run by its name, exit code 2; resumed, the bytes are those of a whole."""
     folder, written = tmp_path / "full", []
     write = demonstration.write_episode
@@ -219,7 +233,7 @@ def test_a_full_disk_loses_no_finished_episode(recorded, tmp_path, monkeypatch, 
         write(path, arrays, **options)
 
     monkeypatch.setattr(demonstration, "write_episode", full)
-    assert main(["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]) == 2
+    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], Factories(env=kept_worlds)) == 2
     said = capsys.readouterr().err
     assert "disk full" in said and written[1] in said and "resume" in said
     records, _ = read_journal(folder / "episodes.jsonl")
@@ -227,30 +241,31 @@ def test_a_full_disk_loses_no_finished_episode(recorded, tmp_path, monkeypatch, 
     assert written[0] in done and written[1] not in done
     assert not (folder / "episodes" / written[1]).exists() and not list(folder.rglob("*.part"))
     monkeypatch.undo()
-    assert main(["resume", str(folder)]) == 0
-    same(recorded, folder)
+    assert main(["resume", str(folder)], Factories(env=kept_worlds)) == 0
+    same(brief, folder)
 
 
-def test_only_successes_are_kept_in_rounds(recorded, tmp_path, capsys):
+def test_only_successes_are_kept_in_rounds(recorded, tmp_path, kept_worlds, capsys):
     """Under a cap that the slowest episode misses, another attempt is made; what failed is counted, and has no file."""
-    steps = {r.repeat: r.steps for r in load_run(recorded).records}
+    steps = {r.repeat: r.steps for r in load_run(recorded).records if r.repeat < 2}
     slowest = max(steps, key=steps.get)
     cap = steps[slowest] - 1
     folder = tmp_path / "successes"
-    flags = ["--episodes", str(COUNT), "--only-success", "--max-steps", str(cap), "--cameras", "--worlds", "2"]
-    code = main(["record", "--task", "boxing", "--engine", "mujoco", "--device", "cpu", *flags, "--out", str(folder)])
+    flags = ["--episodes", "2", "--only-success", "--max-steps", str(cap), "--cameras", "--worlds", "2"]
+    command = ["record", "--task", "boxing", "--engine", "mujoco", "--device", "cpu", *flags, "--out", str(folder)]
+    code = main(command, Factories(env=kept_worlds))
     records = load_run(folder).records
     kept = [r for r in records if r.outcome == "success"]
-    assert slowest not in {r.repeat for r in kept} and len(records) > COUNT
+    assert slowest not in {r.repeat for r in kept} and len(records) > 2
     assert {r.repeat for r in records} == set(range(len(records)))
-    assert len(episode_files([folder])) == len(kept) <= COUNT and code == (0 if len(kept) == COUNT else 1)
+    assert len(episode_files([folder])) == len(kept) <= 2 and code == (0 if len(kept) == 2 else 1)
     assert all("episode" not in r.media for r in records if r.outcome != "success")
     said = capsys.readouterr().out
     assert f"recorded: {len(kept)} episode" in said and f"{len(records) - len(kept)} timeout" in said
     assert json.loads((folder / "results.json").read_text())["complete"] is True
 
 
-def test_a_picture_for_a_policy_is_rendered_once(recorded, tmp_path, monkeypatch):
+def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, kept_worlds, monkeypatch):
     """Where the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
     renders = []
     render = Camera.render
@@ -261,11 +276,11 @@ def test_a_picture_for_a_policy_is_rendered_once(recorded, tmp_path, monkeypatch
         policy.needs_image, policy.camera = True, CameraConfig(width=64, height=64)
         return policy
 
-    command = ["record", *SMALL, "--episodes", "1", "--out", str(tmp_path / "seen")]
-    assert main(command, Factories(policy=seeing)) == 0
+    command = ["record", *BRIEF, "--episodes", "1", "--out", str(tmp_path / "seen")]
+    assert main(command, Factories(env=kept_worlds, policy=seeing)) == 0
     (record,) = load_run(tmp_path / "seen").records
     assert len(renders) <= record.steps + 1
-    assert (tmp_path / "seen" / record.media["front"]).read_bytes() == (recorded / record.media["front"]).read_bytes()
+    assert (tmp_path / "seen" / record.media["front"]).read_bytes() == (brief / record.media["front"]).read_bytes()
 
 
 @pytest.mark.parametrize("name", ["episodes", "episodes/videos"])

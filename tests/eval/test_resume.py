@@ -6,10 +6,8 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -24,6 +22,7 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records import journal as journal_module
 from arena_newton.policies.base import PolicyUnavailable
 from arena_newton.rules import seeding
+from tests.children import Child
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
@@ -52,10 +51,7 @@ def lines(folder):
 
 def start(folder, *flags, pause="0.02"):
     """The command line in a process of its own."""
-    script = Path(__file__).parent / "eval_fakes.py"
-    command = [sys.executable, str(script), "run", *FLAGS, *flags, "--out", str(folder)]
-    environment = os.environ | {"FAKE_TICK_S": pause}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Child("eval_fakes", ["run", *FLAGS, *flags, "--out", str(folder)], FAKE_TICK_S=pause)
 
 
 def wait_for_lines(process, folder, n):

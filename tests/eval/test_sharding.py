@@ -14,9 +14,9 @@ from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.plan.suite_options import MatrixOptions
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
 from arena_newton.eval.suites.suite_call import plan_call
+from arena_newton.eval.suites.suite_options import MatrixOptions
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "visual", "--repeats", "4"]
@@ -229,6 +229,7 @@ def submit(folder, *arguments, **variables):
     return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.release
 def test_the_batch_file(tmp_path):
     """The batch file plays a shard per task of an array, again on demand, and merge joins what it wrote."""
     file = ROOT / "examples" / "shards.sbatch"

@@ -24,10 +24,10 @@ from arena_newton.eval.tables.table_entries import (
     SEMANTIC_STRENGTH,
     SuiteTable,
     interval_text,
-    points,
     probability,
     semantic_text,
 )
+from arena_newton.pages.tables import points
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +319,7 @@ def test_cells_that_one_table_must_not_mix(tmp_path):
     with pytest.raises(InputError, match="max_steps is 1300, in"):
         read_cells([tmp_path / "a", tmp_path / "c"])
     write_cell(tmp_path / "d", cell, [], seed_range="demonstration")
-    with pytest.raises(InputError, match="d: holds recordings for training; tables are of evaluations"):
+    with pytest.raises(InputError, match="d: holds recordings for training; results are of evaluations"):
         read_cells([tmp_path / "d"])
 
 
@@ -360,7 +360,7 @@ def test_wrong_calls_are_one_error(suite, tmp_path, capsys, arguments, message):
 
 def hostile(text):
     """A table whose policy and notes say this."""
-    return SuiteTable("x", "Title", f"caption {text}", ("policy", "rate"), 1, ((text, "1"),), (0,), ())
+    return SuiteTable(("policy", "rate"), ((text, "1"),), "lr", "Title", f"caption {text}", "x")
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def test_what_is_missing_is_said(tmp_path):
     run = run_of(tmp_path, "a", rows)
     run.document["planned"] = 60
     text = joint_table([run])
-    assert "a is incomplete: 50 of 60 episodes." in text and "1 episode of 50 ended with an error." in text
+    assert "a is incomplete: 50 of 60 episodes." in text and "1 episode of 50 ended with an error; they count" in text
 
 
 def test_semantic_numbers_say_what_they_are(tmp_path):
@@ -77,7 +77,7 @@ def test_semantic_numbers_say_what_they_are(tmp_path):
         ({}, {}, "b: episode football t p base seed 0 repeat 0 is in .*a too"),
         ({"mode": "visual"}, {"rules": "released"}, "b: rules is released, in .*a paper"),
         ({"mode": "visual"}, {"max_steps": 50}, "b: max_steps is 50, in .*a null"),
-        ({"mode": "visual", "hashes": {"checkpoint": "bb"}}, {}, "b: weights of t are bb, elsewhere aa"),
+        ({"mode": "visual", "hashes": {"checkpoint": "bb"}}, {}, "b: weights of t are bb, in .*a aa"),
     ],
 )
 def test_runs_that_one_table_must_not_mix(tmp_path, change, config, message):

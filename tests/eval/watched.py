@@ -4,8 +4,12 @@ import hashlib
 
 import numpy as np
 
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
+from arena_newton.eval.plan import episode_plan
+from arena_newton.eval.play.env_cache import CachedEnv
 from arena_newton.interfaces import Recorder
+from arena_newton.rollout import Rollout
 
 
 class WatchedEnv(ArenaEnv):
@@ -32,6 +36,10 @@ class WatchedEnv(ArenaEnv):
         return status
 
 
+class LastingWatchedEnv(CachedEnv, WatchedEnv):
+    """A watched environment that is handed out again."""
+
+
 class Table(Recorder):
     """Keeps the actions of every episode, by its seed: float32, shape [ticks, 40]."""
 
@@ -50,3 +58,21 @@ class Table(Recorder):
         """The action of a tick; the last one after the end."""
         rows = self.rows[int(seed)]
         return rows[min(int(tick), len(rows) - 1)]
+
+
+def watched_rollout(made, task, count, worlds, policy, *, recorder=(), max_steps=None):
+    """Play the first episodes of the plan in watched worlds; hashes by episode seed, and results in the plan's order.
+
+    Args:
+        made: Builder of the worlds, such as the fixture `watched_worlds`.
+    """
+    camera = policy.camera if policy.needs_image else None
+    given = {"worlds": worlds, "engine": "mujoco", "device": "cpu", "camera": camera}
+    env = made(task, tracker=trackers.get("twist2"), **given)
+    episodes = episode_plan.expand([task], trackers=["twist2"], policy="test", seeds=[0], repeats=count)
+    WatchedEnv.history.clear()
+    results = Rollout(env, policy, episodes, recorder=recorder, max_steps=max_steps).run()
+    hashes = {seed: list(ticks) for seed, ticks in WatchedEnv.history.items()}
+    WatchedEnv.history.clear()
+    env.close()
+    return hashes, results

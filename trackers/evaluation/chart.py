@@ -18,13 +18,13 @@ __all__ = ["chart", "missing"]
 _COLOURS = {"pass": "#8fcfa5", "MISS": "#f0a090", "": "#d0d0d0"}
 """Colour by verdict."""
 _WIDEST = 2.0
-"""Where a bar is cut off, as a multiple of the limit."""
+"""Length at which a bar is cut off, as a multiple of the limit."""
 _NARROWEST = 0.012
 """Least length of a bar: its colour stays visible."""
 
 
 def missing() -> str:
-    """What to install to draw charts; empty where they can be drawn."""
+    """Extra to install for charts; empty where they can be drawn."""
     if importlib.util.find_spec("matplotlib") is not None:
         return ""
     return "needs matplotlib: install `arena-newton[plots]`"

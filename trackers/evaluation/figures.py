@@ -36,7 +36,7 @@ class Result:
     """One tracker on one plan."""
 
     label: str
-    """What tables call it."""
+    """Name in tables."""
     interface: str
     """Name of the tracker's class: which bars apply follows from it."""
     official: bool
@@ -55,7 +55,7 @@ class Result:
 
     @property
     def whole(self) -> bool:
-        """Whether the plan holds every cell of the full suite: the bar of the fall rate is one for all of it."""
+        """True if the plan holds every cell of the full suite: the bar of the fall rate is one for all of it."""
         return {cell.name for cell in suite("full")} <= {cell.name for cell in self.plan.cells}
 
     @property
@@ -79,7 +79,7 @@ class Figure:
     limit: float | None = None
     """The bar as a number, in the unit of `number`; None without one."""
     at_least: bool = False
-    """Whether `number` must reach `limit`; otherwise it must not pass it."""
+    """True if `number` must reach `limit`; otherwise it must not pass it."""
 
     @property
     def ratio(self) -> float | None:
@@ -108,7 +108,7 @@ class Sample:
         return float(self.measures[measure].mean())
 
     def common(self) -> dict[str, Any]:
-        """What every text may name: falls, rollouts, and the fall rate with its 95 % interval [%]."""
+        """Values that every text may use: falls, rollouts, and the fall rate with its 95 % interval [%]."""
         fell, count = int(self.fell.sum()), len(self.fell)
         low, high = wilson(fell, count)
         rate = f"{fell}/{count} = {100 * fell / max(count, 1):.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
@@ -120,7 +120,7 @@ Numbers = dict[str, float]
 
 @dataclass(frozen=True)
 class FigureBar:
-    """How a figure is read off the suite, and its bar."""
+    """Figure of the suite, and its bar."""
 
     name: str
     """The figure's row."""
@@ -135,11 +135,11 @@ class FigureBar:
     limit: float | None = None
     """Bar of the judged number."""
     at_least: bool = False
-    """Whether the number must reach the limit; otherwise it must not pass it."""
+    """True if the number must reach the limit; otherwise it must not pass it."""
     no_fall: bool = False
-    """Whether nobody may fall besides."""
+    """True if no fall is allowed in addition."""
     key: str = ""
-    """Where each interface has a limit of its own, or none: its key in `Interface.bars`."""
+    """Key of `Interface.bars` where each interface has a limit of its own, or none."""
     whole: bool | None = None
     """Shown only if every cell of the full suite was played (True), or only if not (False)."""
 

@@ -34,7 +34,7 @@ CONTACTS, CONSTRAINTS = 64, 224
 
 @dataclass(frozen=True)
 class WorldKind:
-    """How a world's model differs from the scene's."""
+    """Differences of a world's model from the scene's."""
 
     friction: float = 1.0
     """Sliding friction of everything but the ball."""

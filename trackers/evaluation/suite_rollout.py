@@ -44,7 +44,7 @@ centimetres (`SOLE_FRONT`, `SOLE_BACK`) where it draws clips for training, which
 
 
 class Settings(TypedDict, total=False):
-    """Where a plan is played."""
+    """Machine and batch on which a plan is played."""
 
     engine: str
     """`auto` (the default), `mujoco` or `warp`."""
@@ -56,7 +56,7 @@ class Settings(TypedDict, total=False):
 
 @dataclass
 class Plan:
-    """Which cell each world plays and the random numbers it gets; the same for every tracker."""
+    """Assignment of cells and random numbers to worlds, the same for every tracker."""
 
     cells: list[Cell]
     cell: np.ndarray

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.cli.intervals import wilson
+from arena_newton.pages.tables import Table
 from arena_newton.trackers.evaluation.figures import Figure, Result, figures
 
 __all__ = ["COLUMNS", "cell_rows", "document", "figure_table", "markdown", "write"]
@@ -29,6 +30,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "torque": ("torque [of limit]", ".3f"),
 }
 """Measures of the printed tables: heading and format; JSON and CSV hold all of them."""
+RULE = (" --- ", " --: ")
+"""Marks under the heads of the tables."""
 
 
 def _means(result: Result, rows: np.ndarray) -> dict[str, float | None]:
@@ -94,13 +97,12 @@ def figure_table(results: Sequence[Result]) -> str:
     """Figures of all trackers, one column each, Markdown."""
     columns = [{f.name: f for f in figures(r, results)} for r in results]
     names = list(dict.fromkeys(name for column in columns for name in column))
-    head = ["figure", "bar", *(r.label for r in results)]
-    lines = [_line(head), _line(["---"] * len(head))]
+    rows = []
     for name in names:
         found = [column.get(name) for column in columns]
         bars = list(dict.fromkeys(f.bar for f in found if f is not None and f.bar))
-        lines.append(_line([name, " / ".join(bars), *map(_shown, found)]))
-    return "\n".join(lines)
+        rows.append((name, " / ".join(bars), *map(_shown, found)))
+    return "\n".join(Table(("figure", "bar", *(r.label for r in results)), rows).compact(rule=RULE))
 
 
 def _shown(figure: Figure | None) -> str:
@@ -109,20 +111,16 @@ def _shown(figure: Figure | None) -> str:
     return f"{figure.value} **{figure.verdict}**" if figure.verdict else figure.value
 
 
-def _line(texts: Sequence[str]) -> str:
-    return "| " + " | ".join(texts) + " |"
-
-
 def _table(entries: Sequence[dict[str, Any]], key: str) -> str:
-    head = [key, "tracker", "falls", "[95 %]", *(title for title, _ in COLUMNS.values())]
-    lines = [_line(head), _line(["---"] * len(head))]
+    rows = []
     for entry in entries:
         numbers = [
             "–" if entry.get(name) is None else format(entry[name], pattern) for name, (_, pattern) in COLUMNS.items()
         ]
         interval = f"[{100 * entry['fall_rate_low']:.1f}, {100 * entry['fall_rate_high']:.1f}] %"
-        lines.append(_line([entry[key], entry["tracker"], f"{entry['falls']}/{entry['rollouts']}", interval, *numbers]))
-    return "\n".join(lines)
+        rows.append((entry[key], entry["tracker"], f"{entry['falls']}/{entry['rollouts']}", interval, *numbers))
+    head = (key, "tracker", "falls", "[95 %]", *(title for title, _ in COLUMNS.values()))
+    return "\n".join(Table(head, rows).compact(rule=RULE))
 
 
 def _interleaved(tables: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:

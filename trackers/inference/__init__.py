@@ -1,1 +1,1 @@
-"""What runs a network: weights files, ONNX Runtime, block products."""
+"""Network inference: weights files, ONNX Runtime, block products."""

@@ -132,9 +132,9 @@ class BlockRunner:
         self.device = torch.device(device)
         on_host = any(getattr(module, "on_host", False) for module in network.modules())
         self.fixed = self.device.type == "cpu"
-        """Whether rows have the same bits in any batch."""
+        """True if rows have the same bits in any batch."""
         self.path = "onnxruntime" if self.fixed or on_host else "torch"
-        """What runs the network: `onnxruntime` or `torch`."""
+        """Library that runs the network: `onnxruntime` or `torch`."""
         padding = max(_BLOCK_SIZES) if self.fixed else 1
         self._buffer = torch.zeros(-(-worlds // padding) * padding, in_width, device=self.device)
         self.input = self._buffer[:worlds]
@@ -190,7 +190,7 @@ class BlockRunner:
 
 
 def _keeps_bits(product: Network, block: int, width: int, generator: torch.Generator) -> bool:
-    """Whether a row has the same bits in either position of a block, and a block the same bits among any others."""
+    """True if a row has the same bits in either position of a block, and a block the same bits among any others."""
     rows = torch.randn(block * max(_COUNTS), width, generator=generator)
     blocks = rows.split(block)
     expected = torch.cat([product(part.clone()) for part in blocks])

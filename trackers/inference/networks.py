@@ -1,4 +1,4 @@
-"""What the networks of our own trackers are made of; training and deployment use the same modules.
+"""Modules of our own trackers' networks; training and deployment use the same modules.
 
 A network takes the front end's observation as it is: it normalises its inputs itself.
 """

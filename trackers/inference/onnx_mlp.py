@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import read_bytes
+from arena_newton.files.untrusted_files import read_bytes
 
 __all__ = ["OnnxNetwork", "load", "read"]
 

@@ -15,7 +15,7 @@ import onnxruntime
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files import limits, probe
+from arena_newton.files import limits, sandboxed_load
 from arena_newton.trackers.inference import onnx_mlp
 from arena_newton.trackers.inference.blocks import session_options
 
@@ -42,7 +42,7 @@ class OnnxSession(torch.nn.Module):
         _, runnable, data = onnx_mlp.read(path, in_width=in_width, flag=flag)
         self.sha256 = hashlib.sha256(data).hexdigest()
         # Its compiled reader takes a file on trust, and some operators make any number of numbers of none.
-        (fault,) = probe.faults(
+        (fault,) = sandboxed_load.faults(
             "network", [f"{path}\t{in_width}"], memory=limits.NETWORK_MEMORY, seconds=limits.NETWORK_SECONDS
         )
         if fault:
@@ -69,7 +69,7 @@ class OnnxSession(torch.nn.Module):
 
     @property
     def on_host(self) -> bool:
-        """Whether it computes on the CPU whatever the device of its rows: no CUDA graph can hold it then."""
+        """True if it computes on the CPU whatever the device of its rows: no CUDA graph can hold it then."""
         return self.twin is None
 
     def convert(self, device: torch.device) -> None:

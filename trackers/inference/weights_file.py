@@ -22,8 +22,8 @@ from safetensors.torch import save as encode
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import read_bytes
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import read_bytes
 from arena_newton.robot.g1 import TICK, DriveGains, PhysicsRate
 from arena_newton.trackers import base, interface
 from arena_newton.trackers.inference.networks import TrackerNetwork
@@ -46,15 +46,15 @@ class Weights:
     network: TrackerNetwork
     """The network with its input normalisation."""
     action_form: ActionForm
-    """How raw outputs become joint targets."""
+    """Conversion of raw outputs to joint targets."""
     drive: DriveGains
     """Drive that the network was trained with."""
     physics: PhysicsRate
     """Physics rate that it was trained at."""
     card: dict[str, Any] = field(default_factory=dict)
-    """How the weights came to be: `commit`, `command`, `samples`, `minutes`, `data`, `licences`, `metrics`, …"""
+    """Origin of the weights: `commit`, `command`, `samples`, `minutes`, `data`, `licences`, `metrics`, …"""
     symmetric: bool = False
-    """Whether the tracker averages the action and its mirror image (`networks.Symmetric`)."""
+    """True if the tracker averages the action and its mirror image (`networks.Symmetric`)."""
     sha256: str = ""
     """SHA-256 of the file, after loading."""
 
@@ -156,7 +156,7 @@ def load(path: str | Path, wanted: str | None = None, *, flag: str = "--checkpoi
 
 
 def _tensors(network: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """What a file holds of a network: all but the counts behind its input statistics."""
+    """Tensors of a network that a file holds: all but the counts behind its input statistics."""
     return {name: t for name, t in network.state_dict().items() if not name.endswith(".count")}
 
 

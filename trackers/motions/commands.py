@@ -57,7 +57,7 @@ class Channel:
     acceleration: Numbers | None = None
     """Largest acceleration [unit/s²]; with a rate only."""
     per_arm_speed: bool = False
-    """Whether rate and acceleration are multiplied by the channel `arm_speed`."""
+    """True if rate and acceleration are multiplied by the channel `arm_speed`."""
 
     @property
     def width(self) -> int:
@@ -111,12 +111,12 @@ class MotionCommand:
     shift: Tensor = _channel((2,), -0.12, 0.12, rate=0.12, acceleration=0.5)
     """Centre of mass forward and left of where it balances [m], shape [worlds, 2]; while both feet stand."""
     foot_offset: Tensor = _channel((), 0.0, 0.12, rate=0.08, acceleration=0.4)
-    """How far walking feet are set behind the pelvis [m], shape [worlds]: leans the robot into a push."""
+    """Distance of walking feet behind the pelvis [m], shape [worlds]: leans the robot into a push."""
     stance_width: Tensor = _channel((), 0.16, 0.36, neutral=0.22, rate=0.2, acceleration=1.0)
     """Distance between the feet [m], shape [worlds]."""
     stagger: Tensor = _channel((), -0.3, 0.3, rate=0.2, acceleration=1.0)
-    """How far a walking left foot is set ahead of the right one, beyond the gait's own steps [m], shape [worlds]: by
-    the length of a step, the right foot lands next to the left one, which leaves room for a sill between two pairs."""
+    """Distance of a walking left foot ahead of the right one, beyond the gait's own steps [m], shape [worlds]. At the
+    length of a step the right foot lands next to the left one, which leaves room for a sill between two pairs."""
     swing_height: Tensor = _channel((), 0.02, 0.22, neutral=0.08, rate=0.2, acceleration=1.0)
     """Height of a step [m], shape [worlds]."""
     step_time: Tensor = _channel((), SHORTEST_STEP, 0.8, neutral=0.45, rate=0.3, acceleration=2.0)
@@ -133,7 +133,7 @@ class MotionCommand:
         acceleration=3.2,
         per_arm_speed=True,
     )
-    """Where the left and the right palm (`kinematics.HAND_POINT` ahead of the wrist) must be [m], pelvis' heading
+    """Wanted positions of the left and the right palm (`kinematics.HAND_POINT` ahead of the wrist) [m], pelvis' heading
     frame, shape [worlds, 2, 3]."""
     reach: Tensor = _channel((2,), 0.0, 1.0, rate=1.6, acceleration=8.0)
     """Weight of `hand_point` against `arms`, 0 to 1, shape [worlds, 2]."""
@@ -145,7 +145,7 @@ class MotionCommand:
     """Height of the ground ahead [m], shape [worlds]: the next foot that lands 0.2 m ahead of the other one steps onto
     it, the other one follows."""
     step_in_place: Tensor = _channel()
-    """Whether to step without moving, bool, shape [worlds]."""
+    """True to step without moving, bool, shape [worlds]."""
     kick: Tensor = _channel((), 0.0, 2.0)
     """0 none, 1 left foot, 2 right foot, int64, shape [worlds]; a change from 0 starts one kick."""
     hands: Tensor = _channel((2,))

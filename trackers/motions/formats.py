@@ -21,8 +21,8 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import numbers, read_arrays, read_bytes
 from arena_newton.files.text import counted
+from arena_newton.files.untrusted_files import numbers, read_arrays, read_bytes
 from arena_newton.robot.g1 import MUJOCO_JOINTS, MUJOCO_TO_CANONICAL, TICK
 from arena_newton.trackers.motions.frames import actions_to_motion
 from arena_newton.trackers.motions.kinematics import forward
@@ -51,7 +51,7 @@ JOINT_ORDER_MARGIN = 0.01
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What files do not say about themselves."""
+    """Facts about motions that files lack."""
 
     fps: float | None = None
     """Frame rate of tables [1/s]; 30 by default."""
@@ -66,7 +66,7 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class FileReport:
-    """What was found in one file."""
+    """Findings in one file."""
 
     path: Path
     """The file."""
@@ -79,7 +79,7 @@ class FileReport:
     trimmed: int
     """Frames cut off their starts."""
     notes: tuple[str, ...] = ()
-    """What was assumed."""
+    """Assumptions made."""
 
     def line(self) -> str:
         """The report in one line."""
@@ -93,7 +93,7 @@ class Reading:
     """Clips of one file, or the library that it is."""
 
     report: FileReport
-    """What was found."""
+    """Findings."""
     names: tuple[str, ...]
     """Name of each clip."""
     clips: tuple[Clip, ...] = ()

@@ -143,7 +143,7 @@ class ReferenceGenerator:
             self._present()
 
     def _standing(self, root: Tensor, yaw: Tensor) -> dict[str, Tensor]:
-        """What is not zero in a state of rest in the default pose, and what the solver starts from.
+        """Non-zero values of a state of rest in the default pose, and the start of the solver.
 
         Args:
             root: Pelvis x, y [m], shape [worlds, 2].

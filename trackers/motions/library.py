@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import numbers, read_arrays
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import numbers, read_arrays
 from arena_newton.robot.g1 import MUJOCO_JOINTS, TICK
 from arena_newton.robot.rotations import quat_conjugate, quat_multiply, rotation_vector
 from arena_newton.trackers.motions.frames import frame_mimic
@@ -27,7 +27,7 @@ from arena_newton.usd_scenes.g1.links import LINKS
 __all__ = ["FIXTURES", "FORMAT", "MIRROR_JOINTS", "MIRROR_SIGNS", "SUPPORTS", "DeviceLibrary", "MotionLibrary"]
 
 FORMAT = "arena-newton-motions-1"
-"""What the array `format` of a library file holds."""
+"""Value of the array `format` of a library file."""
 FPS = round(1.0 / TICK)
 SUPPORTS = ("none", "seat", "sill", "platform")
 """Names of `support_kind`."""
@@ -79,14 +79,14 @@ class MotionLibrary:
     licence: np.ndarray = _array(np.str_, "clips")
     """Licence of each clip, str, shape [clips]."""
     source: np.ndarray = _array(np.str_, "clips")
-    """Where each clip is from, str, shape [clips]."""
+    """Origin of each clip, str, shape [clips]."""
     support_kind: np.ndarray = _array(np.int64, "clips")
     """Index into `SUPPORTS` of what the clip stands or sits on in addition to the floor, int64, shape [clips]."""
     support_box: np.ndarray = _array(np.float32, "clips", 7)
     """That support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
     top above the floor [m]; float32, shape [clips, 7]."""
     family_names: np.ndarray = _array(np.str_, "families")
-    """What kinds of motion there are, str, shape [families]."""
+    """Names of the kinds of motion, str, shape [families]."""
 
     def __post_init__(self) -> None:
         """Bring the arrays to their types.
@@ -403,7 +403,7 @@ class DeviceLibrary:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """Device of the tensors."""
         return self.root_pos.device
 
     def index(self, clip: Tensor, step: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import numbers, read_arrays, read_bytes
+from arena_newton.files.untrusted_files import numbers, read_arrays, read_bytes
 from arena_newton.robot.canonical import ACTION_WIDTH, validate_action
 
 __all__ = ["JOINTS_23", "Clip", "checked_clip", "clip_from_fields", "load_actions", "load_clip", "load_plain_pickle"]

@@ -1,4 +1,4 @@
-"""What a library's clips are like: speed, height, joint limits, jumps, sliding feet, height of the soles."""
+"""Properties of a library's clips: speed, height, joint limits, jumps, sliding feet, height of the soles."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ClipMeasures:
     floor: float
     """Height of its soles on the ground [m]; 0 is right."""
     support: str
-    """What it stands or sits on in addition to the floor."""
+    """Support of the robot in addition to the floor."""
     licence: str
     """Its licence."""
     source: str

@@ -64,7 +64,7 @@ class NavigationLimits:
 
 @dataclass
 class NavigationCommand:
-    """What the controller asks for; rows are worlds."""
+    """Command of the controller; rows are worlds."""
 
     velocity: Tensor
     """vx, vy [m/s], yaw rate [rad/s] in the heading frame, [worlds, 3]; zero where the robot holds."""
@@ -192,7 +192,7 @@ class Navigator:
 def follow(
     route: Tensor, here: Tensor, travelled: Tensor, limits: NavigationLimits
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where a robot is on a route, and the point that it should walk to.
+    """Position of a robot on its route, and the point that it should walk to.
 
     Args:
         route: Points from start to goal [m], shape [worlds, points, 2].

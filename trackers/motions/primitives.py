@@ -76,11 +76,11 @@ class Segment:
     """Commands for some time."""
 
     seconds: float
-    """How long [s]."""
+    """Duration [s]."""
     channels: Mapping[str, Any] = field(default_factory=dict)
     """Channels that are not neutral."""
     ramp: bool = False
-    """Whether channels move evenly from the last segment's values instead of jumping."""
+    """True if channels move evenly from the last segment's values instead of jumping."""
 
     def row(self) -> np.ndarray:
         """The packed command; shape [`COMMAND_WIDTH`].

@@ -54,7 +54,7 @@ class _Plan:
     script: Script
     support: str = "none"
     start: float = 0.0
-    """When the robot begins to sit down [s]."""
+    """Time at which the robot begins to sit down [s]."""
     height: float = 0.0
     """Height of the seat or the platform, wanted height of the sill [m]."""
     edge: float = 0.0
@@ -426,7 +426,7 @@ def _along(root_xy: torch.Tensor, feet: torch.Tensor) -> tuple[torch.Tensor, tor
 
 
 def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where along the walk a sill is cleared best, and whether by enough; a sill that is too high is lowered.
+    """Position along the walk at which a sill is cleared best, and whether by enough; one too high is lowered.
 
     Positions along the line from start to end are tried; feet and their soles cross the sill in the air.
     """
@@ -453,7 +453,7 @@ def _place_sill(plans: list[_Plan], out: dict[str, torch.Tensor]) -> tuple[torch
 def place_platform(
     root_xy: torch.Tensor, feet: torch.Tensor, height: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where along a straight walk a platform fits under the feet that tread at its height.
+    """Position along a straight walk at which a platform fits under the feet that tread at its height.
 
     Args:
         root_xy: Pelvis [m], shape [clips, ticks, 2].

@@ -19,7 +19,7 @@ __all__ = ["Card", "Checkpoint", "TrainingPart"]
 
 @dataclass(kw_only=True)
 class TrainingPart:
-    """What the card says of one part of a training; one that was resumed has several."""
+    """Entry of the card for one part of a training; a resumed training has several."""
 
     command: str
     """Command line."""
@@ -39,7 +39,7 @@ class TrainingPart:
 
 @dataclass(kw_only=True)
 class Card(TrainingPart):
-    """What the card of the weights says of a training; keys of a file are the names of the fields."""
+    """Card of the weights, which describes their training; keys of a file are the names of the fields."""
 
     tracker: str
     """Interface."""
@@ -95,7 +95,7 @@ class Checkpoint:
     seconds: float
     """Seconds of training."""
     started: bool = False
-    """Whether the training started from given weights."""
+    """True if the training started from given weights."""
     families: list[str]
     """Families of the references."""
     critic_widths: dict[str, int] = field(default_factory=dict)

@@ -22,7 +22,7 @@ PANELS: tuple[tuple[str, str, bool], ...] = (
     ("std", "standard deviation of the action noise", False),
     ("learning_rate", "learning rate", True),
 )
-"""What is drawn: name in the log, title, logarithmic or not."""
+"""Drawn curves: name in the log, title, logarithmic or not."""
 _SMOOTH = 15
 """Points of the running mean."""
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.pages.tables import Table
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
 from arena_newton.trackers.train.checkpoint import Checkpoint
@@ -132,17 +133,16 @@ def _markdown(card: dict[str, Any]) -> str:
         rows[f"part {k}"] = f"to iteration {part['iter']}, commit {part['commit']}: `{part['command']}`"
     if started := card.get("started_from"):
         rows["started from"] = f"the weights of commit {started}"
-    lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items()), ""]
-    lines += ["## References", "", "| family | clips | minutes |", "|---|---|---|"]
-    lines += [f"| {name} | {f['clips']} | {f['minutes']} |" for name, f in card["data"]["families"].items()]
+    families = [(name, f["clips"], f["minutes"]) for name, f in card["data"]["families"].items()]
+    lines += [*Table(("", ""), list(rows.items())).compact(), "", "## References", ""]
+    lines += Table(("family", "clips", "minutes"), families).compact()
     if figures := card.get("metrics", {}).get("figures"):
         lines += ["", "## Evaluation", ""]
         if command := card["metrics"].get("command"):
             lines += [f"`{command}`", ""]
         if settings := card["metrics"].get("settings"):
             lines += [", ".join(f"{name} {value}" for name, value in settings.items()), ""]
-        lines += ["| figure | bar | value | |", "|---|---|---|---|"]
-        lines += [f"| {f['name']} | {f['bar']} | {f['value']} | {f['verdict']} |" for f in figures]
-    lines += ["", "## At the end of training", "", "| | |", "|---|---|"]
-    lines += [f"| {name} | {value} |" for name, value in card["training"].items()]
+        cells = [(f["name"], f["bar"], f["value"], f["verdict"]) for f in figures]
+        lines += Table(("figure", "bar", "value", ""), cells).compact()
+    lines += ["", "## At the end of training", "", *Table(("", ""), list(card["training"].items())).compact()]
     return "\n".join(lines) + "\n"

@@ -20,7 +20,7 @@ __all__ = ["DeviceLogger", "IterationTimes"]
 
 @dataclass(frozen=True)
 class IterationTimes:
-    """What one iteration took."""
+    """Duration of the parts of one iteration."""
 
     collect: float
     """Rollout [s]."""
@@ -38,14 +38,14 @@ class DeviceLogger(Logger):
         super().__init__(**settings)
         self.options, self.best_reward = options, best_reward
         self.history: list[dict[str, float]] = []
-        """What each iteration measured."""
+        """Measurements of each iteration."""
         self.rewbuffer, self.lenbuffer = deque(maxlen=10), deque(maxlen=10)
         self._ended = torch.zeros(3, device=self.device)  # episodes, their rewards, their lengths
         self._written: float = 0
 
     @property
     def writes(self) -> bool:
-        """Whether this process writes files."""
+        """True if this process writes files."""
         return self.log_dir is not None and not self.disable_logs
 
     def _store_code_state(self) -> list[str]:

@@ -52,11 +52,11 @@ class TrackerPPO(PPO):
         super().__init__(*args, **kwargs)
         self.last_kl = 0.0
         self.parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        """What learns, the actor first."""
+        """Trained parameters, the actor's first."""
         self.stream = torch.cuda.Stream(self.device) if str(self.device).startswith("cuda") else None
         """Stream of the updates on CUDA."""
         self.use_graphs = graph and self.stream is not None
-        """Whether a minibatch is captured."""
+        """True if a minibatch is captured."""
         self.captured: _Captured | None = None
         """A minibatch's graphs, once they are recorded."""
         self._entropy_weight = torch.zeros((), device=self.device)

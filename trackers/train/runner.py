@@ -28,7 +28,7 @@ from arena_newton.trackers.train.train_options import TrainOptions, runner_confi
 __all__ = ["CriticWarmUp", "TrackerRunner", "annealed"]
 
 _ANNEALED = 0.1
-"""What is left of target KL and entropy coefficient at the end of a time limit."""
+"""Fraction of target KL and entropy coefficient that is left at the end of a time limit."""
 _STRIDE = 7919
 """Difference of the seeds of the further processes of trainings that are resumed at successive iterations."""
 _SEEN = 1e9
@@ -66,7 +66,7 @@ class CriticWarmUp:
 
 
 def annealed(elapsed: float, final: float) -> float:
-    """What is left of target KL and entropy coefficient, from 1 down to `_ANNEALED`.
+    """Remaining fraction of target KL and entropy coefficient, from 1 down to `_ANNEALED`.
 
     Args:
         elapsed: Fraction of the time limit that has passed.
@@ -275,7 +275,7 @@ class TrackerRunner(OnPolicyRunner):
         return float(loss.detach()) ** 0.5
 
     def _agree(self, elapsed: float) -> tuple[bool, float]:
-        """Whether to stop, and the fraction of the time limit that has passed: the same answer in every process."""
+        """Agree on whether to stop and on the passed fraction of the time limit: the same answer in every process."""
         stop = float(self._stop)
         if self.is_distributed:
             answers = torch.tensor([stop, elapsed], dtype=torch.float64, device=self.device)

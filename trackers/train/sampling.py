@@ -1,4 +1,4 @@
-"""Where episodes start: clips and their phases, more often where the tracker fails.
+"""Starts of training episodes: clips and their phases, more often where the tracker fails.
 
 Clips are cut into bins of one second. A bin's weight is its family's weight, spread over the family's frames, times
 a factor that grows with its failure rate. All statistics live on the device; the table is renewed once an iteration.
@@ -101,7 +101,7 @@ class ClipSampler:
         self.renew()
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed training needs."""
+        """State that a resumed training needs."""
         return {"library": self.library} | {name: getattr(self, name) for name in _EVIDENCE}
 
     def load_state_dict(self, state: dict[str, Any]) -> bool:

@@ -95,7 +95,7 @@ def _commit(given: str) -> str:
 
 
 def _card(options: TrainOptions, library: MotionLibrary, env: TrackerEnv, processes: int) -> Card:
-    """What a training can say about itself before it starts."""
+    """Card of a training as known before it starts."""
     seconds = library.seconds
     families = {
         str(name): {

@@ -81,7 +81,7 @@ class TrackerEnv(VecEnv):
         self.sim = Simulation(interface.drive, interface.rate, options, device)
         self._every = torch.ones(worlds, dtype=torch.bool, device=device)
         self.delay: torch.Tensor = torch.zeros(worlds, dtype=torch.bool, device=device)
-        """Whether a world's targets arrive one tick late, bool, shape [worlds]."""
+        """True if a world's targets arrive one tick late, bool, shape [worlds]."""
         zero = torch.zeros(worlds, 1, device=device)
         self.privileged: dict[str, torch.Tensor] = {
             "friction": zero,
@@ -90,7 +90,7 @@ class TrackerEnv(VecEnv):
             "payload": zero.repeat(1, 2),
             "motor_strength": zero.repeat(1, 29),
         }
-        """What the start events drew, by name, each of shape [worlds, n]."""
+        """Values drawn by the start events, by name, each of shape [worlds, n]."""
         events.apply(self, "start", self._every, self.events)
         self.randomised: torch.Tensor = torch.cat(list(self.privileged.values()), 1)
         self.sim.finish()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.trackers.interface import names
 
@@ -192,9 +192,7 @@ def check(options: TrainOptions) -> None:
     """
     for option in dataclasses.fields(options):
         if "bounds" in option.metadata:
-            _refuse_outside(
-                "--" + option.name.replace("_", "-"), getattr(options, option.name), *option.metadata["bounds"]
-            )
+            _refuse_outside(flag_name(option.name), getattr(options, option.name), *option.metadata["bounds"])
     _refuse_outside("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
     if options.settle > 0.0 and options.minutes <= 0.0:
         raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")

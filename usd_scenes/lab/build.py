@@ -27,9 +27,9 @@ PARKED: dict[str, tuple[float, float, float]] = {
     "Sill": (0.0, 0.0, -5.0),
     "Platform": (0.0, 0.0, -6.0),
 }
-"""Where the fixtures are parked [m]: out of reach of a robot on the floor."""
+"""Parking positions of the fixtures [m]: out of reach of a robot on the floor."""
 BALL_PARKED = (0.0, 40.0, BALL_RADIUS)
-"""Where the ball of variant `ball` rests until it is used [m]."""
+"""Parking position of the ball of variant `ball` until it is used [m]."""
 
 
 def _support(stage: Usd.Stage, name: str, size: Sequence[float], surface: Usd.Prim, look: Usd.Prim) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from arena_newton.data.datasets.motion_source import Motion, motions
 from arena_newton.files.text import counted
+from arena_newton.pages.tables import Table
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, STATE
 
@@ -68,7 +69,7 @@ class EpisodeFigures:
 
     @property
     def is_outlier(self) -> bool:
-        """Whether it is unlike the others of its task and tracker."""
+        """True if it is unlike the others of its task and tracker."""
         return self.score >= OUTLIER
 
 
@@ -146,26 +147,25 @@ def stats(folders: Sequence[Path], options: StatsOptions) -> int:
 
 def table(found: Sequence[EpisodeFigures]) -> str:
     """Medians per task and tracker, then the most unusual episodes, as Markdown."""
-    head = " | ".join(name.replace("_", " ") for name in FIGURES)
-    lines = [
-        f"| task | tracker | episodes | successes | {head} | outliers |",
-        "|---|---|" + "--:|" * (len(FIGURES) + 3),
-    ]
+    head = [name.replace("_", " ") for name in FIGURES]
+    rows: list[list[object]] = []
     groups: dict[tuple[str, str], list[EpisodeFigures]] = {}
     for one in found:
         groups.setdefault((one.task, one.tracker), []).append(one)
     for (task, tracker), members in groups.items():
         middles = [float(np.median([getattr(one, name) for one in members])) for name in FIGURES]
         wins = sum(one.outcome == "success" for one in members)
-        cells = [task, tracker or "-", len(members), wins, *(f"{value:.3g}" for value in middles)]
-        cells.append(sum(one.is_outlier for one in members))
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
+        outliers = sum(one.is_outlier for one in members)
+        rows.append([task, tracker or "-", len(members), wins, *(f"{value:.3g}" for value in middles), outliers])
+    lines = Table(("task", "tracker", "episodes", "successes", *head, "outliers"), rows, "llr").compact()
     shown = ranked(found)[:MOST_LINES]
-    lines += ["", f"| episode | rows | {head} | score | of |", "|---|" + "--:|" * (len(FIGURES) + 2) + "---|"]
-    for one in shown:
-        cells = [one.name, one.rows, *(f"{getattr(one, name):.3g}" for name in FIGURES)]
-        mark = " (outlier)" if one.is_outlier else ""
-        lines.append("| " + " | ".join(map(str, [*cells, f"{one.score:.1f}", one.reason])) + mark + " |")
+    rows = [
+        [one.name, one.rows, *(f"{getattr(one, name):.3g}" for name in FIGURES), f"{one.score:.1f}"]
+        + [f"{one.reason} (outlier)" if one.is_outlier else one.reason]
+        for one in shown
+    ]
+    align = "l" + "r" * (len(FIGURES) + 2) + "l"
+    lines += ["", *Table(("episode", "rows", *head, "score", "of"), rows, align).compact()]
     if len(found) > len(shown):
         lines.append(f"\n{counted(len(found) - len(shown), 'episode')} more; --json prints all")
     return "\n".join(lines)

@@ -7,8 +7,6 @@ no script run: pictures are in it, and its style is named by its hash.
 from __future__ import annotations
 
 import base64
-import functools
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import av
 import cv2
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from tqdm import tqdm
@@ -26,7 +23,8 @@ from arena_newton.data.datasets.motion_source import Motion, motions
 from arena_newton.data.readers.frame_reader import OpenVideo
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import replace_atomically
-from arena_newton.files.text import counted, plain_text
+from arena_newton.files.text import counted
+from arena_newton.pages.html import EMBEDDED, render
 from arena_newton.pictures.video import evenly
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, HAND_CLOSED, STATE
@@ -36,7 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["inspect", "page"]
 
-FOLDER = Path(__file__).parent / "page"
 POINTS = 400
 """Points of a curve."""
 STRIP_HEIGHT = 110
@@ -68,7 +65,7 @@ class Curve:
     """As `polyline` takes them."""
     colour: int
     faint: bool = False
-    """Whether it is what was measured, drawn behind what was asked for."""
+    """True for the measured values, drawn behind the commanded ones."""
 
 
 @dataclass(frozen=True)
@@ -151,9 +148,6 @@ def page(found: Sequence[EpisodeFigures], shown: Sequence[Shown], title: str) ->
         shown: Those in full, in their order.
         title: What was looked at.
     """
-    style = (FOLDER / "inspect.css").read_text()
-    named = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src data:; style-src 'sha256-{named}'; base-uri 'none'; form-action 'none'"
     anchors = {id(one.figures): f"#episode{number}" for number, one in enumerate(shown)}
     groups: dict[tuple[str, str], list[EpisodeFigures]] = {}
     for one in found:
@@ -162,9 +156,10 @@ def page(found: Sequence[EpisodeFigures], shown: Sequence[Shown], title: str) ->
         key: {name: float(np.median([getattr(one, name) for one in members])) for name in FIGURES}
         for key, members in groups.items()
     }
-    return _template().render(
-        policy=policy,
-        style=Markup(style),
+    return render(
+        Path(__file__).parent / "page" / "inspect.html",
+        styles=["inspect.css"],
+        sources=EMBEDDED,
         title=title,
         found=[(one, anchors.get(id(one), "")) for one in ranked(found)],
         groups=groups,
@@ -175,19 +170,6 @@ def page(found: Sequence[EpisodeFigures], shown: Sequence[Shown], title: str) ->
         height=HEIGHT,
         rows=sum(one.rows for one in found),
     )
-
-
-@functools.cache
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(FOLDER),
-        autoescape=True,
-        finalize=lambda value: value if hasattr(value, "__html__") else plain_text(value),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("inspect.html")
 
 
 def _shown(motion: Motion, about: EpisodeFigures, count: int) -> Shown:

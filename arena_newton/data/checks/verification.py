@@ -19,7 +19,12 @@ from tqdm import tqdm
 
 from arena_newton import tasks
 from arena_newton.data.checks.video_checks import CameraVideos, DatasetMismatch, check_videos
-from arena_newton.data.datasets.layouts import (
+from arena_newton.data.datasets.row_statistics import aggregated, quantile_name, row_statistics
+from arena_newton.data.readers.dataset_files import DatasetFiles, EpisodeRow, read_json
+from arena_newton.data.readers.label_protocols import encode_v4
+from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened, vision
+from arena_newton.data.recording.image_statistics import QUANTILES, VALUES, statistics
+from arena_newton.data.recording.layouts import (
     FPS,
     LAYOUTS,
     Column,
@@ -28,11 +33,6 @@ from arena_newton.data.datasets.layouts import (
     described_slots,
     modality,
 )
-from arena_newton.data.datasets.row_statistics import aggregated, quantile_name, row_statistics
-from arena_newton.data.readers.dataset_files import DatasetFiles, EpisodeRow, read_json
-from arena_newton.data.readers.label_protocols import encode_v4
-from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened, vision
-from arena_newton.data.recording.image_statistics import QUANTILES, VALUES, statistics
 from arena_newton.errors import InputError
 from arena_newton.files.text import counted
 from arena_newton.robot import g1
@@ -76,7 +76,7 @@ class _Subject:
         return self.kind.columns(self.labels)
 
     def origin(self, index: int) -> Mapping[str, object]:
-        """What the block says about an episode."""
+        """Entry of an episode in the block `arena`."""
         episodes = self.arena.get("episodes") if self.arena else None
         found = episodes[index] if isinstance(episodes, list) and index < len(episodes) else {}
         return found if isinstance(found, dict) else {}
@@ -140,7 +140,7 @@ def _verified(files: DatasetFiles, recorded: Sequence[EpisodeFile], jobs: int) -
 
 
 def _subject(files: DatasetFiles) -> _Subject:
-    """Which layout and which labels a dataset has."""
+    """Layout and labels of a dataset."""
     info = files.root / "meta" / "info.json"
     given, arena = files.info.get("robot_type"), files.info.get("arena")
     if arena is not None and not isinstance(arena, dict):

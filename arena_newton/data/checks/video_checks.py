@@ -55,7 +55,7 @@ class DatasetMismatch(ArenaError):
 
 @dataclass(frozen=True)
 class CameraVideos:
-    """What the videos of a camera are held against."""
+    """Expected properties of a camera's videos."""
 
     key: str
     """Feature of the camera."""

@@ -18,7 +18,6 @@ import pyarrow.compute
 import pyarrow.parquet
 from tqdm import tqdm
 
-from arena_newton.data.datasets.layouts import REFERENCE_SOURCES
 from arena_newton.data.datasets.row_statistics import HAND_NAME, aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import (
     DATA_PATH,
@@ -28,6 +27,7 @@ from arena_newton.data.readers.dataset_files import (
     VideoPart,
     read_json,
 )
+from arena_newton.data.recording.layouts import REFERENCE_SOURCES
 from arena_newton.errors import InputError
 from arena_newton.files.limits import MIB
 from arena_newton.files.own_files import replace_atomically
@@ -52,7 +52,7 @@ class Selection:
 
 
 def described(files: DatasetFiles) -> list[dict[str, object]] | None:
-    """What the block `arena` says of each episode; None in a dataset of others.
+    """Entry of each episode in the block `arena`; None in a dataset of others.
 
     Raises:
         InputError: It has another number of episodes, or one is no object.

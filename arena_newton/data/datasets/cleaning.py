@@ -22,9 +22,10 @@ from tqdm import tqdm
 from arena_newton.data.recording.episode import CAMERAS, VIDEO_FOLDER, episode_files, vision, write_episode
 from arena_newton.data.recording.image_statistics import VALUES, add_picture
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import numbers, read_arrays, read_bytes
 from arena_newton.files.new_folder import link, new_folder
 from arena_newton.files.text import counted
+from arena_newton.files.untrusted_files import numbers, read_arrays, read_bytes
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.video import VideoWriter
 from arena_newton.rules import seeding
 
@@ -64,7 +65,7 @@ the larger number, as the recorder has it."""
 
 @dataclass(frozen=True)
 class Rows:
-    """What the rules look at, row by row; None where a recording has no such field."""
+    """Fields that the rules read, row by row; None where a recording has no such field."""
 
     frame: np.ndarray | None
     """Frame index of the source, shape [T]."""
@@ -76,7 +77,7 @@ class Rows:
     step: float
     """Control step [s]."""
     fields: Mapping[str, str]
-    """Which field each was read from."""
+    """Name of the field that each was read from."""
 
 
 def broken_rules(rows: Rows, *, max_gap: int = 1, max_step: float = 2.5) -> dict[str, np.ndarray]:
@@ -236,7 +237,7 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
 
 
 def _is_rows(name: str, array: np.ndarray, count: int) -> bool:
-    """Whether an array has one entry per row."""
+    """True if an array has one entry per row."""
     once = name in ONCE or name.startswith(("episode_", "meta_"))
     if once or name.startswith("arena_vision_") and name.endswith(("_histogram", "_size")):
         return False
@@ -311,10 +312,6 @@ def _add(lines: dict[str, dict[str, int]], file: Path, found: Mapping[str, np.nd
 def table(lines: Mapping[str, Mapping[str, int]]) -> str:
     """Counts per folder as Markdown; a row that breaks several rules counts in each, and once as dropped."""
     names = ("episodes", "rows", *RULES, "dropped", "spoiled")
-    heads = [*names[:-1], "episodes with dropped rows"]
-    out = [f"| folder | {' | '.join(heads)} |", "|---|" + "--:|" * len(names)]
-    out += [f"| {folder} | {' | '.join(str(line[name]) for name in names)} |" for folder, line in lines.items()]
-    if len(lines) > 1:
-        total = [sum(line[name] for line in lines.values()) for name in names]
-        out.append(f"| all | {' | '.join(map(str, total))} |")
-    return "\n".join(out)
+    rows = [[folder, *(line[name] for name in names)] for folder, line in lines.items()]
+    rows += [["all", *(sum(line[name] for line in lines.values()) for name in names)]] if len(lines) > 1 else []
+    return "\n".join(Table(("folder", *names[:-1], "episodes with dropped rows"), rows, "lr").compact())

@@ -10,7 +10,6 @@ from arena_newton.cli.flags import Several
 __all__ = [
     "BuildOptions",
     "CleanOptions",
-    "DatasetBenchOptions",
     "InspectOptions",
     "MergeOptions",
     "SplitOptions",
@@ -26,7 +25,7 @@ class BuildOptions:
     out: Path = Path("dataset")
     """Folder of the dataset, which must not exist yet."""
     labels: str = "v3.1"
-    """What the actions mean: v3.1 (reference pose, the original's) or v4 (root velocities)."""
+    """Meaning of the actions: v3.1 (reference pose, the original's) or v4 (root velocities)."""
     layout: str = "arena"
     """Names of the features: arena (the original's), sonic (GR00T-WholeBodyControl) or lerobot (Unitree G1)."""
     cameras: Several[str] = ()
@@ -49,20 +48,6 @@ class VerifyOptions:
     """Folders of the recorded episodes; without them only the dataset itself is checked."""
     jobs: int = 0
     """Threads that decode videos, a file each; 0: one per core that the process may use."""
-
-
-@dataclass(frozen=True)
-class DatasetBenchOptions:
-    """Measure how fast a dataset is read in random order, and how long it takes to build and to verify."""
-
-    reads: int = 2000
-    """Pictures that each reader reads."""
-    recordings: Several[Path] = ()
-    """Folders of recorded episodes: they are built and verified once more, and the time is measured."""
-    made: int = 0
-    """The folder holds recordings; so many copies of them under other seeds are built, verified and read."""
-    seed: int = 0
-    """Of the order in which pictures are read."""
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from arena_newton import __version__
-from arena_newton.data.datasets.layouts import Layout, described_protocol, described_slots, layout, modality
 from arena_newton.data.datasets.row_statistics import row_statistics
 from arena_newton.data.readers.dataset_files import read_json
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.recording.image_statistics import statistics
+from arena_newton.data.recording.layouts import Layout, described_protocol, described_slots, layout, modality
 from arena_newton.data.recording.source_videos import SourceVideo, source_video
 from arena_newton.errors import InputError
 from arena_newton.files.new_folder import new_folder
@@ -374,7 +374,7 @@ class _Closing:
 
 
 def _encoder(video: SourceVideo) -> RGBEncoderConfig:
-    """What LeRobot writes into `info.json` about the codec; nothing is encoded."""
+    """Encoder settings that LeRobot writes into `info.json`; nothing is encoded."""
     codec = dict(video.codec)
     known = {name: codec.pop(name) for name in ("vcodec", "g", "crf", "preset") if name in codec}
     return RGBEncoderConfig(**known, extra_options=codec)

@@ -25,7 +25,7 @@ DATASET_FILE = Path("meta") / "info.json"
 
 
 def held_out(seed: int | str, fraction: float, salt: int = 0) -> bool:
-    """Whether an episode is held out: of its seed alone, so that it is in every set that it is part of.
+    """True if an episode is held out: of its seed alone, so that it is held out of every set that it is part of.
 
     Args:
         seed: The episode's seed; of an episode without one, its content.

@@ -15,7 +15,7 @@ import pyarrow.parquet
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import check_size, read_bytes
+from arena_newton.files.untrusted_files import check_size, read_bytes
 
 __all__ = ["CODEBASE_VERSION", "DatasetFiles", "EpisodeRow", "VideoPart", "read_json"]
 
@@ -52,7 +52,7 @@ def read_json(path: Path) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class VideoPart:
-    """Where the frames of an episode are."""
+    """Video file and time range with the frames of an episode."""
 
     path: Path
     first: int
@@ -195,7 +195,7 @@ class DatasetFiles:
         return found
 
     def video(self, row: EpisodeRow, key: str) -> VideoPart:
-        """Where the frames of an episode are.
+        """Video file and time range with the frames of an episode.
 
         Raises:
             InputError: The table does not say, or the file is absent.

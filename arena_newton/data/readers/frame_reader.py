@@ -123,7 +123,7 @@ class Frames:
 
     @property
     def parts(self) -> list[VideoPart]:
-        """Where the pictures of each episode are."""
+        """Video file and time range of each episode."""
         return list(self._parts)
 
     def read(self, part: VideoPart, number: int) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files.foreign import numbers
+from arena_newton.files.untrusted_files import numbers
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, validate_action
 from arena_newton.robot.rotations import matrix_from_quat, quat_from_euler
@@ -47,7 +47,7 @@ MAX_RATE = 1e6
 
 @dataclass(frozen=True)
 class LabelProtocol:
-    """What the 40 numbers of an action mean."""
+    """Meaning of an action's 40 numbers."""
 
     name: str
     robot_type: str

@@ -32,7 +32,7 @@ MAX_EPISODES = 100_000
 
 @dataclass(frozen=True)
 class RecordedSeed:
-    """Which of our episodes one of a dataset is, where the dataset says so (block `arena` of `info.json`)."""
+    """Our episode that a dataset's episode was made from, if the dataset names it (block `arena` of `info.json`)."""
 
     task: str
     mode: str

@@ -40,7 +40,7 @@ WAITING_EPISODES = 8
 
 
 class RecordedEpisode(Protocol):
-    """What a planned episode must have so that its file says where it comes from."""
+    """Attributes that a planned episode needs so that its file can name its origin."""
 
     @property
     def index(self) -> int:
@@ -91,7 +91,7 @@ def episode_label(episode: RecordedEpisode) -> str:
 
 @dataclass
 class _Stream:
-    """What is recorded of one world's episode."""
+    """Recorded arrays of one world's episode."""
 
     episode: RecordedEpisode
     worker: int
@@ -267,7 +267,7 @@ class DemonstrationRecorder(Recorder):
             self._film(env, name, camera, mask, observation)
 
     def _act(self, worlds: list[int]) -> None:
-        """Which worlds act in this tick; what follows from that is made where it changes."""
+        """Set the worlds that act in this tick; the choice of films follows only where it changes."""
         if worlds == self._acting and self._reels:
             return
         self._acting = worlds
@@ -495,7 +495,7 @@ class DemonstrationRecorder(Recorder):
 
 
 def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str, np.ndarray | np.generic]:
-    """What the file says of a camera.
+    """Fields of a camera's film in the file.
 
     Raises:
         ArenaError: The film has another number of pictures.

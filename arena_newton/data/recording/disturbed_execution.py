@@ -79,7 +79,7 @@ class ActionNoise(Recorder):
         """Noise of each world's episode, shape [worlds, ticks, 33]."""
 
     def describe(self) -> dict[str, object]:
-        """What a result must record to name this disturbance exactly, as JSON."""
+        """Levels to record with every result so that this disturbance is named exactly, as JSON."""
         return self.levels.describe()
 
     def start(self, env: World, world: int, episode: Planned) -> None:

@@ -68,7 +68,7 @@ class Pictured:
     width: int
     """[px]."""
     depth: bool
-    """Whether their depths are recorded too."""
+    """True if their depths are recorded too."""
 
 
 @dataclass(eq=False)
@@ -90,8 +90,8 @@ class Reel:
 
 
 Finished = Callable[[Mapping[str, FilmFacts | None] | None], None]
-"""What is done with an episode's finished films, by camera; None where one of them is broken. A film without pictures
-has no facts."""
+"""Callback for an episode's finished films, by camera; it gets None where one of them is broken. A film without
+pictures has no facts."""
 
 
 class Filming(abc.ABC):

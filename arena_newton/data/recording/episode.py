@@ -23,8 +23,9 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.foreign import check_size, numbers, read_arrays
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import check_size, numbers, read_arrays
+from arena_newton.pages.tables import Table
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 if TYPE_CHECKING:
@@ -143,8 +144,8 @@ FIELDS = (
 
 def fields_table() -> str:
     """`FIELDS` as a Markdown table."""
-    rows = [f"| `{f.name}` | {f.kind} | {f.shape or 'one value'} | {f.sentence} |" for f in FIELDS]
-    return "\n".join(["| field | type | shape | what |", "|---|---|---|---|", *rows]) + "\n"
+    rows = [(f"`{f.name}`", f.kind, f.shape or "one value", f.sentence) for f in FIELDS]
+    return "\n".join(Table(("field", "type", "shape", "what"), rows).compact()) + "\n"
 
 
 def vision(camera: str, name: str) -> str:
@@ -228,7 +229,7 @@ class EpisodeFile:
             raise InputError(f"{self.path}: num_frames is {self.rows}, expected 1 to {MAX_ROWS}")
 
     def __contains__(self, name: str) -> bool:
-        """Whether the file has that array."""
+        """True if the file has that array."""
         return name in self.names
 
     def load(self, names: Iterable[str]) -> None:

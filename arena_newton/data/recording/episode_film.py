@@ -13,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from arena_newton.data.recording.image_statistics import VALUES, add_picture
-from arena_newton.files.foreign import create
+from arena_newton.files.untrusted_files import create
 from arena_newton.pictures.video import VideoWriter
 
 __all__ = ["CRF", "Film", "FilmFacts", "key_frames"]
@@ -33,7 +33,7 @@ def key_frames(height: int) -> int:
 
 @dataclass(frozen=True)
 class FilmFacts:
-    """What a finished film holds."""
+    """Facts about a finished film."""
 
     width: int
     """[px]."""

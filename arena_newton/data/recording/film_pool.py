@@ -73,7 +73,7 @@ class _Slots:
         slots = slots_of(3 * made.worlds * made.height * made.width)
         self.fd = os.memfd_create("arena_newton_pictures", os.MFD_CLOEXEC)
         self.facts = self.fd, slots, made.worlds, made.height, made.width, int(made.depth)
-        """What a process maps them by."""
+        """Arguments with which a process maps them."""
         memory = SlotMemory(*self.facts)
         self.pictures = [torch.from_numpy(pictures) for pictures in memory.pictures]
         self.depths = [torch.from_numpy(depths) for depths in memory.depths or ()]
@@ -81,7 +81,7 @@ class _Slots:
         """Processes that have not read a slot yet."""
         self.reels: Sequence[Reel] = ()
         self.messages: dict[int, list[tuple[_Worker, bytes]]] = {}
-        """What is said of each slot as long as the films are `reels`."""
+        """Messages about each slot, valid as long as the films are `reels`."""
         self._whole = torch.from_numpy(np.ndarray((memory.size,), np.uint8, memory.memory))
         self._pinned = device.type == "cuda" and pin(self._whole, device)
         """Into memory that is not pinned a GPU copies too, and whoever asks it waits."""
@@ -204,7 +204,7 @@ class FilmPool(Filming):
             self._receive(PATIENCE)
 
     def _messages(self, slots: _Slots, slot: int) -> list[tuple[_Worker, bytes]]:
-        """What each process must know of the pictures in a slot."""
+        """Message to each process about the pictures in a slot."""
         rows: dict[int, list[tuple[int, int]]] = {}
         for row, reel in enumerate(slots.reels):
             rows.setdefault(reel.worker, []).append((reel.number, row))

@@ -26,7 +26,7 @@ from arena_newton.data.recording.episode_film import Film, FilmFacts
 __all__ = ["SlotMemory", "main", "packed", "unpacked"]
 
 LENGTH = struct.Struct("<I")
-"""What a message begins with: the number of its bytes, which are JSON."""
+"""Prefix of a message: the number of its bytes, which are JSON."""
 PATIENCE = 1.0
 """Time after which a process that waits makes sure that its recorder is alive [s]."""
 

@@ -1,4 +1,4 @@
-"""How strongly the execution of demonstrations is disturbed: numbers only, so that a plan loads nothing heavy."""
+"""Levels of the disturbance of demonstrations: numbers only, so that a plan loads nothing heavy."""
 
 from __future__ import annotations
 
@@ -38,5 +38,5 @@ class NoiseLevels:
         return replace(self, **deviations)
 
     def describe(self) -> dict[str, object]:
-        """What a result must record to name the disturbance exactly, as JSON."""
+        """Levels to record with every result so that the disturbance is named exactly, as JSON."""
         return {"name": "ornstein_uhlenbeck", **asdict(self)}

@@ -31,7 +31,7 @@ class SourceVideo:
 
     @property
     def kind(self) -> str:
-        """What must be the same in all videos of a camera."""
+        """Properties that all videos of a camera share."""
         options = " ".join(f"{name} {value}" for name, value in self.codec.items())
         return f"{self.width}x{self.height} {options}"
 

@@ -93,7 +93,7 @@ class PolicyVectorEnv(ArenaVectorEnv):
         super()._begin(mask, numbers)
 
     def _observation(self) -> Observations:
-        """What is seen, and which task it is."""
+        """Observation and task."""
         return super()._observation() | {name: value.copy() for name, value in self._vectors.items()}
 
     def _keep(self, folder: Path, world: int) -> None:

@@ -1,4 +1,4 @@
-"""What LeRobot's command line knows of our worlds: flags, features, and how a batch is made."""
+"""Plug-in of LeRobot's command line for our worlds: flags, features, and the making of a batch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FPS = 50
 CAMERAS = {"front": "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
 """Name in datasets (the original's) → camera of the scene."""
 REPEATED = (f"observation.{OBS_STATE}", f"observation.{OBS_ENV_STATE}")
-"""What LeRobot makes of observations that have a dataset's name already."""
+"""Names that LeRobot gives to observations that have a dataset's name already."""
 FITS = ("pad", "native")
 """`pictures.settings.Fit`."""
 logger = logging.getLogger(__name__)
@@ -201,10 +201,10 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
         return made
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """What changes observations before the policy's own processors, and actions after them."""
+        """Processors of observations before the policy's own ones, and of actions after them."""
         return PolicyProcessorPipeline(steps=[DropRepeated()]), PolicyProcessorPipeline(steps=[])
 
 
 def _names(given: str) -> tuple[str, ...]:
-    """What is named with commas between."""
+    """Names of a list with commas."""
     return tuple(name.strip() for name in given.split(",") if name.strip())

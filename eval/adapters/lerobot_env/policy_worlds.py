@@ -1,4 +1,4 @@
-"""What a batch of worlds must know of the policy that plays in it; a checkpoint of ours says it itself."""
+"""Facts about the policy that a batch of worlds needs; a checkpoint of ours holds them itself."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["PolicyWorlds", "policy_worlds"]
 
 @dataclass(frozen=True)
 class PolicyWorlds:
-    """How a policy's pictures and actions are meant."""
+    """Meaning of a policy's pictures and actions."""
 
     labels: str = "v3.1"
     """Label protocol of its actions, v3.1 or v4."""
@@ -33,7 +33,7 @@ class PolicyWorlds:
     height: int = 224
     """Height of its pictures [px]."""
     fit: Fit = "pad"
-    """How the camera's 4:3 picture goes into that size, as in `CameraConfig`."""
+    """Fit of the camera's 4:3 picture into that size, as in `CameraConfig`."""
     source: Path | None = None
     """File that says so; None: these are the defaults of what says nothing."""
 
@@ -49,7 +49,7 @@ class PolicyWorlds:
 
 
 def policy_worlds() -> PolicyWorlds:
-    """What the policy of LeRobot's flag `--policy.path` says; defaults without one that is a folder.
+    """Facts of the policy of LeRobot's flag `--policy.path`; defaults without one that is a folder.
 
     Of a checkpoint without `arena_policy.json`, such as one of `lerobot-train`, the size of its pictures is known.
 

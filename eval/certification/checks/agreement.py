@@ -14,10 +14,8 @@ from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import (
     Check,
     CheckFinding,
-    Sheet,
     Verdict,
     discordant,
-    percent,
     pooled_score,
     score,
     skipped,
@@ -25,6 +23,7 @@ from arena_newton.eval.certification.finding import (
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import mcnemar
 from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.devices import resolve_engine
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def engines(context: Context) -> CheckFinding:
     return CheckFinding("fail" if wrong else verdict, f"in {ticks}; {rates}", (sheet, rate_sheet), (*wrong, *notes))
 
 
-def _same_start(context: Context, other: str, device: str) -> tuple[str, Sheet, list[str]]:
+def _same_start(context: Context, other: str, device: str) -> tuple[str, Table, list[str]]:
     """Findings of the first ticks: in words, as a table and as faults."""
     rows, wrong, most = [], [], 0.0
     tracker = context.trackers[0]
@@ -89,11 +88,8 @@ def _same_start(context: Context, other: str, device: str) -> tuple[str, Sheet, 
         late = [tick for tick, gap in enumerate(gaps, 1) if not gap <= SAME_STATE]
         wrong += [f"{task}: positions differ by {gaps[tick - 1]:.1e} at tick {tick}" for tick in late[:1]]
     head = ("task", "arrays that differ", *(f"tick {tick + 1}" for tick in range(SAME_TICKS)))
-    sheet = Sheet(
-        f"Models of both engines, and the largest difference of a position [m, rad]; {SAME_STATE:.0e} is allowed",
-        head,
-        tuple(rows),
-    )
+    title = f"Models of both engines, and the largest difference of a position [m, rad]; {SAME_STATE:.0e} is allowed"
+    sheet = Table(head, rows, title=title)
     return f"the first {SAME_TICKS} ticks positions differ by at most {most:.1e}", sheet, wrong
 
 
@@ -142,7 +138,7 @@ def bound_of_difference(only_first: int, only_second: int, pairs: int) -> tuple[
     return -upper(only_second), upper(only_first)
 
 
-def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Sheet, tuple[str, ...]]:
+def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Table, tuple[str, ...]]:
     """Success and falls of the experts on both engines, episode by episode."""
     rows, tests, total = [], [], {"success": [0, 0], "fall": [0, 0]}
     pairs = 0
@@ -177,24 +173,24 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, She
         "p of falls",
     )
     said = [
-        f"{what} by {percent(low, 1)} to {percent(high, 1)}"
+        f"{what} by {percent(low)} % to {percent(high)} %"
         for what, (low, high) in zip(("success", "falls"), bounds.values(), strict=True)
     ]
     notes = [
         f"Engines are equivalent where the 95 % interval of the difference of their rates, all {pairs} pairs of the "
-        f"same episodes together, is within {percent(MARGIN)} on either side: {'; '.join(said)}. It has the upper "
+        f"same episodes together, is within {percent(MARGIN, 0)} % on either side: {'; '.join(said)}. It has the upper "
         "97.5 % bounds (Clopper and Pearson) of the pairs that only one engine wins, less 0 of the other's: wider than "
         "the interval of `eval compare`, and sure to cover in 95 %. "
         f"They differ in a cell where p, that of McNemar's exact test, is below {level:.2g}: {DIFFERENT} over "
         f"{2 * len(tests)} tests; all cells together where it is below {DIFFERENT} and the rates are more than "
-        f"{percent(MARGIN)} apart."
+        f"{percent(MARGIN, 0)} % apart."
     ]
     notes += [f"{which}: the engines differ" for which in apart]
     verdict: Verdict = "fail" if apart or far else "pass" if within else "note"
     if verdict == "note":
-        notes.append(f"{pairs} pairs are too few to show that the rates are within {percent(MARGIN)}.")
+        notes.append(f"{pairs} pairs are too few to show that the rates are within {percent(MARGIN, 0)} %.")
     summary = f"{this} and {other} on {where}: rates differ in {', '.join(said)} (95 %)"
-    return verdict, summary, Sheet("Rates of both engines", head, tuple(rows)), tuple(notes)
+    return verdict, summary, Table(head, rows, title="Rates of both engines"), tuple(notes)
 
 
 def batches(context: Context) -> CheckFinding:
@@ -215,7 +211,7 @@ def batches(context: Context) -> CheckFinding:
             rows.append((task, tracker, f"{int(found['ticks']):,}", "none" if differs is None else str(differs)))
             broken += [f"{task} through {tracker}: differs from tick {differs} on"] * (differs is not None)
     head = ("task", "tracker", "ticks compared", "first tick that differs")
-    sheet = Sheet(f"{BATCHED} episodes in one world, in {BATCHED} worlds, and in the reverse order", head, tuple(rows))
+    sheet = Table(head, rows, title=f"{BATCHED} episodes in one world, in {BATCHED} worlds, and in the reverse order")
     summary = f"{len(rows) - len(broken)} of {len(rows)} groups of episodes have the same bits in every batch and order"
     return CheckFinding("fail" if broken else "pass", summary, (sheet,), tuple(broken))
 
@@ -252,7 +248,7 @@ def official(context: Context) -> CheckFinding:
     a, b, p = pooled_score(ours), pooled_score(theirs), mcnemar(gained, lost)
     rows.append(("all", *a.cells(), *b.cells(), f"{p:.2g}"))
     head = ("task", "our weights", "95 % interval", "official weights", "95 % interval", "p")
-    sheet = Sheet("Experts through our TWIST2 weights and through the official ones", head, tuple(rows))
+    sheet = Table(head, rows, title="Experts through our TWIST2 weights and through the official ones")
     summary = f"experts succeed in {a.successes} of {a.episodes} episodes with our weights, "
     summary += f"in {b.successes} with the official ones (p = {p:.2g})"
     worse = p < DIFFERENT and a.rate < b.rate

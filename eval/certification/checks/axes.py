@@ -14,9 +14,10 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.checks.traces import first_difference, play, world_of
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, Sheet, score, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, score, skipped
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.interfaces import World
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.rules.rule_types import CylinderRange, ObjectRule, PoseRange
 
@@ -62,7 +63,7 @@ def visual(context: Context) -> CheckFinding:
         if picture.is_file():
             pictures.append(Picture(f"{task}: first picture of one episode, base and visual", picture))
     head = ("task", "episodes", "ticks compared", "first tick that differs", "mean change of the first picture [0-255]")
-    sheet = Sheet("Visual mode against base mode, the same seeds, the expert through " + tracker, head, tuple(rows))
+    sheet = Table(head, rows, title="Visual mode against base mode, the same seeds, the expert through " + tracker)
     summary = f"{len(broken)} deviations"
     if not broken:
         all_ticks = sum(int(row[2].replace(",", "")) for row in rows)
@@ -118,7 +119,7 @@ def semantic(context: Context) -> CheckFinding:
                 )
     head = ("task", "tracker", "base", "semantic", "95 % interval", "difference")
     summary = f"semantic variants change the experts' successes by at most {worst} of {context.episodes} episodes"
-    sheet = Sheet(f"Semantic against base mode; {allowed} of {context.episodes} are allowed", head, tuple(rows))
+    sheet = Table(head, rows, title=f"Semantic against base mode; {allowed} of {context.episodes} are allowed")
     outside += [f"{row[0]} through {row[1]}: solved in neither mode" for row in rows if row[2].startswith("0/")]
     note = (
         "An expert does not look: equal numbers say that variants change looks alone, not that policies cope with them."
@@ -200,7 +201,7 @@ def execution(context: Context) -> CheckFinding:
         "execution range",
         f"drawn in {DRAWN_SEEDS} episodes",
     )
-    sheet = Sheet("What execution mode moves; every other number of every episode has the same bits", head, tuple(rows))
+    sheet = Table(head, rows, title="What execution mode moves; every other number of every episode has the same bits")
     summary = f"execution mode moves {len(rows)} coordinates, the rules name these and no other"
     if broken:
         summary = f"{len(broken)} deviations from what the rules name"
@@ -212,13 +213,13 @@ def _range(bounds: tuple[float, float] | None) -> str:
 
 
 def _fills(low: float, high: float, bounds: tuple[float, float]) -> bool:
-    """Whether draws lie in a range and span it."""
+    """True if draws lie in a range and span it."""
     least, most = min(bounds), max(bounds)
     return least <= low and high <= most and high - low >= FILLED * (most - least)
 
 
 def _light_faults(task: str, rules: str, seeds: list[int]) -> list[str]:
-    """What is wrong with the lights: visual mode draws one for each episode, the other modes share one."""
+    """Faults of the lights: visual mode draws one for each episode, the other modes share one."""
     spec, rule_set = tasks.get(task), rule_sets.get(rules)
     lights = {
         mode: [spec.draw(seed, mode, rule_set).light for seed in seeds] for mode in ("base", "execution", "semantic")

@@ -15,7 +15,8 @@ import numpy as np
 
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, percent
+from arena_newton.eval.certification.finding import Check, CheckFinding
+from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.ball import BALL
 from arena_newton.physics.devices import resolve_engine
 from arena_newton.physics.engines import make_physics
@@ -445,13 +446,14 @@ def physics(context: Context) -> CheckFinding:
     head = ("task", "tracker", "engine", "closed form", "numbers", "largest deviation [%]", "of")
     summary = f"{count - len(wrong):,} of {count:,} measured numbers are what closed forms say"
     notes = (
-        f"Allowed are {percent(TOLERANCE, 1)} of gravity and weight, {percent(MASS_TOLERANCE[0], 1)} of a link's mass "
-        f"({percent(MASS_TOLERANCE[1], 1)} below {LIGHT:g} kg), {percent(DRIVE_TOLERANCE)} of stiffness and damping, "
-        f"{percent(FRICTION_TOLERANCE)} of friction, and {BOUNCE[0]:+g} to {BOUNCE[1]:+g} of the restitution.",
+        f"Allowed are {percent(TOLERANCE)} % of gravity and weight, {percent(MASS_TOLERANCE[0])} % of a link's mass "
+        f"({percent(MASS_TOLERANCE[1])} % below {LIGHT:g} kg), {percent(DRIVE_TOLERANCE, 0)} % of stiffness and "
+        f"damping, {percent(FRICTION_TOLERANCE, 0)} % of friction, and {BOUNCE[0]:+g} to {BOUNCE[1]:+g} of the "
+        "restitution.",
         "Masses come from the momentum that pushes give, stiffness from a held torque, damping from the impulse of a "
         "drive that comes to rest, friction from what slides: no number of the compiled model is read.",
     )
-    sheet = Sheet("Measured numbers against their closed forms", head, tuple(rows))
+    sheet = Table(head, rows, title="Measured numbers against their closed forms")
     return CheckFinding("fail" if wrong else "pass", summary, (sheet,), (*wrong, *notes))
 
 

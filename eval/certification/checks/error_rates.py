@@ -14,10 +14,11 @@ import numpy as np
 from scipy.stats import binom
 
 from arena_newton.cli.intervals import wilson
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding
 from arena_newton.eval.statistics.comparison import LEVEL, Contender, compare
 from arena_newton.eval.statistics.detectable import paired_power
 from arena_newton.eval.statistics.trainings import MATCHED_SPREAD, RateTerm, trained_contrast
+from arena_newton.pages.tables import Table, between, percent
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
@@ -51,14 +52,14 @@ SEED = 20260611
 
 @dataclass
 class EventTally:
-    """How often something happened."""
+    """Frequency of an event."""
 
     case: str
     what: str
     kind: str
     """`error`: at most the level; `power`: as high as it gets; `coverage`: about 95 % or more; `shown`: as it is."""
     expected: float | None = None
-    """What it must be, computed in closed form, where there is one."""
+    """Expected frequency in closed form, where there is one."""
     happened: int = 0
     times: int = 0
 
@@ -74,7 +75,7 @@ class EventTally:
 
     @property
     def holds(self) -> bool:
-        """Whether the count agrees with what it must be, up to chance."""
+        """True if the count agrees with the expected one, up to chance."""
         if self.kind == "error":
             return bool(self.happened <= binom.isf(SLACK, self.times, LEVEL))
         if self.kind == "coverage":
@@ -226,9 +227,8 @@ def _statistics(context: Context) -> CheckFinding:
     found = tallies(number)
     rows = []
     for tally in found:
-        low, high = wilson(tally.happened, tally.times)
-        expected = "" if tally.expected is None else f"{100 * tally.expected:.1f}"
-        figures = (f"{100 * tally.rate:.1f}", f"{100 * low:.1f} to {100 * high:.1f}", expected)
+        expected = "" if tally.expected is None else percent(tally.expected)
+        figures = (percent(tally.rate), between(wilson(tally.happened, tally.times), 1), expected)
         rows.append((tally.case, tally.what, tally.kind, *figures, "" if tally.holds else "fails"))
     errors = [tally.rate for tally in found if tally.kind == "error"]
     failed = [f"{tally.what} ({tally.case})" for tally in found if not tally.holds]
@@ -243,7 +243,7 @@ def _statistics(context: Context) -> CheckFinding:
     return CheckFinding(
         "fail" if failed else "pass",
         summary + (f"; {', '.join(failed)}" if failed else ""),
-        (Sheet(f"{EPISODES} episodes of each policy in {len(RATES)} tasks, level 5 %", head, tuple(rows)),),
+        (Table(head, rows, title=f"{EPISODES} episodes of each policy in {len(RATES)} tasks, level 5 %"),),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,20 +10,20 @@ from dataclasses import dataclass
 from arena_newton.cli.intervals import wilson
 from arena_newton.eval.certification.checks.labelled_failures import agreements, labelled_failures, labelled_sheets
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Verdict, skipped
 from arena_newton.eval.certification.stand_ins.bodies import Body
 from arena_newton.eval.certification.stand_ins.sabotage import SABOTAGES
 from arena_newton.eval.folders.failure_rules import stage_of
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.plan.interaction import INTERACTIONS
-from arena_newton.eval.reports.wording import markdown_table
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
 
 LEAST = 0.8
 """Least precision and recall of each stage."""
 QUICK_FAILURES = 2
-"""Episodes of each kind, task and tracker under --quick."""
+"""Episodes of each kind of failure and tracker under --quick, all in one task."""
 ENOUGH = 20
 """From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
@@ -50,11 +51,11 @@ class Confusion:
     """(scripted, said) → episodes."""
 
     def scripted(self, stage: FailureStage) -> int:
-        """How many failures of a stage were scripted."""
+        """Number of scripted failures of a stage."""
         return sum(self.counts.get((stage, said), 0) for said in FailureStage)
 
     def said(self, stage: FailureStage) -> int:
-        """How many failures are said to be of a stage."""
+        """Number of failures that the rules assign to a stage."""
         return sum(self.counts.get((scripted, stage), 0) for scripted in FailureStage)
 
     def recall(self, stage: FailureStage) -> float | None:
@@ -85,7 +86,7 @@ def failures(context: Context) -> CheckFinding:
     for task in tasks:
         for tracker in context.sample:
             for name, sabotage in SABOTAGES.items():
-                if task in sabotage.without:
+                if task in sabotage.without or context.options.quick and task != _quick_task(name):
                     continue
                 episodes = min(QUICK_FAILURES, context.episodes) if context.options.quick else None
                 cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT, episodes=episodes)
@@ -119,8 +120,14 @@ def failures(context: Context) -> CheckFinding:
     )
     sheets = (*(_sheet(task, matrix) for task, matrix in matrices.items()), *labelled_sheets(real))
     for sheet in sheets:
-        print(f"{sheet.title}\n\n{markdown_table(sheet.head, sheet.rows, left=1)}")
+        print(f"{sheet.title}\n\n{dataclasses.replace(sheet, align='lr').markdown()}")
     return CheckFinding(verdict, summary, sheets, (*(text for text, _ in below), *notes))
+
+
+def _quick_task(name: str) -> str | None:
+    """The task in which a kind of failure is played under --quick: the kinds go round the tasks."""
+    fit = [task for task in INTERACTIONS if task not in SABOTAGES[name].without]
+    return fit[list(SABOTAGES).index(name) % len(fit)] if fit else None
 
 
 def _below(matrix: Confusion) -> list[tuple[str, bool]]:
@@ -141,7 +148,7 @@ def _below(matrix: Confusion) -> list[tuple[str, bool]]:
     return found
 
 
-def _sheet(task: str, matrix: Confusion) -> Sheet:
+def _sheet(task: str, matrix: Confusion) -> Table:
     """The matrix: a row for each stage that was scripted."""
 
     def part(value: float | None) -> str:
@@ -157,7 +164,7 @@ def _sheet(task: str, matrix: Confusion) -> Sheet:
         for scripted in FailureStage
     ]
     head = ("scripted", *(f"said {stage}" for stage in FailureStage), "recall", "precision")
-    return Sheet(f"{task}: scripted failures (rows) and what the rules say (columns)", head, tuple(rows))
+    return Table(head, rows, title=f"{task}: scripted failures (rows) and what the rules say (columns)")
 
 
 BODIES: dict[str, Body] = {name: sabotage.body for name, sabotage in SABOTAGES.items()}

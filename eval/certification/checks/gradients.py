@@ -19,8 +19,9 @@ from arena_newton.differentiable import ReferenceState, RollingBall, ball_flight
 from arena_newton.differentiable.kernel_gradients import recorded
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, percent
+from arena_newton.eval.certification.finding import Check, CheckFinding
 from arena_newton.interfaces import Recorder, World
+from arena_newton.pages.tables import Table, percent
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.judge import Judge
@@ -35,8 +36,8 @@ __all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "agreement_of", "flight
 TOLERANCE = 0.0025
 """An exact slope may differ from its estimate by so much of it, or of the root mean square of all if that is larger."""
 KINK = TOLERANCE
-"""Where slopes within the step differ from the estimate by more, the function has a kink there, or is smaller than what
-float32 resolves: there is no one slope to compare with."""
+"""Largest difference between slopes within the step and the estimate. Beyond it the function has a kink there, or is
+smaller than float32 resolves: there is no one slope to compare with."""
 COMPARABLE = 0.1
 """Of the slopes at least so many must be comparable. Feet abreast are a kink of VisNavi's margin, for a start."""
 MOVED = (0, 1, 2, 3, 4, 5, 6, 7, 8)
@@ -74,11 +75,11 @@ class Slopes(NamedTuple):
     exact: torch.Tensor
     estimated: torch.Tensor
     spread: torch.Tensor
-    """How far slopes within the step are from the estimate."""
+    """Distance of slopes within the step from the estimate."""
 
 
 class Agreement(NamedTuple):
-    """How far exact slopes are from estimated ones."""
+    """Distance of exact slopes from estimated ones."""
 
     compared: int
     total: int
@@ -87,7 +88,7 @@ class Agreement(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether enough could be compared and all agree."""
+        """True if enough could be compared and all agree."""
         return self.compared >= COMPARABLE * self.total and self.error <= TOLERANCE
 
 
@@ -136,9 +137,9 @@ def gradients(context: Context) -> CheckFinding:
         f"The tolerance is {100 * TOLERANCE:g} % of the estimate, or of the root mean square of all of the same kind. "
         "Estimates are central differences; those of the conversion are played through the closed loop.",
         "Where slopes within the step differ by more than that there is a kink, or too little slope for float32: "
-        f"nothing is compared there, and {percent(1.0 - COMPARABLE)} of the slopes at most may be left out so.",
+        f"nothing is compared there, and {percent(1.0 - COMPARABLE, 0)} % of the slopes at most may be left out so.",
     )
-    sheet = Sheet("Exact slopes and central differences", head, tuple(rows))
+    sheet = Table(head, rows, title="Exact slopes and central differences")
     return CheckFinding("fail" if wrong else "pass", summary, (sheet,), (*wrong, *notes))
 
 
@@ -161,7 +162,7 @@ def _measured(context: Context, task: str, tracker: str) -> JsonObject:
 
 
 def _conversion(env: ArenaEnv, seed: int) -> Slopes:
-    """Where the reference is after some ticks of the closed loop, against the same by `reference_step`."""
+    """Slopes of the reference after some ticks of the closed loop, against the same by `reference_step`."""
     draws = torch.Generator().manual_seed(SEED)
     weights = [torch.randn(width, generator=draws).to(env.torch_device) for width in (3, 4)]
     stand = torch.tensor(STAND_ACTION, device=env.torch_device)

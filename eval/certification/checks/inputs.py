@@ -14,13 +14,14 @@ from arena_newton import policies, rule_sets, tasks
 from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import check_parts
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.text import counted
 from arena_newton.interfaces import Chunk, Observation, Tracker
+from arena_newton.pages.tables import Table
 from arena_newton.policies.base import Mask, Policy
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
@@ -70,8 +71,8 @@ def policy_inputs(context: Context) -> CheckFinding:
         wrong += [
             f"{task}: placements of {found['known']} of {found['episodes']} episodes follow from the seed"
         ] * bool(found["known"])
-    sheet = Sheet(
-        "What follows from the seeds that a policy is given", ("task", "numbers given", "placements"), tuple(rows)
+    sheet = Table(
+        ("task", "numbers given", "placements"), rows, title="What follows from the seeds that a policy is given"
     )
     summary = "a policy's seeds lead to no placement of their episodes, tried as seeds of episodes and of objects"
     note = (
@@ -177,7 +178,7 @@ def tracker_inputs(context: Context) -> CheckFinding:
     summary = f"{counted(len(rows), 'tracker')} gave the same targets again from command and state alone, bit for bit"
     summary = wrong[0] if wrong else summary
     return CheckFinding(
-        "fail" if wrong else "pass", summary, (Sheet("Trackers outside of a world", head, tuple(rows)),), tuple(wrong)
+        "fail" if wrong else "pass", summary, (Table(head, rows, title="Trackers outside of a world"),), tuple(wrong)
     )
 
 

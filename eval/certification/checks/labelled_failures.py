@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton.errors import InputError
-from arena_newton.eval.certification.finding import Sheet
 from arena_newton.eval.folders.failure_rules import stage_of
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.records.journal import EpisodeRecord, read_journal
+from arena_newton.pages.tables import Table
 
 __all__ = ["LABELLED", "JudgeAgreement", "LabelledFailure", "agreements", "labelled_failures", "labelled_sheets"]
 
@@ -90,15 +90,15 @@ def agreements(failures: Sequence[LabelledFailure]) -> list[JudgeAgreement]:
     return found
 
 
-def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Sheet]:
+def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Table]:
     """The agreements, and for each pair of judges what the one says of the failures of a stage that the other says."""
     rows = [
         (*one.judges, one.part, str(one.failures), str(one.same), f"{one.rate:.2f}") for one in agreements(failures)
     ]
-    sheets = [Sheet("real failures: agreement", ("judge", "and", "numbers", "failures", "same", "rate"), tuple(rows))]
+    sheets = [Table(("judge", "and", "numbers", "failures", "same", "rate"), rows, title="real failures: agreement")]
     for a, b in itertools.combinations(range(len(failures[0].said)), 2):
         counts = Counter((one.said[b], one.said[a]) for one in failures)
         table = tuple((str(row), *(str(counts[row, said]) for said in FailureStage)) for row in FailureStage)
         head = (JUDGES[b], *(f"said {stage}" for stage in FailureStage))
-        sheets.append(Sheet(f"real failures: {JUDGES[b]} (rows) and what {SAYS[a]} (columns)", head, table))
+        sheets.append(Table(head, table, title=f"real failures: {JUDGES[b]} (rows) and what {SAYS[a]} (columns)"))
     return sheets

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 
 from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet, Verdict, pooled_score, score
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Verdict, pooled_score, score
 from arena_newton.files.text import counted
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "GLIDES"]
 
@@ -40,7 +41,7 @@ SHOWN = 2
 """Film strips of each task that the page shows."""
 
 
-def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, tuple[Picture, ...]]:
+def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Table, tuple[Picture, ...]]:
     """Successes of the experts with a body by task, the table of them, and pictures of those successes."""
     rows, pictures, found = [], [], {}
     for tracker in context.sample:
@@ -56,7 +57,7 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Sheet, t
                 which = f"{task} through {tracker}, seed {record.group_seed} repeat {record.repeat}"
                 pictures.append(Picture(f"{which}, {context.bodies[body].title}: success at step {record.steps}", path))
     head = ("task", "tracker", "successes", "95 % interval", "falls", "mean progress", "with legs")
-    return found, Sheet(f"Experts with {context.bodies[body].title}", head, tuple(rows)), tuple(pictures)
+    return found, Table(head, rows, title=f"Experts with {context.bodies[body].title}"), tuple(pictures)
 
 
 def _broken(context: Context, body: str) -> tuple[str, ...]:

@@ -10,7 +10,8 @@ from scipy.optimize import least_squares
 
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, percent
+from arena_newton.eval.certification.finding import Check, CheckFinding
+from arena_newton.pages.tables import Table, percent
 from arena_newton.pictures.camera import CAMERA_PRIMS
 from arena_newton.pictures.settings import CameraConfig
 
@@ -56,8 +57,8 @@ def camera(context: Context) -> CheckFinding:
     expected = " x ".join(f"{2.0 * np.degrees(np.arctan(tangent)):.2f}°" for tangent in true)
     head = ("task", "pixels of the floor", "width [°]", "height [°]", "largest deviation [%]")
     summary = f"the head camera's lens is at most {100 * worst:.2f} % from that of {expected}"
-    note = f"Half width and half height at unit distance may deviate by {percent(TOLERANCE, 1)}."
-    sheet = Sheet("The lens, as the floor in the first picture shows it", head, tuple(rows))
+    note = f"Half width and half height at unit distance may deviate by {percent(TOLERANCE)} %."
+    sheet = Table(head, rows, title="The lens, as the floor in the first picture shows it")
     return CheckFinding("fail" if wrong else "pass", summary, (sheet,), (*wrong, note))
 
 

@@ -17,7 +17,7 @@ from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.checks.same_files import contents, digest
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, Verdict, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, Verdict, skipped
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
@@ -27,6 +27,7 @@ from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
 from arena_newton.files.own_processes import environment
 from arena_newton.files.text import counted, plain_text
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "RayRun", "compared", "play_by_ray", "plan_of"]
 
@@ -47,11 +48,11 @@ POLL = 0.2
 ENDING = 60.0
 """Time for the cluster to end when it is told to [s]."""
 COMMAND = (sys.executable, "-P", "-m", "arena_newton.eval")
-"""What plays by a cluster."""
+"""Command that plays on a cluster."""
 ACTOR = b"ray::EpisodeActor.play"
-"""How the title of a process begins while it plays for a cluster."""
+"""Title prefix of a process while it plays for a cluster."""
 REPLACED = "left: a process"
-"""What a run says of a process that it lost with the episodes that it played."""
+"""Message of a run about a process that it lost with the episodes that it played."""
 SHOWN = (CONFIG_FILE, JOURNAL_FILE, "results.json", "table.md", "table.csv", "report.md", "report.html")
 """Files that a page names; the others are counted."""
 NAMED = 20
@@ -61,7 +62,7 @@ BITS = "bits are promised on engine mujoco alone"
 
 @dataclass(frozen=True)
 class RayRun:
-    """How a run by a cluster went."""
+    """Outcome of a run on a cluster."""
 
     code: int | None
     """Its exit code; None where it had to be stopped."""
@@ -177,7 +178,7 @@ def compared(alone: Path, other: Path) -> JsonObject:
 
 
 def _judged(found: JsonObject, who: str) -> tuple[Verdict, str, tuple[str, ...]]:
-    """What compared digests say: the verdict, a sentence about those who played, and what is wrong."""
+    """Judgement of compared digests: the verdict, a sentence about those who played, and what is wrong."""
     files, episodes = cast("list[list[str]]", found["files"]), cast("int", found["episodes"])
     different = [name for name, one, two in files if one != two]
     wrong = tuple(f"{name} differs" for name in different[:NAMED])
@@ -188,7 +189,7 @@ def _judged(found: JsonObject, who: str) -> tuple[Verdict, str, tuple[str, ...]]
     return "fail" if wrong else "pass", said, wrong
 
 
-def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Sheet:
+def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Table:
     """The files that a reader knows, and the others together."""
     files = cast("list[list[str]]", found["files"])
     shown = [tuple(row) for row in files if row[0] in SHOWN]
@@ -198,7 +199,7 @@ def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Sheet:
         shown.append((f"{len(rest)} more, together", *sums))
     cells = f"{counted(cast('int', found['episodes']), 'episode')} of {' '.join(plan.task)} through"
     title = f"SHA-256 of the files of {cells} {' '.join(plan.tracker)}, without the times at which they were played"
-    return Sheet(title, ("file", "one process", other), tuple(shown))
+    return Table(("file", "one process", other), shown, title=title)
 
 
 def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:

@@ -14,7 +14,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.context import CertifyCell, Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, score, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, score, skipped
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.folders.run_folder import EPISODES
 from arena_newton.eval.plan.options import RunOptions
@@ -22,9 +22,10 @@ from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.identity import config_hash
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.records.schema import JsonObject
-from arena_newton.files.foreign import read_arrays
 from arena_newton.files.own_files import file_label
 from arena_newton.files.text import counted, plain_text
+from arena_newton.files.untrusted_files import read_arrays
+from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "SOLVED", "own_replay", "recorded"]
 
@@ -133,7 +134,7 @@ def recording(context: Context) -> CheckFinding:
     head = ("task", "tracker", "steps", "recorded rows", "recorded actions", "arrays compared with a replay's")
     summary = f"{len(rows) - len(wrong)} of {counted(len(rows), 'recording')} hold every tick, and a replay of the "
     summary += "actions gives the same arrays to the last bit"
-    sheet = Sheet(f"Recordings of an episode of at most {RECORDED_TICKS} ticks", head, tuple(rows))
+    sheet = Table(head, rows, title=f"Recordings of an episode of at most {RECORDED_TICKS} ticks")
     return CheckFinding("fail" if wrong else "pass", wrong[0] if wrong else summary, (sheet,), tuple(wrong))
 
 

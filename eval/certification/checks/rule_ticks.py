@@ -16,8 +16,9 @@ import numpy as np
 from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
 from arena_newton.interfaces import EpisodeResult, Recorder, World
+from arena_newton.pages.tables import Table
 from arena_newton.rollout import Rollout
 from arena_newton.tasks import boxing, double_desk, football, open_door, pp_box, vis_navi
 
@@ -193,7 +194,7 @@ def rules(context: Context) -> CheckFinding:
         wrong.append("no episode succeeded")
     head = ("task", "ticks in a row", "the rule holds at tick", "the episode succeeds at tick")
     summary = f"{len(rows) - len(wrong)} of {len(rows)} episodes succeed at the tick at which the paper's rule holds"
-    sheet = Sheet(f"The expert's episodes through {tracker}, judged again from their states", head, tuple(rows))
+    sheet = Table(head, rows, title=f"The expert's episodes through {tracker}, judged again from their states")
     return CheckFinding("fail" if wrong else "pass", summary, (sheet,), tuple(wrong))
 
 

@@ -21,7 +21,7 @@ HOW = ("options", "shard", "status")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """What every file of a results folder says, by its path.
+    """Contents of every file of a results folder, by its path.
 
     Times at which episodes were played are left out of the journal, whose lines are brought into the plan's order, and
     out of the episodes' own files; of config.json what says how the plan was played is left out.

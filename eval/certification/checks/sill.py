@@ -10,8 +10,9 @@ import numpy as np
 
 from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, percent, skipped
+from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
 from arena_newton.interfaces import Recorder, World
+from arena_newton.pages.tables import Table, percent
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.double_desk import SILL
 
@@ -68,7 +69,7 @@ def sill(context: Context) -> CheckFinding:
         touched = ticks[ticks > 0]
         middle = f"{np.median(touched):g}, {touched.max()}" if len(touched) else "-"
         rows.append((tracker, f"{free}/{len(ticks)}", f"{trod}/{len(ticks)}", middle, f"{force.max():.0f}"))
-        said.append(f"{tracker} crosses without a touch in {percent(free / len(ticks))}")
+        said.append(f"{tracker} crosses without a touch in {percent(free / len(ticks), 0)} %")
     head = (
         "tracker",
         "without a touch",
@@ -76,7 +77,7 @@ def sill(context: Context) -> CheckFinding:
         "ticks of the others: median, most",
         "most force [N]",
     )
-    sheet = Sheet("Touches of the sill in an episode", head, tuple(rows))
+    sheet = Table(head, rows, title="Touches of the sill in an episode")
     return CheckFinding("note", "; ".join(said), (sheet,), ("An episode that touches the sill counts as it ends.",))
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from arena_newton.eval.certification.checks.replays import SOLVED, own_replay, recorded
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Sheet, percent, pooled_score, score
+from arena_newton.eval.certification.finding import Check, CheckFinding, pooled_score, score
+from arena_newton.pages.tables import Table, percent
 from arena_newton.rule_sets import names as rule_sets
 
 __all__ = ["CHECKS"]
@@ -32,11 +33,11 @@ def solvable(context: Context) -> CheckFinding:
     summary += f"not by their actions alone: {gaps[0]}" if gaps else f"{replays} replays of their actions end the same"
     head = ("task", "tracker", "rules", "successes", "95 % interval", "falls", "mean steps of a success")
     notes = [f"Not by their actions alone, {gap}." for gap in gaps]
-    notes += [f"An expert is to reach {percent(SOLVED)} within its interval; below that are {', '.join(low)}."] * bool(
-        low
-    )
+    notes += [
+        f"An expert is to reach {percent(SOLVED, 0)} % within its interval; below that are {', '.join(low)}."
+    ] * bool(low)
     return CheckFinding(
-        "fail" if low or gaps else "pass", summary, (Sheet("Success of the experts", head, tuple(rows)),), tuple(notes)
+        "fail" if low or gaps else "pass", summary, (Table(head, rows, title="Success of the experts"),), tuple(notes)
     )
 
 

@@ -1,4 +1,4 @@
-"""What a swapped tracker costs: an expert's actions, recorded through one tracker, replayed through the other."""
+"""Cost of a swapped tracker: an expert's actions, recorded through one tracker, replayed through the other."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from arena_newton.eval.certification.finding import (
     Check,
     CheckFinding,
     Score,
-    Sheet,
     Verdict,
     discordant,
-    percent,
     pooled_score,
     score,
     skipped,
 )
 from arena_newton.eval.statistics.stats import mcnemar
+from arena_newton.pages.tables import Table, percent
 
 __all__ = ["CHECKS", "retention"]
 
@@ -30,7 +29,7 @@ SHOWN_BY = 0.05
 
 def retention(own: Score, other: Score) -> str:
     """Ret, the fraction of the success rate that the other tracker keeps (paper, cross-GMT)."""
-    return percent(other.rate / own.rate) if own.successes else "-"
+    return f"{percent(other.rate / own.rate, 0)} %" if own.successes else "-"
 
 
 def swap(context: Context) -> CheckFinding:
@@ -71,7 +70,7 @@ def swap(context: Context) -> CheckFinding:
         few = few or a.episodes < ENOUGH
         kept.append(f"{source} to {target} keeps {retention(a, b)} (p = {p:.2g})")
     head = ("task", "recorded through", "replayed through", "recorded", "replayed", "95 % interval", "falls")
-    sheet = Sheet("The swap", (*head, "Delta [points]", "Ret"), tuple(rows))
+    sheet = Table((*head, "Delta [points]", "Ret"), rows, title="The swap")
     notes.append(
         "No policy is in the loop of the replay: the same 40 numbers per tick meet the same episodes, and only what "
         "executes them differs. Delta is the difference of the success rates, Ret their quotient, p that of McNemar's "

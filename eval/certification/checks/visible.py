@@ -12,10 +12,11 @@ from PIL import Image
 from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
-from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Sheet
+from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.kernels.tick import RUNNING
+from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.rules import seeding
 
@@ -79,8 +80,8 @@ def visible(context: Context) -> CheckFinding:
         "latest",
         "never",
     )
-    sheet = Sheet(
-        f"The head camera's picture of the expert's episodes, looked at every {EVERY} ticks", head, tuple(rows)
+    sheet = Table(
+        head, rows, title=f"The head camera's picture of the expert's episodes, looked at every {EVERY} ticks"
     )
     summary = f"the target is in the first picture of {shown} of {total} episodes"
     summary += "" if missing else ", and is seen in all of them"
@@ -144,7 +145,7 @@ def first_sights(env: World, seeds: list[int], prim: str) -> tuple[list[int | No
 
 
 def _shapes_of(env: World, prim: str) -> torch.Tensor:
-    """Which shapes of the model belong to a prim, bool, shape [shapes]."""
+    """Shapes of the model that belong to a prim, bool, shape [shapes]."""
     labels = env.scene.model.shape_label
     return torch.tensor([f"{label}/".startswith(f"{prim}/") for label in labels], device=env.torch_device)
 

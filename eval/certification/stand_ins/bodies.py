@@ -47,7 +47,7 @@ GLIDE_HEIGHT = SPAWN_HEIGHT
 """Height at which the gliding base holds the pelvis [m]: the spawn height. A robot that stands has its pelvis 2 cm
 lower, so straight down from it the soles hang 2 cm clear of the floor."""
 GLIDE_RATE = 10.0
-"""How fast the gliding base closes a gap to its target: velocity [m/s, rad/s] per gap [m, rad]."""
+"""Speed at which the gliding base closes a gap to its target: velocity [m/s, rad/s] per gap [m, rad]."""
 GLIDE_ACCELERATION = 10.0
 """Largest acceleration of the base [m/s²]: 340 N on the whole robot, as much as its own weight. So hard does it push
 against what blocks it."""
@@ -201,7 +201,7 @@ class GlidingBase:
         most = [GLIDE_ACCELERATION] * 3 + [TIP_ACCELERATION] * 2 + [TURN_ACCELERATION]
         self._most = TICK * torch.tensor(most, device=env.torch_device)
         self.target = torch.zeros(env.worlds, 3, device=env.torch_device)
-        """Where the base is to be: x, y [m] and yaw [rad], shape [worlds, 3]."""
+        """Target of the base: x, y [m] and yaw [rad], shape [worlds, 3]."""
 
     def begin(self, mask: torch.Tensor) -> None:
         """The base of the worlds in `mask` (bool, shape [worlds]) is to stay where the robot is now."""
@@ -245,7 +245,7 @@ class GlidingEnv(ArenaEnv):
 
     @functools.cached_property
     def base(self) -> GlidingBase:
-        """What carries the robot."""
+        """Base that carries the robot."""
         return GlidingBase(self)
 
     def reset(
@@ -280,7 +280,7 @@ class Body:
 
     name: str
     title: str
-    """What it is, in words."""
+    """Title in words."""
     equip: Callable[[Factories], Factories]
     """Makes what a run is built with from what it is built with for the whole robot."""
 

@@ -1,4 +1,4 @@
-"""How the saboteurs of `sabotage` fail in tasks that are done with the hands: a door, a box, a hammer.
+"""Failures of the saboteurs of `sabotage` in tasks that are done with the hands: a door, a box, a hammer.
 
 One entry per task: where a blind robot believes the object, how a clumsy one touches it without effect, how weak legs
 must be. Nothing that is not in an entry differs from the other tasks.
@@ -32,13 +32,13 @@ class Handling:
     opens: tuple[float, float] | None = None
     """Ticks after the first touch at which clumsy hands let go, drawn between these. None: they never do."""
     apart: float = 0.0
-    """How far each hand goes outwards for that [m]; fingers open in any case."""
+    """Distance that each hand goes outwards for that [m]; fingers open in any case."""
     halts: float = 0.0
     """Distance at which a robot that does not reach for the object halts before it, its arms hanging [m]; 0 where no
     such robot is played."""
 
     def elsewhere(self, style: Style, distance: tuple[float, float]) -> Tensor:
-        """Where blind robots believe it minus where it is, so far away [m], shape [worlds, 3]."""
+        """Error of blind robots about its position, of this length [m], shape [worlds, 3]."""
         far, turn = style.uniform("far", *distance), style.uniform("to", *map(math.radians, self.blind))
         return torch.stack([far * torch.cos(turn), far * torch.sin(turn), torch.zeros_like(far)], dim=1)
 

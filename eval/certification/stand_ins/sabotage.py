@@ -68,14 +68,14 @@ OFF_CENTRE = (0.18, 0.22)
 AWAY = 1.5
 """Distance that an object is moved by when it is touched first [m]."""
 BEFORE_BALL = (1.05, 1.30)
-"""How far before the ball a robot that aims badly kicks the air, drawn between these [m]: it comes to stand up to 0.6 m
-past the place where it believes the ball."""
+"""Distances before the ball at which a robot that aims badly kicks the air, one drawn per episode [m]: it comes to a
+stand up to 0.6 m past the position where it believes the ball."""
 BESIDE_GOAL = (4.5, 5.5)
-"""How far to a side of the goal's middle a robot that kicks badly believes it, drawn between these [m]: the posts are
-at 2.5 m, and it aims up to 0.8 m inwards."""
+"""Distances to a side of the goal's middle at which a robot that kicks badly believes it, one drawn per episode [m]:
+the posts are at 2.5 m, and it aims up to 0.8 m inwards."""
 BESIDE_SEAT = (0.90, 1.20)
-"""How far beyond its place on the sofa a robot that aims badly turns its back, drawn between these [m]: beside the
-armrest, which begins 0.5 m beyond that place."""
+"""Distances beyond its position on the sofa at which a robot that aims badly turns its back, one drawn per episode [m]:
+next to the armrest, which begins 0.5 m beyond that position."""
 HALTS = (0.36, 0.30)
 """Distance to a ball at which a robot that does not kick halts, and over how many before that it slows down [m]."""
 SLOWEST = 0.25
@@ -99,7 +99,7 @@ class MisledSight(Sight):
         self.robot_off, self.hands_off, self.object_off, self.goal_off = (
             torch.zeros(worlds, 3, device=self.device) for _ in range(4)
         )
-        """Where robot, hands, object and goal are believed minus where they are [m], shape [worlds, 3]."""
+        """Errors of the believed positions of robot, hands, object and goal [m], shape [worlds, 3]."""
         self._robot = frozenset(int(body) for body in env.scene.robot.bodies)
         self._object = _bodies_of(env, self.view.box.body_id)
 
@@ -209,11 +209,11 @@ class MisledExpert(ExpertPolicy):
         """Displace what is believed, from the truth of this tick."""
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
-        """What is commanded in place of the expert's command."""
+        """Command in place of the expert's command."""
         return command
 
     def spoil(self, actions: Tensor | np.ndarray) -> Tensor | np.ndarray:
-        """What is done in place of the expert's actions, shape [worlds, n, 40]."""
+        """Actions in place of the expert's actions, shape [worlds, n, 40]."""
         return actions
 
 
@@ -416,19 +416,19 @@ class RelocatingEnv(ArenaEnv):
 
     @functools.cached_property
     def view(self) -> InteractionView:
-        """Where the robot is."""
+        """View that measures the robot's position."""
         return InteractionView(self)
 
     @functools.cached_property
     def relocated(self) -> Tensor:
-        """How far the object was moved [m], shape [worlds, 3]."""
+        """Displacement of the object [m], shape [worlds, 3]."""
         if not isinstance(self.physics, MujocoPhysics):
             raise InputError("--checks failures: an object is moved on engine mujoco alone; choose --engine mujoco")
         return torch.zeros(self.worlds, 3, device=self.torch_device)
 
     @property
     def movable(self) -> bool:
-        """Whether the object can be moved: what is a part of the room cannot."""
+        """True if the object can be moved: a part of the room cannot."""
         return self.view.box.body_id != 0
 
     @functools.cached_property
@@ -438,7 +438,7 @@ class RelocatingEnv(ArenaEnv):
 
     @functools.cached_property
     def free(self) -> bool:
-        """Whether the object is a free body."""
+        """True if the object is a free body."""
         return int(self.scene.mj_model.body_mocapid[self.root]) < 0
 
     def reset(
@@ -506,7 +506,7 @@ class Sabotage:
     stage: FailureStage
     """The stage at which it fails."""
     body: Body
-    """What a task is played with."""
+    """Body that plays the tasks."""
     without: tuple[str, ...] = ()
     """Tasks in which there is no such failure."""
 

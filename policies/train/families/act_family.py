@@ -9,9 +9,9 @@ import torch
 from torch import nn
 from torchvision.ops.misc import FrozenBatchNorm2d
 
-from arena_newton.policies.lerobot.resnet_weights import check_resnet, load_resnet
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import ACTION, FRONT, PAD, TrainableModel, new_policy, prepared
+from arena_newton.policies.train.families.resnet_weights import check_resnet, load_resnet
 from arena_newton.policies.train.frames.feature_scaling import Stats
 
 __all__ = ["ActModel", "build", "check_weights", "with_batch_norm"]

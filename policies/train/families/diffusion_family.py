@@ -9,7 +9,6 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import nn
 
-from arena_newton.policies.lerobot.resnet_weights import check_resnet, load_resnet
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
@@ -18,6 +17,7 @@ from arena_newton.policies.train.families.policy_model import (
     prepared,
     with_time_axis,
 )
+from arena_newton.policies.train.families.resnet_weights import check_resnet, load_resnet
 from arena_newton.policies.train.frames.feature_scaling import Stats
 
 __all__ = ["DiffusionModel", "build", "check_weights"]

@@ -22,7 +22,7 @@ from arena_newton.policies.train.frames.feature_scaling import Stats
 __all__ = ["Model", "build", "check_weights"]
 
 Model = TrainableModel
-"""What `build` returns."""
+"""Model that `build` returns."""
 
 _MODULES = {family: f"arena_newton.policies.train.families.{family}_family" for family in FAMILIES}
 

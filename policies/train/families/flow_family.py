@@ -27,7 +27,6 @@ from arena_newton.policies.lerobot.encoder_sources import (
     tokenizer_from,
     write_clip,
 )
-from arena_newton.policies.lerobot.pretrained_weights import weights_folder
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
@@ -37,6 +36,7 @@ from arena_newton.policies.train.families.policy_model import (
     prepared,
     with_time_axis,
 )
+from arena_newton.policies.train.families.pretrained_weights import weights_folder
 from arena_newton.policies.train.families.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 from arena_newton.policies.train.frames.feature_scaling import Stats
 

@@ -32,12 +32,6 @@ from arena_newton.policies.lerobot.encoder_sources import (
     read_tokenizer,
     tokenizer_from,
 )
-from arena_newton.policies.lerobot.pretrained_weights import (
-    check_safetensors,
-    checksum,
-    read_safetensors,
-    weights_folder,
-)
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
@@ -47,6 +41,12 @@ from arena_newton.policies.train.families.policy_model import (
     finished,
     new_policy,
     prepared,
+)
+from arena_newton.policies.train.families.pretrained_weights import (
+    check_safetensors,
+    checksum,
+    read_safetensors,
+    weights_folder,
 )
 from arena_newton.policies.train.families.prompts import MASK, TOKENS, set_tokenizer_name, tokenized
 from arena_newton.policies.train.frames.feature_scaling import Stats
@@ -171,7 +171,7 @@ class Pi05Model(TrainableModel):
 
 
 def prompts(tasks: Sequence[str], state: torch.Tensor) -> list[str]:
-    """What pi0.5 reads, from instructions and normalised states [B, 64] (`Pi05PrepareStateTokenizerProcessorStep`)."""
+    """Prompts of pi0.5 from instructions and normalised states [B, 64] (`Pi05PrepareStateTokenizerProcessorStep`)."""
     edges = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
     bins = np.digitize(state.reshape(len(tasks), -1).float().cpu().numpy(), bins=edges) - 1
     texts = [task.strip().replace("_", " ").replace("\n", " ") for task in tasks]

@@ -1,4 +1,4 @@
-"""What every family of policies has in common: features, processors, groups of parameters, saving."""
+"""Base of every family of policies: features, processors, groups of parameters, saving."""
 
 from __future__ import annotations
 
@@ -100,11 +100,11 @@ class TrainableModel(abc.ABC):
     """A policy of LeRobot with what training it needs."""
 
     capturable: ClassVar[bool] = True
-    """Whether `loss` and its backward pass can be captured in a CUDA graph."""
+    """True if `loss` and its backward pass can be captured in a CUDA graph."""
     compilable: ClassVar[bool] = True
-    """Whether `compiled_parts` can be compiled."""
+    """True if `compiled_parts` can be compiled."""
     reads_task: ClassVar[bool] = False
-    """Whether the policy reads the task's instruction."""
+    """True if the policy reads the task's instruction."""
 
     def __init__(self, recipe: TrainingRecipe, stats: Stats, device: torch.device, policy: PreTrainedPolicy):
         """With processors that are made from the statistics.
@@ -164,7 +164,7 @@ class TrainableModel(abc.ABC):
         return {}
 
     def tokens(self, tasks: Sequence[str], state: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-        """What a batch needs in place of `task`; empty for families that read no instruction.
+        """Inputs of a batch in place of `task`; empty for families that read no instruction.
 
         Args:
             tasks: An instruction per row.
@@ -189,7 +189,7 @@ class TrainableModel(abc.ABC):
         return (errors * valid).sum() / (valid.sum() * errors.shape[-1]).clamp_min(1)
 
     def is_backbone(self, parameter: str) -> bool:
-        """Whether a parameter, by name, belongs to the vision encoder and has the recipe's `lr_backbone`."""
+        """True if a parameter, by name, belongs to the vision encoder and has the recipe's `lr_backbone`."""
         return False
 
     def state_dict(self) -> dict[str, torch.Tensor]:

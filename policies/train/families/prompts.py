@@ -1,4 +1,4 @@
-"""What a policy reads: instructions as tokens, none of them cut."""
+"""Prompts of a policy: instructions as tokens, none of them cut."""
 
 from __future__ import annotations
 

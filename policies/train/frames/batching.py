@@ -1,4 +1,4 @@
-"""Which rows a step trains on, a pure function of seed and step, and the batch that is made of them on the device."""
+"""Rows of a training step, a pure function of seed and step, and the batch that is made of them on the device."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class BatchMaker:
     tokens: Mapping[str, torch.Tensor] | None = None
     """Tokens of language of every instruction, or of every row: key → shape [instructions or rows, L]."""
     tokens_per_row: bool = False
-    """Whether the tokens are those of rows."""
+    """True if the tokens are those of rows."""
 
     def __post_init__(self) -> None:
         """Make the constants."""

@@ -279,7 +279,7 @@ class DecoderPool:
                 self.close()  # what they would still say belongs to no later decoding
 
     def _heard(self, worker: _Worker, films: Sequence[EpisodeFilm]) -> Iterator[dict[str, object]]:
-        """What a process has said.
+        """Messages of a process.
 
         Raises:
             ArenaError: It ended.
@@ -331,7 +331,7 @@ def _tell(worker: _Worker, message: dict[str, object]) -> None:
 
 
 def _how(process: subprocess.Popen[bytes]) -> str:
-    """How a process ended, in words."""
+    """Ending of a process, in words."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(DEATH_PATIENCE)
     code = process.returncode

@@ -113,7 +113,7 @@ def mapped(fd: int, process: int, slot: int) -> mmap.mmap:
 
 
 class _Decoding:
-    """What the process does."""
+    """Work of the process."""
 
     def __init__(self, height: int, width: int, memory: mmap.mmap, slot: int):
         self._height, self._width = height, width

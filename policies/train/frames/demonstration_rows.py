@@ -1,4 +1,4 @@
-"""What a training reads of datasets besides pictures: states, actions of one protocol, tasks, statistics."""
+"""Rows of datasets that a training reads besides pictures: states, actions of one protocol, tasks, statistics."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class DatasetRows:
 
     @property
     def described(self) -> dict[str, object]:
-        """What a checkpoint says of it."""
+        """Description of it in a checkpoint."""
         return {
             "name": self.root.resolve().name,
             "hash": self.hash,
@@ -197,7 +197,7 @@ def converted(actions: np.ndarray, given: str, wanted: str) -> np.ndarray:
 
 
 def picture_statistics(files: DatasetFiles, camera: str) -> dict[str, np.ndarray]:
-    """What `meta/stats.json` says of the pictures, and their number.
+    """Picture statistics in `meta/stats.json`, and the number of pictures.
 
     Raises:
         InputError: It says nothing usable.

@@ -1,4 +1,4 @@
-"""How numbers of the data become inputs of a network: a factor and an offset each, the same as LeRobot's processors."""
+"""Scaling of the data's numbers for a network: a factor and an offset each, the same as LeRobot's processors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 """Standard deviation of each."""
 EPS = 1e-8
-"""What LeRobot adds to a standard deviation (`NormalizerProcessorStep.eps`)."""
+"""Addend of LeRobot to a standard deviation (`NormalizerProcessorStep.eps`)."""
 _RANGES = (("min", "max"), ("q01", "q99"), ("q10", "q90"))
 _PICTURES = "observation.images."
 

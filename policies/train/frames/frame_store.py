@@ -59,7 +59,7 @@ class FrameStore:
     lengths: tuple[int, ...]
     """Rows of each episode."""
     held: tuple[bool, ...]
-    """Whether an episode is held out."""
+    """True for an episode that is held out."""
     top: int
     """Black rows above [px]."""
     bottom: int
@@ -67,7 +67,7 @@ class FrameStore:
 
     @property
     def device(self) -> torch.device:
-        """Where the rows are."""
+        """Device of the rows."""
         return self.pictures.device
 
     @property
@@ -193,7 +193,7 @@ def load_frames(
 
 
 def episode_films(datasets: Sequence[DatasetRows]) -> list[EpisodeFilm]:
-    """Where the pictures of all episodes are, and their rows."""
+    """Video files and time ranges of all episodes' pictures, and their rows."""
     found: list[EpisodeFilm] = []
     row = 0
     for dataset in datasets:

@@ -36,10 +36,10 @@ _GREY = (0.2989, 0.587, 0.114)
 
 @dataclass(frozen=True)
 class TransformDraw:
-    """What is done to each sample of a batch."""
+    """Transforms drawn for each sample of a batch."""
 
     chosen: torch.Tensor
-    """Which transforms, bool, shape [B, 6], in the order of `RANGES`."""
+    """Chosen transforms, bool, shape [B, 6], in the order of `RANGES`."""
     values: torch.Tensor
     """Their parameters, float32, shape [B, 6]."""
     moved: torch.Tensor

@@ -31,12 +31,12 @@ import arena_newton  # noqa: E402
 from arena_newton import trackers  # noqa: E402
 from arena_newton.data.__main__ import main  # noqa: E402
 from arena_newton.data.datasets import lerobot_dataset  # noqa: E402
-from arena_newton.data.datasets.layouts import LAYOUTS  # noqa: E402
 from arena_newton.data.datasets.lerobot_dataset import FinishedVideos, choose, write_dataset  # noqa: E402
 from arena_newton.data.readers.frame_reader import OpenVideo  # noqa: E402
 from arena_newton.data.readers.label_protocols import encode_v4  # noqa: E402
 from arena_newton.data.recording.demonstration import DemonstrationRecorder  # noqa: E402
 from arena_newton.data.recording.episode import EpisodeFile, episode_files  # noqa: E402
+from arena_newton.data.recording.layouts import LAYOUTS  # noqa: E402
 from arena_newton.env import ArenaEnv  # noqa: E402
 from arena_newton.errors import ArenaError, InputError  # noqa: E402
 from arena_newton.pictures.settings import CameraConfig  # noqa: E402

@@ -14,10 +14,9 @@ import pytest
 pytest.importorskip("pyarrow")
 
 from arena_newton.data import Frames  # noqa: E402
-from arena_newton.data.checks.episode_copies import copy_episodes  # noqa: E402
-from arena_newton.data.datasets.layouts import LAYOUTS  # noqa: E402
 from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset  # noqa: E402
 from arena_newton.data.recording.episode import EpisodeFile, episode_files  # noqa: E402
+from arena_newton.data.recording.layouts import LAYOUTS  # noqa: E402
 from arena_newton.errors import InputError  # noqa: E402
 from tests.arena_newton.data import made_episodes  # noqa: E402
 from tests.arena_newton.data.consistent import ROWS, consistent_episode  # noqa: E402
@@ -144,56 +143,3 @@ def test_it_needs_no_lerobot():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout == "light\n", done.stderr
-
-
-def test_bench_measures_both_readers_the_build_and_the_check(made, tmp_path, capsys):
-    """`data bench` prints reads of LeRobot and of ours, and the time of build and check; a wrong flag is named."""
-    from arena_newton.data.__main__ import main
-
-    root, _ = made
-    consistent_episode(tmp_path / "r", repeat=0)
-    before = sorted(root.parent.iterdir())
-    code = main(["bench", str(root), "--reads", "20", "--recordings", str(tmp_path / "r")])
-    lines = capsys.readouterr().out.splitlines()
-    names = ["random reads", "random reads", "building", "verifying"]
-    assert [line.split(",")[0] for line in lines[:4]] == names
-    assert "data.Frames, 224x224, 3 episodes, 2 cameras" in lines[1] and "1 episode, 40 rows" in lines[2]
-    assert code == int(any("MISS" in line for line in lines))
-    assert sorted(root.parent.iterdir()) == before, "what was built is removed"
-    for flags, words in {
-        ("--reads", "0"): "--reads 0",
-        ("--made", "-1"): "--made -1",
-        ("--made", "2", "--recordings", str(root)): "--made: the folder holds",
-        ("--made", "2"): "holds no episodes",
-    }.items():
-        assert main(["bench", str(root), *flags]) == 2
-        assert words in capsys.readouterr().err
-
-
-def test_bench_makes_a_set_of_any_size(tmp_path, capsys, monkeypatch):
-    """Copies under other seeds make a sound set of the size asked for; nothing of it is left, also not in a cache."""
-    import datasets
-
-    from arena_newton.data.__main__ import main
-
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
-    for repeat in range(2):
-        consistent_episode(tmp_path / "r", ROWS + repeat, repeat=repeat)
-    main(["bench", str(tmp_path / "r"), "--reads", "20", "--made", "5"])
-    lines = capsys.readouterr().out.splitlines()
-    assert "5 episodes, 1 camera" in lines[1] and "building, 32x32, 5 episodes, 202 rows" in lines[2]
-    assert "verifying, 32x32, 5 episodes, 202 rows" in lines[3]
-    assert [path.name for path in tmp_path.iterdir()] == ["r"]
-
-
-def test_copies_are_recordings(tmp_path):
-    """Each copy has a seed of its own and the arrays and pictures of its source."""
-    for repeat in range(2):
-        consistent_episode(tmp_path / "r", ROWS + repeat, repeat=repeat)
-    sources = [EpisodeFile(file) for file in episode_files([tmp_path / "r"])]
-    copies = [EpisodeFile(file) for file in copy_episodes(sources, tmp_path / "c", 5)]
-    assert len({copy.integer("arena_episode_seed") for copy in copies}) == 5
-    for number, copy in enumerate(copies):
-        source = sources[number % 2]
-        np.testing.assert_array_equal(copy.action, source.action)
-        assert copy.video("front").read_bytes() == source.video("front").read_bytes()

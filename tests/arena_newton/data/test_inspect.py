@@ -136,7 +136,8 @@ def test_the_page_needs_nothing_else(folder, tmp_path):
     page = Outside()
     page.feed(text)
     assert page.found == []
-    assert "default-src 'none'; img-src data:; style-src 'sha256-" in html.unescape(text)
+    policy = "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; style-src 'sha256-"
+    assert policy in html.unescape(text)
     assert len(page.images) == 2 and text.count("<section") == 2
     assert text.count("repeat0005") >= 2 and text.count("<tr") >= 9
     assert ">approach</span>" in text and ">strike</span>" in text

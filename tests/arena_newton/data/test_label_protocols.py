@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.data.datasets.layouts import described_protocol
 from arena_newton.data.readers.label_protocols import (
     LABELS,
     V4,
@@ -14,6 +13,7 @@ from arena_newton.data.readers.label_protocols import (
     encode_v4,
     protocol,
 )
+from arena_newton.data.recording.layouts import described_protocol
 from arena_newton.errors import InputError
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, STAND_ACTION
 from arena_newton.robot.g1 import TICK

@@ -22,10 +22,10 @@ from arena_newton.data.checks import video_checks  # noqa: E402
 from arena_newton.data.checks.verification import rebuilt_state, verify  # noqa: E402
 from arena_newton.data.checks.video_checks import CameraVideos, DatasetMismatch, check_videos  # noqa: E402
 from arena_newton.data.datasets.data_options import VerifyOptions  # noqa: E402
-from arena_newton.data.datasets.layouts import LAYOUTS  # noqa: E402
 from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset  # noqa: E402
 from arena_newton.data.readers.dataset_files import DatasetFiles  # noqa: E402
 from arena_newton.data.recording.episode import EpisodeFile, episode_files  # noqa: E402
+from arena_newton.data.recording.layouts import LAYOUTS  # noqa: E402
 from arena_newton.errors import ArenaError  # noqa: E402
 from arena_newton.pictures.video import VideoWriter  # noqa: E402
 from tests.arena_newton.data import made_episodes  # noqa: E402

@@ -18,8 +18,8 @@ import zmq
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
-from arena_newton.data.datasets.layouts import state_names
 from arena_newton.data.readers.label_protocols import action_names
+from arena_newton.data.recording.layouts import state_names
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies import Chunk, Observation, Policy, world_mask
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec

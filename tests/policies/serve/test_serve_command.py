@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import os
 import shutil
 import signal
 import socket
@@ -118,7 +117,6 @@ def test_the_command_serves_until_it_is_interrupted(stop, protocol):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     try:
         first, second = process.stdout.readline(), process.stdout.readline()

@@ -126,6 +126,18 @@ def test_sockets_survive_damaged_frames(served, protocol):
         client.close()
 
 
+def test_a_client_that_sends_on_after_a_failure_is_let_go(served):
+    """Frames that follow a failed request do not keep its connection: it ends before the library gives up waiting."""
+    one = served(Remembers(), "openpi")
+    client = one.socket()
+    client.recv(timeout=10)
+    for _ in range(3):
+        client.send(b"\xc1")
+    assert isinstance(client.recv(timeout=10), str)
+    with pytest.raises(ConnectionClosed):
+        client.recv(timeout=6)
+
+
 def test_http_survives_damaged_bodies(served):
     """Damaged bodies and heads are answered with a status and one line of JSON, or hung up on; the server goes on."""
     one = served(Remembers(sees=True), "arena", max_wait=0.0)

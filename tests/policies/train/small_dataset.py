@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from arena_newton.data.datasets.layouts import LAYOUTS
 from arena_newton.data.datasets.lerobot_dataset import choose, write_dataset
 from arena_newton.data.recording.episode import episode_files
+from arena_newton.data.recording.layouts import LAYOUTS
 from tests.arena_newton.data import made_episodes
 from tests.arena_newton.data.consistent import consistent_episode
 

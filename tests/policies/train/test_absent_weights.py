@@ -8,11 +8,10 @@ from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot import pretrained_weights
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train import measured_training, training
-from arena_newton.policies.train.families import families
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
+from arena_newton.policies.train import training
+from arena_newton.policies.train.families import families, pretrained_weights
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from tests.policies.train.small_dataset import info
 
 FAMILIES = ("act", "diffusion", "flow", "pi05")
@@ -45,13 +44,6 @@ def test_no_picture_is_decoded_for_a_training_that_cannot_begin(dataset, tmp_pat
         training.train(flags)
     assert NAMES[family] in str(error.value) or "safetensors" in str(error.value)
     assert not (tmp_path / "out").exists() and info(dataset)
-
-
-def test_a_bench_makes_no_pictures_first(tmp_path, monkeypatch):
-    """A measured training looks for its weights before it makes up pictures."""
-    monkeypatch.setattr(measured_training, "made_frames", lambda *a, **k: pytest.fail("pictures were made"))
-    with pytest.raises(InputError, match="no such folder"):
-        measured_training.measured(TrainingBenchOptions(recipe="small", device="cpu", weights=str(tmp_path / "absent")))
 
 
 @pytest.mark.parametrize("family", ["act", "diffusion"])

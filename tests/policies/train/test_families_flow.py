@@ -7,11 +7,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot import pretrained_weights
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.lerobot.encoder_sources import checkpoint_encoders, made_clip, made_tokenizer, write_clip
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train.families import families
+from arena_newton.policies.train.families import families, pretrained_weights
 from arena_newton.policies.train.families.policy_model import with_time_axis
 from tests.policies.train.made_stats import made_batch, made_stats
 from tests.policies.train.stock_lerobot import opened, raw_observation

@@ -9,11 +9,10 @@ from lerobot.processor import TransitionKey
 from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
-from arena_newton.policies.lerobot import pretrained_weights
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.lerobot.encoder_sources import GEMMA_FILE, checkpoint_encoders
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train.families import families
+from arena_newton.policies.train.families import families, pretrained_weights
 from arena_newton.policies.train.families.pi05_family import PADDED, load_base, prompts
 from tests.fuzz.mutants import damaged
 from tests.policies.train.made_stats import made_batch, made_stats

@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import io
 import json
 import os
 import random
@@ -26,9 +25,7 @@ from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import (
-    measured_training,
     training,
-    training_bench,
     training_log,
     training_loop,
     training_state,
@@ -37,7 +34,7 @@ from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.frame_store import made_frames
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, TrainingBenchOptions
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import chosen_recipe, train
 from tests.fuzz.mutants import damaged
@@ -48,20 +45,10 @@ from tests.policies.train.small_dataset import info, make_dataset, padded
 STEPS = 8
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Work this small is slower in two threads, on a busy machine by far."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(autouse=True)
 def narrow(monkeypatch):
     """A vision encoder that trains in milliseconds."""
     narrow_network.install(monkeypatch.setattr)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
 def options(data, out, **changes):
@@ -553,28 +540,6 @@ def test_damaged_states_are_refused_by_name(whole, tmp_path, monkeypatch):
         file.write_bytes(sound)
         training_state.restore(trainer, checkpoint)
     assert refused > 100
-
-
-def test_the_bench_measures_trainings_side_by_side(monkeypatch):
-    """Each training is a process that begins when all are ready and answers a figure; a failed one is an error."""
-    program = Path(__file__).with_name("made_measurement.py")
-    monkeypatch.setattr(training_bench, "_command", lambda flags: [sys.executable, str(program), flags])
-    given = TrainingBenchOptions(recipe="small", device="cpu", trainings=(1, 3), seconds=0.1)
-    found = training_bench.bench(given)
-    assert [(count, len(figures)) for count, figures in found] == [(1, 1), (3, 3)]
-    assert all(figure.steps_per_s == 5.0 for _, figures in found for figure in figures)
-    for frames, words in ((666, "2 at once: no memory"), (667, "2 at once: a training ended with code 3")):
-        with pytest.raises(ArenaError, match=words):
-            training_bench.bench(dataclasses.replace(given, frames=frames, trainings=(2,)))
-
-
-def test_a_measured_training_counts_its_steps(monkeypatch, capsys):
-    """It says that it is ready, waits to be told, and answers the speed of real steps."""
-    monkeypatch.setattr(sys, "stdin", io.StringIO("go\n"))
-    flags = dataclasses.asdict(TrainingBenchOptions(recipe="small", device="cpu", frames=100, seconds=0.2))
-    assert measured_training.main(json.dumps(flags)) == 0
-    ready, answer = capsys.readouterr().out.splitlines()
-    assert ready == "ready" and json.loads(answer)["steps_per_s"] > 0 and not json.loads(answer)["graphed"]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

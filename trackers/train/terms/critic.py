@@ -1,4 +1,4 @@
-"""What only the critic sees: one function per term, all listed in `CRITIC`; the observation is the terms in its order.
+"""Privileged terms of the critic: one function per term, all listed in `CRITIC`, whose order is the observation's.
 
 A term sees the environment and the exact state against the reference frame of the state; vectors are in the measured
 heading frame.

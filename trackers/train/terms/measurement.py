@@ -1,4 +1,4 @@
-"""What one tick measured next to what its reference asked for: the argument of reward, termination and critic terms."""
+"""Measurement of one tick and its reference: the argument of reward, termination and critic terms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TickMeasurement:
     state: Simulation
     """The measured state: `root_pos`, `joint_pos`, `torque`, …; its views change with the next tick."""
     reference: Frame
-    """Where the robot should be now."""
+    """Wanted state of the robot now."""
     foot_vel: torch.Tensor
     """World frame [m/s], zero on an episode's first tick, shape [worlds, 2, 3]."""
     action: torch.Tensor
@@ -40,7 +40,7 @@ class TickMeasurement:
 
     @cached_property
     def finite(self) -> torch.Tensor:
-        """Whether the measured state is finite, bool, shape [worlds]."""
+        """True if the measured state is finite, bool, shape [worlds]."""
         return torch.isfinite(self.state.qpos).all(1) & torch.isfinite(self.state.qvel).all(1)
 
     @cached_property

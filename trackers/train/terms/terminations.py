@@ -1,4 +1,4 @@
-"""When an episode ends early: one function per term, all listed with their bounds in `TERMINATIONS`."""
+"""Early endings of an episode: one function per term, all listed with their bounds in `TERMINATIONS`."""
 
 from __future__ import annotations
 

@@ -1,0 +1,46 @@
+"""Flags of `eval certify`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from arena_newton.cli.flags import Several
+
+__all__ = ["CertifyOptions"]
+
+
+@dataclass(frozen=True)
+class CertifyOptions:
+    """Measure what the benchmark claims of itself: solvable tasks that need legs, clean axes, engines that agree.
+
+    The tasks' experts play in all checks but policy-inputs, execution, physics, camera and statistics. Exit code 0: no
+    check fails; 1: one fails; 2: bad input.
+    """
+
+    out: str = "results/certify"
+    """Folder of the certificate and of the evaluations behind it."""
+    quick: bool = False
+    """A few episodes of everything by two processes: minutes instead of hours, and wide intervals."""
+    task: Several[str] = ()
+    """Tasks; all that have an expert when none is named."""
+    tracker: Several[str] = ("twist2", "sonic")
+    """Trackers, with the weights they come with; the first one alone where one is enough."""
+    checks: Several[str] = ()
+    """Names of checks to run: journal recording solvable policy-inputs tracker-inputs frozen-legs gliding-base visual
+    semantic execution physics camera rules engines batches official shards ray swap visible sill failures statistics
+    gradients; all when none is named."""
+    episodes: int | None = None
+    """Episodes of each cell: 60, the protocol's, or 2 under --quick."""
+    worlds: int = 20
+    """Episodes simulated at once."""
+    engine: str = "mujoco"
+    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    device: str | None = None
+    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    twist2_checkpoint: str | None = None
+    """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
+    jobs: int = 1
+    """Processes that play at once, each on cores of its own, 2 under --quick (0: only play and write no page, as each
+    of them does)."""
+    resume: bool = False
+    """Continue a certification in its folder; what was played is kept."""

@@ -1,0 +1,22 @@
+"""`python -m arena_newton.eval loop`: from demonstrations to the report of a trained policy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from arena_newton.eval.loop.loop_options import LoopOptions
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+
+__all__ = ["run"]
+
+
+def run(options: LoopOptions, factories: Factories | None = None) -> int:
+    """Run the loop; missing libraries are named before those that are there load."""
+    from arena_newton.eval.loop.loop_requirements import check_libraries
+
+    check_libraries(options.policy)
+    from arena_newton.eval.loop import learning_loop
+
+    return learning_loop.run(options, factories)

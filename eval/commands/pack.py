@@ -1,0 +1,197 @@
+"""`python -m arena_newton.eval pack`: a trained checkpoint becomes a small policy with a card of what it reaches."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arena_newton.cli.flags import Several, shell_command, words
+from arena_newton.errors import InputError
+from arena_newton.files.text import counted
+
+if TYPE_CHECKING:
+    from arena_newton.eval.folders.results import RunRecord
+    from arena_newton.eval.tables.episode_table import EvaluatedCell
+    from arena_newton.policies.learned.learned_card import CellResult, PolicyCard
+
+__all__ = ["PackOptions", "run"]
+
+ENOUGH = 0.75
+"""Success rate from which on a task counts as solved."""
+PROGRAM = "arena_newton.eval"
+
+
+@dataclass(frozen=True)
+class PackOptions:
+    """Pack a trained checkpoint into the form that ships: float16, a card, at most 32 MB; ACT only.
+
+    `eval run --policy learned:<out>` runs it, without LeRobot. Without --out it becomes the policy of this package,
+    `--policy learned`.
+    """
+
+    out: str | None = None
+    """Folder to write; that of the policy that comes with the package when none is named."""
+    tasks: Several[str] = ()
+    """Tasks that it is offered for, the one first that the default run shows; with results those that it solves at
+    75 % in mode base through every tracker of its training, otherwise those of its training."""
+    results: Several[str] = ()
+    """Results folders or suites of eval whose cells of this checkpoint go into the card; a packed policy that is
+    packed again keeps its other cells."""
+    command: str = ""
+    """Command of the training, if not as the checkpoint remembers it."""
+    note: str = ""
+    """A sentence for the card."""
+
+
+def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
+    """Write the packed policy, and print what it is.
+
+    Raises:
+        InputError: The checkpoint or a flag is unfit, or the results are of another policy.
+    """
+    from arena_newton import tasks
+    from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, PolicyCard, read_card
+    from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
+    from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
+    from arena_newton.policies.train.checkpoint_packing import pack, packed_digest, training_command
+
+    (given,) = checkpoints
+    if options.out is not None and not options.out.strip():
+        raise InputError("--out: is empty, name a folder")
+    folder = checkpoint_folder(given, "pack")
+    checkpoint = read_act_checkpoint(folder)
+    facts = checkpoint.facts
+    before = read_card(folder) if (folder / CARD_FILE).is_file() else None  # of one that is packed again
+    digests = (checkpoint.digest, packed_digest(folder))
+    found = _results([Path(name).expanduser() for name in options.results], digests)
+    kept = _kept(before, digests, found)
+    found = (*found, *kept)
+    # Of equally good tasks the first stays the first.
+    trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.task_vector or facts.tasks))))
+    chosen = options.tasks or (_solved(found, trained, facts.trackers) if found else trained)
+    for task in chosen:
+        if task not in tasks.names():
+            known = f"choose from {', '.join(tasks.names())}"
+            if options.tasks:
+                raise InputError(f"--tasks {task}: unknown, {known}")
+            raise InputError(
+                f"{folder}: was trained on {task}, a task that is not known; --tasks takes others, {known}"
+            )
+    if not chosen:
+        why = f"none is solved at {100 * ENOUGH:.0f} %" if found else "the checkpoint names none"
+        raise InputError(f"--tasks: {why}; name those that it is offered for")
+    out = SHIPPED if options.out is None else Path(options.out).expanduser()
+    flags = PackOptions(tasks=options.tasks, results=tuple(Path(name).name for name in options.results))
+    packed_by = shell_command(PROGRAM, "pack", given.name or given.resolve().name, *words(flags))
+    card = PolicyCard(
+        tasks=tuple(dict.fromkeys(chosen)),
+        command=options.command or training_command(facts.options) or (before.command if before is not None else ""),
+        packed_by="; then ".join([*([before.packed_by] if before and kept else []), packed_by]),
+        note=options.note or (before.note if before is not None else ""),
+        results=_in_order(found, chosen, facts.trackers),
+    )
+    card = pack(folder, out, card)
+    print(f"{out}: {card.bytes / 1e6:.2f} MB, weights {card.weights}, tasks {', '.join(card.tasks)}")
+    for one in card.results:
+        print(f"  {one.task} {one.tracker} {one.mode}: {one.successes}/{one.episodes}")
+    spec = "learned" if out == SHIPPED else f"learned:{out}"
+    print(f"run it: {shell_command(PROGRAM, '--task', card.tasks[0], '--policy', spec)}")
+    return 0
+
+
+def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResult, ...]:
+    """What a checkpoint reached: its cells, chunks executed as it says itself, without latency.
+
+    Raises:
+        InputError: A folder is unfit or unfinished, was played under conditions of its own, or holds no cell of this
+            checkpoint.
+    """
+    if not folders:
+        return ()
+    from arena_newton.eval.folders.results import load_run
+    from arena_newton.eval.tables.evaluated_cells import read_cells
+    from arena_newton.policies.learned.learned_card import CellResult
+
+    read = read_cells(folders)
+    cells = [cell for cell in read.cells if cell.weights in digests]
+    plain = [cell for cell in cells if not cell.latency and cell.replan is None and not cell.ensemble]
+    if not plain:
+        where = " ".join(map(str, folders))
+        raise InputError(
+            f"--results {where}: no cell of this checkpoint (weights {' or '.join(digests)}), its chunks executed whole"
+        )
+    for folder in dict.fromkeys(cell.folder for cell in plain):
+        _check_usual(load_run(folder))
+    plain.sort(key=_names)
+    for cell, other in itertools.pairwise(plain):
+        if _names(cell) == _names(other):
+            names = f"{cell.task} {cell.tracker} {cell.mode}"
+            raise InputError(f"--results {other.folder}: {names} is in {cell.folder} too; leave one of them out")
+    for note in read.notes:
+        print(note)
+    return tuple(
+        CellResult(
+            task=cell.task,
+            tracker=cell.tracker,
+            mode=cell.mode,
+            episodes=len(cell.records),
+            successes=sum(cell.held().values()),
+            falls=sum(cell.held("fall").values()),
+        )
+        for cell in plain
+    )
+
+
+def _kept(before: PolicyCard | None, digests: Sequence[str], found: Sequence[CellResult]) -> list[CellResult]:
+    """Cells of the card of a policy that is packed again, whose weights stay; those that were found anew are not."""
+    if before is None or before.weights not in digests:
+        return []
+    return [cell for cell in before.results if _names(cell) not in {_names(one) for one in found}]
+
+
+def _check_usual(run: RunRecord) -> None:
+    """Refuse a run that is no result of the benchmark: cut budgets, another scene, or unfinished.
+
+    Raises:
+        InputError: It is one of these.
+    """
+    from arena_newton.eval.folders.results import is_complete
+
+    where = f"--results {run.folder}"
+    if not is_complete(run):
+        # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
+        played = f"{len(run.records):,} of {counted(run.document['planned'], 'episode')}"
+        raise InputError(f"{where}: is unfinished ({played}), and what ends first is no fair sample; eval resume it")
+    for name, said in (("max_steps", "--max-steps"), ("variant", "--variant")):
+        if run.config.get(name) is not None:
+            raise InputError(f"{where}: was played with {said}, which makes it no result of the benchmark")
+
+
+def _names(cell: EvaluatedCell | CellResult) -> tuple[str, str, str]:
+    return cell.task, cell.tracker, cell.mode
+
+
+def _in_order(cells: Sequence[CellResult], offered: Sequence[str], trackers: Sequence[str]) -> tuple[CellResult, ...]:
+    """Cells as a card lists them: tasks that it is offered for and trackers of its training come first."""
+    from arena_newton import tasks
+    from arena_newton.rules.rule_types import MODES
+
+    def place(name: str, known: Sequence[str]) -> tuple[int, str]:
+        return (known.index(name) if name in known else len(known)), name
+
+    first = (*offered, *tasks.names())
+    return tuple(sorted(cells, key=lambda c: (place(c.task, first), place(c.tracker, trackers), place(c.mode, MODES))))
+
+
+def _solved(found: Sequence[CellResult], trained: Sequence[str], trackers: Sequence[str]) -> tuple[str, ...]:
+    """Tasks solved often enough in mode base through every tracker of the training, the best first."""
+    rates: dict[str, list[float]] = {}
+    for one in found:
+        if one.mode == "base" and one.tracker in (trackers or (one.tracker,)):
+            rates.setdefault(one.task, []).append(one.rate)
+    solved = [task for task in trained if len(rates.get(task, ())) >= max(len(trackers), 1)]
+    solved = [task for task in solved if min(rates[task]) >= ENOUGH]
+    return tuple(sorted(solved, key=lambda task: -min(rates[task])))

@@ -1,0 +1,41 @@
+"""`python -m arena_newton.eval resume`: a run goes on in its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arena_newton.errors import InputError
+from arena_newton.eval.commands.run import run as evaluate
+from arena_newton.eval.plan.options import RunOptions
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+
+__all__ = ["defaults", "run"]
+
+
+def defaults(folders: Sequence[Path]) -> RunOptions:
+    """Flags with which the run was begun.
+
+    Raises:
+        InputError: The folder is none of a run, or damaged.
+    """
+    from arena_newton.eval.folders.run_folder import stored_options
+
+    return stored_options(folders[0])
+
+
+def run(folders: Sequence[Path], options: RunOptions, factories: Factories | None = None) -> int:
+    """Play what is left.
+
+    Raises:
+        InputError: A flag is not that of the run.
+    """
+    (folder,), stored = folders, defaults(folders)
+    if stored.until_width is not None and options.max != stored.max:
+        raise InputError(f"--max was {stored.max}, now {options.max}: it was said before the first episode, and stays")
+    if options.out != str(folder):
+        raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
+    return evaluate(options, factories)

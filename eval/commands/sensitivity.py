@@ -1,0 +1,163 @@
+"""`python -m arena_newton.eval sensitivity`: success and margin over a grid of a task's placements."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from arena_newton.cli.flags import Several
+from arena_newton.cli.intervals import wilson
+from arena_newton.errors import InputError
+from arena_newton.eval.studies.placement_options import PlacementOptions
+from arena_newton.files.text import counted
+from arena_newton.robot.g1 import TICK
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.studies.placement_axes import Axis
+    from arena_newton.eval.studies.placement_files import PointTally
+    from arena_newton.interfaces import EpisodeResult
+
+__all__ = ["SensitivityOptions", "run"]
+
+FORMAT = 1
+"""Version of sensitivity.json."""
+MOST_AXES = 2
+"""Axes of a picture."""
+
+
+@dataclass(frozen=True)
+class SensitivityOptions(PlacementOptions):
+    """Map success and margin of a policy over the placements of a task: a grid over one or two numbers.
+
+    At every point the same seeds are played (common random numbers), so that neighbours differ by the placement alone.
+    Needs the extra [plots].
+    """
+
+    grid: Several[int] = (7, 7)
+    """Points along each axis, the ends of its range among them."""
+    out: str | None = None
+    """Folder to write, which must not exist; results/sensitivity_<task>_<tracker>_<mode> when none is named."""
+
+
+def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
+    """Play the grid; write episodes.csv, sensitivity.csv, sensitivity.json and sensitivity.png; print what was found.
+
+    Returns:
+        Exit code: 0, or 1 when an episode ended with an error.
+
+    Raises:
+        InputError: A flag is unfit; raised before the first episode.
+        StorageError: A file cannot be written.
+    """
+    from arena_newton.eval.records.journal import write_atomic
+    from arena_newton.eval.reports.progress import Progress
+    from arena_newton.eval.studies.placed_play import MOST_EPISODES, PlacedWorlds, placement_run
+    from arena_newton.eval.studies.placement_files import PlacedRows, point_rows, study_folder, tallies
+    from arena_newton.eval.studies.placement_map import draw_grid
+    from arena_newton.eval.tables.suite_figures import save
+
+    config, all_axes = placement_run(options)
+    axes = all_axes if options.axes else _widest(all_axes)
+    if len(axes) > MOST_AXES:
+        raise InputError(f"--axes {' '.join(options.axes)}: a map has one or two")
+    grid = _grid(axes, options.grid, MOST_EPISODES)
+    points = list(itertools.product(*grid))
+    count = len(points) * len(config.episodes)
+    if count > MOST_EPISODES:
+        raise InputError(f"--grid and --repeats: make {count:,} episodes, at most {MOST_EPISODES:,}")
+    with PlacedWorlds(config, axes, factories) as worlds:
+        folder = study_folder(options.out, "sensitivity", config.flags.task[0], options.tracker, options.mode)
+        rows = PlacedRows(folder, axes)
+        budget = config.episodes[0].max_steps
+        progress = Progress(budget * count, planned=count)
+        progress.group(f"{config.flags.task[0]} {options.tracker} {options.mode}")
+
+        def ended(result: EpisodeResult) -> None:
+            rows.add(result)
+            progress.episode(budget, round(result.sim_s / TICK))
+
+        try:
+            results = worlds.play(worlds.placed(points), ended, progress.tick)
+        finally:
+            progress.close()
+            rows.close()
+    found = tallies(results)
+    write_atomic(folder / "sensitivity.csv", point_rows(axes, found))
+    write_atomic(folder / "sensitivity.json", _json(options, axes, grid, found))
+    title = f"{config.policy_label} through {options.tracker}: {config.flags.task[0]}, {options.mode}"
+    save(draw_grid(axes, grid, found, title), folder / "sensitivity.png")
+    print("\n".join(summary(axes, found)))
+    print(f"written: {folder / 'sensitivity.png'}, sensitivity.csv, sensitivity.json, episodes.csv")
+    return 1 if any(one.errors for one in found) else 0
+
+
+def _widest(axes: Sequence[Axis]) -> tuple[Axis, ...]:
+    """Both coordinates of the object with the largest area; without one, the first two axes that are no numbers."""
+    by_record: dict[str, dict[str, Axis]] = {}
+    for axis in axes:
+        by_record.setdefault(axis.record, {})[axis.key] = axis
+    flat = [(one["x"], one["y"]) for one in by_record.values() if {"x", "y"} <= set(one)]
+    if flat:
+        return max(flat, key=lambda pair: math.prod(axis.high - axis.low for axis in pair))
+    return tuple(axis for axis in axes if not axis.counts)[:MOST_AXES] or tuple(axes[:MOST_AXES])
+
+
+def _grid(axes: Sequence[Axis], points: Sequence[int], most: int) -> list[tuple[float, ...]]:
+    shown = " ".join(map(str, points))
+    if len(points) not in (1, len(axes)) and not (len(axes) == 1 and points == SensitivityOptions.grid):
+        raise InputError(f"--grid {shown}: expected one number, or one for each of the {len(axes)} axes")
+    if any(not 1 <= number <= most for number in points):
+        raise InputError(f"--grid {shown}: expected at least 1 point along an axis, at most {most:,}")
+    numbers = list(points) * len(axes) if len(points) == 1 else points
+    return [axis.grid(number) for axis, number in zip(axes, numbers, strict=False)]
+
+
+def summary(axes: Sequence[Axis], points: Sequence[PointTally]) -> list[str]:
+    """Rate over all placements and the worst of them, in words."""
+    successes, judged = sum(one.successes for one in points), sum(one.judged for one in points)
+    errors = sum(one.errors for one in points)
+    low, high = wilson(successes, judged)
+    rate = f"{successes / judged:.1%}" if judged else "none judged"
+    lines = [
+        f"success over {counted(len(points), 'placement')}: {successes}/{judged} ({rate}, 95 % {low:.1%} to {high:.1%})"
+    ]
+    if errors:
+        lines.append(f"{counted(errors, 'episode')} ended with an error and are in no rate")
+    told = [one for one in points if one.judged]
+    if successes < judged:
+        worst = min(told, key=lambda one: (one.rate, one.mean_margin))
+        counts = f"{worst.successes}/{worst.judged}, mean margin {worst.mean_margin:+.3f} m"
+        lines.append(f"worst at {worst.where(axes)}: {counts}")
+    elif told:
+        slowest = max(told, key=lambda one: one.success_s)
+        lines.append(f"slowest at {slowest.where(axes)}: {slowest.success_s:.1f} s")
+    return lines
+
+
+def _json(
+    options: SensitivityOptions, axes: Sequence[Axis], grid: Sequence[Sequence[float]], points: Sequence[PointTally]
+) -> str:
+    successes, judged = sum(one.successes for one in points), sum(one.judged for one in points)
+    told = [
+        {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
+        for row in (dataclasses.asdict(one) | {"success_rate": one.rate} for one in points)
+    ]
+    document = {
+        "format": FORMAT,
+        "flags": {name: value for name, value in dataclasses.asdict(options).items() if name not in ("out", "worlds")},
+        "axes": [
+            dataclasses.asdict(axis) | {"name": axis.name, "grid": values}
+            for axis, values in zip(axes, grid, strict=True)
+        ],
+        "successes": successes,
+        "judged": judged,
+        "interval": wilson(successes, judged),
+        "points": told,
+    }
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"

@@ -1,0 +1,51 @@
+"""`eval bench`: bars are judged where they belong, a start that fails is named."""
+
+import json
+import subprocess
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from arena_newton.errors import ArenaError
+from arena_newton.eval.bench import bench_learned, bench_start
+from arena_newton.policies.learned import learned_card
+from tests.made_packed import packed
+
+
+def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch):
+    """Ticks of both, in turn, as a ratio that is judged; the note says where the time of the one that sees goes."""
+    monkeypatch.setattr(learned_card, "SHIPPED", packed(tmp_path / "policy", ("boxing",)))
+    for name, value in (("WARM_UP", 2), ("ROUNDS", 1), ("WORLDS", (1,))):
+        monkeypatch.setattr(bench_learned, name, value)
+    (figure,) = bench_learned.learned_figures(6)
+    assert figure.value > 0.0 and figure.bar == 2.0 and figure.verdict in ("pass", "MISS")
+    assert "boxing, 1 world" in figure.name and "pictures" in figure.note and "policy of the package" in figure.note
+
+
+def test_three_starts_with_two_caches(monkeypatch):
+    """The second start has the first one's cache, the third an empty one and one thread; off CUDA nothing is judged."""
+    calls = []
+
+    def fake(command, env, **options):
+        calls.append((env["WARP_CACHE_PATH"], command[-1]))
+        return SimpleNamespace(returncode=0, stderr="", stdout=json.dumps({"environment": 2.0}) + "\n")
+
+    monkeypatch.setattr(subprocess, "run", fake)
+    figures = list(bench_start.start_figures())
+    caches = [cache for cache, _ in calls]
+    assert caches[0] == caches[1] != caches[2] and calls[2][1].endswith(", 1)") and calls[0][1].endswith(", 0)")
+    assert [figure.bar for figure in figures] == [40.0, 8.0]
+    assert torch.cuda.is_available() or [figure.value for figure in figures] == [None, None]
+    for figure in figures:  # what comes before the environment is said, but not judged
+        assert "environment 2.0 s" in figure.note and "not in the figure: interpreter and libraries" in figure.note
+        assert figure.value == 2.0 or figure.note.startswith("2.0 s, judged on CUDA only")
+
+
+def test_a_start_that_fails_says_why(monkeypatch):
+    """The last words of the process are in the error."""
+    monkeypatch.setattr(
+        subprocess, "run", lambda *a, **k: SimpleNamespace(returncode=1, stderr="no\nmemory left", stdout="")
+    )
+    with pytest.raises(ArenaError, match="the first tick was not reached: no memory left"):
+        list(bench_start.start_figures())

@@ -1,0 +1,89 @@
+"""One environment for runs that follow each other: episodes are the same to the last bit."""
+
+import json
+
+import pytest
+
+from arena_newton import trackers
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.play.env_cache import EnvCache
+from arena_newton.eval.play.run import Factories
+from arena_newton.eval.suites.suite_records import read_suite
+
+SUITE = """
+[defaults]
+seeds = 0
+repeats = 3
+worlds = 2
+max_steps = 25
+engine = "mujoco"
+[matrix]
+tasks = ["boxing"]
+[[policies]]
+name = "expert"
+spec = "expert"
+[[policies]]
+name = "still"
+spec = "stand"
+[[policies]]
+name = "again"
+spec = "expert"
+"""
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """Folder of a suite of three cells that were played in one environment, and that environment's cache."""
+    folder = tmp_path_factory.mktemp("suite")
+    (folder / "three.toml").write_text(SUITE)
+    cache = EnvCache()
+    assert main(["matrix", str(folder / "three.toml"), "--out", str(folder / "out")], Factories(env=cache)) == 0
+    cache.drop()
+    return folder / "out", cache
+
+
+def ends(path):
+    """How each episode of a journal ended, with every number that physics decides."""
+    keys = (
+        "index",
+        "episode_seed",
+        "outcome",
+        "reason",
+        "steps",
+        "margin",
+        "progress",
+        "phases",
+        "predicates",
+        "events",
+    )
+    return [{key: json.loads(line)[key] for key in keys} for line in path.read_text().splitlines()]
+
+
+def test_episodes_do_not_know_what_ran_before(played, tmp_path):
+    """Cells in a used environment equal runs in one of their own, bit for bit, and one environment was built."""
+    out, cache = played
+    assert cache.built == 1
+    assert [cell.status for cell in read_suite(out).cells] == ["done"] * 3
+    flags = "--task boxing --seeds 0 --repeats 3 --worlds 2 --max-steps 25 --engine mujoco --policy".split()
+    for name, policy in (("still", "stand"), ("again", "expert")):
+        assert main(["run", *flags, policy, "--out", str(tmp_path / name)]) in (0, 1)
+        alone = ends(tmp_path / name / "episodes.jsonl")
+        assert len(alone) == 3 and len({line["margin"] for line in alone}) == 3
+        assert ends(out / name / "twist2/boxing/base/episodes.jsonl") == alone
+    first = ends(out / "expert/twist2/boxing/base/episodes.jsonl")
+    assert first == ends(out / "again/twist2/boxing/base/episodes.jsonl")
+    assert first != ends(out / "still/twist2/boxing/base/episodes.jsonl")
+
+
+def test_another_environment_is_built():
+    """Another number of worlds, another mode or what was dropped is built again; the same is handed out again."""
+    cache = EnvCache()
+    made = {"engine": "mujoco", "device": "cpu", "rules": "paper", "mode": "base"}
+    first = cache("boxing", tracker=trackers.get("twist2", None), worlds=1, **made)
+    first.close()
+    assert cache("boxing", tracker=trackers.get("twist2", None), worlds=1, **made) is first
+    second = cache("boxing", tracker=trackers.get("twist2", None), worlds=2, **made)
+    assert second is not first and cache.built == 2
+    cache.drop()
+    assert cache("boxing", tracker=trackers.get("twist2", None), worlds=2, **made) is not second
+    cache.drop()
