@@ -6,37 +6,27 @@ Markdown and one HTML page; what comes from the folder is text to both, pictures
 from __future__ import annotations
 
 import csv
-import json
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from arena_newton.data.recording.episode import VIDEO_FOLDER
-from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run
+from arena_newton.eval.loop.loop_options import LoopOptions
+from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
 from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.reports.progress import duration
 from arena_newton.eval.reports.wording import media_of
-from arena_newton.eval.statistics.stats import wilson
+from arena_newton.eval.statistics.stats import aggregate
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.html import FILES, render
 from arena_newton.pages.tables import Table, between, escaped
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 
-__all__ = [
-    "DATASET",
-    "EVALUATION",
-    "RECORDINGS",
-    "TRAINING",
-    "LoopRecord",
-    "StageRecord",
-    "lines",
-    "read",
-    "write",
-]
+__all__ = ["DATASET", "EVALUATION", "RECORDINGS", "TRAINING", "curve", "worked_seconds", "write"]
 
 RECORDINGS, DATASET, TRAINING, EVALUATION = "demonstrations", "dataset", "training", "evaluation"
 """Folders of the stages."""
@@ -46,73 +36,7 @@ WIDTH, HEIGHT = 640, 180
 """Size of the curve [px]."""
 MOST_POINTS = 400
 """Points of a curve; of more, every second, third ... is drawn."""
-MAX_BYTES = 1 << 20
-"""Largest loop.json that is read."""
-STAGES = {
-    "record": "record demonstrations",
-    "build": "build the dataset",
-    "train": "train",
-    "evaluate": "evaluate",
-}
-
-
-@dataclass
-class StageRecord:
-    """One stage of a loop."""
-
-    finished: bool = False
-    seconds: float = 0.0
-    """Time of all attempts that were not killed [s]."""
-    attempts: int = 0
-    code: int = 0
-    """Exit code of the finished stage."""
-    checkpoint: str | None = None
-    """Of the training: its last checkpoint, relative to the loop's folder."""
-
-
-@dataclass
-class LoopRecord:
-    """Content of loop.json."""
-
-    options: Mapping[str, object]
-    """The flags, with everything filled in."""
-    stages: dict[str, StageRecord] = field(default_factory=dict)
-
-
-def read(path: Path, version: int) -> LoopRecord:
-    """Read loop.json.
-
-    Raises:
-        InputError: It is not one of this version.
-    """
-    try:
-        content = json.loads(path.read_bytes()[: MAX_BYTES + 1])
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({plain(str(error))[:200]})") from None
-    if not isinstance(content, dict) or content.get("format") != version:
-        raise InputError(f"{path}: expected an object with format {version}")
-    options, stages = content.get("options"), content.get("stages")
-    if not isinstance(options, dict) or not isinstance(stages, dict):
-        raise InputError(f"{path}: expected objects named options and stages")
-    known = {one.name for one in fields(StageRecord)}
-    found = {}
-    for name, values in stages.items():
-        if name not in STAGES or not isinstance(values, dict) or not set(values) <= known:
-            raise InputError(f"{path}: stages: {plain(name)[:80]} is no stage with {', '.join(sorted(known))}")
-        stage = StageRecord(**values)
-        right = isinstance(stage.finished, bool) and all(
-            isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number < math.inf
-            for number in (stage.seconds, stage.attempts, stage.code)
-        )
-        inside = stage.checkpoint is None or (
-            isinstance(stage.checkpoint, str)
-            and not Path(stage.checkpoint).is_absolute()
-            and ".." not in Path(stage.checkpoint).parts
-        )
-        if not right or not inside:
-            raise InputError(f"{path}: stages: {name} has a value that no stage has")
-        found[name] = stage
-    return LoopRecord(options, found)
+RATE_HEAD = ["task", "tracker", "mode", "successes", "SR %", "95 % Wilson", "falls", "timeouts", "errors"]
 
 
 def curve(folder: Path) -> dict[str, list[tuple[float, float]]]:
@@ -133,7 +57,7 @@ def curve(folder: Path) -> dict[str, list[tuple[float, float]]]:
     return {name: points[:: max(1, math.ceil(len(points) / MOST_POINTS))] for name, points in found.items()}
 
 
-def _paths(curves: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, object] | None:
+def _paths(curves: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, Any] | None:
     """The curves as lines of an SVG with a logarithmic axis of losses; None where there is nothing to draw."""
     drawn = {name: [(x, y) for x, y in points if y > 0] for name, points in curves.items()}
     every = [point for points in drawn.values() for point in points]
@@ -171,102 +95,88 @@ def _films(run: RunRecord) -> list[tuple[EpisodeRecord, list[str]]]:
     return [(record, strips) for record, strips in found if strips]
 
 
-def _stage_rows(loop: LoopRecord) -> list[list[str]]:
-    rows = []
-    for name, words in STAGES.items():
-        if name in loop.stages:
-            stage = loop.stages[name]
-            again = f", in {stage.attempts} attempts" if stage.attempts > 1 else ""
-            rows.append([words, f"{stage.seconds:.1f}", ("finished" if stage.finished else "not finished") + again])
-    total = sum(stage.seconds for stage in loop.stages.values())
-    return [*rows, ["all", f"{total:.1f}", duration(total)]]
+def _time(text: str) -> float:
+    """A stored time in seconds; 0 where it is none."""
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError:
+        return 0.0
+
+
+def worked_seconds(run: RunRecord) -> float:
+    """Time in which the last call for a run worked or episodes of earlier ones were played, without pauses [s]."""
+    spans = [(record.started_at, record.finished_at) for record in run.records]
+    if run.status is not None:
+        spans.append((run.status["started_at"], run.status["finished_at"]))
+    total = until = 0.0
+    for begin, end in sorted((_time(str(first)), _time(str(last))) for first, last in spans):
+        total += max(0.0, end - max(begin, until))
+        until = max(until, end)
+    return total
 
 
 def _rate_rows(run: RunRecord) -> list[list[str]]:
     rows = []
-    for cell in dict.fromkeys((r.task, r.tracker, r.mode) for r in run.records):
-        own = [r for r in run.records if (r.task, r.tracker, r.mode) == cell]
-        ends = Counter(r.outcome for r in own)
-        rates = [f"{100 * ends['success'] / len(own):.1f}", between(wilson(ends["success"], len(own)))]
-        rows.append(
-            [*map(plain, cell), f"{ends['success']}/{len(own)}", *rates]
-            + [str(ends[outcome]) for outcome in ("fall", "timeout", "error")]
-        )
+    for cell in aggregate(run.records)["cells"]:
+        rates = [f"{100 * (cell['sr'] or 0.0):.1f}", between(cell["ci95"])]
+        names = [plain(name) for name in (cell["task"], cell["tracker"], cell["mode"])]
+        ends = [str(cell[ending]) for ending in ("falls", "timeouts", "errors")]
+        rows.append([*names, f"{cell['successes']}/{cell['episodes']}", *rates, *ends])
     return rows
 
 
-RATE_HEAD = ["task", "tracker", "mode", "successes", "SR %", "95 % Wilson", "falls", "timeouts", "errors"]
-
-
-def _facts(out: Path, loop: LoopRecord) -> list[tuple[str, str]]:
-    """Recording and training in words."""
-    found = []
-    if (out / RECORDINGS / "config.json").is_file():
-        recorded = load_run(out / RECORDINGS).records
-        won = sum(record.outcome == "success" for record in recorded)
-        found.append(("recorded", f"{counted(len(recorded), 'attempt')}, {won:,} of them successes"))
-        found.append(("world-ticks recorded", f"{sum(record.steps for record in recorded):,}"))
-        videos = sum(f.stat().st_size for f in (out / RECORDINGS / "episodes" / VIDEO_FOLDER).glob("*.mp4"))
-        found.append(("pictures", f"{videos / 1e6:,.1f} MB of video"))
-    stage = loop.stages.get("train")
-    if stage is not None and stage.checkpoint is not None:
-        facts = CheckpointFacts.read(out / stage.checkpoint)
-        if facts is not None:
-            trained = f"{facts.family}, recipe {facts.recipe}, {facts.steps:,} steps in {facts.minutes:.2f} min"
-            found.append(("trained", f"{trained} on {facts.device or 'an unnamed device'}, labels {facts.labels}"))
-        found.append(("checkpoint", stage.checkpoint))
-        weights = out / stage.checkpoint / "model.safetensors"
-        if weights.is_file():
-            found.append(("weights", f"{weights.stat().st_size / 1e6:,.1f} MB"))
-    return [(name, plain(value)) for name, value in found]
-
-
-def lines(out: Path, loop: LoopRecord) -> list[str]:
-    """Last lines of the command: times and rates."""
-    times = ", ".join(f"{name} {duration(stage.seconds)}" for name, stage in loop.stages.items())
-    found = [f"time: {times}; together {duration(sum(stage.seconds for stage in loop.stages.values()))}"]
-    for row in _rate_rows(load_run(out / EVALUATION)):
-        found.append(f"{row[0]} through {row[1]}: {row[3]} successes, {row[4]} % (95 % Wilson {row[5]})")
-    return found
-
-
-def write(out: Path, loop: LoopRecord, command: str) -> Path:
-    """Write `loop.md` and `loop.html`.
+def write(out: Path, options: LoopOptions, command: str) -> list[str]:
+    """Write `loop.md` and `loop.html`; stages whose folders are gone are left out.
 
     Returns:
-        The page.
+        Lines for the terminal: times, rates, the page.
     """
     run = load_run(out / EVALUATION)
-    drawn, films, facts = _paths(curve(out / TRAINING)), _films(run), _facts(out, loop)
-    rates, stages = _rate_rows(run), _stage_rows(loop)
-    notes = ["A small loop, which tries the machinery: no result."] if loop.options.get("small") is True else []
-    text = [f"# The loop of {escaped(' '.join(map(str, _listed(loop.options.get('task')))))}", ""]
-    text += [f"`{plain(command).replace('`', '')}`", "", "## Result", "", Table(RATE_HEAD, rates, "lllr").markdown()]
-    text += [f"> {note}" for note in notes] + [
-        "",
-        "## Time",
-        "",
-        Table(["stage", "seconds", ""], stages, "lr").markdown(),
-        "## What was made",
-        "",
-    ]
+    drawn, films, rates = _paths(curve(out / TRAINING)), _films(run), _rate_rows(run)
+    times: dict[str, float] = {}
+    facts: list[tuple[str, str]] = []
+    if (out / RECORDINGS / CONFIG_FILE).is_file():
+        recorded = load_run(out / RECORDINGS)
+        times["record demonstrations"] = worked_seconds(recorded)
+        won = sum(record.outcome == "success" for record in recorded.records)
+        facts.append(("recorded", f"{counted(len(recorded.records), 'attempt')}, {won:,} of them successes"))
+        facts.append(("world-ticks recorded", f"{sum(record.steps for record in recorded.records):,}"))
+        videos = sum(f.stat().st_size for f in (out / RECORDINGS / "episodes" / VIDEO_FOLDER).glob("*.mp4"))
+        facts.append(("pictures", f"{videos / 1e6:,.1f} MB of video"))
+        if (out / DATASET).is_dir() and recorded.status is not None:
+            written = max((f.stat().st_mtime for f in (out / DATASET).rglob("*") if f.is_file()), default=0.0)
+            times["build the dataset"] = max(0.0, written - _time(str(recorded.status["finished_at"])))
+    checkpoint = out / TRAINING / "checkpoints/last/pretrained_model"
+    if (trained := CheckpointFacts.read(checkpoint)) is not None:
+        times["train"] = 60.0 * trained.minutes
+        words = f"{trained.family}, recipe {trained.recipe}, {trained.steps:,} steps in {trained.minutes:.2f} min"
+        facts.append(("trained", f"{words} on {trained.device or 'an unnamed device'}, labels {trained.labels}"))
+        facts.append(("checkpoint", str(checkpoint.relative_to(out))))
+        weights = sum(file.stat().st_size for file in checkpoint.glob("model.safetensors"))
+        facts.append(("weights", f"{weights / 1e6:,.1f} MB"))
+    times["evaluate"] = worked_seconds(run)
+    times["all"] = sum(times.values())
+    stages = [[name, f"{seconds:.1f}"] for name, seconds in times.items()]
+    notes = ["A small loop, which tries the machinery: no result."] if options.small else []
+    title = " ".join(options.task)
+    text = [f"# The loop of {escaped(title)}", "", f"`{plain(command).replace('`', '')}`", ""]
+    text += ["## Result", "", Table(RATE_HEAD, rates, "lllr").markdown(), *(f"> {note}" for note in notes), ""]
+    text += ["## Time", "", Table(["stage", "seconds"], stages, "lr").markdown(), "## What was made", ""]
     text += [f"- {escaped(name)}: {escaped(value)}" for name, value in facts]
     if drawn is not None:
-        ends = drawn["ends"]
-        assert isinstance(ends, dict)
-        said = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in ends.items())
-        text += [f"- last {said} at step {drawn['last']} (curve: loop.html)"]
+        ends = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in drawn["ends"].items())
+        text += [f"- last {ends} at step {drawn['last']} (curve: loop.html)"]
     text += ["", "## A success and a failure", ""]
     for record, strips in films:
-        title = f"{record.task} {record.mode} seed {record.group_seed} repeat {record.repeat}"
-        text += [f"{escaped(title)}: {escaped(record.outcome)} after {record.steps} ticks", ""]
-        text += [f"![{escaped(title)}]({path})" for path in strips] + [""]
+        named = escaped(f"{record.task} {record.mode} seed {record.group_seed} repeat {record.repeat}")
+        text += [f"{named}: {escaped(record.outcome)} after {record.steps} ticks", ""]
+        text += [f"![{named}]({path})" for path in strips] + [""]
     write_atomic(out / "loop.md", "\n".join(text).rstrip() + "\n")
     page = render(
         FOLDER / "loop.html",
         styles=["report.css"],
         sources=FILES,
-        title=" ".join(map(str, _listed(loop.options.get("task")))),
+        title=title,
         command=command,
         head=RATE_HEAD,
         rates=rates,
@@ -277,8 +187,6 @@ def write(out: Path, loop: LoopRecord, command: str) -> Path:
         notes=notes,
     )
     write_atomic(out / "loop.html", page)
-    return out / "loop.html"
-
-
-def _listed(value: object) -> Sequence[object]:
-    return value if isinstance(value, list | tuple) else [value]
+    lines = ["time: " + ", ".join(f"{name} {duration(seconds)}" for name, seconds in times.items())]
+    lines += [f"{row[0]} through {row[1]}: {row[3]} successes, {row[4]} % (95 % Wilson {row[5]})" for row in rates]
+    return [*lines, f"report: {out / 'loop.html'}"]

@@ -18,10 +18,12 @@ from safetensors.torch import save_file
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
-from arena_newton.eval.loop import learning_loop, loop_report
-from arena_newton.eval.loop.learning_loop import LOOP_FILE, LoopParts, resolved
+from arena_newton.eval.loop import learning_loop
+from arena_newton.eval.loop.learning_loop import LOOP_FILE, is_begun, resolved
 from arena_newton.eval.loop.loop_options import LoopOptions
-from arena_newton.eval.loop.loop_report import StageRecord
+from arena_newton.eval.loop.loop_report import worked_seconds
+from arena_newton.files.new_folder import held_folder
+from arena_newton.files.text import is_printable
 from tests.fuzz.mutants import damaged
 
 FLAGS = ["--small", "--task", "boxing", "--tracker", "pd", "--engine", "mujoco", "--device", "cpu", "--episodes", "2"]
@@ -29,7 +31,6 @@ FLAGS += ["--steps", "6", "--max-steps", "12", "--worlds", "2", "--seed", "3"]
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from arena_newton.eval.loop import learning_loop
 from arena_newton.eval.__main__ import main
 from arena_newton.policies.train import policy_trainer
 at = sys.argv.pop(1)
@@ -59,11 +60,6 @@ def killed(stage, out, *flags):
     assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
 
 
-def content(out):
-    """Stages of loop.json."""
-    return json.loads((out / LOOP_FILE).read_text())["stages"]
-
-
 @pytest.fixture(scope="module")
 def looped(tmp_path_factory):
     """A small loop that was killed in recording, training and evaluation, then finished by the same command."""
@@ -82,14 +78,11 @@ def test_kills_cost_no_finished_stage(looped):
     """After kill -9 in three stages the same command finishes; what was finished is not made again."""
     out, code, first, made = looped
     assert code == 0 and len(first) == 1
-    stages = content(out)
-    assert list(stages) == ["record", "build", "train", "evaluate"]
-    assert all(stage["finished"] for stage in stages.values())
-    assert [stage["attempts"] for stage in stages.values()] == [2, 1, 2, 2]
     assert {path: path.stat().st_mtime_ns for path in made} == made
     assert len((out / "demonstrations" / "episodes.jsonl").read_text().splitlines()) == 2
-    checkpoint = out / stages["train"]["checkpoint"]
-    assert (checkpoint / "model.safetensors").is_file() and checkpoint.parent.name == "000006"
+    assert len((out / "evaluation" / "episodes.jsonl").read_text().splitlines()) == 3
+    checkpoint = (out / "training" / "checkpoints" / "last").resolve()
+    assert (checkpoint / "pretrained_model" / "model.safetensors").is_file() and checkpoint.name == "000006"
 
 
 def test_the_trained_policy_sees_and_is_evaluated(looped):
@@ -105,31 +98,41 @@ def test_the_report_has_times_rate_curve_and_strips(looped):
     """Markdown and page name stages, the rate with its interval, the training and a strip that exists."""
     out, *_ = looped
     text, page = (out / "loop.md").read_text(), (out / "loop.html").read_text()
-    for words in ("record demonstrations", "95 % Wilson", "recipe small, 6 steps", "in 2 attempts", "0/3"):
+    for words in ("record demonstrations", "95 % Wilson", "recipe small, 6 steps", "evaluate", "0/3"):
         assert words in text and words in page, words
     assert "<polyline" in page and "script-src" not in page and "<script" not in page
     strips = [line.split("](")[1].rstrip(")") for line in text.splitlines() if line.startswith("![")]
     assert strips and all((out / path).is_file() and path in page for path in strips)
 
 
-def test_a_finished_loop_only_writes_its_report(looped, capsys):
-    """The same command again trains and plays nothing; the seconds stay."""
-    out, *_ = looped
-    before = content(out)
+def test_a_finished_loop_only_writes_its_report(looped, tmp_path, capsys, monkeypatch):
+    """The same command trains and plays nothing, also in a folder that was moved or lacks what earlier stages left."""
+    out = tmp_path / "moved"
+    shutil.copytree(looped[0], out, symlinks=True)
+    flags = ["loop", *FLAGS, "--out", str(out)]
+    monkeypatch.setattr(learning_loop, "train", lambda options: pytest.fail("trained again"))
+    monkeypatch.setattr(learning_loop, "execute", lambda *a: pytest.fail("played again"))
+    texts = []
+    for _ in range(2):
+        assert main(flags) == 0 and capsys.readouterr().out.count("finished before") == 4
+        texts.append((out / "loop.md").read_text())
+        (out / "loop.html").unlink()
+    assert texts[0] == texts[1] and "| record demonstrations" in texts[0]
+    for name in ("demonstrations", "dataset", "training/checkpoints"):
+        shutil.rmtree(out / name)
+    assert main(flags) == 0 and capsys.readouterr().out.count("finished before") == 4
+    assert (out / "loop.html").is_file()
 
-    def never(options):
-        raise AssertionError("trained again")
 
-    (out / "loop.html").unlink()
-    options = LoopOptions(**_options(out))
-    assert learning_loop.run(options, parts=LoopParts(train=never)) == 0
-    assert content(out) == before and (out / "loop.html").is_file()
-    assert capsys.readouterr().out.count("finished before") == 4
-
-
-def _options(out):
-    stored = json.loads((out / LOOP_FILE).read_text())["options"]
-    return stored | {"task": tuple(stored["task"]), "out": str(out)}
+def test_pauses_are_no_time_of_a_stage(looped):
+    """A stage's time is that in which its last call worked or an episode of an earlier one was played."""
+    run = load_run(looped[0] / "demonstrations")
+    at = "2026-01-01T{}+00:00".format
+    spans = [("10:00:00.000", "10:00:30.000"), ("10:00:20.000", "10:00:50.000")]
+    records = [dataclasses.replace(run.records[0], started_at=at(a), finished_at=at(b)) for a, b in spans]
+    status = {"state": "success", "started_at": at("12:00:00"), "finished_at": at("12:01:00"), "error": None}
+    found = dataclasses.replace(run, records=records, document=run.document | {"status": status})
+    assert worked_seconds(found) == 50.0 + 60.0
 
 
 def test_another_loop_is_refused(looped, capsys):
@@ -149,22 +152,12 @@ def test_a_stage_of_other_code_says_how_to_go_on(tmp_path):
     stage.mkdir()
     (stage / "config.json").write_text("{}")
     with pytest.raises(InputError) as caught:
-        learning_loop._Loop(options, tmp_path, None, LoopParts()).play()
+        learning_loop._Loop(options, tmp_path).play()
     assert str(caught.value).endswith(f", or remove {stage}, and the loop's command plays this stage again")
 
 
-def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
+def test_ctrl_c_says_how_to_go_on(tmp_path, capsys, monkeypatch):
     """An interruption in training is code 130 and the command to continue; the next call resumes the training."""
-
-    class Stop(learning_loop._Loop):
-        def _record(self):
-            (self.out / "demonstrations" / "episodes").mkdir(parents=True)
-            (self.out / "demonstrations" / "episodes" / "one.npz").touch()
-            return 0
-
-        def _build(self):
-            return 0
-
     given = []
 
     def stop(options):
@@ -172,12 +165,12 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
         (tmp_path / "training" / "checkpoints" / "last").mkdir(parents=True, exist_ok=True)
         raise KeyboardInterrupt
 
-    options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
+    monkeypatch.setattr(learning_loop, "train", stop)
+    (tmp_path / "dataset").mkdir()
     for _ in range(2):
-        assert Stop(options, tmp_path, None, LoopParts(train=stop)).play() == 130
+        assert learning_loop._Loop(resolved(dataclasses.replace(_small(), out=str(tmp_path))), tmp_path).play() == 130
     assert "continue with: python -m arena_newton.eval loop --task boxing" in capsys.readouterr().out
     assert given[0].resume is None and given[1].resume == tmp_path / "training"
-    assert content(tmp_path)["train"]["attempts"] == 2 and content(tmp_path)["record"]["attempts"] == 1
 
 
 def _small():
@@ -244,11 +237,11 @@ def test_a_missing_extra_is_said_first(tmp_path, capsys, monkeypatch):
 def test_a_folder_that_cannot_hold_the_loop_is_refused(tmp_path, capsys, monkeypatch):
     """A disk that is too full, a path through a file and one without permission are found before anything is made."""
     (tmp_path / "file").touch()
-    parts = LoopParts(check=lambda options: 3_000_000_000)
+    monkeypatch.setattr(learning_loop, "check_training", lambda options: 3_000_000_000)
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**12, 0, 3_000_000_000))
     with pytest.raises(InputError, match=r"take about 3\.1 GB, 3\.0 GB are free there"):
-        learning_loop.run(dataclasses.replace(_small(), out=str(tmp_path / "out")), parts=parts)
+        learning_loop.run(dataclasses.replace(_small(), out=str(tmp_path / "out")))
     assert main(["loop", *FLAGS, "--out", str(tmp_path / "file" / "out")]) == 2
     assert f"{tmp_path}/file is a file" in capsys.readouterr().err
     monkeypatch.setattr(os, "access", lambda *a: False)
@@ -259,60 +252,63 @@ def test_a_folder_that_cannot_hold_the_loop_is_refused(tmp_path, capsys, monkeyp
 def test_a_loop_that_goes_on_is_checked_for_what_is_left(tmp_path, monkeypatch):
     """A loop whose training is to come is checked again when it goes on; what is recorded counts as free."""
     options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
-    stages = {"record": StageRecord(True, 1.0, 1, 0, ""), "build": StageRecord(True, 1.0, 1, 0, "")}
-    loop = learning_loop._Loop(options, tmp_path, None, LoopParts(), stages)
-    loop._write()
+    write_flags(tmp_path, options)
+    (tmp_path / "dataset").mkdir()
 
     def lacking(options):
         raise InputError("--weights: absent now")
 
+    monkeypatch.setattr(learning_loop, "check_training", lacking)
     with pytest.raises(InputError, match="absent now"):
-        learning_loop.run(options, parts=LoopParts(check=lacking))
+        learning_loop.run(options)
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**12, 0, 50_000_000))
-    (tmp_path / "demonstrations").mkdir()
-    (tmp_path / "demonstrations" / "film.mp4").write_bytes(bytes(2_000_000))
+    (tmp_path / "dataset" / "film.mp4").write_bytes(bytes(2_000_000))
     trained = []
-    loop.parts = LoopParts(check=lambda options: trained.append(options.out) or 1_000_000)
-    loop.check()
+    monkeypatch.setattr(learning_loop, "check_training", lambda options: trained.append(options.out) or 1_000_000)
+    learning_loop._Loop(options, tmp_path).check()
     assert trained == [tmp_path / "training"]
+
+
+def write_flags(out, options):
+    """Write loop.json."""
+    (out / LOOP_FILE).write_text(json.dumps({"options": dataclasses.asdict(options)}))
 
 
 def test_two_processes_do_not_share_a_folder(tmp_path, capsys):
     """A folder in which another process works is refused."""
-    with learning_loop.held(tmp_path / "out"):
+    with held_folder(tmp_path / "out", "works in it"):
         assert main(["loop", *FLAGS, "--out", str(tmp_path / "out")]) == 2
     assert "another process works in it" in capsys.readouterr().err
 
 
 def test_a_damaged_file_is_one_error(tmp_path):
-    """Whatever is wrong with loop.json, the reader names the file and nothing is overwritten."""
-    good = json.dumps(
-        {
-            "format": 1,
-            "options": {"task": ["boxing"]},
-            "stages": {"train": dataclasses.asdict(StageRecord(True, 2.5, 1, 0, "training/x"))},
-        }
-    ).encode()
+    """Whatever is wrong with loop.json, one error names the file or the flag, and nothing is overwritten."""
+    options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
+    write_flags(tmp_path, options)
     path, refused, rng = tmp_path / LOOP_FILE, 0, random.Random(0)
+    good = path.read_bytes()
+    assert is_begun(tmp_path, options)
     for _ in range(300):
-        path.write_bytes(damaged(good, rng, text=True))
+        path.write_bytes(content := damaged(good, rng, text=True))
         try:
-            loop_report.read(path, 1)
+            assert is_begun(tmp_path, options)
         except InputError as error:
-            assert str(path) in str(error)
+            assert str(error).startswith((str(path), f"--out {tmp_path}: was begun with --"))
+            assert is_printable(str(error))
             refused += 1
+        assert path.read_bytes() == content
     assert refused > 50
 
 
 def test_a_folder_that_is_refused_stays_as_it_was(tmp_path, capsys):
-    """A damaged loop.json, or one of other flags, leaves no lock behind."""
+    """Nothing is left in the folder of a damaged loop.json, or of one of other flags."""
     path, out = tmp_path / LOOP_FILE, ["--out", str(tmp_path)]
     path.write_text("{")
     assert main(["loop", *FLAGS, *out]) == 2
     assert f"error: {path}: not readable as JSON" in capsys.readouterr().err
     assert [one.name for one in tmp_path.iterdir()] == [LOOP_FILE] and path.read_text() == "{"
-    path.write_text(json.dumps({"format": 1, "options": {"task": ["football"]}, "stages": {}}))
+    path.write_text(json.dumps({"options": {"task": ["football"]}}))
     assert main(["loop", *FLAGS, *out]) == 2
     assert "was begun with --task football" in capsys.readouterr().err
     assert [one.name for one in tmp_path.iterdir()] == [LOOP_FILE]

@@ -125,7 +125,7 @@ def test_a_failed_recording_leaves_launches_plain():
 
 
 @wp.kernel
-def _judge_kernel(height: wp.array[float], round: int, least: float, success: wp.array[int], margin: wp.array[float]):
+def judge_kernel(height: wp.array[float], round: int, least: float, success: wp.array[int], margin: wp.array[float]):
     """Heights above a limit."""
     w = wp.tid()
     margin[w] = height[w] - least
@@ -134,7 +134,7 @@ def _judge_kernel(height: wp.array[float], round: int, least: float, success: wp
 
 def test_a_wrapper_takes_the_kernels_arguments():
     """Arrays by position or name, flags as numbers, defaults where nothing is given; what is missing is an error."""
-    launch_judge = launching.launcher(_judge_kernel, least=0.5)
+    launch_judge = launching.launcher(judge_kernel, least=0.5)
     assert launch_judge.__name__ == "launch_judge" and launch_judge.__doc__ == "Heights above a limit."
     height = wp.array([0.0, 1.0], dtype=float, device="cpu")
     outputs = {"success": wp.zeros(2, dtype=int, device="cpu"), "margin": wp.zeros(2, dtype=float, device="cpu")}
