@@ -1,7 +1,6 @@
 """A punch shown at one target is refined until it hits another one, played without looking.
 
-Shows: the exact gradient from a margin through the robot's kinematics and the conversion of actions to all of an
-episode's actions; values come from the engine, which plays the actions again each round. A minute on a CPU.
+Shows: the exact gradient from a margin to all of an episode's actions; values come from the engine. A minute on a CPU.
 
     python examples/refine_reference.py --shown 8 --wanted 0
 """

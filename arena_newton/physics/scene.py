@@ -331,11 +331,11 @@ def _empty() -> newton.ModelBuilder:
 
 
 _OWN: dict[tuple[Path, str | None, str], newton.ModelBuilder] = {}
-"""What the importer made of the project's own scenes: it takes nearly all of a scene's building."""
+"""Models as the importer made them of the project's own scenes: that takes nearly all of a scene's building."""
 
 
 def _imported(stage: Usd.Stage, path: Path, variant: str | None, hands: str) -> newton.ModelBuilder:
-    """What Newton's importer makes of a stage; the project's own scenes are imported once per process."""
+    """Model that Newton's importer makes of a stage; the project's own scenes are imported once per process."""
     key = (path.resolve(), variant, hands)
     if key in _OWN:
         return copy.deepcopy(_OWN[key])

@@ -48,12 +48,12 @@ LOOP_FILE = "loop.json"
 RECORD_WORLDS = {True: 100, False: 20}
 """Episodes simulated at once, with CUDA and without."""
 FULL = {"episodes": 100, "repeats": 20, "recipe": "fast", "size": "224x224"}
-"""What is left open in a loop."""
+"""Values of flags that are not given."""
 SMALL_STEPS = 20
 """Optimizer steps of a small loop."""
 SMALL = {"episodes": 3, "repeats": 1, "recipe": "small", "size": "64x64", "max_steps": 60, "worlds": 3}
 SMALL |= {"steps": SMALL_STEPS}
-"""What is left open in one that only tries the machinery."""
+"""Values of flags that are not given to a loop that only tries the machinery."""
 
 
 def run(options: LoopOptions, factories: Factories | None = None) -> int:
@@ -161,7 +161,7 @@ def _flags(options: LoopOptions) -> dict[str, object]:
 
 
 def is_begun(out: Path, options: LoopOptions) -> bool:
-    """Whether the folder holds this loop already; False where it is empty or not there.
+    """True if the folder holds this loop already, False where it is empty or not there.
 
     Raises:
         InputError: It is a loop's with other flags, holds something else, or cannot be written.

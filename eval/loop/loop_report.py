@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.eval.folders.results import RunRecord, load_run
@@ -57,7 +56,7 @@ def curve(folder: Path) -> dict[str, list[tuple[float, float]]]:
     return {name: points[:: max(1, math.ceil(len(points) / MOST_POINTS))] for name, points in found.items()}
 
 
-def _paths(curves: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, Any] | None:
+def _paths(curves: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, object] | None:
     """The curves as lines of an SVG with a logarithmic axis of losses; None where there is nothing to draw."""
     drawn = {name: [(x, y) for x, y in points if y > 0] for name, points in curves.items()}
     every = [point for points in drawn.values() for point in points]

@@ -95,7 +95,7 @@ def test_what_is_imported_is_a_dependency():
     names |= {"zmq": "pyzmq", "sklearn": "scikit-learn", "huggingface_hub": "huggingface-hub"}
     names |= {"mujoco_warp": "mujoco-warp", "rsl_rl": "rsl-rl-lib"}
     # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
-    known = {*sys.stdlib_module_names, "arena_newton", "benchmarks", "tensordict"}
+    known = {*sys.stdlib_module_names, "_typeshed", "arena_newton", "benchmarks", "tensordict"}
     # Run by the interpreter of that other program, never imported.
     theirs = {"benchmarks/mjlab_training.py": {"mjlab"}}
     for folder in ("arena_newton", *FLOORS, "benchmarks"):

@@ -10,13 +10,12 @@ from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.certification import certificate, certify, claims
+from arena_newton.eval.certification import certificate, certify, certify_options, claims
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import legs, solvable, swap
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.certification.stand_ins.bodies import Body
-from arena_newton.eval.plan import options as flags
 from arena_newton.eval.play import run as runs
 from arena_newton.eval.records.journal import ContradictionError
 from arena_newton.eval.statistics.stats import mcnemar
@@ -336,6 +335,6 @@ def test_every_check_shows_a_claim():
 
 def test_names_in_the_help_are_the_checks():
     """The flag's text lists every check, in their order."""
-    text = Path(flags.__file__).read_text()
+    text = Path(certify_options.__file__).read_text()
     named = re.search(r"Names of checks to run: ([\w\s-]+?); all", text)[1].split()
     assert named == [check.name for check in certify.CHECKS]

@@ -204,7 +204,14 @@ def test_pack_names_the_flag_or_the_checkpoint_of_an_unknown_task(tmp_path, caps
 def won(line):
     """The journal line of an episode as if it had succeeded when it ended."""
     record = json.loads(line)
-    record |= {"outcome": "success", "reason": "success", "margin": 0.0, "startup_fall": False, "events": []}
+    record |= {
+        "outcome": "success",
+        "reason": "success",
+        "margin": 0.0,
+        "progress": 1.0,
+        "startup_fall": False,
+        "events": [],
+    }
     if record.get("predicates"):
         record["predicates"] |= {list(record["predicates"])[-1]: record["steps"]}
     return json.dumps(record) + "\n"

@@ -104,7 +104,7 @@ def test_bad_requests_are_named(names, changes, message):
 def test_planning_imports_no_heavy_package():
     """A plan needs NumPy alone."""
     code = (
-        "import sys; from arena_newton.eval import plan;"
+        "import sys; from arena_newton.eval.plan import episode_plan as plan;"
         "[plan.listed(e) for e in plan.expand(['all'], trackers=['pd'], policy='stand', repeats=1)];"
         "print([m for m in ('warp', 'torch', 'pxr', 'mujoco', 'newton', 'cv2') if m in sys.modules])"
     )

@@ -282,7 +282,7 @@ def place(page: Chromium) -> np.ndarray:
 
 def still(page: Chromium) -> np.ndarray:
     """Wait until the robot stands, and say where."""
-    before = [place(page), 0]
+    before = [place(page), int(page.value("Number(document.body.dataset.tick)"))]
 
     def check() -> bool:
         tick, now = int(page.value("Number(document.body.dataset.tick)")), place(page)

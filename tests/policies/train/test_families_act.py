@@ -64,7 +64,7 @@ def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
     ours = model.postprocess(model.policy.predict_action_chunk(model.preprocess(dict(observation))))
     theirs = after(policy.predict_action_chunk(before(dict(observation))))
     assert ours.shape == (2, 20, 40)
-    assert torch.allclose(ours, theirs, atol=1e-6)
+    assert torch.allclose(ours, theirs, atol=1e-5)
     model.policy.train()
     assert not torch.allclose(model.policy.model.backbone.bn1.running_mean, torch.zeros(64)), "statistics were learned"
     facts = CheckpointFacts.read(tmp_path)
