@@ -203,7 +203,7 @@ def upward_rooms(edges: list[Import]) -> list[Import]:
 
 SPLIT = (PACKAGE, f"{PACKAGE}.data", *(f"{PACKAGE}.{room}" for room in ("trackers", "policies", "eval")))
 """Folders of which a picture shows the parts."""
-COLOURS = dict(zip(ROOMS, ("#8d6e63", "#c0a030", "#2e7d32", "#1565c0", "#6a1b9a", "#37474f"), strict=False))
+COLOURS = dict(zip(ROOMS, ("#8d6e63", "#c0a030", "#2e7d32", "#1565c0", "#6a1b9a", "#37474f", "#546e7a"), strict=True))
 """Colour of each top-level folder in a picture."""
 
 
