@@ -33,7 +33,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_addoption(parser):
-    """How many damaged files each reader gets."""
+    """Flag for the number of damaged files that each reader gets."""
     help = "damaged files per reader: 30, or 200 in the tests that damage files alone"
     parser.addoption("--fuzz", choices=("brief", "full"), default="brief", help=help)
 

@@ -27,7 +27,7 @@ def small(folder):
 
 @pytest.mark.parametrize("family", ["act", "flow", "pi05"])
 def test_random_weights_are_made_without_a_gpu(tmp_path, monkeypatch, family):
-    """Where there are several GPUs none of them is started, and the generator of whoever asks stays where it was."""
+    """Machines with several GPUs start none of them, and the generator of whoever asks stays where it was."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     before = torch.random.get_rng_state()
     policy_bench.random_checkpoint(tmp_path / family, "small", family=family)

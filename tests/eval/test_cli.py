@@ -304,7 +304,7 @@ def test_every_command_has_its_file():
 
 
 def test_options_are_written_as_they_are_typed():
-    """What a command prints of its options gives the same options again."""
+    """Options as a command prints them give the same options again."""
     for options in (
         RunOptions(task=("boxing", "vis_navi"), ray=(), follow=True, remote_timeout=2.5, until_width=0.1),
         MatrixOptions(only="policy=act task=boxing", shard="1/4", ray=("auto",), ray_gpus=0.5, keep_going=True),

@@ -32,7 +32,7 @@ def modules():
 
 
 def excluded(name):
-    """Whether a module lies in one of the exceptions, or is a command line."""
+    """True if a module lies in one of the exceptions, or is a command line."""
     rooms = [part.as_posix() for part in Path(name).parents]
     return Path(name).name == "__main__.py" or any(room in identity.UNHASHED for room in rooms)
 

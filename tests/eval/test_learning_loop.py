@@ -283,7 +283,7 @@ def test_two_processes_do_not_share_a_folder(tmp_path, capsys):
 
 
 def test_a_damaged_file_is_one_error(tmp_path):
-    """Whatever is wrong with loop.json, one error names the file or the flag, and nothing is overwritten."""
+    """A damaged loop.json is one error that names the file or the flag, and nothing is overwritten."""
     options = resolved(dataclasses.replace(_small(), out=str(tmp_path)))
     write_flags(tmp_path, options)
     path, refused, rng = tmp_path / LOOP_FILE, 0, random.Random(0)
