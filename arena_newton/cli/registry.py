@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.metadata
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from arena_newton.errors import InputError
 
 __all__ = ["Registry"]
+
+
+@functools.cache
+def _offered(path: tuple[str, ...]) -> importlib.metadata.EntryPoints:
+    """Entry points of all packages on a path; listing them reads a file of every package."""
+    return importlib.metadata.entry_points()
 
 
 class Registry[T]:
@@ -40,7 +48,7 @@ class Registry[T]:
 
     def points(self, name: str | None = None) -> list[importlib.metadata.EntryPoint]:
         """Entry points of other packages, of one name or all."""
-        found = importlib.metadata.entry_points(group=self.group)
+        found = _offered(tuple(sys.path)).select(group=self.group)
         return [point for point in found if name is None or point.name == name]
 
     def names(self) -> tuple[str, ...]:
