@@ -90,7 +90,6 @@ def sound(tmp_path_factory):
         patch.setattr(config, "code_hash", lambda: "0" * 12)
         for module in (config, identity):
             patch.setattr(module, "hash_path", cached)
-        patch.setattr("os.fsync", lambda file: None)
         assert main([*FLAGS, "--out", str(folder)], factories()) == 0
         for path in folder.iterdir():
             if path.name not in ("config.json", "episodes.jsonl"):
