@@ -1,6 +1,5 @@
 """Lets the tests of this folder import each other's stand-ins, and makes what several files read."""
 
-import os
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -10,25 +9,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-@pytest.fixture(scope="session", autouse=True)
-def installed():
-    """Versions of the installed packages are read once, not by every command."""
-    from arena_newton import doctor
-
-    found = doctor.versions()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(doctor, "versions", lambda: dict(found))
-        yield
-
-
 @pytest.fixture(scope="session")
 def made_suite(tmp_path_factory):
     """A suite of known outcomes."""
     from made_suites import plan, write_suite
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda file: None)  # thousands of journal lines
-        return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
+    return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
 
 
 class Keepers(defaultdict):
