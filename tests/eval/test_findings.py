@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import os
 import re
 import shutil
 import statistics
@@ -49,9 +48,8 @@ def played_by(trainings, swapped=45, visual=45, won=45, families=(("act", "act")
     return cells
 
 
-def findings_of(tmp_path, monkeypatch, plan):
+def findings_of(tmp_path, plan):
     """Findings of a suite with these cells, by name."""
-    monkeypatch.setattr(os, "fsync", lambda file: None)
     found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
     return {one.name: one for one in found}
 
@@ -77,53 +75,53 @@ def test_findings_follow_the_data(cells):
     assert "13 points" in text and "of 26 through another" in text and "28 of a difference" in text
 
 
-def test_a_claim_that_fails_does_not_reproduce(tmp_path, monkeypatch):
+def test_a_claim_that_fails_does_not_reproduce(tmp_path):
     """Where in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
-    said = verdicts(findings_of(tmp_path, monkeypatch, played_by(3)).values())
+    said = verdicts(findings_of(tmp_path, played_by(3)).values())
     assert said["perturbation: visual drop"] == said["cross-GMT: sonic → twist2"] == "does not"
     assert said["cross-GMT: asymmetric drop"] == said["cross-GMT: asymmetric falls"] == "does not"
     assert said["tracker-conditioned: same family"] == "does not"
     assert said["SR and AFR disagree: sonic"] == "not measured"
 
 
-def test_a_claim_that_holds_in_three_trainings_reproduces(tmp_path, monkeypatch):
+def test_a_claim_that_holds_in_three_trainings_reproduces(tmp_path):
     """Drops that all trainings share reproduce, by their own spread, which the page names."""
-    found = findings_of(tmp_path, monkeypatch, played_by(3, swapped=12, visual=20))
+    found = findings_of(tmp_path, played_by(3, swapped=12, visual=20))
     assert found["perturbation: visual drop"].verdict == found["cross-GMT: sonic → twist2"].verdict == "reproduces"
     assert "42 trainings" not in found["cross-GMT: sonic → twist2"].ours.replace("21 trainings", "")
     assert "their standard deviation measured" in found["cross-GMT: sonic → twist2"].ours
 
 
-def test_one_training_decides_nothing_small(tmp_path, monkeypatch):
+def test_one_training_decides_nothing_small(tmp_path):
     """A difference of 20 points in one training of one task is within what trainings differ by."""
     plan = [
         (cell_of("act", "act", tracker, "boxing"), outcomes(won)) for tracker, won in (("twist2", 50), ("sonic", 38))
     ]
-    found = findings_of(tmp_path, monkeypatch, plan)["tracker-conditioned: same family"]
+    found = findings_of(tmp_path, plan)["tracker-conditioned: same family"]
     assert found.verdict == "undecided" and found.p_holm > 0.2 and "+20.0 points" in found.ours
 
 
-def test_verdicts_are_adjusted_for_all_claims(tmp_path, monkeypatch):
+def test_verdicts_are_adjusted_for_all_claims(tmp_path):
     """Each p counts the claims that were tested; a verdict stands only below the level after that."""
-    found = findings_of(tmp_path, monkeypatch, played_by(1, swapped=30, visual=30))
+    found = findings_of(tmp_path, played_by(1, swapped=30, visual=30))
     tested = [one for one in found.values() if one.p is not None]
     assert [one.p_holm for one in tested] == pytest.approx(holm([one.p for one in tested]))
     assert all((one.verdict == "undecided") == (one.p_holm >= 0.05) for one in tested)
 
 
-def test_more_policies_are_compared_on_fewer_tasks(tmp_path, monkeypatch):
+def test_more_policies_are_compared_on_fewer_tasks(tmp_path):
     """The runner-up that has three of seven tasks is compared on these, and who is left out is named."""
     plan = []
     for task, tracker in itertools.product((*HOI, *HSI), ("twist2", "sonic")):
         plan += [(cell_of("act", "act", tracker, task), outcomes(55))]
         plan += [(cell_of("dp", "diffusion", tracker, task), outcomes(53))] if task in HSI[:3] else []
         plan += [(cell_of("other", "act", tracker, task), outcomes(3))] if task == HOI[0] else []
-    said = findings_of(tmp_path, monkeypatch, plan)["tracker-conditioned: best family"]
+    said = findings_of(tmp_path, plan)["tracker-conditioned: best family"]
     assert said.verdict == "undecided" and "act is best with both; leads over the second, dp: +3.3 points" in said.ours
     assert said.ours.endswith(f"Compared: act, dp on {' '.join(HSI[:3])}; left out: other ({HOI[0]})")
 
 
-def test_merged_training_is_judged_by_its_own_trackers(tmp_path, monkeypatch):
+def test_merged_training_is_judged_by_its_own_trackers(tmp_path):
     """A merged policy of one tracker that another one executes is a swap, no effect of merging."""
     plan = []
     for task in HOI:
@@ -131,7 +129,7 @@ def test_merged_training_is_judged_by_its_own_trackers(tmp_path, monkeypatch):
         for tracker, won in (("twist2", 45), ("sonic", 0)):
             both = cell_of("all", "act", tracker, task, trained_on=("twist2",), tasks_of=HOI + HSI)
             plan.append((both, outcomes(won)))
-    one = findings_of(tmp_path, monkeypatch, plan)["merged training: TWIST2x7 HOI"]
+    one = findings_of(tmp_path, plan)["merged training: TWIST2x7 HOI"]
     assert one.ours.startswith("act: 0.0 points (") and "4 trainings" in one.ours
     assert one.verdict == "undecided" and "not separated" in one.remark
 

@@ -93,7 +93,6 @@ def base(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "code_hash", lambda: "0" * 12)
     for module in (config, identity):
         monkeypatch.setattr(module, "hash_path", cached)
-    monkeypatch.setattr("os.fsync", lambda file: None)
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "outer" / "inner" / "run"
     folder.parent.mkdir(parents=True)
