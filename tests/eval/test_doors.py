@@ -21,6 +21,7 @@ from arena_newton.eval.adapters.door_comparison import DoorEpisode, DoorPlay, co
 from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
 from arena_newton.eval.adapters.lerobot_env import ArenaNewtonEnv
 from arena_newton.eval.adapters.lerobot_env.labelled_worlds import V4VectorEnv
+from arena_newton.eval.play.run import Factories
 from arena_newton.policies.replay import ReplayEpisodes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies" / "checkpoints"))
@@ -101,14 +102,14 @@ def test_a_folder_that_holds_something_is_left_alone(checkpoint, tmp_path):
 
 
 @pytest.fixture
-def here(monkeypatch):
+def here(monkeypatch, kept_worlds):
     """The programs of doors run in this process, by their command lines; gives their exit codes."""
     codes = []
 
     def call(command, *, stdout, **_):
         assert command[:3] == [sys.executable, "-m", "arena_newton.eval"]
         with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
-            codes.append(main(command[3:]))
+            codes.append(main(command[3:], Factories(env=kept_worlds)))
         return SimpleNamespace(returncode=codes[-1])
 
     monkeypatch.setattr(door_comparison.subprocess, "run", call)
@@ -197,16 +198,19 @@ def test_a_picture_of_no_size_is_named(tmp_path, monkeypatch):
         ArenaNewtonEnv(task="boxing")
 
 
-def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch, tmp_path):
-    """No flag but the checkpoint's path: the episodes of our runner, bit for bit, and files that `replay:` plays."""
+def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch, tmp_path, kept_worlds):
+    """No flag but the checkpoint's path: the episodes of our runner, bit for bit, and files that `replay:` plays.
+
+    What LeRobot records of a policy with a task vector has it as a column.
+    """
     flags = ["--eval.n_episodes=2", "--eval.batch_size=1", "--seed=0", f"--env.episode_length={TICKS}"]
-    flags += [f"--env.episodes={tmp_path / 'kept'}", f"--output_dir={tmp_path / 'out'}"]
+    flags += [f"--env.episodes={tmp_path / 'kept'}", f"--output_dir={tmp_path / 'out'}", "--eval.recording=true"]
     argv(monkeypatch, checkpoint, *flags)
     eval_main()
     lines = [json.loads(line) for line in (tmp_path / "kept" / "outcomes.jsonl").read_text().splitlines()]
     run = ["--task", "boxing", "--policy", f"lerobot:{checkpoint}", "--seeds", "0", "--repeats", "2", "--worlds", "1"]
     run += ["--engine", "mujoco", "--device", "cpu", "--max-steps", str(TICKS), "--actions"]
-    assert main(["run", *run, "--out", str(tmp_path / "run")]) == 0
+    assert main(["run", *run, "--out", str(tmp_path / "run")], Factories(env=kept_worlds)) == 0
     ours = [json.loads(line) for line in (tmp_path / "run" / "episodes.jsonl").read_text().splitlines()]
     ours = {line["episode_seed"]: line for line in ours if "margin" in line}
     assert len(lines) == len(ours) == 2 and {line["tracker"] for line in lines} == {"twist2"}
@@ -221,15 +225,9 @@ def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch,
     policy = policies.get(f"replay:{tmp_path / 'kept' / 'actions'}")
     assert isinstance(policy, ReplayEpisodes)
     policy.close()
-
-
-def test_lerobots_recording_has_the_task_vector(checkpoint, monkeypatch, tmp_path):
-    """What LeRobot records of a policy with a task vector has it as a column."""
-    flags = ["--eval.n_episodes=1", "--eval.batch_size=1", "--seed=0", "--env.episode_length=3"]
-    argv(monkeypatch, checkpoint, *flags, f"--output_dir={tmp_path / 'out'}", "--eval.recording=true")
-    eval_main()
     recorded = LeRobotDataset("eval_recording", root=tmp_path / "out" / "recordings" / "boxing_0")
-    assert recorded.num_frames == 3 and recorded[2]["observation.environment_state"].tolist() == [1.0, 0.0]
+    assert recorded.num_frames == 2 * TICKS
+    assert recorded[2]["observation.environment_state"].tolist() == [1.0, 0.0]
 
 
 def test_the_vector_names_the_task():

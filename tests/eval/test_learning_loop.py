@@ -33,28 +33,34 @@ FLAGS += ["--steps", "6", "--max-steps", "12", "--worlds", "2", "--seed", "3"]
 
 @pytest.fixture(scope="module")
 def looped(tmp_path_factory, kept_worlds):
-    """A small loop that was killed in recording and training, interrupted in evaluation, then finished."""
-    out = tmp_path_factory.mktemp("loop") / "out"
+    """A small loop: interrupted in recording and before training, killed in training, interrupted in evaluation."""
+    out, codes, append = tmp_path_factory.mktemp("loop") / "out", [], Journal.append
     flags = [*FLAGS, "--out", str(out)]
-    for stage in ("record", "train"):
-        process = Child("killed_loop", [stage, *flags])
-        assert process.wait(120) == -signal.SIGKILL, process.communicate()
-        if stage == "record":
-            first = [record.index for record in load_run(out / "demonstrations").records]
+
+    def stop(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    def played(owner, name, call):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(owner, name, call)
+            codes.append(main(["loop", *flags], Factories(env=kept_worlds)))
+
+    played(Journal, "append", lambda *given: (append(*given), stop()))
+    first = [record.index for record in load_run(out / "demonstrations").records]
+    played(learning_loop, "train", stop)
     made = {path: path.stat().st_mtime_ns for path in sorted((out / "dataset").rglob("*")) if path.is_file()}
-    codes = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Journal, "append", lambda *a, f=Journal.append: (f(*a), signal.raise_signal(signal.SIGINT)))
-        codes.append(main(["loop", *flags], Factories(env=kept_worlds)))
+    process = Child("killed_loop", flags)
+    assert process.wait(120) == -signal.SIGKILL, process.communicate()
+    played(Journal, "append", lambda *given: (append(*given), stop()))
     assert len(load_run(out / "evaluation").records) == 1
-    codes.append(main(["loop", *flags], Factories(env=kept_worlds)))
+    played(Journal, "append", append)
     return out, codes, first, made
 
 
 def test_kills_cost_no_finished_stage(looped):
-    """After kill -9 in two stages and Ctrl-C in a third the same command finishes; nothing finished is made again."""
+    """After Ctrl-C and kill -9 in its stages the same command finishes; what was finished is not made again."""
     out, codes, first, made = looped
-    assert codes == [130, 0] and len(first) == 1 and made
+    assert codes == [130, 130, 130, 0] and len(first) == 1 and made
     assert {path: path.stat().st_mtime_ns for path in made} == made
     assert len((out / "demonstrations" / "episodes.jsonl").read_text().splitlines()) == 2
     assert len((out / "evaluation" / "episodes.jsonl").read_text().splitlines()) == 3

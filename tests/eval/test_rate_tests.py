@@ -385,8 +385,8 @@ def test_every_plan_that_is_said_to_be_computed_is():
 
 
 def test_comparisons_keep_their_level_and_find_what_is_there():
-    """On 150 synthetic comparisons of each case no test errs more than its level allows, and power is as computed."""
-    found = error_rates.tallies(150, episodes=20)
+    """On synthetic comparisons of each case no test errs more than its level allows, and power is as computed."""
+    found = error_rates.tallies(60, episodes=20)
     assert [tally for tally in found if not tally.holds] == []
     by_name = {(tally.case, tally.what): tally for tally in found}
     none, much = (
@@ -415,7 +415,7 @@ def test_a_test_that_errs_is_found_out(monkeypatch):
         "arena_newton.eval.statistics.comparison.stratified_test", lambda strata: stratified_test(strata) / 4
     )
     monkeypatch.setattr(error_rates, "SPREADS", ())
-    assert any(not tally.holds for tally in error_rates.tallies(150, episodes=20))
+    assert any(not tally.holds for tally in error_rates.tallies(60, episodes=20))
 
 
 def test_an_interval_of_episodes_alone_is_found_out(monkeypatch):

@@ -261,19 +261,19 @@ def test_suites_are_found_by_name(tmp_path):
             suite_path(given)
 
 
-def test_damaged_suite_files_are_refused_or_read(tmp_path):
-    """Of 400 damaged suite files each is read, or refused with an error that names it."""
+def test_damaged_suite_files_are_refused_or_read(tmp_path, mutants):
+    """Each damaged suite file is read, or refused with an error that names it."""
     rng, path = random.Random(5), tmp_path / "m.toml"
     sound = START.encode() + b"replan = 4\n[[cells]]\nexclude = { tracker = 'sonic' }\n[defaults]\nseeds = [0, 1]\n"
     refused = 0
-    for _ in range(400):
+    for _ in range(mutants):
         path.write_bytes(damaged(sound, rng, text=True))
         try:
             expand_cells(read_suite_file(path))
         except InputError as error:
             assert str(path) in str(error)
             refused += 1
-    assert 100 < refused < 400
+    assert mutants / 4 < refused < mutants
 
 
 @pytest.fixture
@@ -350,12 +350,12 @@ def test_a_damaged_suite_is_refused(written, change, said):
         read_suite(written)
 
 
-def test_damaged_records_are_refused_or_read(written):
-    """Of 300 damaged plans and 300 damaged journals each is read, or refused with an error that names it."""
+def test_damaged_records_are_refused_or_read(written, mutants):
+    """Each damaged plan and each damaged journal is read, or refused with an error that names it."""
     rng, refused = random.Random(6), 0
     for path in (written / "suite.json", written / journal_file(2, 4)):
         sound = path.read_bytes()
-        for _ in range(300):
+        for _ in range(mutants):
             path.write_bytes(damaged(sound, rng, text=True))
             try:
                 read_suite(written)
@@ -363,4 +363,4 @@ def test_damaged_records_are_refused_or_read(written):
                 assert str(path) in str(error)
                 refused += 1
         path.write_bytes(sound)
-    assert 200 < refused < 600
+    assert 2 * mutants / 3 < refused < 2 * mutants
