@@ -140,7 +140,7 @@ def compiled(path: str | Path, variant: str | None = None) -> Compiled:
     dropped = io.StringIO()
     with warnings.catch_warnings(), contextlib.redirect_stdout(dropped), contextlib.redirect_stderr(dropped):
         warnings.simplefilter("ignore")
-        scene = load_scene(path, worlds=1, device="cpu", native=True, variant=variant)
+        scene = load_scene(path, worlds=1, device="cpu", native=True, variant=variant, drawn=False)
     m = scene.mj_model
     options: dict[str, Any] = {name: np.array(getattr(m.opt, name)) for name in _OPTIONS}
     options |= {

@@ -177,19 +177,23 @@ def search_context() -> Ar.DefaultResolverContext:
 
 def _read_layer(location: Location, shown: str, found: Dependencies, *, built_on: bool) -> Contents:
     """Contents of a layer; faults of its units and numbers go to `found`."""
+    known = _known_as(location)
+    if known in _OWN_CONTENTS:
+        return _OWN_CONTENTS[known]
     _check_layer(location)
     try:
         layer = Sdf.Layer.FindOrOpen(str(location))
         if layer is None:
             raise _Unreadable("not a readable USD layer")
-        if built_on:
-            found.problems += _units(layer, shown)
+        units = list(_units(layer, shown)) if built_on else []
         contents, faults = _contents(layer)
     except (Tf.ErrorException, UnicodeDecodeError, RuntimeError, MemoryError) as error:
         raise _Unreadable(f"not a readable USD layer: {_plain(reason(error), location)}") from None
     if faults:
-        found.problems += [Problem(shown, where, message) for where, message in faults]
         found.fatal = True
+    found.problems += [*units, *(Problem(shown, where, message) for where, message in faults)]
+    if built_on and not (units or faults) and location.file.resolve().is_relative_to(_ROOT / PACKAGE):
+        _OWN_CONTENTS[known] = contents
     return contents
 
 
@@ -225,6 +229,8 @@ def _too_large(size: int, most: int) -> str:
 
 _CRATE_FAULTS: dict[tuple[str, int, int, int], str | None] = {}
 """Faults found in binary layers, by name, file, size and time: a scene is walked more than once."""
+_OWN_CONTENTS: dict[tuple[str, int, int, int], Contents] = {}
+"""Sound layers of this package that others build on, likewise."""
 
 
 def _known_as(location: Location) -> tuple[str, int, int, int]:

@@ -54,7 +54,9 @@ def _pairs(path: str | Path, task: str) -> dict[tuple[str, str], tuple[float, li
         # As in a run: a user's file keeps its own selection but in semantic mode.
         variant = spec.variant(mode, rules) if mode == "semantic" or str(path) == task else None
         if variant not in scenes:
-            scenes[variant] = load_scene(path, worlds=1, device="cpu", native=True, variant=variant, rules=rules)
+            scenes[variant] = load_scene(
+                path, worlds=1, device="cpu", native=True, variant=variant, rules=rules, drawn=False
+            )
         for pair, depth in _inside(scenes[variant], spec.draw(_SEED, mode, rules), spec).items():
             deepest, modes = found.get(pair, (0.0, []))
             found[pair] = (max(depth, deepest), [*modes, mode])

@@ -30,6 +30,10 @@ HEAD = """#usda 1.0
 """
 
 
+BARE = HEAD.replace("    subLayers = [@{scene}@]\n", "")
+"""The same without the scene: what must not be composed is found before it is missed."""
+
+
 def layer(folder: Path, body: str = "", *, task: str = "football", head: str = HEAD) -> Path:
     """A user's layer on top of a task's scene; `body` may be written on one line."""
     path = folder / "my_room.usda"
@@ -174,7 +178,7 @@ def test_centre_of_mass_and_axes_are_required(tmp_path):
 @pytest.mark.parametrize("arc", ["references", "payload", "subLayers", "texture", "variant"])
 def test_foreign_asset_paths_are_named_wherever_they_stand(tmp_path, asset, word, arc):
     """Remote, absolute and missing paths are refused in references, payloads, sublayers, attributes and variants."""
-    head, prim = HEAD, "/World/Room"
+    head, prim = BARE, "/World/Room"
     if arc in ("references", "payload"):
         body = f'over "World" {{ def Xform "Room" ({arc} = @{asset}@) {{}} }}'
     elif arc == "texture":
@@ -186,7 +190,7 @@ def test_foreign_asset_paths_are_named_wherever_they_stand(tmp_path, asset, word
             f'variantSet "look" = {{ "far" (references = @{asset}@) {{}} }}\n}} }}'
         )
     else:
-        head, body, prim = HEAD.replace("@{scene}@", f"@{{scene}}@, @{asset}@"), "", "my_room.usda"
+        head, body, prim = HEAD.replace("{scene}", asset), "", "my_room.usda"
     only(layer(tmp_path, body, head=head), asset, word, prim)
 
 
@@ -248,9 +252,9 @@ def test_garbage_is_one_line_wherever_it_stands(tmp_path, name, arc):
     if not arc:
         path = tmp_path / name
     elif arc == "subLayers":
-        path = layer(tmp_path, head=HEAD.replace("@{scene}@", f"@{{scene}}@, @{name}@"))
+        path = layer(tmp_path, head=HEAD.replace("{scene}", name))
     else:
-        path = layer(tmp_path, f'over "World" {{ def Xform "Room" ({arc} = @{name}@) {{}} }}')
+        path = layer(tmp_path, f'over "World" {{ def Xform "Room" ({arc} = @{name}@) {{}} }}', head=BARE)
     found = texts(path)
     assert len(found) == 1, found
     assert words in found[0] and name in found[0]
@@ -278,11 +282,11 @@ def test_what_is_no_regular_file_is_refused_unopened(tmp_path, make, word, arc):
     if not arc:
         path = tmp_path / name
     elif arc == "subLayers":
-        path = layer(tmp_path, head=HEAD.replace("@{scene}@", f"@{{scene}}@, @{name}@"))
+        path = layer(tmp_path, head=HEAD.replace("{scene}", name))
     elif arc == "texture":
-        path = layer(tmp_path, f'over "World" {{ def Xform "Room" {{ asset inputs:file = @{name}@ }} }}')
+        path = layer(tmp_path, f'over "World" {{ def Xform "Room" {{ asset inputs:file = @{name}@ }} }}', head=BARE)
     else:
-        path = layer(tmp_path, f'over "World" {{ def Xform "Room" ({arc} = @{name}@) {{}} }}')
+        path = layer(tmp_path, f'over "World" {{ def Xform "Room" ({arc} = @{name}@) {{}} }}', head=BARE)
     only(path, word, name)
 
 
@@ -361,35 +365,37 @@ def test_a_package_is_followed_inside(tmp_path):
     assert "bad.usdz" in line and "@../my.png@ does not exist" in line
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "double3 xformOp:translate = (nan, 0, 0)",
-        "float3 xformOp:scale = (1, inf, 1)",
-        "quatf xformOp:orient = (1, 0, nan, 0)",
-        "matrix4d xformOp:transform = ((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,nan))",
-        "double size = -inf",
-        "double size = 1e300",
-        "point3f[] points = [(0, 0, 0), (0, nan, 0)]",
-        "double2 mjc:solref = (nan, 1)",
-        "float newton:damping = nan",
-        "float3 arena:size = (1, 1, nan)",
-        "half arena:half = inf",
-        "timecode arena:time = nan",
-        "quatf[] arena:turns = [(1, 0, 0, nan)]",
-        "double size.timeSamples = {\n0: 1,\n1: nan,\n}",
-        "float physics:mass = nan",
-        "float3 physics:diagonalInertia = (1, nan, 1)",
-        "point3f physics:centerOfMass = (0, inf, 0)",
-        "quatf physics:principalAxes = (nan, 0, 0, 0)",
-    ],
+NOT_FINITE = (
+    "double3 xformOp:translate = (nan, 0, 0)",
+    "float3 xformOp:scale = (1, inf, 1)",
+    "quatf xformOp:orient = (1, 0, nan, 0)",
+    "matrix4d xformOp:transform = ((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,nan))",
+    "double size = -inf",
+    "double size = 1e300",
+    "point3f[] points = [(0, 0, 0), (0, nan, 0)]",
+    "double2 mjc:solref = (nan, 1)",
+    "float newton:damping = nan",
+    "float3 arena:size = (1, 1, nan)",
+    "half arena:half = inf",
+    "timecode arena:time = nan",
+    "quatf[] arena:turns = [(1, 0, 0, nan)]",
+    "double size.timeSamples = {\n0: 1,\n1: nan,\n}",
+    "float physics:mass = nan",
+    "float3 physics:diagonalInertia = (1, nan, 1)",
+    "point3f physics:centerOfMass = (0, inf, 0)",
+    "quatf physics:principalAxes = (nan, 0, 0, 0)",
 )
-def test_numbers_are_finite(tmp_path, line):
+
+
+def test_numbers_are_finite(tmp_path):
     """Every number that is authored anywhere must be finite; prim and attribute are named."""
-    path = tmp_path / "my_room.usda"
-    layer(tmp_path)
-    path.write_text(path.read_text() + f'over "World"\n{{\n over "Ball"\n {{\n{line}\n }}\n}}\n')
-    only(path, "/World/Ball." + line.split()[1].removesuffix(".timeSamples"), "expected finite")
+    body = "".join(f'over "P{number}"\n{{\n{line}\n}}\n' for number, line in enumerate(NOT_FINITE))
+    path = layer(tmp_path, head=BARE)
+    path.write_text(path.read_text() + f'over "World"\n{{\n{body}}}\n')
+    found = texts(path)
+    assert len(found) == len(NOT_FINITE)
+    for number, (line, text) in enumerate(zip(NOT_FINITE, found, strict=True)):
+        assert f"/World/P{number}." + line.split()[1].removesuffix(".timeSamples") in text and "expected finite" in text
 
 
 def test_principal_axes_are_a_rotation(tmp_path):
